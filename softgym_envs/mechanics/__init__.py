@@ -1,0 +1,1 @@
+"""Physics of soft bodies. Knows no robot, no task and no learning."""

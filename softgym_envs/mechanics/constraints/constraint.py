@@ -1,0 +1,41 @@
+"""The interface of a constraint function."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+__all__ = ["Constraint"]
+
+
+class Constraint(ABC):
+    """A function ``delta(x)`` of the nodes with ``size`` rows and a work-conjugate effort per row.
+
+    An effort is positive when it does positive work on a growing delta (``mechanics`` sign convention).
+
+    Attributes:
+        name: identifier within a model.
+        size: number of rows.
+        dofs: degrees of freedom of the full node array (3 * node + axis) it depends on, shape (k,).
+        unilateral: the effort cannot be negative when displacement-driven (a cable cannot push).
+        unit: units of displacement and effort, for people.
+    """
+
+    name: str
+    size: int
+    dofs: np.ndarray
+    unilateral: bool = False
+    unit: tuple[str, str] = ("m", "N")
+
+    @abstractmethod
+    def value(self, x: np.ndarray) -> np.ndarray:
+        """Return delta, shape (size,), at node positions ``x`` [m], shape (n, 3)."""
+
+    @abstractmethod
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """Return d delta / d x over ``dofs``, shape (size, k)."""
+
+    def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray | None:
+        """Return ``sum_i effort_i d2 delta_i / dx2`` over ``dofs``, shape (k, k), or None if delta is linear."""
+        return None

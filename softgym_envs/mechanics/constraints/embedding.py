@@ -1,0 +1,53 @@
+"""Material points embedded in tetrahedra by barycentric coordinates."""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["EmbeddedPoints"]
+
+
+class EmbeddedPoints:
+    """Points that move with a tetrahedral mesh.
+
+    A point outside the mesh is extrapolated from the element where its smallest barycentric coordinate is
+    largest (the "nearest" element).
+
+    Args:
+        points: reference positions [m], shape (p, 3).
+        nodes: mesh nodes at rest [m], shape (n, 3).
+        tetrahedra: corner indices, shape (m, 4).
+        hint: elements to prefer, shape (p,). A hinted element is kept while the point stays close to it, so that
+            the embedding changes smoothly when a mesh of the same topology is moved.
+
+    Attributes:
+        elements: element of each point, shape (p,).
+        weights: barycentric coordinates, shape (p, 4).
+        node_ids: corner nodes, shape (p, 4).
+    """
+
+    def __init__(
+        self, points: np.ndarray, nodes: np.ndarray, tetrahedra: np.ndarray, hint: np.ndarray | None = None
+    ) -> None:
+        points = np.atleast_2d(np.asarray(points, dtype=float))
+        if not np.isfinite(points).all():
+            raise ValueError(f"embedded points must be finite, got {points.tolist()}")
+        corners = nodes[tetrahedra]
+        edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+        inverse = np.linalg.inv(edges)
+        self.elements = np.empty(len(points), dtype=np.int64)
+        self.weights = np.empty((len(points), 4))
+        for i, point in enumerate(points):
+            tail = np.einsum("mij,mj->mi", inverse, point - corners[:, 0])
+            barycentric = np.column_stack([1.0 - tail.sum(axis=1), tail])
+            score = barycentric.min(axis=1)
+            best = int(np.argmax(score))
+            if hint is not None and score[hint[i]] > score[best] - 0.5:
+                best = int(hint[i])
+            self.elements[i] = best
+            self.weights[i] = barycentric[best]
+        self.node_ids = np.asarray(tetrahedra)[self.elements]
+
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """Return the points [m], shape (p, 3), at node positions ``x``, shape (n, 3)."""
+        return np.einsum("pk,pkd->pd", self.weights, x[self.node_ids])

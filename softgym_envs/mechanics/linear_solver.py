@@ -1,0 +1,116 @@
+"""Sparse symmetric direct solvers behind one small interface: analyse once, factorise and solve many times."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import splu
+
+__all__ = ["CholmodSolver", "LinearSolver", "SuperLUSolver", "make_solver"]
+
+
+class LinearSolver(ABC):
+    """Solver for symmetric matrices of one fixed sparsity pattern.
+
+    Args:
+        indptr: CSC column pointers of the lower triangle, shape (n + 1,).
+        indices: sorted row indices of the lower triangle, shape (nnz,).
+    """
+
+    name: str
+
+    def __init__(self, indptr: np.ndarray, indices: np.ndarray) -> None:
+        self.indptr = indptr
+        self.indices = indices
+        self.size = len(indptr) - 1
+
+    @abstractmethod
+    def factorise(self, values: np.ndarray) -> bool:
+        """Factorise the matrix with the lower-triangle values, shape (nnz,).
+
+        Returns:
+            False if this method cannot factorise it (not positive definite, or singular).
+        """
+
+    @abstractmethod
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        """Solve for the columns of ``rhs``, shape (n, k), with the last factorisation."""
+
+
+class CholmodSolver(LinearSolver):
+    """Supernodal Cholesky of CHOLMOD, from the cvxopt wheel (GPL). Positive definite matrices only."""
+
+    name = "cholmod"
+
+    def __init__(self, indptr: np.ndarray, indices: np.ndarray) -> None:
+        super().__init__(indptr, indices)
+        from cvxopt import cholmod, matrix, spmatrix
+
+        self._cholmod, self._matrix = cholmod, matrix
+        columns = np.repeat(np.arange(self.size), np.diff(indptr))
+        diagonal = (indices == columns).astype(float)
+        self._lower = spmatrix(matrix(diagonal), matrix(indices.astype(np.int64)), matrix(columns.astype(np.int64)))
+        self._factor = cholmod.symbolic(self._lower)
+
+    def factorise(self, values: np.ndarray) -> bool:
+        self._lower.V = self._matrix(values)
+        try:
+            self._cholmod.numeric(self._lower, self._factor)
+        except ArithmeticError:
+            return False
+        return True
+
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        solution = self._matrix(np.asfortranarray(rhs))
+        self._cholmod.solve(self._factor, solution)
+        return np.asarray(solution)
+
+
+class SuperLUSolver(LinearSolver):
+    """LU of SuperLU (scipy, BSD): always available, and handles indefinite matrices."""
+
+    name = "superlu"
+
+    def __init__(self, indptr: np.ndarray, indices: np.ndarray) -> None:
+        super().__init__(indptr, indices)
+        columns = np.repeat(np.arange(self.size), np.diff(indptr))
+        strict = np.flatnonzero(indices != columns)
+        rows_full = np.concatenate([indices, columns[strict]])
+        columns_full = np.concatenate([columns, indices[strict]])
+        order = np.lexsort((rows_full, columns_full))
+        self._source = np.concatenate([np.arange(len(indices)), strict])[order]
+        self._rows = rows_full[order]
+        self._pointers = np.concatenate([[0], np.cumsum(np.bincount(columns_full, minlength=self.size))])
+
+    def factorise(self, values: np.ndarray) -> bool:
+        full = csc_matrix((values[self._source], self._rows, self._pointers), shape=(self.size, self.size))
+        try:
+            self._lu = splu(
+                full, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options={"SymmetricMode": True}
+            )
+        except RuntimeError:  # exactly singular
+            return False
+        return True
+
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        return self._lu.solve(np.ascontiguousarray(rhs))
+
+
+def make_solver(name: str, indptr: np.ndarray, indices: np.ndarray) -> LinearSolver:
+    """Return the solver of a name: ``"cholmod"``, ``"superlu"``, or ``"auto"`` for the fastest one installed.
+
+    Raises:
+        ValueError: for an unknown name.
+        ImportError: if ``"cholmod"`` is asked for and cvxopt is not installed.
+    """
+    if name not in ("auto", "cholmod", "superlu"):
+        raise ValueError(f"unknown linear solver '{name}'; allowed: auto, cholmod, superlu")
+    if name != "superlu":
+        try:
+            return CholmodSolver(indptr, indices)
+        except ImportError:
+            if name == "cholmod":
+                raise
+    return SuperLUSolver(indptr, indices)

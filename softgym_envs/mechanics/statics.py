@@ -1,0 +1,282 @@
+"""Static equilibrium of displacement- and effort-driven actuators.
+
+Newton's method on the KKT system by the Schur complement: the tangent is factorised once per iteration, solved for
+the few constraint columns, and ``W`` is there. Step lengths follow the affine-invariant natural monotonicity test
+of Deuflhard (Newton Methods for Nonlinear Problems, 2004, algorithm NLEQ-ERR): a step is accepted when the
+simplified Newton correction that follows it is smaller, which needs no scaling between forces and displacements.
+Displacement-driven cables are unilateral: each correction solves a small linear complementarity problem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.linear_solver import SuperLUSolver
+from softgym_envs.mechanics.model import MechanicalModel
+
+__all__ = ["Equilibrium", "Statics", "solve_complementarity"]
+
+
+def solve_complementarity(W: np.ndarray, gap: np.ndarray) -> np.ndarray:
+    """Solve ``0 <= y _|_ W y + gap >= 0`` for a symmetric positive definite W, shape (m, m).
+
+    Written as non-negative least squares, which ends after finitely many exchanges.
+    """
+    lower = np.linalg.cholesky(W)
+    return nnls(lower.T, np.linalg.solve(lower, -gap))[0]
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """A solved state.
+
+    Attributes:
+        x: node positions [m], shape (n, 3).
+        condensed: the condensed model at the state.
+        delta: constraint values of all rows, shape (size,).
+        effort: efforts of all rows, shape (size,).
+        slack: per actuator row, True where a unilateral actuator hangs slack.
+        iterations: Newton iterations spent, over all load increments.
+        increments: load increments used.
+    """
+
+    x: np.ndarray
+    condensed: CondensedModel
+    delta: np.ndarray
+    effort: np.ndarray
+    slack: np.ndarray
+    iterations: int
+    increments: int
+
+
+class _NotFound(Exception):
+    """Newton's method failed on one increment."""
+
+
+class Statics:
+    """Follows the equilibrium of a model under changing commands, starting each solve from the last state.
+
+    Args:
+        model: the body.
+        tolerance: largest correction of any node left at convergence [m].
+        max_iterations: Newton iterations per load increment.
+        max_halvings: how often a load increment is halved before giving up.
+    """
+
+    def __init__(
+        self,
+        model: MechanicalModel,
+        *,
+        tolerance: float = 1e-10,
+        max_iterations: int = 30,
+        max_halvings: int = 8,
+    ) -> None:
+        self.model = model
+        self.tolerance = tolerance
+        self.max_iterations = max_iterations
+        self.max_halvings = max_halvings
+        model.prepare()
+        self._actuators = sum(c.size for c in model.constraints["a"])
+        self._unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
+        self._fallback: SuperLUSolver | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Go back to the undeformed shape with no effort. The equilibrium under loads is found by `solve`."""
+        self.x = self.model.nodes.copy()
+        self.effort = np.zeros(self.model.size)
+        self._fresh = False
+
+    def restore(self, x: np.ndarray, effort: np.ndarray) -> None:
+        """Start the next solve from node positions ``x`` (n, 3) and efforts (size,) of all rows."""
+        self.x = x.copy()
+        self.effort = effort.copy()
+        self._fresh = False
+
+    # -- one linearisation ------------------------------------------------------------------------------------------
+
+    def _linearise(self) -> bool:
+        """Assemble and factorise at the current state. False if elements are inverted or the tangent is singular."""
+        assembled = self.model.assemble(self.x, self.effort)
+        if assembled is None:
+            return False
+        return self._factorise(assembled)
+
+    def _factorise(self, assembled: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]) -> bool:
+        self._residual, values, self._H, self._delta = assembled
+        solver = self.model.solver
+        if solver.factorise(values):
+            self._active = solver
+        else:
+            # Cholesky fails on a tangent that is indefinite though the constrained problem is stable.
+            if self._fallback is None:
+                self._fallback = SuperLUSolver(solver.indptr, solver.indices)
+            if not self._fallback.factorise(values):
+                return False
+            self._active = self._fallback
+        columns = self._active.solve(np.column_stack([self._H, self._residual]))
+        self._AH, self._Ar = columns[:, :-1], columns[:, -1]
+        self._W = self._H.T @ self._AH
+        if not np.isfinite(self._W).all():
+            return False
+        self._W = 0.5 * (self._W + self._W.T)
+        self._fresh = True
+        return True
+
+    def _correction(
+        self, Ar: np.ndarray, delta: np.ndarray, effort: np.ndarray, target: np.ndarray, driven: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Solve the linearised KKT system; returns the step of the free dofs and of the efforts."""
+        step_effort = np.zeros_like(effort)
+        # Effort-driven rows: the residual already holds their current effort; move it to the commanded value.
+        rows = np.arange(len(effort))
+        forced = np.setdiff1d(rows, driven)
+        step_effort[forced] = target[forced] - effort[forced]
+        if len(driven):
+            H = self._H[:, driven]
+            gap = delta[driven] - target[driven] - H.T @ Ar + self._W[np.ix_(driven, forced)] @ step_effort[forced]
+            W = self._W[np.ix_(driven, driven)]
+            unilateral = self._unilateral[driven]
+            if not unilateral.any():
+                step_effort[driven] = np.linalg.solve(W, -gap)
+            else:
+                new = self._solve_driven(W, gap - W @ effort[driven], unilateral)
+                step_effort[driven] = new - effort[driven]
+        return self._AH @ step_effort - Ar, step_effort
+
+    @staticmethod
+    def _solve_driven(W: np.ndarray, free_gap: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
+        """Efforts with ``W y + free_gap = 0`` (bilateral rows), complementary to ``y >= 0`` (unilateral rows)."""
+        y = np.linalg.solve(W, -free_gap)
+        if (y[unilateral] >= 0).all():
+            return y
+        b, u = np.flatnonzero(~unilateral), np.flatnonzero(unilateral)
+        if len(b) == 0:
+            return solve_complementarity(W, free_gap)
+        inner = np.linalg.solve(W[np.ix_(b, b)], np.column_stack([W[np.ix_(b, u)], free_gap[b]]))
+        reduced = W[np.ix_(u, u)] - W[np.ix_(u, b)] @ inner[:, :-1]
+        y_u = solve_complementarity(reduced, free_gap[u] - W[np.ix_(u, b)] @ inner[:, -1])
+        y = np.empty(len(free_gap))
+        y[u], y[b] = y_u, -inner[:, -1] - inner[:, :-1] @ y_u
+        return y
+
+    # -- Newton -----------------------------------------------------------------------------------------------------
+
+    def _newton(self, target: np.ndarray, driven: np.ndarray) -> int:
+        """Converge at one load level; returns the iterations. Leaves the state untouched by raising `_NotFound`."""
+        if not self._fresh and not self._linearise():
+            raise _NotFound
+        step_q, step_effort = self._correction(self._Ar, self._delta, self.effort, target, driven)
+        length = 1.0
+        for iteration in range(1, self.max_iterations + 1):
+            norm = float(np.abs(step_q).max(initial=0.0))
+            if not np.isfinite(norm):
+                raise _NotFound
+            while True:
+                x = self.x + self.model.warp(self.x, length * step_q)
+                effort = self.effort + length * step_effort
+                assembled = self.model.assemble(x, effort)
+                if assembled is not None:
+                    Ar = self._active.solve(assembled[0][:, None])[:, 0]
+                    next_q, next_effort = self._correction(Ar, assembled[3], effort, target, driven)
+                    remaining = float(np.abs(next_q).max(initial=0.0))
+                    # At the last digits round-off decides, not Newton.
+                    if remaining <= (1.0 - 0.25 * length) * norm or remaining <= self.tolerance:
+                        break
+                length *= 0.5
+                if length < 1e-3:
+                    raise _NotFound
+            contraction = remaining / norm if norm > 0.0 else 0.0
+            if length == 1.0 and remaining > self.tolerance and remaining * contraction <= 0.1 * self.tolerance:
+                # The simplified correction alone reaches the tolerance: take it and save a factorisation.
+                closer = x + self.model.warp(x, next_q)
+                finished = self.model.assemble(closer, effort + next_effort)
+                if finished is not None:
+                    x, effort, assembled = closer, effort + next_effort, finished
+            self.x, self.effort = x, effort
+            if not self._factorise(assembled):
+                raise _NotFound
+            step_q, step_effort = self._correction(self._Ar, self._delta, effort, target, driven)
+            if length == 1.0 and float(np.abs(step_q).max(initial=0.0)) <= self.tolerance:
+                return iteration
+            length = min(1.0, 2.0 * length)
+        raise _NotFound
+
+    def solve(self, target: Sequence[float] | np.ndarray, mode: str | Sequence[str] = "displacement") -> Equilibrium:
+        """Find the equilibrium under commanded actuators.
+
+        Args:
+            target: one value per actuator row: displacement [m, ...] or effort [N, ...].
+            mode: ``"displacement"`` or ``"effort"`` for all actuators, or one of them per row.
+
+        Returns:
+            The equilibrium. Unilateral actuators driven in displacement may end slack: their reached displacement
+            is then larger than commanded, and their effort is zero.
+
+        Raises:
+            ConvergenceError: with the fraction of the increment that was reached; the last converged state is kept.
+            ValueError: for a wrong shape, a non-finite value or an unknown mode.
+        """
+        count = self._actuators
+        target = np.asarray(target, dtype=float)
+        if target.shape != (count,):
+            raise ValueError(f"target must have shape ({count},), got {target.shape}")
+        if not np.isfinite(target).all():
+            raise ValueError(f"target must be finite, got {target.tolist()}")
+        modes = [mode] * count if isinstance(mode, str) else list(mode)
+        if len(modes) != count or any(m not in ("displacement", "effort") for m in modes):
+            raise ValueError(f"mode must be 'displacement' or 'effort' (one, or {count} of them), got {mode!r}")
+        driven = np.array([i for i, m in enumerate(modes) if m == "displacement"], dtype=int)
+        forced = np.array([i for i, m in enumerate(modes) if m == "effort"], dtype=int)
+        if not self._fresh and not self._linearise():
+            raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
+
+        # The path goes from the present values; rows that carry no load command keep their effort at zero.
+        start = np.zeros(self.model.size)
+        start[driven], start[forced] = self._delta[driven], self.effort[forced]
+        goal = np.zeros(self.model.size)
+        goal[:count] = target
+        # A slack cable's reached displacement exceeds its command: the path starts from the command's side.
+        done, size, iterations, increments, halvings = 0.0, 1.0, 0, 0, 0
+        while done < 1.0:
+            level = min(1.0, done + size)
+            kept = self.x, self.effort
+            try:
+                iterations += self._newton(start + level * (goal - start), driven)
+            except _NotFound:
+                self.restore(*kept)
+                halvings += 1
+                size *= 0.5
+                if halvings > self.max_halvings or not self._linearise():
+                    reached = ", ".join(f"{v:.6g}" for v in (start + done * (goal - start))[:count])
+                    wanted = ", ".join(f"{v:.6g}" for v in target)
+                    raise ConvergenceError(
+                        f"no equilibrium for actuators [{wanted}] ({'/'.join(sorted(set(modes)))}): "
+                        f"stopped at {100 * done:.1f} % of the increment, actuators [{reached}]",
+                        fraction=done,
+                    ) from None
+                continue
+            increments += 1
+            done = level
+            halvings = max(0, halvings - 1)
+            size *= 1.5
+        return self._state(driven, iterations, increments)
+
+    def _state(self, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
+        effort = self.effort.copy()
+        slack = np.zeros(self._actuators, dtype=bool)
+        rows = driven[self._unilateral[driven]] if len(driven) else driven
+        slack[rows] = effort[rows] <= 0.0
+        condensed = CondensedModel(
+            compliance=self._W.copy(),
+            free=self._delta - self._W @ effort,
+            effort=effort,
+            roles=self.model.roles,
+        )
+        return Equilibrium(self.x.copy(), condensed, self._delta.copy(), effort, slack, iterations, increments)
