@@ -67,6 +67,11 @@ class Statics:
         tolerance: largest correction of any node left at convergence [m].
         max_iterations: Newton iterations per load increment.
         max_halvings: how often a load increment is halved before giving up.
+
+    Attributes:
+        x: present node positions [m], shape (n, 3).
+        effort: present efforts of all rows, shape (size,).
+        unilateral: actuator rows that cannot push, shape (n_a,); may be changed between solves.
     """
 
     def __init__(
@@ -83,7 +88,7 @@ class Statics:
         self.max_halvings = max_halvings
         model.prepare()
         self._actuators = sum(c.size for c in model.constraints["a"])
-        self._unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
+        self.unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
         self._fallback: SuperLUSolver | None = None
         self.reset()
 
@@ -142,7 +147,7 @@ class Statics:
             H = self._H[:, driven]
             gap = delta[driven] - target[driven] - H.T @ Ar + self._W[np.ix_(driven, forced)] @ step_effort[forced]
             W = self._W[np.ix_(driven, driven)]
-            unilateral = self._unilateral[driven]
+            unilateral = self.unilateral[driven]
             if not unilateral.any():
                 step_effort[driven] = np.linalg.solve(W, -gap)
             else:
@@ -271,7 +276,7 @@ class Statics:
     def _state(self, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
         effort = self.effort.copy()
         slack = np.zeros(self._actuators, dtype=bool)
-        rows = driven[self._unilateral[driven]] if len(driven) else driven
+        rows = driven[self.unilateral[driven]] if len(driven) else driven
         slack[rows] = effort[rows] <= 0.0
         condensed = CondensedModel(
             compliance=self._W.copy(),

@@ -1,0 +1,33 @@
+"""Backends: one interface, several physics. A new backend needs its file and one row in `BACKENDS`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from softgym_envs.backends.backend import Backend
+    from softgym_envs.robots.robot import Robot
+
+__all__ = ["BACKENDS", "make_backend"]
+
+BACKENDS: dict[str, str] = {
+    "fem": "softgym_envs.backends.fem:FEMBackend",
+    "surrogate": "softgym_envs.backends.surrogate:SurrogateBackend",
+}
+"""Registry: name to ``module:class``, imported when used."""
+
+
+def make_backend(name: str, robot: Robot, **options: object) -> Backend:
+    """Return a backend for a robot by its registry name.
+
+    Raises:
+        ValueError: for an unknown name or a wrong option.
+    """
+    if name not in BACKENDS:
+        raise ValueError(f"unknown backend '{name}'; allowed: {', '.join(BACKENDS)}")
+    module, _, cls = BACKENDS[name].partition(":")
+    try:
+        return getattr(import_module(module), cls)(robot, **options)
+    except TypeError as error:
+        raise ValueError(f"backend '{name}': {error}") from None

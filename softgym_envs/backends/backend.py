@@ -1,0 +1,84 @@
+"""The interface between physics and everything above it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.robots.robot import Robot
+
+__all__ = ["Backend", "State"]
+
+
+@dataclass(frozen=True)
+class State:
+    """What is known of a robot at an equilibrium.
+
+    Attributes:
+        command: commanded displacements or efforts, shape (n_a,).
+        displacement: reached actuator displacements [m, ...], shape (n_a,); larger than commanded where slack.
+        effort: actuator efforts [N, ...], shape (n_a,).
+        effector: effector positions [m], shape (k, 3).
+        slack: actuators that hang slack, shape (n_a,).
+        condensed: condensed model at the state.
+        nodes: deformed nodes [m], shape (n, 3), where the backend has them.
+    """
+
+    command: np.ndarray
+    displacement: np.ndarray
+    effort: np.ndarray
+    effector: np.ndarray
+    slack: np.ndarray
+    condensed: CondensedModel
+    nodes: np.ndarray | None = None
+
+
+class Backend(ABC):
+    """Physics of one robot: ``reset(design) -> State``, ``step(command) -> State``.
+
+    Attributes:
+        robot: the family of bodies.
+        design: the present complete design.
+        state: the present state.
+    """
+
+    robot: Robot
+    design: dict[str, float]
+    state: State
+
+    @abstractmethod
+    def reset(self, design: Mapping[str, float] | None = None) -> State:
+        """Go to the rest equilibrium of a design (default: the present one). Nothing is rebuilt if it is the same.
+
+        Raises:
+            DesignError: for a malformed design.
+            InfeasibleDesign: if its geometry cannot exist.
+        """
+
+    @abstractmethod
+    def step(self, command: np.ndarray, mode: str = "displacement") -> State:
+        """Go to the equilibrium under a command, shape (n_a,), from the present one.
+
+        Args:
+            command: actuator displacements, or efforts.
+            mode: ``"displacement"`` or ``"effort"``.
+
+        Raises:
+            ConvergenceError: if no equilibrium is found; the present state is kept.
+        """
+
+    def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
+        """Return the state under a command without going there."""
+        kept = self.state
+        try:
+            return self.step(command, mode)
+        finally:
+            self.restore(kept)
+
+    @abstractmethod
+    def restore(self, state: State) -> None:
+        """Go back to a state of the present design."""

@@ -1,0 +1,1 @@
+"""Environments: robot x task x backend."""

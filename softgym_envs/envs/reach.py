@@ -1,0 +1,46 @@
+"""Reach: bring the effector to a random goal and hold it there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softgym_envs.envs.task import Kinematics, Task
+from softgym_envs.robots.robot import Robot
+
+__all__ = ["Reach"]
+
+
+class Reach(Task):
+    """A random goal per episode.
+
+    Args:
+        robot: the robot.
+        goals: ``"reachable"`` draws goals the present body can reach; or an array of goals [m], shape (k, 3), to draw
+            from whatever the body is, which makes bodies comparable.
+        command_low: smallest command of a reachable goal, as a fraction of the actuator range; 0.5 asks for goals
+            deep in the workspace.
+    """
+
+    name = "reach"
+    success_distance = 0.002
+    horizon = 1
+
+    def __init__(self, robot: Robot, *, goals: str | np.ndarray = "reachable", command_low: float = 0.0) -> None:
+        super().__init__(robot)
+        if isinstance(goals, str):
+            if goals != "reachable":
+                raise ValueError(f"goals = {goals!r} is unknown; allowed: 'reachable' or an array of shape (k, 3)")
+            self.goals = None
+        else:
+            self.goals = np.asarray(goals, dtype=float).reshape(-1, 3)
+            if len(self.goals) == 0 or not np.isfinite(self.goals).all():
+                raise ValueError("goals must be at least one finite point of shape (3,)")
+        if not 0.0 <= command_low < 1.0:
+            raise ValueError(f"command_low = {command_low} is out of bounds; allowed: [0, 1)")
+        self.command_low = command_low
+
+    def sample(self, rng: np.random.Generator, kinematics: Kinematics) -> np.ndarray:
+        if self.goals is not None:
+            return self.goals[rng.integers(len(self.goals))][None]
+        low = self.robot.lower + self.command_low * (self.robot.upper - self.robot.lower)
+        return kinematics(rng.uniform(low, self.robot.upper))[None]

@@ -1,0 +1,81 @@
+"""The interface of a task: it sees effectors, efforts and a goal, never a backend. All of it is batched."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from importlib import import_module
+
+import numpy as np
+
+from softgym_envs.robots.robot import Robot
+
+__all__ = ["TASKS", "Task", "make_task", "tolerance"]
+
+TASKS: dict[str, str] = {
+    "reach": "softgym_envs.envs.reach:Reach",
+    "track": "softgym_envs.envs.track:Track",
+}
+"""Registry: name to ``module:class``, imported when used."""
+
+Kinematics = Callable[[np.ndarray], np.ndarray]
+"""Maps a command (n_a,) to the effectors it leads to [m], shape (3,), for the present body."""
+
+
+def tolerance(x: np.ndarray, bound: float, margin: float) -> np.ndarray:
+    """Return 1 for ``x <= bound``, falling as 1 / (1 + 9 ((x - bound) / margin)^2): 0.1 at ``bound + margin``."""
+    excess = np.maximum(x - bound, 0.0) / margin
+    return 1.0 / (1.0 + 9.0 * excess * excess)
+
+
+class Task(ABC):
+    """What a robot is to do.
+
+    Attributes:
+        name: registry name.
+        success_distance: distance below which a goal counts as reached [m].
+        horizon: control steps a goal path describes; paths hold their last goal beyond it.
+    """
+
+    name: str
+    success_distance: float
+    horizon: int
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+
+    @abstractmethod
+    def sample(self, rng: np.random.Generator, kinematics: Kinematics) -> np.ndarray:
+        """Draw the goals of one episode: a path [m], shape (p, 3); p = 1 for a fixed goal."""
+
+    def goal(self, path: np.ndarray, step: int) -> np.ndarray:
+        """Goal [m] (3,) at a control step of a path (p, 3), which is spread over the horizon."""
+        index = min(step * len(path) // max(self.horizon, 1), len(path) - 1)
+        return path[index]
+
+    def reward_terms(self, distance: np.ndarray, effort_share: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the factors of the reward, each in [0, 1].
+
+        Args:
+            distance: effector to goal [m], shape (...).
+            effort_share: mean actuator effort over its scale, shape (...).
+        """
+        close = 0.5 * tolerance(distance, 0.0, self.success_distance) + 0.5 * tolerance(
+            distance, 0.0, 0.25 * self.robot.size
+        )
+        return {"distance": close, "effort": 1.0 - 0.05 * np.clip(effort_share, 0.0, 1.0)}
+
+
+def make_task(name: str, robot: Robot, **options: object) -> Task:
+    """Return a task by its registry name.
+
+    Raises:
+        ValueError: for an unknown name or a wrong option.
+    """
+    if name not in TASKS:
+        raise ValueError(f"unknown task '{name}'; allowed: {', '.join(TASKS)}")
+    module, _, cls = TASKS[name].partition(":")
+    try:
+        return getattr(import_module(module), cls)(robot, **options)
+    except TypeError as error:
+        raise ValueError(f"task '{name}': {error}") from None

@@ -1,0 +1,31 @@
+"""Robots: one readable file each. A new robot needs its file and one row in `ROBOTS`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from softgym_envs.robots.robot import Robot
+
+__all__ = ["ROBOTS", "make_robot"]
+
+ROBOTS: dict[str, str] = {
+    "finger": "softgym_envs.robots.soft_finger:SoftFinger",
+}
+"""Registry: name to ``module:class``, imported when used."""
+
+
+def make_robot(name: str, **options: object) -> Robot:
+    """Return a robot by its registry name.
+
+    Raises:
+        ValueError: for an unknown name or a wrong option.
+    """
+    if name not in ROBOTS:
+        raise ValueError(f"unknown robot '{name}'; allowed: {', '.join(ROBOTS)}")
+    module, _, cls = ROBOTS[name].partition(":")
+    try:
+        return getattr(import_module(module), cls)(**options)
+    except TypeError as error:
+        raise ValueError(f"robot '{name}': {error}") from None

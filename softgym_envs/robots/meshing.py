@@ -1,0 +1,186 @@
+"""Meshes from gmsh, behind a content-keyed cache and a time limit.
+
+A geometry is a function ``build(**parameters)`` that draws one volume in the current gmsh model **in millimetres**;
+it runs in a process of its own, because OpenCASCADE may hang on an infeasible shape. Nodes come back in metres.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from softgym_envs.errors import DataError, InfeasibleDesign
+from softgym_envs.storage import atomic_write, cache_directory
+
+__all__ = ["BodyMesh", "mesh_geometry"]
+
+_FORMAT = 2
+_SHIPPED = Path(__file__).parent / "meshes"
+
+
+@dataclass(frozen=True)
+class BodyMesh:
+    """A tetrahedral mesh with its classified surface.
+
+    Attributes:
+        nodes: positions [m], shape (n, 3).
+        tetrahedra: corner indices, shape (m, 4).
+        triangles: boundary triangles, shape (k, 3).
+        surfaces: geometric surface of each boundary triangle, shape (k,).
+        origin: ``"meshed"``, ``"morphed"`` or ``"remeshed"``: how this mesh came to be.
+    """
+
+    nodes: np.ndarray
+    tetrahedra: np.ndarray
+    triangles: np.ndarray
+    surfaces: np.ndarray
+    origin: str = "meshed"
+
+    def save(self, path: Path) -> None:
+        """Write to an npz file, atomically."""
+        with atomic_write(path) as stream:
+            np.savez_compressed(
+                stream,
+                format=_FORMAT,
+                nodes=self.nodes,
+                tetrahedra=self.tetrahedra.astype(np.int32),
+                triangles=self.triangles.astype(np.int32),
+                surfaces=self.surfaces.astype(np.int32),
+            )
+
+    @classmethod
+    def load(cls, path: Path) -> BodyMesh:
+        """Read an npz file.
+
+        Raises:
+            DataError: if the file is missing, truncated or of another format.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                if int(data["format"]) != _FORMAT:
+                    raise DataError(f"mesh '{path}' has format {int(data['format'])}, expected {_FORMAT}")
+                return cls(
+                    nodes=data["nodes"],
+                    tetrahedra=data["tetrahedra"].astype(np.int64),
+                    triangles=data["triangles"].astype(np.int64),
+                    surfaces=data["surfaces"].astype(np.int64),
+                )
+        except DataError:
+            raise
+        except Exception as error:
+            raise DataError(f"mesh '{path}' cannot be read: {error}") from error
+
+
+def mesh_geometry(
+    build: Callable[..., None], parameters: dict[str, float], *, mesh_size: float, time_limit: float = 60.0
+) -> BodyMesh:
+    """Mesh a geometry, or return it from the cache.
+
+    Args:
+        build: module-level function that draws one volume with ``gmsh.model.occ`` in millimetres.
+        parameters: its keyword arguments.
+        mesh_size: target edge length [m].
+        time_limit: wall-clock limit of the meshing process [s].
+
+    Raises:
+        InfeasibleDesign: if the geometry cannot be drawn or meshed, or takes too long.
+    """
+    name = f"{build.__module__}:{build.__qualname__}"
+    parameters = {key: float(value) for key, value in sorted(parameters.items())}
+    request = {"build": name, "parameters": parameters, "mesh_size": float(mesh_size)}
+    # The geometry's source and constants are part of the key: an edited shape never meets an old mesh.
+    constants = {k: v for k, v in vars(sys.modules[build.__module__]).items() if k.isupper() and isinstance(v, int | float)}
+    source = inspect.getsource(build) + json.dumps(constants, sort_keys=True)
+    key = hashlib.sha256((json.dumps(request, sort_keys=True) + source + str(_FORMAT)).encode()).hexdigest()[:24]
+    for folder in (_SHIPPED, cache_directory("meshes")):
+        path = folder / f"{key}.npz"
+        if path.exists():
+            try:
+                return BodyMesh.load(path)
+            except DataError:
+                if folder == _SHIPPED:
+                    raise
+                path.unlink(missing_ok=True)  # a damaged cache entry is made again
+    with tempfile.TemporaryDirectory() as scratch:
+        request["output"] = str(Path(scratch) / "mesh.npz")
+        command = [sys.executable, "-m", "softgym_envs.robots.meshing", json.dumps(request)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, timeout=time_limit, env=environment, check=False
+            )
+        except subprocess.TimeoutExpired:
+            raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s for {parameters}") from None
+        if done.returncode != 0:
+            reason = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
+            raise InfeasibleDesign(f"the geometry cannot be meshed for {parameters}: {reason}")
+        mesh = BodyMesh.load(Path(request["output"]))
+    mesh.save(path)
+    return mesh
+
+
+def _mesh_here(request: dict) -> BodyMesh:
+    """Draw and mesh in this process."""
+    import gmsh
+
+    module, _, function = request["build"].partition(":")
+    gmsh.initialize()
+    try:
+        for option, value in (
+            ("General.Terminal", 0),
+            ("General.NumThreads", 1),
+            ("Mesh.RandomSeed", 1),
+            ("Mesh.MeshSizeExtendFromBoundary", 0),
+            ("Mesh.MeshSizeFromPoints", 0),
+            ("Mesh.MeshSizeFromCurvature", 0),
+            ("Mesh.OptimizeNetgen", 1),
+            ("Mesh.MeshSizeMax", request["mesh_size"] * 1e3),
+            ("Mesh.MeshSizeMin", request["mesh_size"] * 1e3),
+        ):
+            gmsh.option.setNumber(option, value)
+        gmsh.model.add("body")
+        getattr(import_module(module), function)(**request["parameters"])
+        gmsh.model.occ.synchronize()
+        volumes = gmsh.model.getEntities(3)
+        if len(volumes) != 1:
+            raise ValueError(f"the geometry has {len(volumes)} volumes, expected one")
+        gmsh.model.mesh.generate(3)
+        tags, coordinates, _ = gmsh.model.mesh.getNodes()
+        number = np.zeros(int(tags.max()) + 1, dtype=np.int64)
+        number[tags] = np.arange(len(tags))
+        tetrahedra = number[gmsh.model.mesh.getElementsByType(4)[1].reshape(-1, 4)]
+        triangles, surfaces = [], []
+        for _, surface in gmsh.model.getEntities(2):
+            found = number[gmsh.model.mesh.getElementsByType(2, surface)[1].reshape(-1, 3)]
+            triangles.append(found)
+            surfaces.append(np.full(len(found), surface))
+        if len(tetrahedra) == 0:
+            raise ValueError("gmsh made no tetrahedra")
+        nodes = coordinates.reshape(-1, 3) * 1e-3
+        used, renumbered = np.unique(tetrahedra, return_inverse=True)
+        back = np.full(len(nodes), -1)
+        back[used] = np.arange(len(used))
+        return BodyMesh(
+            nodes=nodes[used],
+            tetrahedra=renumbered.reshape(tetrahedra.shape),
+            triangles=back[np.concatenate(triangles)],
+            surfaces=np.concatenate(surfaces),
+        )
+    finally:
+        gmsh.finalize()
+
+
+if __name__ == "__main__":
+    arguments = json.loads(sys.argv[1])
+    _mesh_here(arguments).save(Path(arguments["output"]))

@@ -1,0 +1,156 @@
+"""The Robot base class: a family of bodies over a design space."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from softgym_envs.designs import DesignSpace
+from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.meshing import BodyMesh
+from softgym_envs.robots.morphing import Feature, Morpher
+
+__all__ = ["Actuator", "Robot"]
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """One actuator of a robot.
+
+    Args:
+        name: identifier.
+        low: smallest commanded displacement [unit].
+        high: largest commanded displacement [unit].
+        rate: largest change of the command per control step [unit].
+        unit: unit of displacement.
+        unilateral: cannot push.
+    """
+
+    name: str
+    low: float
+    high: float
+    rate: float
+    unit: str = "m"
+    unilateral: bool = True
+
+
+class Robot(ABC):
+    """A family of bodies; one file per robot.
+
+    Attributes:
+        name: registry name, also of its options when weights or meshes are looked up.
+        design_space: variables of the body with bounds and baseline.
+        actuators: in the order of the commands.
+        effectors: names, in the order of the effector rows of the condensed model.
+        size: a characteristic length [m], for scaling.
+        effector_rest: effector of the baseline body at rest [m], shape (3,).
+        effort_scale: typical effort of each actuator of the baseline body [N, ...], shape (n_a,).
+        stiffness_variable: design variable that scales all efforts and nothing else (Young's modulus without dead
+            loads), or None. Surrogates use it exactly instead of learning it.
+    """
+
+    name: str
+    design_space: DesignSpace
+    actuators: tuple[Actuator, ...]
+    effectors: tuple[str, ...]
+    size: float
+    effector_rest: np.ndarray
+    effort_scale: np.ndarray
+    stiffness_variable: str | None = None
+
+    #: Smallest element quality, relative to the baseline mesh, that a moved mesh may have before it is remeshed.
+    quality_bound = 0.3
+
+    def __init__(self, *, mesh_size: float, meshing: str = "morph") -> None:
+        if meshing not in ("morph", "remesh"):
+            raise ValueError(f"meshing = {meshing!r} is unknown; allowed: 'morph', 'remesh'")
+        if not (np.isfinite(mesh_size) and mesh_size > 0):
+            raise ValueError(f"mesh_size = {mesh_size} m must be positive and finite")
+        self.mesh_size = float(mesh_size)
+        self.meshing = meshing
+        self._morpher: Morpher | None = None
+
+    # -- what a robot defines ---------------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def variant(self) -> str:
+        """Name of this kind of the robot, as used for pretrained weights."""
+
+    @property
+    @abstractmethod
+    def signature(self) -> dict[str, object]:
+        """The options that change its mechanics, JSON-serialisable; weights are valid for one signature."""
+
+    @abstractmethod
+    def mesh(self, design: Mapping[str, float]) -> BodyMesh:
+        """Mesh the body of a complete design anew (or from the cache)."""
+
+    @abstractmethod
+    def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
+        """Geometric features that carry the boundary of the body, by name."""
+
+    @abstractmethod
+    def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
+        """Make the model of a meshed body: material, boundary conditions, actuators, effectors, contacts."""
+
+    def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
+        """Rough displacement [m] (n, 3) of the baseline nodes to a design; it only starts the mesh motion."""
+        return np.zeros_like(nodes)
+
+    # -- what follows from it ---------------------------------------------------------------------------------------
+
+    def body(self, design: Mapping[str, float] | None = None) -> BodyMesh:
+        """Return the mesh of a design: the baseline mesh moved, or a new one when its quality falls too low.
+
+        Raises:
+            DesignError: for a malformed design.
+            InfeasibleDesign: if the geometry cannot exist.
+        """
+        complete = self.design_space.complete(design)
+        if self.meshing == "remesh":
+            return self.mesh(complete)
+        baseline = self.design_space.baseline
+        if self._morpher is None:
+            self._morpher = Morpher(self.mesh(baseline), self.features(baseline))
+        base = self._morpher.mesh
+        nodes = self._morpher.move(self.features(complete), self.guess(base.nodes, complete))
+        if self._morpher.quality(nodes) >= self.quality_bound:
+            return BodyMesh(nodes, base.tetrahedra, base.triangles, base.surfaces, "morphed")
+        fresh = self.mesh(complete)
+        return BodyMesh(fresh.nodes, fresh.tetrahedra, fresh.triangles, fresh.surfaces, "remeshed")
+
+    def build(self, design: Mapping[str, float] | None = None) -> MechanicalModel:
+        """Return the mechanical model of a design; missing variables take their baseline.
+
+        Raises:
+            DesignError: for a malformed design.
+            InfeasibleDesign: if the geometry cannot exist.
+        """
+        complete = self.design_space.complete(design)
+        try:
+            return self.equip(self.body(complete), complete)
+        except ValueError as error:
+            if isinstance(error, InfeasibleDesign):
+                raise
+            shown = {name: round(value, 9) for name, value in complete.items()}
+            raise InfeasibleDesign(f"robot '{self.name}' cannot be built for {shown}: {error}") from error
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Smallest commanded displacements, shape (n_a,)."""
+        return np.array([actuator.low for actuator in self.actuators])
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Largest commanded displacements, shape (n_a,)."""
+        return np.array([actuator.high for actuator in self.actuators])
+
+    @property
+    def rates(self) -> np.ndarray:
+        """Largest change of the command per control step, shape (n_a,)."""
+        return np.array([actuator.rate for actuator in self.actuators])

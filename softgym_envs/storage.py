@@ -1,0 +1,48 @@
+"""Files that are either whole or absent, and where caches live."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+__all__ = ["atomic_write", "cache_directory", "write_json"]
+
+
+@contextmanager
+def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
+    """Open a temporary file beside ``path`` and move it there when the block ends without an error."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, mode) as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: str | Path, value: object) -> None:
+    """Write a JSON file atomically, indented."""
+    with atomic_write(path, "w") as stream:
+        json.dump(value, stream, indent=2)
+        stream.write("\n")
+
+
+def cache_directory(name: str) -> Path:
+    """Folder of a cache: ``$SOFTGYM_CACHE`` if set, else the user's cache folder."""
+    root = os.environ.get("SOFTGYM_CACHE")
+    if root is None:
+        from platformdirs import user_cache_dir
+
+        root = user_cache_dir("softgym-envs", appauthor=False)
+    return Path(root) / name
