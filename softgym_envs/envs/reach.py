@@ -30,17 +30,17 @@ class Reach(Task):
         if isinstance(goals, str):
             if goals != "reachable":
                 raise ValueError(f"goals = {goals!r} is unknown; allowed: 'reachable' or an array of shape (k, 3)")
-            self.goals = None
+            self.fixed_goals = None
         else:
-            self.goals = np.asarray(goals, dtype=float).reshape(-1, 3)
-            if len(self.goals) == 0 or not np.isfinite(self.goals).all():
+            self.fixed_goals = np.asarray(goals, dtype=float).reshape(-1, 3)
+            if len(self.fixed_goals) == 0 or not np.isfinite(self.fixed_goals).all():
                 raise ValueError("goals must be at least one finite point of shape (3,)")
         if not 0.0 <= command_low < 1.0:
             raise ValueError(f"command_low = {command_low} is out of bounds; allowed: [0, 1)")
         self.command_low = command_low
 
-    def sample(self, rng: np.random.Generator, kinematics: Kinematics) -> np.ndarray:
-        if self.goals is not None:
-            return self.goals[rng.integers(len(self.goals))][None]
+    def sample(self, rng: np.random.Generator, count: int, kinematics: Kinematics) -> np.ndarray:
+        if self.fixed_goals is not None:
+            return self.fixed_goals[rng.integers(len(self.fixed_goals), size=count)][:, None]
         low = self.robot.lower + self.command_low * (self.robot.upper - self.robot.lower)
-        return kinematics(rng.uniform(low, self.robot.upper))[None]
+        return kinematics(rng.uniform(low, self.robot.upper, (count, len(low))))[:, None]

@@ -19,7 +19,7 @@ TASKS: dict[str, str] = {
 """Registry: name to ``module:class``, imported when used."""
 
 Kinematics = Callable[[np.ndarray], np.ndarray]
-"""Maps a command (n_a,) to the effectors it leads to [m], shape (3,), for the present body."""
+"""Maps commands (B, n_a) to the effectors they lead to [m], shape (B, 3), for the present bodies."""
 
 
 def tolerance(x: np.ndarray, bound: float, margin: float) -> np.ndarray:
@@ -45,13 +45,16 @@ class Task(ABC):
         self.robot = robot
 
     @abstractmethod
-    def sample(self, rng: np.random.Generator, kinematics: Kinematics) -> np.ndarray:
-        """Draw the goals of one episode: a path [m], shape (p, 3); p = 1 for a fixed goal."""
+    def sample(self, rng: np.random.Generator, count: int, kinematics: Kinematics) -> np.ndarray:
+        """Draw the goals of ``count`` episodes: paths [m], shape (count, p, 3); p = 1 for a fixed goal."""
 
-    def goal(self, path: np.ndarray, step: int) -> np.ndarray:
-        """Goal [m] (3,) at a control step of a path (p, 3), which is spread over the horizon."""
-        index = min(step * len(path) // max(self.horizon, 1), len(path) - 1)
-        return path[index]
+    def goals(self, paths: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """Goals [m] (B, 3) at control steps (B,) of paths (B, p, 3), which are spread over the horizon."""
+        count = paths.shape[1]
+        if count == 1:
+            return paths[:, 0]
+        index = np.minimum(steps * count // max(self.horizon, 1), count - 1)
+        return paths[np.arange(len(paths)), index]
 
     def reward_terms(self, distance: np.ndarray, effort_share: np.ndarray) -> dict[str, np.ndarray]:
         """Return the factors of the reward, each in [0, 1].

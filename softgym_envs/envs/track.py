@@ -46,5 +46,5 @@ class Track(Task):
             raise ValueError(f"jitter = {jitter} m must be non-negative and finite")
         self.jitter = jitter
 
-    def sample(self, rng: np.random.Generator, kinematics: Kinematics) -> np.ndarray:
-        return self.path + rng.uniform(-self.jitter, self.jitter, 3)
+    def sample(self, rng: np.random.Generator, count: int, kinematics: Kinematics) -> np.ndarray:
+        return self.path + rng.uniform(-self.jitter, self.jitter, (count, 1, 3))

@@ -13,23 +13,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
 
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.complementarity import solve_complementarity
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.linear_solver import SuperLUSolver
 from softgym_envs.mechanics.model import MechanicalModel
 
-__all__ = ["Equilibrium", "Statics", "solve_complementarity"]
-
-
-def solve_complementarity(W: np.ndarray, gap: np.ndarray) -> np.ndarray:
-    """Solve ``0 <= y _|_ W y + gap >= 0`` for a symmetric positive definite W, shape (m, m).
-
-    Written as non-negative least squares, which ends after finitely many exchanges.
-    """
-    lower = np.linalg.cholesky(W)
-    return nnls(lower.T, np.linalg.solve(lower, -gap))[0]
+__all__ = ["Equilibrium", "Statics"]
 
 
 @dataclass(frozen=True)
@@ -151,25 +142,12 @@ class Statics:
             if not unilateral.any():
                 step_effort[driven] = np.linalg.solve(W, -gap)
             else:
-                new = self._solve_driven(W, gap - W @ effort[driven], unilateral)
+                try:
+                    new = solve_complementarity(W[None], (gap - W @ effort[driven])[None], unilateral)[0]
+                except np.linalg.LinAlgError:  # unstable: W is indefinite and the answer not unique
+                    raise _NotFound from None
                 step_effort[driven] = new - effort[driven]
         return self._AH @ step_effort - Ar, step_effort
-
-    @staticmethod
-    def _solve_driven(W: np.ndarray, free_gap: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
-        """Efforts with ``W y + free_gap = 0`` (bilateral rows), complementary to ``y >= 0`` (unilateral rows)."""
-        y = np.linalg.solve(W, -free_gap)
-        if (y[unilateral] >= 0).all():
-            return y
-        b, u = np.flatnonzero(~unilateral), np.flatnonzero(unilateral)
-        if len(b) == 0:
-            return solve_complementarity(W, free_gap)
-        inner = np.linalg.solve(W[np.ix_(b, b)], np.column_stack([W[np.ix_(b, u)], free_gap[b]]))
-        reduced = W[np.ix_(u, u)] - W[np.ix_(u, b)] @ inner[:, :-1]
-        y_u = solve_complementarity(reduced, free_gap[u] - W[np.ix_(u, b)] @ inner[:, -1])
-        y = np.empty(len(free_gap))
-        y[u], y[b] = y_u, -inner[:, -1] - inner[:, :-1] @ y_u
-        return y
 
     # -- Newton -----------------------------------------------------------------------------------------------------
 

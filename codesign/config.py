@@ -1,0 +1,270 @@
+"""Configuration of a co-design study. Lengths and all other quantities are SI."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from agents.config import EnvironmentConfig, SACConfig
+from softgym_envs.config import Config
+from softgym_envs.designs import DesignSpace
+from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.robots import make_robot
+from softgym_envs.robots.robot import Robot
+
+__all__ = [
+    "PRUNERS",
+    "SAMPLERS",
+    "FinalistsConfig",
+    "GoalsConfig",
+    "PrunerConfig",
+    "SamplerConfig",
+    "ScreenConfig",
+    "StudyConfig",
+    "TrainingConfig",
+    "robot_of",
+]
+
+SAMPLERS: dict[str, str] = {
+    "tpe": "TPESampler",
+    "cmaes": "CmaEsSampler",
+    "gp": "GPSampler",
+    "nsgaii": "NSGAIISampler",
+    "qmc": "QMCSampler",
+    "random": "RandomSampler",
+}
+"""Registry: name to class of `optuna.samplers`."""
+
+PRUNERS: dict[str, str] = {
+    "none": "NopPruner",
+    "median": "MedianPruner",
+    "percentile": "PercentilePruner",
+    "hyperband": "HyperbandPruner",
+    "successive_halving": "SuccessiveHalvingPruner",
+    "threshold": "ThresholdPruner",
+}
+"""Registry: name to class of `optuna.pruners`. Their steps are environment steps of training."""
+
+
+def robot_of(environment: EnvironmentConfig) -> Robot:
+    """Return the family of bodies of an environment.
+
+    Raises:
+        ValueError: for an unknown environment ID or a wrong option of the robot.
+    """
+    if environment.id not in ENVIRONMENTS:
+        raise ValueError(f"unknown environment '{environment.id}'; allowed: {', '.join(ENVIRONMENTS)}")
+    row = ENVIRONMENTS[environment.id]
+    options = getattr(environment, "robot_options", None)
+    return make_robot(row.robot, **dict(row.robot_options if options is None else options))
+
+
+def _check_options(kind: str, name: str, cls: type, options: dict[str, Any]) -> None:
+    """Raise ValueError for a keyword that the constructor of a sampler or pruner does not take."""
+    allowed = [key for key in inspect.signature(cls).parameters if key not in ("seed", "args", "kwargs")]
+    for key in options:
+        if key not in allowed:
+            raise ValueError(f"unknown option '{key}' of {kind} '{name}'; allowed: {', '.join(allowed) or 'none'}")
+    try:
+        cls(**options)
+    except ImportError as error:
+        raise ValueError(f"{kind} '{name}' needs a package that is not installed: {error}") from None
+    except TypeError as error:
+        raise ValueError(f"{kind} '{name}': {error}") from None
+
+
+class SamplerConfig(Config):
+    """Who proposes bodies: ``name`` of `SAMPLERS`, ``seed``, and further arguments of its class."""
+
+    name: Literal["tpe", "cmaes", "gp", "nsgaii", "qmc", "random"] = "tpe"
+    seed: int = Field(0, ge=0)
+    options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _known_options(self) -> SamplerConfig:
+        import optuna
+
+        _check_options("sampler", self.name, getattr(optuna.samplers, SAMPLERS[self.name]), self.options)
+        return self
+
+
+class PrunerConfig(Config):
+    """Who stops hopeless trials: ``name`` of `PRUNERS`, and further arguments of its class."""
+
+    name: Literal["none", "median", "percentile", "hyperband", "successive_halving", "threshold"] = "none"
+    options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _known_options(self) -> PrunerConfig:
+        import optuna
+
+        _check_options("pruner", self.name, getattr(optuna.pruners, PRUNERS[self.name]), self.options)
+        return self
+
+
+class GoalsConfig(Config):
+    """Three disjoint sets of goals: to train on, to choose bodies by, and unseen ones to test the choice.
+
+    Attributes:
+        source: ``"family"``: effector positions that random bodies of the family reach, the same for every body;
+            ``"task"``: as the task draws them for the baseline body (for tasks whose goals are paths).
+        count: goals every trial is scored on.
+        unseen_count: goals only the finalists are tested on.
+        training_count: goals that training episodes draw from (``"family"`` only).
+        seed: seed of all three.
+        command_low: goals need every actuator above this part of its range, in [0, 1) (``"family"`` only).
+    """
+
+    source: Literal["family", "task"] = "family"
+    count: int = Field(40, ge=1)
+    unseen_count: int = Field(30, ge=2)
+    training_count: int = Field(300, ge=1)
+    seed: int = Field(0, ge=0)
+    command_low: float = Field(0.0, ge=0.0, lt=1.0)
+
+
+class TrainingConfig(Config):
+    """Training inside one trial; see `agents.config.TrainConfig`. Not used by the strategy ``"qp"``.
+
+    Attributes:
+        steps: environment steps of one trial.
+        report_every: environment steps between two reports to the pruner.
+        evaluation_episodes: episodes behind each report.
+        num_envs: environments in parallel in one trial.
+        seed: the same in all trials, so that they differ by their bodies.
+        sac: hyper-parameters.
+    """
+
+    steps: int = Field(2500, ge=1)
+    report_every: int = Field(500, ge=1)
+    evaluation_episodes: int = Field(20, ge=1)
+    num_envs: int = Field(1, ge=1)
+    seed: int = Field(0, ge=0)
+    sac: SACConfig = Field(default_factory=SACConfig)
+
+
+class ScreenConfig(Config):
+    """A cheap first look: many bodies scored by the inverse QP, the best of them become trials.
+
+    Attributes:
+        enabled: whether there is one.
+        candidates: bodies to score, spread evenly over the box.
+        keep: fraction of the candidates that becomes trials.
+        goals: goals per candidate, the first ones of those that bodies are chosen by.
+    """
+
+    enabled: bool = False
+    candidates: int = Field(32, ge=2)
+    keep: float = Field(0.15, gt=0.0, le=1.0)
+    goals: int = Field(10, ge=1)
+
+    @property
+    def kept(self) -> int:
+        """Number of candidates that become trials."""
+        return max(1, round(self.keep * self.candidates)) if self.enabled else 0
+
+
+class FinalistsConfig(Config):
+    """The check on FEM.
+
+    Attributes:
+        count: best bodies to test beside the baseline; 0 for no check.
+        choose: who names the winner: the ``"surrogate"`` score of the trials, or the ``"fem"`` score of the finalists
+            on the same goals. Never the unseen goals.
+        fem_options: options of the FEM backend.
+    """
+
+    count: int = Field(3, ge=0)
+    choose: Literal["surrogate", "fem"] = "surrogate"
+    fem_options: dict[str, Any] | None = None
+
+
+class StudyConfig(Config):
+    """A co-design study.
+
+    Attributes:
+        name: title of the study and its report.
+        environment: robot, task and backend of the trials. Its ``design`` (default: the robot's baseline) is the
+            baseline body of the study and gives the variables that are not optimised.
+        variables: names of the design variables to optimise.
+        objective: what is optimised: success rate and return upwards, mean final distance downwards.
+        strategy: ``"warm_start"`` fine-tunes a design-conditioned policy in each trial, ``"scratch"`` trains a new one,
+            ``"qp"`` trains none and scores a body by the inverse QP.
+        policy: design-conditioned policy to start from, for ``"warm_start"``.
+        trials: number of bodies, the baseline and those of the screen included.
+        workers: processes, one thread each.
+        sampler: who proposes bodies.
+        pruner: who stops hopeless trials.
+        goals: what the body has to reach.
+        training: training inside one trial.
+        screen: cheap first look by the inverse QP.
+        finalists: check on FEM.
+    """
+
+    name: str = Field(min_length=1)
+    environment: EnvironmentConfig
+    variables: tuple[str, ...] = Field(min_length=1)
+    objective: Literal["success_rate", "mean_distance", "mean_return"] = "mean_distance"
+    strategy: Literal["warm_start", "scratch", "qp"] = "warm_start"
+    policy: str | None = None
+    trials: int = Field(ge=1)
+    workers: int = Field(1, ge=1)
+    sampler: SamplerConfig = Field(default_factory=SamplerConfig)
+    pruner: PrunerConfig = Field(default_factory=PrunerConfig)
+    goals: GoalsConfig = Field(default_factory=GoalsConfig)
+    training: TrainingConfig = Field(default_factory=TrainingConfig)
+    screen: ScreenConfig = Field(default_factory=ScreenConfig)
+    finalists: FinalistsConfig = Field(default_factory=FinalistsConfig)
+
+    @field_validator("environment")
+    @classmethod
+    def _comparable(cls, environment: EnvironmentConfig) -> EnvironmentConfig:
+        if environment.sample_design:
+            raise ValueError("sample_design must be false: a trial has one body; 'variables' names what is optimised")
+        robot_of(environment).design_space.complete(environment.design)
+        return environment
+
+    @model_validator(mode="after")
+    def _consistent(self) -> StudyConfig:
+        space = self.space
+        repeated = [name for name in self.variables if self.variables.count(name) > 1]
+        if repeated:
+            raise ValueError(f"variables: '{repeated[0]}' is named twice")
+        for name in self.variables:
+            space[name]
+        if self.strategy == "warm_start" and not self.policy:
+            raise ValueError("strategy 'warm_start' needs 'policy', the file of a trained design-conditioned policy")
+        if self.strategy != "warm_start" and self.policy:
+            raise ValueError(f"policy = '{self.policy}' is of no use to strategy '{self.strategy}'; remove it")
+        if self.strategy == "qp" and self.pruner.name != "none":
+            raise ValueError(f"pruner '{self.pruner.name}' has nothing to stop in strategy 'qp'; allowed: none")
+        if self.strategy != "qp" and self.training.report_every > self.training.steps:
+            raise ValueError(
+                f"training.report_every = {self.training.report_every} exceeds training.steps = {self.training.steps}"
+            )
+        if self.screen.enabled and self.screen.goals > self.goals.count:
+            raise ValueError(f"screen.goals = {self.screen.goals} exceeds goals.count = {self.goals.count}")
+        if 1 + self.screen.kept > self.trials:
+            raise ValueError(
+                f"trials = {self.trials} is too few for the baseline and the {self.screen.kept} bodies kept by the screen"
+            )
+        if self.finalists.count >= self.trials and self.trials > 1:
+            raise ValueError(f"finalists.count = {self.finalists.count} must be below trials = {self.trials}")
+        return self
+
+    @property
+    def robot(self) -> Robot:
+        """The family of bodies."""
+        return robot_of(self.environment)
+
+    @property
+    def space(self) -> DesignSpace:
+        """All design variables of the robot."""
+        return self.robot.design_space
+
+    @property
+    def baseline(self) -> dict[str, float]:
+        """The complete baseline design [SI]."""
+        return self.space.complete(self.environment.design)

@@ -1,0 +1,42 @@
+"""Jobs that several processes share: each is one file, made by whoever gets its lock first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from codesign.folder import StudyFolder
+from softgym_envs.storage import write_json
+
+__all__ = ["Job", "run_jobs"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One result file and how to make it.
+
+    Args:
+        path: the JSON file.
+        make: returns its content.
+    """
+
+    path: Path
+    make: Callable[[], dict[str, Any]]
+
+
+def run_jobs(folder: StudyFolder, jobs: Iterable[Job]) -> None:
+    """Do every job that is not done yet and that no other process is at."""
+    from filelock import Timeout
+
+    for job in jobs:
+        if job.path.exists():
+            continue
+        lock = folder.lock(f"{job.path.parent.name}-{job.path.stem}")
+        try:
+            with lock.acquire(timeout=0):
+                if not job.path.exists():
+                    write_json(job.path, job.make())
+        except Timeout:
+            continue

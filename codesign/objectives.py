@@ -1,0 +1,58 @@
+"""What a body is judged by. A score is larger for a better body, whatever the objective."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["OBJECTIVES", "Objective", "rank_key"]
+
+
+@dataclass(frozen=True)
+class Objective:
+    """One way to judge an evaluation.
+
+    Args:
+        key: field of `agents.evaluation.Evaluation`.
+        label: for people.
+        unit: unit that people read.
+        scale: from SI to ``unit``.
+        sign: 1 if more is better, -1 if less is.
+    """
+
+    key: str
+    label: str
+    unit: str
+    scale: float
+    sign: int
+
+    def score(self, record: Mapping[str, Any]) -> float:
+        """Score of a stored evaluation, larger is better [SI]."""
+        return self.sign * float(record[self.key])
+
+    def shown(self, score: float) -> float:
+        """The value of the objective behind a score, in ``unit``."""
+        return self.sign * score * self.scale
+
+    def text(self, score: float | None) -> str:
+        """The value of the objective behind a score, with its unit."""
+        if score is None:
+            return "-"
+        return f"{self.shown(score):.{1 if self.unit == '%' else 2}f}{' ' + self.unit if self.unit else ''}"
+
+
+OBJECTIVES: dict[str, Objective] = {
+    objective.key: objective
+    for objective in (
+        Objective("success_rate", "Success rate", "%", 100.0, 1),
+        Objective("mean_distance", "Mean final distance", "mm", 1e3, -1),
+        Objective("mean_return", "Mean return", "", 1.0, 1),
+    )
+}
+"""Registry: name to objective."""
+
+
+def rank_key(score: float, record: Mapping[str, Any]) -> tuple[float, float]:
+    """Sort key of an evaluation, larger is better; equal scores are told apart by the mean distance."""
+    return (score, -float(record["mean_distance"]))

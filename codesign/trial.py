@@ -1,0 +1,166 @@
+"""One trial: from a body to a score."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agents.config import EnvironmentConfig, TrainConfig
+from codesign.folder import StudyFolder
+from codesign.objectives import OBJECTIVES
+from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.storage import write_json
+
+if TYPE_CHECKING:
+    import optuna
+
+__all__ = ["assess", "run_trial"]
+
+
+def assess(
+    agent: str | Path,
+    environment: EnvironmentConfig,
+    goals: np.ndarray,
+    design: Mapping[str, float],
+) -> dict[str, Any]:
+    """Evaluate an agent on a body.
+
+    Args:
+        agent: ``"qp"``, ``"random"`` or a policy file.
+        environment: environment of the trials.
+        goals: goals [m], shape (k, p, 3).
+        design: complete design [SI].
+
+    Returns:
+        The evaluation as plain data [SI], with its cost, or only ``"error"`` if the body cannot be simulated.
+    """
+    from agents.evaluation import evaluate
+
+    started, cpu = time.perf_counter(), time.process_time()
+    try:
+        evaluation = evaluate(agent, environment, goals, design=dict(design), seed=0)
+    except (InfeasibleDesign, ConvergenceError) as error:
+        return {"error": str(error)}
+    return {
+        "success_rate": float(evaluation.success_rate),
+        "mean_distance": float(evaluation.mean_distance),
+        "worst_distance": float(evaluation.worst_distance),
+        "mean_return": float(evaluation.mean_return),
+        "distances": np.asarray(evaluation.distances, dtype=float).tolist(),
+        "returns": np.asarray(evaluation.returns, dtype=float).tolist(),
+        "effort": float(np.mean(evaluation.effort)),
+        "steps": int(evaluation.steps),
+        "seconds": time.perf_counter() - started,
+        "cpu_seconds": time.process_time() - cpu,
+    }
+
+
+def training_config(folder: StudyFolder, design: Mapping[str, float]) -> TrainConfig:
+    """Configuration of the training of one body, on the training goals of the study."""
+    config, goals = folder.config, folder.goals["training"]
+    update: dict[str, Any] = {"design": dict(design), "sample_design": False}
+    if len(goals):
+        update["task_options"] = {**(config.environment.task_options or {}), "goals": goals.tolist()}
+    training = config.training
+    return TrainConfig(
+        environment=config.environment.model_copy(update=update),
+        sac=training.sac,
+        steps=training.steps,
+        num_envs=training.num_envs,
+        seed=training.seed,
+        evaluation_episodes=training.evaluation_episodes,
+        report_every=training.report_every,
+    )
+
+
+class _Reporter:
+    """Passes learning progress on to the pruner, and keeps the learning curve."""
+
+    def __init__(self, trial: optuna.Trial) -> None:
+        self.trial = trial
+        self.curve: dict[int, float] = dict(trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values)
+        self.pruned = False
+        # Everything is compared with the baseline, so it is always trained to the end.
+        self.prunable = trial.user_attrs.get("origin") != "baseline"
+
+    def __call__(self, step: int, value: float) -> bool:
+        if step not in self.curve and np.isfinite(value):
+            self.curve[step] = float(value)
+            self.trial.report(float(value), step)
+        self.pruned = self.prunable and self.trial.should_prune()
+        return self.pruned
+
+
+def run_trial(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
+    """Run a claimed trial, write its ``result.json`` and return it.
+
+    Returns:
+        ``state`` is ``"complete"``, ``"pruned"`` or ``"infeasible"``; ``score`` is larger for better bodies;
+        ``evaluation`` is that of the trial's controller, ``qp`` that of the inverse QP, on the selection goals.
+    """
+    config = folder.config
+    design = config.space.complete({**config.baseline, **trial.params})
+    goals = folder.goals["selection"]
+    started, cpu = time.perf_counter(), time.process_time()
+    result: dict[str, Any] = {
+        "number": trial.number,
+        "origin": trial.user_attrs["origin"],
+        "sampler_seed": trial.user_attrs.get("sampler_seed"),
+        "process": trial.user_attrs["process"],
+        "design": design,
+        "state": "complete",
+        "score": None,
+        "reason": None,
+        "agent": "qp",
+        "evaluation": None,
+        "qp": assess("qp", config.environment, goals, design),
+        "curve": [],
+        "training_steps": 0,
+    }
+    try:
+        if "error" in result["qp"]:
+            raise InfeasibleDesign(result["qp"]["error"])
+        evaluation = result["qp"] if config.strategy == "qp" else _train_and_assess(folder, trial, result)
+        if evaluation is not None:
+            result.update(evaluation=evaluation, score=OBJECTIVES[config.objective].score(evaluation))
+    except (InfeasibleDesign, ConvergenceError) as error:
+        result.update(state="infeasible", reason=str(error))
+    if result["score"] is not None and not np.isfinite(result["score"]):
+        result.update(state="infeasible", reason=f"the score is {result['score']}", score=None)
+    result.update(
+        seconds=time.perf_counter() - started, cpu_seconds=time.process_time() - cpu, finished_at=time.time()
+    )
+    write_json(folder.trial(trial.number) / "result.json", result)
+    return result
+
+
+def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str, Any]) -> dict[str, Any] | None:
+    """Train the controller of a body and evaluate it; None if the pruner stopped it."""
+    from agents.training import train
+
+    config = folder.config
+    reporter = _Reporter(trial)
+    policy = train(
+        training_config(folder, result["design"]),
+        folder.trial(trial.number),
+        initial=Path(config.policy) if config.strategy == "warm_start" and config.policy else None,
+        report=reporter,
+        progress=False,
+    )
+    steps = max(reporter.curve, default=0) if reporter.pruned else config.training.steps
+    result.update(
+        agent=Path(policy).resolve().relative_to(folder.path).as_posix(),
+        curve=[[step, value] for step, value in sorted(reporter.curve.items())],
+        training_steps=steps,
+    )
+    if reporter.pruned:
+        result.update(state="pruned", reason=f"stopped by the pruner after {steps} steps")
+        return None
+    evaluation = assess(policy, config.environment, folder.goals["selection"], result["design"])
+    if "error" in evaluation:
+        raise ConvergenceError(evaluation["error"])
+    return evaluation

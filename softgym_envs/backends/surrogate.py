@@ -1,0 +1,190 @@
+"""The surrogate backend: a learned condensed model in place of the finite elements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from softgym_envs.backends.backend import Backend, State
+from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.complementarity import solve_complementarity
+from softgym_envs.robots.robot import Robot
+from softgym_envs.surrogate.model import Context, SurrogateModel
+from softgym_envs.surrogate.pretrained import pretrained_model
+
+__all__ = ["Settled", "SurrogateBackend", "settle"]
+
+#: Largest change of a slack cable's length left when its search ends [m].
+TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Batched states: ``displacement`` and ``effort`` (B, n_a), ``effector`` (B, n_e), ``slack`` (B, n_a)."""
+
+    displacement: np.ndarray
+    effort: np.ndarray
+    effector: np.ndarray
+    slack: np.ndarray
+
+
+def settle(
+    model: SurrogateModel,
+    context: Context,
+    target: np.ndarray,
+    start: np.ndarray,
+    unilateral: np.ndarray,
+    slack: np.ndarray | None = None,
+    *,
+    max_iterations: int = 12,
+) -> Settled:
+    """Find the states under commanded displacements, with cables that cannot push.
+
+    A taut state is one evaluation of the model. Where a cable would have to push, the displacement it reaches is
+    found by Newton's method on the complementarity problem, with the model's own W.
+
+    Args:
+        model: the learned condensed model.
+        context: prepared bodies.
+        target: commanded displacements, shape (B, n_a).
+        start: displacements reached before, shape (B, n_a): where the search begins for slack cables.
+        unilateral: actuators that cannot push, shape (n_a,).
+        slack: actuators slack before, shape (B, n_a).
+        max_iterations: bound on the search; it ends after two or three.
+    """
+    guess = target if slack is None else np.where(slack, np.maximum(start, target), target)
+    effort, effector = model.state(context, guess)
+    wrong = unilateral & ((effort < 0.0) | (guess > target))
+    loose = np.zeros(guess.shape, dtype=bool)
+    if not wrong.any():
+        return Settled(guess, effort, effector, loose)
+    searched = np.flatnonzero(wrong.any(axis=1))
+    rows = searched
+    displacement = guess.copy()
+    limit = 0.25 * (model.robot.upper - model.robot.lower)
+    for iteration in range(max_iterations):
+        if iteration % 4 == 0:
+            # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
+            part = context.rows(rows)
+            W = model.compliance(part, displacement[rows])[:, : model.count, : model.count]
+        present = effort[rows]
+        gap = displacement[rows] - (W @ present[:, :, None])[:, :, 0] - target[rows]
+        taut = solve_complementarity(W, gap, unilateral)
+        # Far steps are cut: the network is only asked where its neighbourhood of known states reaches.
+        step = np.minimum(np.maximum((W @ (taut - present)[:, :, None])[:, :, 0], -limit), limit)
+        displacement[rows] += step
+        moving = np.abs(step).max(axis=1) > TOLERANCE
+        # A last step below the tolerance is taken without asking the model again.
+        effort[rows[~moving]] = taut[~moving]
+        if not moving.any():
+            break
+        if not moving.all():
+            rows, W, part = rows[moving], W[moving], part.rows(moving)
+        effort[rows], effector[rows] = model.state(part, displacement[rows])
+    loose[searched] = unilateral & (displacement[searched] > target[searched] + 10.0 * TOLERANCE)
+    effort = np.where(loose, 0.0, np.where(unilateral, np.maximum(effort, 0.0), effort))
+    return Settled(displacement, effort, effector, loose)
+
+
+class SurrogateBackend(Backend):
+    """States from a learned condensed model.
+
+    Args:
+        robot: the family of bodies.
+        design: first design; missing variables take their baseline.
+        weights: folder of weights; default the shipped ones.
+    """
+
+    def __init__(
+        self, robot: Robot, design: Mapping[str, float] | None = None, weights: str | Path | None = None
+    ) -> None:
+        self.robot = robot
+        self.model = pretrained_model(robot, weights)
+        self._unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
+        self.design = {}
+        self.reset(robot.design_space.complete(design))
+
+    def reset(self, design: Mapping[str, float] | None = None) -> State:
+        complete = self.design if design is None else self.robot.design_space.complete(design)
+        if complete != self.design:
+            values = np.array([list(complete.values())])
+            self._context = self.model.context(values)
+            self.design = dict(complete)
+            zero = np.zeros((1, self.model.count))
+            effort, effector = self.model.state(self._context, zero)
+            self._rest = self._state(zero[0], Settled(zero, effort, effector, zero.astype(bool)))
+        self.state = self._rest
+        return self.state
+
+    def step(self, command: np.ndarray, mode: str = "displacement") -> State:
+        command = np.asarray(command, dtype=float)
+        if command.shape != (self.model.count,) or not np.isfinite(command).all():
+            raise ValueError(f"command must be {self.model.count} finite numbers, got {command.tolist()}")
+        if mode == "displacement":
+            settled = settle(
+                self.model,
+                self._context,
+                command[None],
+                self.state.displacement[None],
+                self._unilateral,
+                self.state.slack[None],
+            )
+        elif mode == "effort":
+            settled = self._under_effort(command)
+        else:
+            raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
+        self.state = self._state(command, settled)
+        return self.state
+
+    def _under_effort(self, effort: np.ndarray) -> Settled:
+        """Newton's method on ``effort(displacement) = effort``."""
+        displacement = self.state.displacement[None].copy()
+        limit = 0.25 * (self.robot.upper - self.robot.lower)
+        for _ in range(50):
+            found, effector = self.model.state(self._context, displacement)
+            W = self.model.compliance(self._context, displacement)[0, : self.model.count, : self.model.count]
+            step = np.clip(W @ (effort - found[0]), -limit, limit)
+            if np.abs(step).max() < TOLERANCE:
+                return Settled(displacement, found, effector, np.zeros_like(displacement, dtype=bool))
+            displacement = displacement + step
+        raise ConvergenceError(f"the surrogate finds no displacement for efforts {effort.tolist()} N")
+
+    def restore(self, state: State) -> None:
+        self.state = state
+
+    def _state(self, command: np.ndarray, settled: Settled) -> State:
+        return _SurrogateState(
+            model=self.model,
+            context=self._context,
+            command=command.copy(),
+            displacement=settled.displacement[0],
+            effort=settled.effort[0],
+            effector=settled.effector[0].reshape(-1, 3),
+            slack=settled.slack[0],
+        )
+
+
+class _SurrogateState(State):
+    """A state whose condensed model is evaluated when it is asked for: agents that do not look at W do not pay."""
+
+    def __init__(self, model: SurrogateModel, context: Context, **fields: np.ndarray) -> None:
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "nodes", None)
+        object.__setattr__(self, "_source", (model, context))
+
+    @cached_property
+    def condensed(self) -> CondensedModel:  # type: ignore[override]
+        model, context = self._source
+        batch = model.condensed(context, self.displacement[None])
+        # Slack cables carry no effort, whatever the network's last digits say.
+        effort = batch.effort[0].copy()
+        effort[: model.count] = self.effort
+        delta = np.concatenate([self.displacement, self.effector.ravel()])
+        W = batch.compliance[0]
+        return CondensedModel(W, delta - W @ effort, effort, batch.roles)

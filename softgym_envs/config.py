@@ -1,0 +1,137 @@
+"""Configuration: YAML files checked against pydantic models, with overrides from the command line."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from softgym_envs.errors import ConfigError
+from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.version import __version__
+
+__all__ = ["Config", "load_config", "provenance", "save_resolved"]
+
+
+class Config(BaseModel):
+    """Base of all configurations: unknown keys are errors, values do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=False)
+
+
+ModelT = TypeVar("ModelT", bound=Config)
+
+
+def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequence[str] = ()) -> ModelT:
+    """Read a YAML file, apply ``a.b=value`` overrides, and check the result.
+
+    Args:
+        path: the file, or None for defaults alone.
+        model: what it must be.
+        overrides: assignments; values are read as YAML.
+
+    Raises:
+        ConfigError: one line naming the key, its value and what is allowed.
+    """
+    data: Any = {}
+    if path is not None:
+        path = Path(path)
+        try:
+            data = yaml.safe_load(path.read_text())
+        except OSError as error:
+            raise ConfigError(f"config '{path}' cannot be read: {error.strerror or error}") from None
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            where = getattr(error, "problem_mark", None)
+            place = f", line {where.line + 1}" if where is not None else ""
+            raise ConfigError(f"config '{path}' is not valid YAML{place}: {getattr(error, 'problem', error)}") from None
+        data = {} if data is None else data
+        if not isinstance(data, dict):
+            raise ConfigError(f"config '{path}' must hold keys and values, got {type(data).__name__}")
+    for override in overrides:
+        key, separator, text = override.partition("=")
+        if not separator or not key:
+            raise ConfigError(f"override '{override}' must look like key=value or part.key=value")
+        node = data
+        *parents, last = key.split(".")
+        for parent in parents:
+            node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                raise ConfigError(f"override '{override}': '{parent}' is a value, not a group of keys")
+        try:
+            node[last] = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise ConfigError(f"override '{override}': the value is not valid YAML") from None
+    return check_config(model, data, f"config '{path}'" if path is not None else "config")
+
+
+def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> ModelT:
+    """Validate plain data, with a one-line `ConfigError` for the first problem."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in first["loc"]) or "(top level)"
+        message = first["msg"].removeprefix("Value error, ").replace("\n", " ")
+        if first["type"] == "extra_forbidden":
+            allowed = _allowed(model, [part for part in first["loc"][:-1] if isinstance(part, str)])
+            message = f"unknown key; allowed: {allowed}" if allowed else "unknown key"
+        elif first["type"] != "missing":
+            message += f", got {first['input']!r}"
+        others = error.error_count() - 1
+        more = f" (and {others} more)" if others else ""
+        raise ConfigError(f"{where}: {key}: {message}{more}") from None
+
+
+def _allowed(model: type[BaseModel], path: list[str]) -> str:
+    for name in path:
+        field = model.model_fields.get(name)
+        inner = None if field is None else field.annotation
+        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
+            return ""
+        model = inner
+    return ", ".join(model.model_fields)
+
+
+def provenance() -> dict[str, Any]:
+    """What made a result: versions, git commit, time, machine."""
+    versions = {"softgym-envs": __version__, "python": platform.python_version()}
+    for package in ("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "optuna", "gmsh", "proxsuite"):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    root = Path(__file__).resolve().parent.parent
+    commit = None
+    if (root / ".git").exists():
+        try:
+            done = subprocess.run(
+                ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"],
+                capture_output=True,
+                text=True,
+                timeout=10,
+                check=False,
+            )
+            commit = done.stdout.strip() or None
+        except (OSError, subprocess.TimeoutExpired):
+            commit = None
+    return {
+        "commit": commit,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "platform": platform.platform(),
+        "versions": versions,
+    }
+
+
+def save_resolved(folder: str | Path, config: Config) -> None:
+    """Write the resolved configuration and its provenance next to a result."""
+    folder = Path(folder)
+    with atomic_write(folder / "config.yaml", "w") as stream:
+        yaml.safe_dump(config.model_dump(mode="json"), stream, sort_keys=False)
+    write_json(folder / "provenance.json", provenance())

@@ -1,0 +1,241 @@
+"""The natively batched environment on the surrogate: one matrix product steps all bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from softgym_envs.backends.surrogate import settle
+from softgym_envs.envs.interface import Interface
+from softgym_envs.envs.soft_robot_env import design_names
+from softgym_envs.envs.task import make_task
+from softgym_envs.robots import make_robot
+from softgym_envs.surrogate.pretrained import pretrained_model
+
+__all__ = ["SoftRobotVectorEnv"]
+
+
+class SoftRobotVectorEnv(VectorEnv):
+    """``num_envs`` copies of a `SoftRobotEnv` on the surrogate backend, stepped together.
+
+    Sub-environments that end are reset in the same step (``AutoresetMode.SAME_STEP``): the returned observation is
+    the first of the next episode, and ``info["final_obs"]``, ``info["final_info"]`` hold the end of the last one.
+
+    Args:
+        robot: registry name of the robot.
+        task: registry name of the task.
+        num_envs: number of sub-environments.
+        max_episode_steps: time limit.
+        backend: ``"surrogate"``; other backends are not batched, use ``vectorization_mode="sync"`` for them.
+        design: body of every episode unless sampled or given in `reset`.
+        sample_design: as for `SoftRobotEnv`; every sub-environment draws its own.
+        design_in_observation: as for `SoftRobotEnv`.
+        action_mode: as for `SoftRobotEnv`.
+        robot_options: options of the robot.
+        task_options: options of the task.
+        backend_options: options of the backend (``weights``).
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+
+    def __init__(
+        self,
+        robot: str,
+        task: str,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        backend: str = "surrogate",
+        design: Mapping[str, float] | None = None,
+        sample_design: bool | Sequence[str] = False,
+        design_in_observation: bool | Sequence[str] = False,
+        action_mode: str = "increment",
+        robot_options: Mapping[str, Any] | None = None,
+        task_options: Mapping[str, Any] | None = None,
+        backend_options: Mapping[str, Any] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if backend != "surrogate":
+            raise ValueError(
+                f"backend = {backend!r} has no batched environment; allowed: 'surrogate' "
+                "(or gymnasium.make_vec(..., vectorization_mode='sync'))"
+            )
+        if render_mode is not None:
+            raise ValueError(f"render_mode = {render_mode!r} is not available in the batched environment; allowed: None")
+        if num_envs < 1:
+            raise ValueError(f"num_envs = {num_envs} must be at least 1")
+        self.num_envs = num_envs
+        self.render_mode = None
+        self.robot = make_robot(robot, **dict(robot_options or {}))
+        self.design_space = self.robot.design_space
+        self.model = pretrained_model(self.robot, **dict(backend_options or {}))
+        self.task = make_task(task, self.robot, **dict(task_options or {}))
+        self.max_episode_steps = max_episode_steps if max_episode_steps is not None else np.iinfo(np.int64).max
+        self._fixed_design = self.design_space.complete(design)
+        self._sampled = design_names(self.design_space, sample_design)
+        shown = design_names(self.design_space, design_in_observation)
+        self.interface = Interface(self.robot, action_mode=action_mode, design_names=shown)
+        self.single_action_space = self.interface.action_space
+        self.single_observation_space = self.interface.observation_space
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+
+        self._unilateral = np.array([actuator.unilateral for actuator in self.robot.actuators])
+        n = len(self.robot.actuators)
+        baseline = np.tile(list(self._fixed_design.values()), (num_envs, 1))
+        self.designs = baseline.astype(float)
+        self._context = self.model.context(self.designs)
+        self._rest_effort = np.zeros((num_envs, n))
+        self._rest_effector = np.zeros((num_envs, 3))
+        self._unit_design = np.zeros((num_envs, len(shown)))
+        self._command = np.zeros((num_envs, n))
+        self._displacement = np.zeros((num_envs, n))
+        self._effort = np.zeros((num_envs, n))
+        self._effector = np.zeros((num_envs, 3))
+        self._slack = np.zeros((num_envs, n), dtype=bool)
+        self._paths = np.zeros((num_envs, 1, 3))
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._changed = False  # bodies were given in reset and are not the fixed one
+        self._begin_bodies(np.arange(num_envs))
+
+    # -- bodies -----------------------------------------------------------------------------------------------------
+
+    def _begin_bodies(self, index: np.ndarray) -> None:
+        """Prepare the models of changed designs."""
+        context = self.model.context(self.designs[index])
+        self._context.put(index, context)
+        zero = np.zeros((len(index), self._command.shape[1]))
+        effort, effector = self.model.state(context, zero)
+        self._rest_effort[index], self._rest_effector[index] = effort, effector[:, :3]
+        for column, name in enumerate(self.interface.design_names):
+            values = self.designs[index, self.design_space.names.index(name)]
+            self._unit_design[index, column] = self.design_space[name].to_unit(values)
+
+    def _begin_episodes(
+        self, index: np.ndarray, design: Mapping[str, float] | None = None, goal: np.ndarray | None = None
+    ) -> None:
+        """Start episodes in the sub-environments ``index``."""
+        if design is not None:
+            self.designs[index] = list({**self._fixed_design, **self.design_space.complete(design)}.values())
+            self._begin_bodies(index)
+        elif self._sampled:
+            names = self.design_space.names
+            for name in self._sampled:
+                draws = self.np_random.uniform(-1.0, 1.0, len(index))
+                self.designs[index, names.index(name)] = self.design_space[name].from_unit(draws)
+            self._begin_bodies(index)
+        elif self._changed:
+            self.designs[index] = list(self._fixed_design.values())
+            self._begin_bodies(index)
+        self._command[index] = 0.0
+        self._displacement[index] = 0.0
+        self._effort[index] = self._rest_effort[index]
+        self._effector[index] = self._rest_effector[index]
+        self._slack[index] = False
+        self._steps[index] = 0
+        if goal is not None:
+            paths = np.broadcast_to(goal, (len(index), *goal.shape))
+        else:
+            paths = self.task.sample(self.np_random, len(index), lambda commands: self._kinematics(index, commands))
+        if paths.shape[1] != self._paths.shape[1]:
+            self._paths = np.zeros((self.num_envs, *paths.shape[1:]))
+        self._paths[index] = paths
+
+    def _kinematics(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        context = self._context.rows(index)
+        return settle(self.model, context, commands, np.zeros_like(commands), self._unilateral).effector[:, :3]
+
+    # -- Gymnasium --------------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode in every sub-environment; ``options`` as for `SoftRobotEnv.reset`, for all of them.
+
+        Raises:
+            DesignError: for a malformed design.
+            ValueError: for an unknown option or a malformed goal.
+        """
+        if isinstance(seed, list):
+            seed = int(np.random.SeedSequence(seed).generate_state(1)[0])
+        super().reset(seed=seed)
+        options = dict(options or {})
+        unknown = set(options) - {"design", "goal"}
+        if unknown:
+            raise ValueError(f"unknown reset option '{sorted(unknown)[0]}'; allowed: design, goal")
+        goal = options.get("goal")
+        if goal is not None:
+            goal = np.asarray(goal, dtype=float).reshape(-1, 3)
+            if len(goal) == 0 or not np.isfinite(goal).all():
+                raise ValueError(f"goal = {options['goal']!r} must be finite with shape (3,) or (p, 3)")
+        self._begin_episodes(np.arange(self.num_envs), options.get("design"), goal)
+        self._changed = options.get("design") is not None
+        return self._observe(), self._info()[0]
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Apply actions (num_envs, n_a) in [-1, 1].
+
+        Raises:
+            ValueError: for actions of a wrong shape or ones that are not finite.
+        """
+        actions = self.interface.check_action(actions)
+        if actions.shape != self.action_space.shape:
+            raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
+        self._command = self.interface.command(actions, self._command)
+        settled = settle(
+            self.model, self._context, self._command, self._displacement, self._unilateral, self._slack
+        )
+        self._displacement, self._effort, self._slack = settled.displacement, settled.effort, settled.slack
+        self._effector = settled.effector[:, :3]
+        self._steps += 1
+        info, reward = self._info()
+        observation = self._observe()
+        truncated = self._steps >= self.max_episode_steps
+        ended = np.flatnonzero(truncated)
+        if len(ended):
+            final_info = {k: v for k, v in info.items() if not k.startswith("_")}
+            final_obs = np.full(self.num_envs, None, dtype=object)
+            for i in ended:
+                final_obs[i] = observation[i].copy()
+            self._begin_episodes(ended)
+            observation = self._observe()
+            info = {**self._info()[0], "final_info": final_info, "_final_info": truncated.copy()}
+            info |= {"final_obs": final_obs, "_final_obs": truncated.copy()}
+        return observation, reward, np.zeros(self.num_envs, dtype=bool), truncated, info
+
+    def _goals(self) -> np.ndarray:
+        return self.task.goals(self._paths, self._steps)
+
+    def _observe(self) -> np.ndarray:
+        return self.interface.observe(
+            self._command, self._displacement, self._effort, self._effector, self._goals(), self._unit_design
+        )
+
+    def _info(self) -> tuple[dict[str, Any], np.ndarray]:
+        goals = self._goals()
+        distance = np.linalg.norm(self._effector - goals, axis=1)
+        share = np.abs(self._effort / self.robot.effort_scale).mean(axis=1)
+        terms = self.task.reward_terms(distance, share)
+        reward = np.ones(self.num_envs)
+        for term in terms.values():
+            reward = reward * term
+        present = np.ones(self.num_envs, dtype=bool)
+        info: dict[str, Any] = {
+            "effector": self._effector.copy(),
+            "goal": goals.copy(),
+            "distance": distance,
+            "is_success": distance < self.task.success_distance,
+            "reward_terms": terms,
+            "displacement": self._displacement.copy(),
+            "effort": self._effort.copy(),
+        }
+        info |= {f"_{name}": present for name in tuple(info)}
+        return info, reward
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Nothing to free."""
+

@@ -1,0 +1,103 @@
+"""Small linear complementarity problems: which cables are taut."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+__all__ = ["solve_complementarity"]
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(W, gap, unilateral, y):
+    """Row by row: the consistent taut set, starting from the most likely ones. Returns the first unsolved row or -1."""
+    count, m = gap.shape
+    a = np.empty((m, m + 1))
+    index = np.empty(m, dtype=np.int64)
+    candidate = np.empty(m)
+    for b in range(count):
+        solved = False
+        scale = 0.0
+        for i in range(m):
+            scale = max(scale, abs(gap[b, i]))
+        tolerance = 1e-12 * scale
+        for code in range(1 << m):
+            # Bit i set: actuator i is slack. Code 0, all taut, comes first.
+            k = 0
+            allowed = True
+            for i in range(m):
+                if code >> i & 1:
+                    if not unilateral[i]:
+                        allowed = False
+                        break
+                else:
+                    index[k] = i
+                    k += 1
+            if not allowed:
+                continue
+            for r in range(k):
+                for c in range(k):
+                    a[r, c] = W[b, index[r], index[c]]
+                a[r, k] = -gap[b, index[r]]
+            # Gaussian elimination without pivoting: fine for positive definite blocks.
+            for p in range(k):
+                if not a[p, p] > 0.0:
+                    allowed = False
+                    break
+                for r in range(p + 1, k):
+                    factor = a[r, p] / a[p, p]
+                    for c in range(p, k + 1):
+                        a[r, c] -= factor * a[p, c]
+            if not allowed:
+                continue
+            for i in range(m):
+                candidate[i] = 0.0
+            for r in range(k - 1, -1, -1):
+                value = a[r, k]
+                for c in range(r + 1, k):
+                    value -= a[r, c] * candidate[index[c]]
+                candidate[index[r]] = value / a[r, r]
+            consistent = True
+            for i in range(m):
+                if code >> i & 1:
+                    value = gap[b, i]
+                    for j in range(m):
+                        value += W[b, i, j] * candidate[j]
+                    if value < -tolerance:
+                        consistent = False
+                        break
+                elif unilateral[i] and candidate[i] < 0.0:
+                    consistent = False
+                    break
+            if consistent:
+                for i in range(m):
+                    y[b, i] = candidate[i]
+                solved = True
+                break
+        if not solved:
+            return b
+    return -1
+
+
+def solve_complementarity(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
+    """Solve ``W y + gap = 0`` for bilateral rows, ``0 <= y _|_ W y + gap >= 0`` for unilateral ones.
+
+    With W positive definite exactly one set of taut actuators is consistent; it is found by trying them, which for
+    the handful of actuators of a robot is faster than any pivoting.
+
+    Args:
+        W: symmetric positive definite matrices, shape (B, m, m).
+        gap: shape (B, m).
+        unilateral: shape (m,).
+
+    Raises:
+        numpy.linalg.LinAlgError: if no set is consistent: a W is not positive definite.
+        ValueError: for more than 16 actuators.
+    """
+    if gap.shape[1] > 16:
+        raise ValueError(f"at most 16 actuators can be told taut from slack, got {gap.shape[1]}")
+    y = np.empty_like(gap)
+    row = _solve(W, gap, unilateral, y)
+    if row >= 0:
+        raise np.linalg.LinAlgError(f"no consistent set of taut actuators in row {row}: W is not positive definite")
+    return y

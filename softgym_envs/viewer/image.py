@@ -1,0 +1,153 @@
+"""Pictures of a robot: the ``rgb_array`` mode of environments, and stills for reports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from softgym_envs.backends.backend import State
+from softgym_envs.robots.robot import Robot
+from softgym_envs.viewer.scene import STUB, Scene
+from softgym_envs.viewer.surface import ShapeFinder, cable_lines
+
+__all__ = ["ImageRenderer", "render_bodies", "render_body"]
+
+
+class ImageRenderer:
+    """Draws states of a robot off screen, always from the same place.
+
+    Shown are the body with its clamped base dark, the cables (amber to red with tension; grey and wavy if slack) with
+    a bead on their pulled end, the effectors (blue), the goal (green) and its path, before a wall with a 10 mm grid.
+    Cables, effectors and goal shine through the body faintly where they are inside or behind it.
+
+    Args:
+        robot: the family of bodies; the camera sees its baseline body at rest and with its actuators at their ends.
+        size: width and height [pixels].
+
+    Raises:
+        ValueError: for a size that is not two positive integers.
+    """
+
+    def __init__(self, robot: Robot, size: tuple[int, int] = (480, 480)) -> None:
+        width, height = (int(n) for n in size)
+        if width < 1 or height < 1:
+            raise ValueError(f"size = {size!r} must be two positive integers: width and height in pixels")
+        self.robot = robot
+        self.size = (width, height)
+        self._shapes = ShapeFinder(robot)
+        self._scene: _Scene | None = None
+
+    def render(self, design: Mapping[str, float], state: State, path: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Return a picture, shape (height, width, 3) uint8.
+
+        A state without nodes is drawn in the shape that a finite-element model takes at its displacements.
+
+        Args:
+            design: the body.
+            state: its state.
+            path: all goals of the episode [m], shape (p, 3).
+            goal: the present goal [m], shape (3,).
+        """
+        scene = self._open()
+        model = self._shapes.load(design)
+        x = self._shapes.nodes(design, state)
+        scene.set_body(model, x)
+        scene.set_ghost(None)
+        scene.set_state(x, state)
+        scene.set_goal(np.asarray(goal), np.asarray(path))
+        distance = 1e3 * float(np.linalg.norm(state.effector[0] - goal))
+        scene.set_text(f"distance {distance:.1f} mm")
+        return scene.picture()
+
+    def render_body(
+        self,
+        design: Mapping[str, float] | None = None,
+        command: np.ndarray | None = None,
+        *,
+        ghost: Mapping[str, float] | None = None,
+        text: str = "",
+    ) -> np.ndarray:
+        """Return a still of a body without a task, shape (height, width, 3) uint8.
+
+        Args:
+            design: the body; missing variables take their baseline.
+            command: actuator displacements, shape (n_a,), default at rest.
+            ghost: another body, drawn as a pale shell at the same command for comparison.
+            text: a caption.
+        """
+        scene = self._open()
+        command = None if command is None else np.asarray(command, dtype=float)
+        if ghost is None:
+            scene.set_ghost(None)
+        else:
+            scene.set_ghost(self._shapes.load(ghost), self._shapes.at(ghost, command))
+        model, x = self._shapes.load(design), self._shapes.at(design, command)
+        scene.set_body(model, x)
+        scene.set_state(x, self._shapes.state)
+        scene.set_goal(None, None)
+        scene.set_text(text)
+        return scene.picture()
+
+    def close(self) -> None:
+        """Free the window. A later picture opens a new one."""
+        if self._scene is not None:
+            self._scene.close()
+            self._scene = None
+
+    def _open(self) -> Scene:
+        if self._scene is None:
+            baseline, lower, upper = self.robot.design_space.baseline, self.robot.lower, self.robot.upper
+            model = self._shapes.load(baseline)
+            # At rest, each actuator alone at its end, and all together, which moves a body in other ways.
+            seen = []
+            for command in (None, *np.where(np.eye(len(upper), dtype=bool), upper, lower), upper):
+                x = self._shapes.at(baseline, command)
+                lines = cable_lines(model, x, self._shapes.state, stub=STUB * self.robot.size)
+                seen += [x, *lines.values()]
+            self._scene = Scene(self.robot, self.size, np.concatenate(seen))
+        return self._scene
+
+
+def render_body(
+    robot: Robot,
+    design: Mapping[str, float] | None = None,
+    command: np.ndarray | None = None,
+    size: tuple[int, int] = (480, 480),
+    *,
+    ghost: Mapping[str, float] | None = None,
+    text: str = "",
+) -> np.ndarray:
+    """Return a still of one body, shape (height, width, 3) uint8; see `ImageRenderer.render_body`."""
+    return render_bodies(robot, [design], command, size, ghost=ghost, texts=[text])
+
+
+def render_bodies(
+    robot: Robot,
+    designs: Sequence[Mapping[str, float] | None],
+    command: np.ndarray | None = None,
+    size: tuple[int, int] = (480, 480),
+    *,
+    ghost: Mapping[str, float] | None = None,
+    texts: Sequence[str] | None = None,
+) -> np.ndarray:
+    """Return stills of several bodies side by side, seen from the same place, shape (height, k * width, 3) uint8.
+
+    Args:
+        robot: the family of bodies.
+        designs: k bodies.
+        command: actuator displacements of all, shape (n_a,), default at rest.
+        size: width and height of one picture [pixels].
+        ghost: a body drawn behind each as a pale shell.
+        texts: k captions.
+    """
+    renderer = ImageRenderer(robot, size)
+    try:
+        captions = [""] * len(designs) if texts is None else texts
+        pictures = [
+            renderer.render_body(design, command, ghost=ghost, text=text)
+            for design, text in zip(designs, captions, strict=True)
+        ]
+    finally:
+        renderer.close()
+    return np.concatenate(pictures, axis=1)

@@ -1,0 +1,228 @@
+"""Recordings of rollouts that the rerun viewer plays: ``rerun rollout.rrd``. Writing one needs no window."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from softgym_envs.backends.backend import State
+from softgym_envs.envs.soft_robot_env import SoftRobotEnv
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.robot import Robot
+from softgym_envs.viewer.scene import COLORS, STUB, tension_color
+from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
+
+__all__ = ["RolloutRecorder", "record_rollout"]
+
+Agent = Callable[[np.ndarray, SoftRobotEnv], np.ndarray]
+"""Maps an observation and the environment, unwrapped, to an action."""
+
+# What an actuator's displacement is plotted in, the factor to it, and the unit of its effort.
+_PLOTTED: dict[str, tuple[str, float, str]] = {
+    "m": ("mm", 1e3, "N"),
+    "m3": ("ml", 1e6, "Pa"),
+    "rad": ("deg", 180.0 / np.pi, "N m"),
+}
+
+
+class RolloutRecorder:
+    """Writes the states of one rollout to an ``.rrd`` file on the timeline ``step``.
+
+    Use it as a context manager: the file is there, whole, when the block ends, and not at all if it ends in an error.
+
+    Logged are ``world/body`` (mesh), ``world/cables/<actuator>``, ``world/effectors``, ``world/goal``, ``world/path``
+    (all in metres), ``plots/distance`` [mm], ``plots/reward``, and for each actuator ``plots/displacement/<actuator>``
+    and ``plots/effort/<actuator>`` (mm and N for cables).
+
+    Args:
+        robot: the family of bodies.
+        path: file to write; folders are made.
+        name: name of the recording in the viewer.
+    """
+
+    def __init__(self, robot: Robot, path: str | Path, *, name: str | None = None) -> None:
+        self.robot = robot
+        self.path = Path(path)
+        self.name = name or self.path.stem
+        self._shapes = ShapeFinder(robot)
+        self._model: MechanicalModel | None = None
+        self._goals: np.ndarray | None = None
+
+    def __enter__(self) -> RolloutRecorder:
+        import rerun
+        import rerun.blueprint as blueprint
+
+        self._stream = rerun.RecordingStream("softgym_envs")
+        # Only the timeline of the control steps: wall-clock time means nothing here.
+        self._stream.set_log_time_enabled(False)
+        self._stream.set_log_tick_enabled(False)
+        plots = [
+            blueprint.TimeSeriesView(origin=f"plots/{kind}", name=kind.capitalize())
+            for kind in ("distance", "reward", "displacement", "effort")
+        ]
+        layout = blueprint.Blueprint(
+            blueprint.Horizontal(
+                blueprint.Spatial3DView(origin="world", name=self.name, background=COLORS["background"]),
+                blueprint.Vertical(*plots),
+                column_shares=[3, 2],
+            ),
+            collapse_panels=True,
+        )
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        handle, self._temporary = tempfile.mkstemp(dir=self.path.parent, prefix=f".{self.path.name}.")
+        os.close(handle)
+        self._stream.save(self._temporary, default_blueprint=layout)
+        self._stream.send_recording_name(self.name)
+        self._log_names()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self._stream.disconnect()
+            if kind is None:
+                os.chmod(self._temporary, 0o644)
+                os.replace(self._temporary, self.path)
+        finally:
+            Path(self._temporary).unlink(missing_ok=True)
+
+    def log(
+        self,
+        step: int,
+        design: Mapping[str, float],
+        state: State,
+        goal: np.ndarray,
+        *,
+        path: np.ndarray | None = None,
+        reward: float | None = None,
+    ) -> None:
+        """Log one state.
+
+        Args:
+            step: control step.
+            design: the body.
+            state: its state; one without nodes is drawn in the shape of a finite-element model.
+            goal: the present goal [m], shape (3,).
+            path: all goals of the episode [m], shape (p, 3).
+            reward: reward that led to the state, none after a reset.
+        """
+        import rerun
+
+        size = self.robot.size
+        self._stream.set_time("step", sequence=step)
+        model = self._shapes.load(design)
+        x = self._shapes.nodes(design, state)
+        self._log_body(model, x)
+        lines = cable_lines(model, x, state, stub=STUB * size)
+        for row, line in lines.items():
+            share = state.effort[row] / self.robot.effort_scale[row]
+            color = COLORS["cable slack"] if state.slack[row] else tension_color(share)
+            strip = rerun.LineStrips3D([line], radii=0.008 * size, colors=color)
+            self._stream.log(f"world/cables/{self.robot.actuators[row].name}", strip)
+        effectors = rerun.Points3D(state.effector, radii=0.026 * size, colors=COLORS["effector"])
+        self._stream.log("world/effectors", effectors)
+        self._stream.log("world/goal", rerun.Points3D(goal, radii=0.034 * size, colors=COLORS["goal"]))
+        if path is not None and len(path) > 1 and (self._goals is None or not np.array_equal(path, self._goals)):
+            self._goals = np.array(path)
+            self._stream.log("world/path", rerun.LineStrips3D([path], radii=0.005 * size, colors=COLORS["goal"]))
+
+        self._plot("distance", 1e3 * float(np.linalg.norm(state.effector[0] - goal)))
+        if reward is not None:
+            self._plot("reward", reward)
+        for row, actuator in enumerate(self.robot.actuators):
+            factor = _PLOTTED.get(actuator.unit, ("", 1.0, ""))[1]
+            self._plot(f"displacement/{actuator.name}", factor * state.displacement[row])
+            self._plot(f"effort/{actuator.name}", state.effort[row])
+
+    def _log_names(self) -> None:
+        import rerun
+
+        self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        names = {"distance": "distance [mm]", "reward": "reward"}
+        for actuator in self.robot.actuators:
+            unit, _, effort = _PLOTTED.get(actuator.unit, (actuator.unit, 1.0, "SI"))
+            names[f"displacement/{actuator.name}"] = f"{actuator.name} [{unit}]"
+            names[f"effort/{actuator.name}"] = f"{actuator.name} [{effort}]"
+        for entity, name in names.items():
+            self._stream.log(f"plots/{entity}", rerun.SeriesLines(names=name), static=True)
+
+    def _log_body(self, model: MechanicalModel, x: np.ndarray) -> None:
+        import rerun
+
+        new = model is not self._model
+        if new:
+            self._model, self._surface = model, BodySurface(model)
+        points = self._surface.points(x)
+        moving = {"vertex_positions": points.astype(np.float32), "vertex_normals": self._surface.normals(points)}
+        if new:
+            colors = np.tile(np.array(COLORS["body"], dtype=np.uint8), (len(points), 1))
+            colors[self._surface.triangles[self._surface.clamped]] = COLORS["clamp"]
+            self._stream.log(
+                "world/body",
+                rerun.Mesh3D(**moving, triangle_indices=self._surface.triangles, vertex_colors=colors),
+            )
+        else:
+            # The viewer keeps the triangles and colours of the step that logged them last.
+            self._stream.log("world/body", rerun.Mesh3D.from_fields(**moving))
+
+    def _plot(self, entity: str, value: float) -> None:
+        import rerun
+
+        self._stream.log(f"plots/{entity}", rerun.Scalars(float(value)))
+
+
+def record_rollout(
+    env: gymnasium.Env,
+    agent: Agent,
+    path: str | Path,
+    *,
+    seed: int | None = 0,
+    options: Mapping[str, Any] | None = None,
+    steps: int | None = None,
+) -> dict[str, Any]:
+    """Run one episode and write it to an ``.rrd`` file, which is whole when this returns.
+
+    Args:
+        env: a `SoftRobotEnv`, wrapped or not; it is reset first and stays open.
+        agent: maps an observation and ``env.unwrapped`` to an action.
+        path: file to write.
+        seed: seed of the reset.
+        options: options of the reset.
+        steps: largest number of steps; default the time limit of the environment.
+
+    Returns:
+        ``return`` (sum of rewards), ``final_distance`` [m], ``success`` at the last step, and ``steps``.
+
+    Raises:
+        ValueError: if the environment is no `SoftRobotEnv`, or has no time limit and ``steps`` is missing.
+    """
+    body = env.unwrapped
+    if not isinstance(body, SoftRobotEnv):
+        raise ValueError(f"only rollouts of SoftRobotEnv can be recorded, got {type(body).__name__}")
+    if steps is None:
+        steps = None if env.spec is None else env.spec.max_episode_steps
+        if steps is None:
+            raise ValueError("the environment has no time limit: pass the number of steps as 'steps'")
+    name = Path(path).stem if env.spec is None else env.spec.id
+    with RolloutRecorder(body.robot, path, name=name) as recorder:
+        observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
+        recorder.log(0, body.design, body.state, body.goal, path=body.path)
+        total, step, over = 0.0, 0, False
+        while step < steps and not over:
+            observation, reward, terminated, truncated, info = env.step(agent(observation, body))
+            step, total, over = step + 1, total + float(reward), terminated or truncated
+            recorder.log(step, body.design, body.state, body.goal, path=body.path, reward=float(reward))
+    return {
+        "return": total,
+        "final_distance": float(info["distance"]),
+        "success": bool(info["is_success"]),
+        "steps": step,
+    }

@@ -1,0 +1,353 @@
+"""The stage that pictures are taken of: a window off screen and everything in it, made once and moved afterwards."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softgym_envs.backends.backend import State
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.robot import Robot
+from softgym_envs.viewer.surface import BodySurface, cable_lines
+
+if TYPE_CHECKING:
+    import pyvista
+
+__all__ = ["COLORS", "STUB", "Scene", "tension_color"]
+
+Color = tuple[int, int, int]
+
+COLORS: dict[str, Color] = {
+    "background": (245, 246, 249),
+    "grid": (196, 203, 214),
+    "shadow": (225, 229, 237),
+    "body": (246, 216, 190),
+    "clamp": (92, 99, 112),
+    "edge": (120, 84, 60),
+    "ghost": (110, 130, 165),
+    "cable low": (245, 166, 35),
+    "cable high": (205, 30, 45),
+    "cable slack": (98, 106, 122),
+    "effector": (35, 95, 205),
+    "goal": (20, 165, 90),
+    "text": (75, 82, 95),
+}
+"""Colours of everything drawn, 0 to 255; recordings use the same."""
+
+# Directions from the body to the camera and to the lights. Bending bodies bend in the y-z plane, seen along x.
+_CAMERA = np.array([1.0, 0.45, 0.28])
+_LIGHT = np.array([1.0, -0.20, 0.50])
+_FILL = np.array([0.3, 1.0, 0.4])
+_VIEW_ANGLE = np.radians(18.0)
+
+STUB = 0.06
+"""Length of an unpulled cable outside the body, in sizes of the robot."""
+
+
+def tension_color(share: float) -> Color:
+    """Return the colour of a taut cable whose effort is ``share`` of its scale."""
+    share = float(np.clip(share, 0.0, 1.0))
+    red, green, blue = (
+        round((1.0 - share) * low + share * high)
+        for low, high in zip(COLORS["cable low"], COLORS["cable high"], strict=True)
+    )
+    return red, green, blue
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
+
+
+def _fit(cloud: np.ndarray, backward: np.ndarray, angle: float, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return position and focal point [m] of an upright camera that just sees a cloud (n, 3).
+
+    Args:
+        cloud: points [m].
+        backward: unit vector from the scene to the camera.
+        angle: vertical view angle [rad].
+        aspect: width over height of the picture.
+    """
+    right = _unit(np.cross([0.0, 0.0, 1.0], backward))
+    up = np.cross(backward, right)
+    depth = cloud @ backward
+    place, distance = np.zeros(3), 0.0
+    for axis, slope in ((right, aspect * np.tan(0.5 * angle)), (up, np.tan(0.5 * angle))):
+        # A camera at (a, D) along (axis, backward) sees a point at (u, w) if |u - a| <= slope (D - w).
+        across = cloud @ axis
+        high, low = np.max(across + slope * depth), np.min(across - slope * depth)
+        place += 0.5 * (high + low) * axis
+        distance = max(distance, (high - low) / (2.0 * slope))
+    return place + distance * backward, place + depth.mean() * backward
+
+
+class _Part:
+    """One mesh on the stage and, if ``faint`` > 0, its faint copy in the layer that shines through the others."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        color: str,
+        *,
+        lit: bool = True,
+        specular: float = 0.0,
+        opacity: float = 1.0,
+        line_width: float = 1.0,
+        faint: float = 0.0,
+    ) -> None:
+        import pyvista
+
+        self.mapper = pyvista.DataSetMapper()
+        self.actors = []
+        for renderer, alpha in ((scene.plotter.renderer, opacity), (scene.front, faint)):
+            if alpha == 0.0:
+                continue
+            look = pyvista.Property(
+                color=COLORS[color],
+                interpolation="Phong",
+                lighting=lit,
+                ambient=0.22 if lit else 0.0,
+                diffuse=0.95 if lit else 1.0,
+                specular=specular,
+                specular_power=25.0,
+                opacity=alpha,
+                line_width=line_width,
+                # Only the near side of a translucent thing, or it would be seen through itself.
+                culling="back" if alpha < 1.0 and lit else "none",
+            )
+            actor = pyvista.Actor(mapper=self.mapper, prop=look)
+            actor.visibility = False
+            renderer.AddActor(actor)
+            self.actors.append(actor)
+
+    def show(self, mesh: pyvista.PolyData | None, color: Color | None = None) -> None:
+        """Draw a mesh from now on, or nothing for None."""
+        visible = mesh is not None and mesh.n_points > 0
+        if visible:
+            self.mapper.dataset = mesh
+        for actor in self.actors:
+            actor.visibility = visible
+            if color is not None:
+                actor.prop.color = color
+
+
+class Scene:
+    """A robot before a wall with a grid.
+
+    Args:
+        robot: the robot.
+        size: width and height [pixels].
+        cloud: all places the body is expected to reach [m], shape (n, 3); the camera is placed to see them.
+    """
+
+    def __init__(self, robot: Robot, size: tuple[int, int], cloud: np.ndarray) -> None:
+        import pyvista
+
+        self.robot = robot
+        self._length = robot.size
+        self._line = max(1.0, size[1] / 480.0)
+        self._open_window(size)
+        self._place_camera(size, cloud)
+        self._draw_wall(cloud)
+
+        self._shadow = _Part(self, "shadow", lit=False)
+        self._ghost = _Part(self, "ghost", opacity=0.30)
+        self._body = _Part(self, "body", specular=0.25)
+        self._edges = _Part(self, "edge", lit=False, opacity=0.35, line_width=1.2 * self._line)
+        self._cables: dict[int, _Part] = {}
+        self._trail = _Part(self, "goal", lit=False, opacity=0.8, line_width=2.5 * self._line, faint=0.3)
+        self._goal = _Part(self, "goal", specular=0.4, faint=0.5)
+        self._effectors = _Part(self, "effector", specular=0.4, faint=0.5)
+        self._ball = pyvista.Sphere(radius=1.0, theta_resolution=24, phi_resolution=16)
+        self._model: MechanicalModel | None = None
+        self._text = None
+        # Smaller captions could not be read.
+        if size[1] >= 200:
+            font = round(11 * size[1] / 480)
+            corner = round(10 * size[1] / 480)
+            text = {"font_size": 1, "color": COLORS["text"], "font": "arial"}
+            self._text = self.plotter.add_text("", position=(corner, corner), **text)
+            scale = self.plotter.add_text(f"grid {1e3 * self._spacing:g} mm", position=(size[0] - corner, corner), **text)
+            scale.prop.justification_horizontal = "right"
+            for caption in (self._text, scale):
+                caption.prop.font_size = font
+
+    # -- set-up -----------------------------------------------------------------------------------------------------
+
+    def _open_window(self, size: tuple[int, int]) -> None:
+        import pyvista
+        from vtkmodules.vtkCommonCore import vtkLogger
+        from vtkmodules.vtkRenderingCore import vtkRenderer
+
+        # Without a display VTK complains about that before it falls back to a window off screen.
+        verbosity = vtkLogger.GetCurrentVerbosityCutoff()
+        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+        try:
+            self.plotter = pyvista.Plotter(
+                off_screen=True, window_size=list(size), lighting="none", theme=pyvista.themes.DocumentTheme()
+            )
+            self.plotter.set_background(COLORS["background"])
+            self.plotter.enable_anti_aliasing("msaa", multi_samples=4)
+            # A second layer with a depth of its own lies over the first.
+            window = self.plotter.render_window
+            layer = window.GetNumberOfLayers()
+            window.SetNumberOfLayers(layer + 1)
+            self.front = vtkRenderer()
+            self.front.SetLayer(layer)
+            self.front.InteractiveOff()
+            self.front.SetActiveCamera(self.plotter.camera)
+            window.AddRenderer(self.front)
+            window.Render()
+        finally:
+            vtkLogger.SetStderrVerbosity(verbosity)
+        for direction, intensity, kind in ((_LIGHT, 0.62, "scene light"), (_FILL, 0.30, "scene light"), (None, 0.22, "headlight")):
+            light = pyvista.Light(light_type=kind, intensity=intensity)
+            if direction is not None:
+                light.position, light.focal_point = tuple(direction), (0.0, 0.0, 0.0)
+            self.plotter.add_light(light)
+            self.front.AddLight(light)
+
+    def _place_camera(self, size: tuple[int, int], cloud: np.ndarray) -> None:
+        margin = 0.07 * self._length * np.vstack([np.eye(3), -np.eye(3)])
+        cloud = (cloud[:, None] + margin).reshape(-1, 3)
+        position, focal = _fit(cloud, _unit(_CAMERA), _VIEW_ANGLE, size[0] / size[1])
+        camera = self.plotter.camera
+        camera.position, camera.focal_point, camera.up = position, focal, (0.0, 0.0, 1.0)
+        camera.view_angle = np.degrees(_VIEW_ANGLE)
+        distance = float(np.linalg.norm(position - focal))
+        camera.clipping_range = (0.3 * distance, 3.0 * distance)
+        self._side = _unit(np.cross([0.0, 0.0, 1.0], _CAMERA))
+
+    def _draw_wall(self, cloud: np.ndarray) -> None:
+        """Draw a grid in the y-z plane behind the body, fading outwards into the background."""
+        import pyvista
+
+        self._wall = float(cloud[:, 0].min()) - 0.15 * self._length
+        self._spacing = 10.0 ** np.floor(np.log10(0.2 * self._length))
+        centre = 0.5 * (cloud.min(axis=0) + cloud.max(axis=0))
+        reach = 1.8 * self._length
+        count = int(np.ceil(reach / self._spacing))
+        middle = np.round(centre[1:] / self._spacing)
+        steps = np.arange(-count, count + 1)
+        y, z = np.meshgrid(middle[0] + steps, middle[1] + steps, indexing="ij")
+        points = np.stack([np.full(y.shape, self._wall), y * self._spacing, z * self._spacing], axis=-1).reshape(-1, 3)
+        index = np.arange(y.size).reshape(y.shape)
+        along = [np.stack(ends, axis=-1).reshape(-1, 2) for ends in ((index[:-1], index[1:]), (index.T[:-1], index.T[1:]))]
+        lines = np.concatenate(along)
+        mesh = _line_mesh(points, lines)
+        fade = np.clip(1.0 - np.linalg.norm(points - [self._wall, *centre[1:]], axis=1) / reach, 0.0, 1.0)[:, None]
+        back, front = np.array(COLORS["background"]), np.array(COLORS["grid"])
+        mesh.point_data["rgb"] = np.round(back + (front - back) * fade**0.7).astype(np.uint8)
+        actor = pyvista.Actor(mapper=pyvista.DataSetMapper(mesh))
+        actor.mapper.set_scalars(mesh["rgb"], "rgb", rgb=True)
+        actor.prop.lighting, actor.prop.line_width = False, 1.3 * self._line
+        self.plotter.renderer.AddActor(actor)
+
+    # -- what moves -------------------------------------------------------------------------------------------------
+
+    def set_body(self, model: MechanicalModel, x: np.ndarray) -> None:
+        """Draw a body at node positions [m] (n, 3); the surface is made anew only for another model."""
+        if model is not self._model:
+            self._model = model
+            self._surface = BodySurface(model)
+            self._skin = _surface_mesh(self._surface)
+            colors = np.array([COLORS["body"], COLORS["clamp"]], dtype=np.uint8)[self._surface.clamped.astype(int)]
+            self._skin.cell_data["rgb"] = colors
+            self._body.show(self._skin)
+            self._body.mapper.set_scalars(colors, "rgb", rgb=True, preference="cell")
+            self._flat = _surface_mesh(self._surface)
+            self._shadow.show(self._flat)
+            self._seams = _line_mesh(np.zeros((len(model.nodes), 3)), self._surface.edges)
+            self._edges.show(self._seams)
+        points = self._surface.points(x)
+        _move(self._skin, points, self._surface.normals(points))
+        light = -_LIGHT / _LIGHT[0]
+        flat = points + (points[:, :1] - self._wall) * light
+        # Just behind the grid.
+        flat[:, 0] = self._wall - 2e-3 * self._length
+        _move(self._flat, flat)
+        # Just before the skin, towards the camera.
+        _move(self._seams, x + 2e-3 * self._length * _unit(_CAMERA))
+
+    def set_ghost(self, model: MechanicalModel | None, x: np.ndarray | None = None) -> None:
+        """Draw another body as a pale shell, or none."""
+        if model is None:
+            self._ghost.show(None)
+            return
+        surface = BodySurface(model)
+        mesh = _surface_mesh(surface)
+        points = surface.points(x)
+        _move(mesh, points, surface.normals(points))
+        self._ghost.show(mesh)
+
+    def set_state(self, x: np.ndarray, state: State) -> None:
+        """Draw cables and effectors of the body set last: node positions [m] (n, 3) and its state."""
+        lines = cable_lines(self._model, x, state, stub=STUB * self._length, side=self._side)
+        for row in self._cables.keys() - lines.keys():
+            self._cables.pop(row)
+        for row, line in lines.items():
+            if row not in self._cables:
+                self._cables[row] = _Part(self, "cable low", specular=0.3, faint=0.45)
+            slack = bool(state.slack[row])
+            color = COLORS["cable slack"] if slack else tension_color(state.effort[row] / self.robot.effort_scale[row])
+            radius = (0.006 if slack else 0.009) * self._length
+            tube = _polyline(line).tube(radius=radius, n_sides=12, capping=True)
+            bead = self._balls(line[:1], 0.018 * self._length)
+            self._cables[row].show(tube.append_polydata(bead), color)
+        self._effectors.show(self._balls(state.effector, 0.026 * self._length))
+
+    def set_goal(self, goal: np.ndarray | None, path: np.ndarray | None) -> None:
+        """Draw the goal [m] (3,), and its path [m] (p, 3) if it moves; nothing for None."""
+        self._goal.show(None if goal is None else self._balls(goal[None], 0.034 * self._length))
+        self._trail.show(None if path is None or len(path) < 2 else _polyline(path))
+
+    def set_text(self, text: str) -> None:
+        """Write a caption in the lower left corner."""
+        if self._text is not None:
+            self._text.input = text
+
+    def picture(self) -> np.ndarray:
+        """Take the picture, shape (height, width, 3) uint8."""
+        self.plotter.render_window.Render()
+        return np.array(self.plotter.screenshot(return_img=True), dtype=np.uint8)
+
+    def close(self) -> None:
+        """Close the window."""
+        self.plotter.render_window.RemoveRenderer(self.front)
+        self.plotter.close()
+
+    def _balls(self, centres: np.ndarray, radius: float) -> pyvista.PolyData:
+        ball = self._ball
+        import pyvista
+
+        points = (centres[:, None] + radius * ball.points).reshape(-1, 3)
+        faces = ball.regular_faces
+        faces = (faces + ball.n_points * np.arange(len(centres))[:, None, None]).reshape(-1, 3)
+        mesh = pyvista.PolyData.from_regular_faces(points, faces)
+        mesh.point_data.active_normals = np.tile(ball.points, (len(centres), 1))
+        return mesh
+
+
+def _line_mesh(points: np.ndarray, lines: np.ndarray) -> pyvista.PolyData:
+    """Mesh of separate lines, node pairs (s, 2)."""
+    import pyvista
+
+    return pyvista.PolyData(points, lines=np.insert(lines, 0, 2, axis=1).ravel())
+
+
+def _polyline(points: np.ndarray) -> pyvista.PolyData:
+    import pyvista
+
+    return pyvista.PolyData(points, lines=[len(points), *range(len(points))])
+
+
+def _surface_mesh(surface: BodySurface) -> pyvista.PolyData:
+    import pyvista
+
+    return pyvista.PolyData.from_regular_faces(np.zeros((len(surface.nodes), 3)), surface.triangles)
+
+
+def _move(mesh: pyvista.PolyData, points: np.ndarray, normals: np.ndarray | None = None) -> None:
+    mesh.points = points
+    if normals is not None:
+        mesh.point_data.active_normals = normals

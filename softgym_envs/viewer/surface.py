@@ -1,0 +1,250 @@
+"""What there is to draw of a robot: the boundary of its body, its cables, and its shape at a state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from softgym_envs.backends.backend import State
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.robot import Robot
+
+if TYPE_CHECKING:
+    import pyvista
+
+__all__ = [
+    "BodySurface",
+    "ShapeFinder",
+    "body_surface",
+    "boundary_triangles",
+    "cable_lines",
+    "commanded_displacement",
+    "slacken",
+]
+
+
+def boundary_triangles(tetrahedra: np.ndarray) -> np.ndarray:
+    """Return the faces (t, 3) that belong to one tetrahedron only, seen counter-clockwise from outside.
+
+    Args:
+        tetrahedra: corner indices of positively oriented tetrahedra, shape (m, 4).
+    """
+    faces = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[np.sort(first[count == 1])]
+
+
+class BodySurface:
+    """Boundary of a body, cut along its sharp edges so that everything else can be shaded smoothly.
+
+    Args:
+        model: the body; element blocks other than tetrahedra are not drawn.
+        feature_angle: an edge is sharp if its two faces differ by more at rest [rad].
+
+    Attributes:
+        nodes: node of each surface vertex, shape (v,); a node on a sharp edge has several vertices.
+        triangles: corner vertices, shape (t, 3).
+        edges: node pairs of the sharp edges, shape (s, 2).
+        clamped: triangles whose nodes are all held, shape (t,).
+    """
+
+    def __init__(self, model: MechanicalModel, feature_angle: float = np.pi / 6) -> None:
+        solids = [block.connectivity for block in model.blocks if block.connectivity.shape[1] == 4]
+        corners = boundary_triangles(np.concatenate(solids)) if solids else np.empty((0, 3), dtype=np.int64)
+        self.clamped = model.fixed[corners].all(axis=1)
+
+        # Half edges (t, 3) sorted by their node pair: the two faces of an edge are neighbours in that order.
+        tails, heads = corners, np.roll(corners, -1, axis=1)
+        key = (np.minimum(tails, heads) * len(model.nodes) + np.maximum(tails, heads)).ravel()
+        order = np.argsort(key, kind="stable")
+        pairs = np.flatnonzero(key[order][1:] == key[order][:-1])
+        one, other = order[pairs], order[pairs + 1]
+        normals = _face_normals(model.nodes, corners)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        smooth = np.einsum("ij,ij->i", normals[one // 3], normals[other // 3]) > np.cos(feature_angle)
+        self.edges = np.column_stack([tails.ravel(), heads.ravel()])[one[~smooth]]
+
+        # Corners of triangles are one vertex if they share their node across a smooth edge. The neighbour runs
+        # along the edge the other way, so the tail of one half edge is the head of the other.
+        a, b = one[smooth], other[smooth]
+        after = np.arange(3 * len(corners)).reshape(-1, 3)
+        after = np.roll(after, -1, axis=1).ravel()
+        rows, columns = np.concatenate([a, after[a]]), np.concatenate([after[b], b])
+        graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(corners.size, corners.size))
+        _, vertex = connected_components(graph, directed=False)
+        self.triangles = vertex.reshape(-1, 3)
+        self.nodes = np.empty(vertex.max(initial=-1) + 1, dtype=np.int64)
+        self.nodes[vertex] = corners.ravel()
+
+    def points(self, x: np.ndarray) -> np.ndarray:
+        """Return the vertices [m] (v, 3) at node positions ``x`` [m] (n, 3)."""
+        return x[self.nodes]
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """Return unit normals (v, 3) at vertices [m] (v, 3): area-weighted means of the faces around them."""
+        faces = np.repeat(_face_normals(points, self.triangles), 3, axis=0)
+        corners = self.triangles.ravel()
+        total = np.column_stack([np.bincount(corners, faces[:, d], minlength=len(points)) for d in range(3)])
+        return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+
+
+def _face_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    corners = points[triangles]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def body_surface(model: MechanicalModel, x: np.ndarray | None = None) -> pyvista.PolyData:
+    """Return the boundary surface of a body as a mesh [m], for pictures and for export (``.save("body.stl")``).
+
+    Args:
+        model: the body.
+        x: node positions [m], shape (n, 3); default at rest.
+
+    Returns:
+        A mesh with point normals, the point array ``node`` and the cell array ``clamped``.
+    """
+    import pyvista
+
+    surface = BodySurface(model)
+    points = surface.points(model.nodes if x is None else x)
+    mesh = pyvista.PolyData.from_regular_faces(points, surface.triangles)
+    mesh.point_data["node"] = surface.nodes
+    mesh.point_data.active_normals = surface.normals(points)
+    mesh.cell_data["clamped"] = surface.clamped
+    return mesh
+
+
+def cable_lines(
+    model: MechanicalModel, x: np.ndarray, state: State, *, stub: float, side: Sequence[float] = (0.0, 1.0, 0.0)
+) -> dict[int, np.ndarray]:
+    """Return what is seen of the cables at a state: a polyline [m] (p, 3) from the pulled end to the anchor.
+
+    Args:
+        model: the body.
+        x: node positions [m], shape (n, 3).
+        state: the state.
+        stub: length of an unpulled cable outside the body [m]; it grows as the cable is pulled.
+        side: direction of the waves of a slack cable, shape (3,).
+
+    Returns:
+        Polylines by actuator row; actuators that are no cables are left out.
+    """
+    lines, row = {}, 0
+    pulled = commanded_displacement(state)
+    for constraint in model.constraints["a"]:
+        if hasattr(constraint, "path"):
+            path = constraint.path(x)
+            outwards = (path[0] - path[1]) / np.linalg.norm(path[0] - path[1])
+            end = path[0] + (stub + pulled[row]) * outwards
+            lines[row] = np.vstack([end, slacken(path, state.displacement[row] - pulled[row], side)])
+        row += constraint.size
+    return lines
+
+
+def commanded_displacement(state: State) -> np.ndarray:
+    """Return how far each actuator is driven, shape (n_a,), whatever the mode of the command was.
+
+    That is the reached displacement, except of a slack cable, whose path shortens further than it is pulled.
+    """
+    return np.where(state.slack, state.command, state.displacement)
+
+
+def slacken(path: np.ndarray, excess: float, side: Sequence[float], count: int = 12) -> np.ndarray:
+    """Lay a cable that is longer than its path into waves, so that slack can be seen; a taut one is returned as is.
+
+    Each segment of length L takes its share e of the excess as a sine of one period: to second order its length
+    grows by ``(pi a)^2 / L``, hence the amplitude ``a = sqrt(e L) / pi``.
+
+    Args:
+        path: polyline [m], shape (p, 3).
+        excess: length to lose [m].
+        side: direction of the waves, shape (3,).
+        count: points per segment.
+
+    Returns:
+        Polyline [m], shape ((p - 1) * count + 1, 3) if slack.
+    """
+    if excess <= 0.0:
+        return path
+    segments = np.diff(path, axis=0)
+    lengths = np.linalg.norm(segments, axis=1)
+    side = np.asarray(side, dtype=float)
+    tangents = segments / lengths[:, None]
+    across = side - tangents * (tangents @ side)[:, None]
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+    # Beyond a quarter of the segment the formula fails and the picture with it.
+    amplitude = np.minimum(lengths * np.sqrt(excess / lengths.sum()) / np.pi, 0.25 * lengths)
+    s = np.arange(count) / count
+    waves = np.sin(2.0 * np.pi * s)[None, :, None] * (amplitude[:, None] * across)[:, None, :]
+    line = path[:-1, None] + s[None, :, None] * segments[:, None] + waves
+    return np.vstack([line.reshape(-1, 3), path[-1:]])
+
+
+class ShapeFinder:
+    """Gives the nodes of a state: its own, or, where the backend knows none, those of a finite-element model.
+
+    Args:
+        robot: the family of bodies.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self._backend: FEMBackend | None = None
+        self._target: np.ndarray | None = None
+
+    def load(self, design: Mapping[str, float] | None = None) -> MechanicalModel:
+        """Return the mechanical model of a design, built only if the design is not the present one.
+
+        Raises:
+            DesignError: for a malformed design.
+            InfeasibleDesign: if its geometry cannot exist.
+            ConvergenceError: if it has no equilibrium at rest.
+        """
+        complete = self.robot.design_space.complete(design)
+        if self._backend is None or complete != self._backend.design:
+            self._backend = FEMBackend(self.robot, complete)
+            self._target = None
+        return self._backend.model
+
+    @property
+    def state(self) -> State:
+        """State of the finite-element model, wherever it was sent last."""
+        assert self._backend is not None
+        return self._backend.state
+
+    def nodes(self, design: Mapping[str, float], state: State) -> np.ndarray:
+        """Return the nodes [m] (n, 3) of a state of a design."""
+        if state.nodes is not None:
+            return state.nodes
+        return self.at(design, commanded_displacement(state))
+
+    def at(self, design: Mapping[str, float] | None, displacement: np.ndarray | None = None) -> np.ndarray:
+        """Return the nodes [m] (n, 3) of a design at actuator displacements (n_a,), by default at rest.
+
+        Where no equilibrium is found they are those of the last shape: a picture should not end a rollout.
+        """
+        self.load(design)
+        backend = self._backend
+        if displacement is None:
+            self._target = None
+            return backend.reset().nodes
+        if self._target is not None and np.array_equal(displacement, self._target):
+            return backend.state.nodes
+        self._target = np.array(displacement, dtype=float)
+        last = backend.state
+        try:
+            return backend.step(self._target).nodes
+        except ConvergenceError:
+            pass
+        try:  # a long way from the last shape may fail where the way from rest does not
+            backend.reset()
+            return backend.step(self._target).nodes
+        except ConvergenceError:
+            backend.restore(last)
+            return last.nodes

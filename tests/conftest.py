@@ -1,0 +1,114 @@
+"""Fixtures shared by the tests: reference data, small meshes and solved fingers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from softgym_envs.mechanics.materials import MATERIALS
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.statics import Statics
+from softgym_envs.robots import make_robot
+
+DATA = Path(__file__).parent / "data"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache_folder(tmp_path_factory):
+    """An empty cache of meshes, so that no test depends on, or writes to, the user's own."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOFTGYM_CACHE", str(folder))
+        yield folder
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20240229)
+
+
+def _box(size=(1.0, 1.0, 1.0), cells=(2, 2, 2), jitter=0.0, seed=0):
+    """A box [0, size] cut into cubes of six tetrahedra each; inner nodes moved by up to ``jitter`` cells."""
+    counts = np.array(cells)
+    grid = np.stack(np.meshgrid(*(np.arange(n + 1) for n in cells), indexing="ij"), axis=-1).reshape(-1, 3)
+    spacing = np.asarray(size, dtype=float) / counts
+    inside = ((grid > 0) & (grid < counts)).all(axis=1)
+    noise = np.random.default_rng(seed).uniform(-jitter, jitter, grid.shape) * inside[:, None]
+    strides = np.array([(cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1])
+    corners = grid[(grid < counts).all(axis=1)] @ strides
+    paths = []
+    for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
+        steps = np.concatenate([[0], np.cumsum(strides[list(order)])])
+        paths.append(corners[:, None] + steps)
+    return (grid + noise) * spacing, np.concatenate(paths)
+
+
+@pytest.fixture(scope="session")
+def box():
+    """Function ``box(size, cells, jitter, seed) -> nodes, tetrahedra``."""
+    return _box
+
+
+@pytest.fixture(params=sorted(MATERIALS))
+def beam(request):
+    """A soft cantilever of one material with two cables off its axis, an effector and a jittered mesh."""
+    nodes, tetrahedra = _box((0.1, 0.02, 0.02), (6, 2, 2), jitter=0.2)
+    model = MechanicalModel.from_mesh(
+        nodes,
+        tetrahedra,
+        fixed=nodes[:, 0] == 0.0,
+        material=request.param,
+        young_modulus=2.0e5,
+        poisson_ratio=0.35,
+        density=1000.0,
+    )
+    for name, y, z in (("top", 0.006, 0.017), ("side", 0.018, 0.009)):
+        points = np.array([[x, y, z] for x in (0.02, 0.05, 0.09)])
+        model.add_cable(name, points, np.array([-0.005, y, z]))
+    model.add_effector("tip", np.array([0.1, 0.011, 0.009]))
+    return model
+
+
+@pytest.fixture(scope="session")
+def notched():
+    """The notched beam and its reference equilibria, in SI."""
+    mesh = np.load(DATA / "notched_lc6_mesh.npz")
+    solved = np.load(DATA / "notched_lc6_fast_polar_nu0.3_positions.npz")
+    return SimpleNamespace(
+        nodes=mesh["nodes"] * 1e-3,
+        tetrahedra=mesh["tets"],
+        fixed=mesh["fixed"],
+        cable_points=mesh["cable_points"] * 1e-3,
+        pull_point=mesh["pull_point"] * 1e-3,
+        positions=solved["positions"] * 1e-3,
+        displacements=solved["displacements"] * 1e-3,
+        forces=solved["forces_N"],
+    )
+
+
+@pytest.fixture(scope="session")
+def fingers():
+    """Function ``fingers(cables, material) -> robot, model``; each body is built once."""
+    robots = {}
+
+    def get(cables, material):
+        key = (cables, material)
+        if key not in robots:
+            robot = make_robot("finger", cables=cables, material=material)
+            robots[key] = robot, robot.build()
+        return robots[key]
+
+    return get
+
+
+@pytest.fixture(params=[(cables, material) for material in sorted(MATERIALS) for cables in (1, 2)], ids=str)
+def finger(request, fingers):
+    """A baseline finger of each material with 1 and 2 cables: its robot, model and fresh statics of high accuracy."""
+    robot, model = fingers(*request.param)
+    model.nodal_loads[:] = 0.0
+    model.set_gravity((0.0, 0.0, 0.0))
+    model.refresh_loads()
+    return SimpleNamespace(robot=robot, model=model, statics=Statics(model, tolerance=1e-12))
