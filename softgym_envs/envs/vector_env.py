@@ -138,7 +138,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self._slack[index] = False
         self._steps[index] = 0
         if goal is not None:
-            paths = np.broadcast_to(goal, (len(index), *goal.shape))
+            paths = goal
         else:
             paths = self.task.sample(self.np_random, len(index), lambda commands: self._kinematics(index, commands))
         if paths.shape[1] != self._paths.shape[1]:
@@ -154,7 +154,9 @@ class SoftRobotVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode in every sub-environment; ``options`` as for `SoftRobotEnv.reset`, for all of them.
+        """Start an episode in every sub-environment; ``options`` as for `SoftRobotEnv.reset`.
+
+        ``"design"`` is the body of all of them; ``"goal"`` may have a leading dimension of ``num_envs``.
 
         Raises:
             DesignError: for a malformed design.
@@ -169,9 +171,11 @@ class SoftRobotVectorEnv(VectorEnv):
             raise ValueError(f"unknown reset option '{sorted(unknown)[0]}'; allowed: design, goal")
         goal = options.get("goal")
         if goal is not None:
-            goal = np.asarray(goal, dtype=float).reshape(-1, 3)
-            if len(goal) == 0 or not np.isfinite(goal).all():
-                raise ValueError(f"goal = {options['goal']!r} must be finite with shape (3,) or (p, 3)")
+            goal = np.asarray(goal, dtype=float)
+            if goal.ndim < 3:
+                goal = np.broadcast_to(goal.reshape(-1, 3), (self.num_envs, *goal.reshape(-1, 3).shape))
+            if goal.shape[0] != self.num_envs or goal.shape[1] == 0 or goal.shape[2:] != (3,) or not np.isfinite(goal).all():
+                raise ValueError(f"goal must be finite with shape (3,), (p, 3) or ({self.num_envs}, p, 3), got {goal.shape}")
         self._begin_episodes(np.arange(self.num_envs), options.get("design"), goal)
         self._changed = options.get("design") is not None
         return self._observe(), self._info()[0]

@@ -19,7 +19,7 @@ from softgym_envs.surrogate.dataset import generate_dataset
 from softgym_envs.surrogate.model import FORMAT, NETWORKS, Features, SurrogateModel, load_model
 from softgym_envs.surrogate.sampling import SamplingPlan, learned_variables
 
-__all__ = ["FitConfig", "fit", "test_errors"]
+__all__ = ["FitConfig", "fit", "generate", "test_errors"]
 
 
 class SplitConfig(Config):
@@ -347,6 +347,23 @@ def test_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[str,
     }
 
 
+def generate(
+    config: FitConfig, data_folder: str | Path, *, progress: bool = True
+) -> dict[str, dict[str, np.ndarray]]:
+    """Generate the datasets ``train``, ``validation`` and ``test`` of a surrogate, or take up what is there."""
+    return {
+        split: generate_dataset(
+            Path(data_folder) / split,
+            config.robot,
+            SamplingPlan(**getattr(config.data, split).model_dump()),
+            robot_options=config.robot_options,
+            workers=config.workers,
+            progress=progress,
+        )
+        for split in ("train", "validation", "test")
+    }
+
+
 def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progress: bool = True) -> dict[str, float]:
     """Generate the data (or take up what is there), train, test once, and write the weights with their card.
 
@@ -364,17 +381,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
 
     folder, data_folder = Path(folder), Path(data_folder)
     robot = make_robot(config.robot, **config.robot_options)
-    data = {}
-    for split in ("train", "validation", "test"):
-        plan = SamplingPlan(**getattr(config.data, split).model_dump())
-        data[split] = generate_dataset(
-            data_folder / split,
-            config.robot,
-            plan,
-            robot_options=config.robot_options,
-            workers=config.workers,
-            progress=progress,
-        )
+    data = generate(config, data_folder, progress=progress)
     torch.set_num_threads(config.workers)
     torch.manual_seed(config.seed)
     features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)

@@ -18,7 +18,7 @@ class ImageRenderer:
     """Draws states of a robot off screen, always from the same place.
 
     Shown are the body with its clamped base dark, the cables (amber to red with tension; grey and wavy if slack) with
-    a bead on their pulled end, the effectors (blue), the goal (green) and its path, before a wall with a 10 mm grid.
+    a bead on their pulled end, the effectors (blue), the goal (green) and its path, before a wall with a scale grid.
     Cables, effectors and goal shine through the body faintly where they are inside or behind it.
 
     Args:
@@ -36,7 +36,7 @@ class ImageRenderer:
         self.robot = robot
         self.size = (width, height)
         self._shapes = ShapeFinder(robot)
-        self._scene: _Scene | None = None
+        self._scene: Scene | None = None
 
     def render(self, design: Mapping[str, float], state: State, path: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Return a picture, shape (height, width, 3) uint8.
@@ -73,7 +73,7 @@ class ImageRenderer:
         Args:
             design: the body; missing variables take their baseline.
             command: actuator displacements, shape (n_a,), default at rest.
-            ghost: another body, drawn as a pale shell at the same command for comparison.
+            ghost: another body, drawn pale behind it at the same command, for comparison.
             text: a caption.
         """
         scene = self._open()
@@ -138,7 +138,7 @@ def render_bodies(
         designs: k bodies.
         command: actuator displacements of all, shape (n_a,), default at rest.
         size: width and height of one picture [pixels].
-        ghost: a body drawn behind each as a pale shell.
+        ghost: a body drawn pale behind each.
         texts: k captions.
     """
     renderer = ImageRenderer(robot, size)

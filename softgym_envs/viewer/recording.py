@@ -161,17 +161,20 @@ class RolloutRecorder:
         if new:
             self._model, self._surface = model, BodySurface(model)
         points = self._surface.points(x)
-        moving = {"vertex_positions": points.astype(np.float32), "vertex_normals": self._surface.normals(points)}
+        normals = self._surface.normals(points)
         if new:
             colors = np.tile(np.array(COLORS["body"], dtype=np.uint8), (len(points), 1))
             colors[self._surface.triangles[self._surface.clamped]] = COLORS["clamp"]
-            self._stream.log(
-                "world/body",
-                rerun.Mesh3D(**moving, triangle_indices=self._surface.triangles, vertex_colors=colors),
+            mesh = rerun.Mesh3D(
+                vertex_positions=points,
+                vertex_normals=normals,
+                vertex_colors=colors,
+                triangle_indices=self._surface.triangles,
             )
         else:
             # The viewer keeps the triangles and colours of the step that logged them last.
-            self._stream.log("world/body", rerun.Mesh3D.from_fields(**moving))
+            mesh = rerun.Mesh3D.from_fields(vertex_positions=points, vertex_normals=normals)
+        self._stream.log("world/body", mesh)
 
     def _plot(self, entity: str, value: float) -> None:
         import rerun

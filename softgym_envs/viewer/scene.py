@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -25,7 +25,7 @@ COLORS: dict[str, Color] = {
     "body": (246, 216, 190),
     "clamp": (92, 99, 112),
     "edge": (120, 84, 60),
-    "ghost": (110, 130, 165),
+    "ghost": (120, 140, 180),
     "cable low": (245, 166, 35),
     "cable high": (205, 30, 45),
     "cable slack": (98, 106, 122),
@@ -82,13 +82,14 @@ def _fit(cloud: np.ndarray, backward: np.ndarray, angle: float, aspect: float) -
 
 
 class _Part:
-    """One mesh on the stage and, if ``faint`` > 0, its faint copy in the layer that shines through the others."""
+    """One mesh on the stage and, if ``faint`` > 0, its faint copy in the layer before all others."""
 
     def __init__(
         self,
         scene: Scene,
         color: str,
         *,
+        back: bool = False,
         lit: bool = True,
         specular: float = 0.0,
         opacity: float = 1.0,
@@ -99,7 +100,7 @@ class _Part:
 
         self.mapper = pyvista.DataSetMapper()
         self.actors = []
-        for renderer, alpha in ((scene.plotter.renderer, opacity), (scene.front, faint)):
+        for renderer, alpha in ((scene.back if back else scene.middle, opacity), (scene.front, faint)):
             if alpha == 0.0:
                 continue
             look = pyvista.Property(
@@ -148,10 +149,10 @@ class Scene:
         self._line = max(1.0, size[1] / 480.0)
         self._open_window(size)
         self._place_camera(size, cloud)
-        self._draw_wall(cloud)
+        self._draw_wall(size[0] / size[1], cloud)
 
-        self._shadow = _Part(self, "shadow", lit=False)
-        self._ghost = _Part(self, "ghost", opacity=0.30)
+        self._shadow = _Part(self, "shadow", back=True, lit=False)
+        self._ghost = _Part(self, "ghost", back=True, opacity=0.55)
         self._body = _Part(self, "body", specular=0.25)
         self._edges = _Part(self, "edge", lit=False, opacity=0.35, line_width=1.2 * self._line)
         self._cables: dict[int, _Part] = {}
@@ -160,17 +161,10 @@ class Scene:
         self._effectors = _Part(self, "effector", specular=0.4, faint=0.5)
         self._ball = pyvista.Sphere(radius=1.0, theta_resolution=24, phi_resolution=16)
         self._model: MechanicalModel | None = None
-        self._text = None
-        # Smaller captions could not be read.
-        if size[1] >= 200:
-            font = round(11 * size[1] / 480)
-            corner = round(10 * size[1] / 480)
-            text = {"font_size": 1, "color": COLORS["text"], "font": "arial"}
-            self._text = self.plotter.add_text("", position=(corner, corner), **text)
-            scale = self.plotter.add_text(f"grid {1e3 * self._spacing:g} mm", position=(size[0] - corner, corner), **text)
-            scale.prop.justification_horizontal = "right"
-            for caption in (self._text, scale):
-                caption.prop.font_size = font
+        self._text: Any = None
+        if size[1] >= 200:  # smaller captions could not be read
+            self._text = self._caption("", size, "left")
+            self._caption(f"grid {1e3 * self._spacing:g} mm", size, "right")
 
     # -- set-up -----------------------------------------------------------------------------------------------------
 
@@ -186,26 +180,36 @@ class Scene:
             self.plotter = pyvista.Plotter(
                 off_screen=True, window_size=list(size), lighting="none", theme=pyvista.themes.DocumentTheme()
             )
-            self.plotter.set_background(COLORS["background"])
+            self.plotter.background_color = pyvista.Color(COLORS["background"])
             self.plotter.enable_anti_aliasing("msaa", multi_samples=4)
-            # A second layer with a depth of its own lies over the first.
-            window = self.plotter.render_window
-            layer = window.GetNumberOfLayers()
-            window.SetNumberOfLayers(layer + 1)
-            self.front = vtkRenderer()
-            self.front.SetLayer(layer)
-            self.front.InteractiveOff()
-            self.front.SetActiveCamera(self.plotter.camera)
-            window.AddRenderer(self.front)
-            window.Render()
+            # Three layers, each with a depth of its own: wall, shadow and ghost; body and all; the faint copies.
+            self.back, self.middle, self.front = self.plotter.renderer, vtkRenderer(), vtkRenderer()
+            self.window = cast(Any, self.plotter.render_window)
+            for renderer in (self.middle, self.front):
+                layer = self.window.GetNumberOfLayers()
+                self.window.SetNumberOfLayers(layer + 1)
+                renderer.SetLayer(layer)
+                renderer.InteractiveOff()
+                renderer.AutomaticLightCreationOff()
+                renderer.SetActiveCamera(self.plotter.camera)
+                self.window.AddRenderer(renderer)
+            self.window.Render()
         finally:
             vtkLogger.SetStderrVerbosity(verbosity)
-        for direction, intensity, kind in ((_LIGHT, 0.62, "scene light"), (_FILL, 0.30, "scene light"), (None, 0.22, "headlight")):
-            light = pyvista.Light(light_type=kind, intensity=intensity)
-            if direction is not None:
-                light.position, light.focal_point = tuple(direction), (0.0, 0.0, 0.0)
-            self.plotter.add_light(light)
-            self.front.AddLight(light)
+        for direction, intensity in ((_LIGHT, 0.62), (_FILL, 0.30), (_CAMERA, 0.22)):
+            light = pyvista.Light(position=tuple(direction), focal_point=(0.0, 0.0, 0.0), intensity=intensity)
+            for renderer in (self.back, self.middle, self.front):
+                renderer.AddLight(light)
+
+    def _caption(self, text: str, size: tuple[int, int], side: str) -> Any:
+        import pyvista
+
+        scale = size[1] / 480.0
+        caption = pyvista.Text(text, position=(10 * scale if side == "left" else size[0] - 10 * scale, 10 * scale))
+        caption.prop.color, caption.prop.font_size = COLORS["text"], max(10, round(11 * scale))
+        caption.prop.justification_horizontal = side
+        self.middle.AddViewProp(caption)
+        return caption
 
     def _place_camera(self, size: tuple[int, int], cloud: np.ndarray) -> None:
         margin = 0.07 * self._length * np.vstack([np.eye(3), -np.eye(3)])
@@ -218,22 +222,22 @@ class Scene:
         camera.clipping_range = (0.3 * distance, 3.0 * distance)
         self._side = _unit(np.cross([0.0, 0.0, 1.0], _CAMERA))
 
-    def _draw_wall(self, cloud: np.ndarray) -> None:
+    def _draw_wall(self, aspect: float, cloud: np.ndarray) -> None:
         """Draw a grid in the y-z plane behind the body, fading outwards into the background."""
         import pyvista
 
         self._wall = float(cloud[:, 0].min()) - 0.15 * self._length
         self._spacing = 10.0 ** np.floor(np.log10(0.2 * self._length))
         centre = 0.5 * (cloud.min(axis=0) + cloud.max(axis=0))
-        reach = 1.8 * self._length
+        reach = 1.8 * self._length * max(1.0, aspect)
         count = int(np.ceil(reach / self._spacing))
         middle = np.round(centre[1:] / self._spacing)
         steps = np.arange(-count, count + 1)
         y, z = np.meshgrid(middle[0] + steps, middle[1] + steps, indexing="ij")
         points = np.stack([np.full(y.shape, self._wall), y * self._spacing, z * self._spacing], axis=-1).reshape(-1, 3)
         index = np.arange(y.size).reshape(y.shape)
-        along = [np.stack(ends, axis=-1).reshape(-1, 2) for ends in ((index[:-1], index[1:]), (index.T[:-1], index.T[1:]))]
-        lines = np.concatenate(along)
+        ends = ((index[:-1], index[1:]), (index[:, :-1], index[:, 1:]))
+        lines = np.concatenate([np.stack(pair, axis=-1).reshape(-1, 2) for pair in ends])
         mesh = _line_mesh(points, lines)
         fade = np.clip(1.0 - np.linalg.norm(points - [self._wall, *centre[1:]], axis=1) / reach, 0.0, 1.0)[:, None]
         back, front = np.array(COLORS["background"]), np.array(COLORS["grid"])
@@ -241,7 +245,7 @@ class Scene:
         actor = pyvista.Actor(mapper=pyvista.DataSetMapper(mesh))
         actor.mapper.set_scalars(mesh["rgb"], "rgb", rgb=True)
         actor.prop.lighting, actor.prop.line_width = False, 1.3 * self._line
-        self.plotter.renderer.AddActor(actor)
+        self.back.AddActor(actor)
 
     # -- what moves -------------------------------------------------------------------------------------------------
 
@@ -270,8 +274,8 @@ class Scene:
         _move(self._seams, x + 2e-3 * self._length * _unit(_CAMERA))
 
     def set_ghost(self, model: MechanicalModel | None, x: np.ndarray | None = None) -> None:
-        """Draw another body as a pale shell, or none."""
-        if model is None:
+        """Draw another body at node positions [m] (n, 3) as a pale shape behind everything, or none for None."""
+        if model is None or x is None:
             self._ghost.show(None)
             return
         surface = BodySurface(model)
@@ -282,7 +286,8 @@ class Scene:
 
     def set_state(self, x: np.ndarray, state: State) -> None:
         """Draw cables and effectors of the body set last: node positions [m] (n, 3) and its state."""
-        lines = cable_lines(self._model, x, state, stub=STUB * self._length, side=self._side)
+        assert self._model is not None
+        lines = cable_lines(self._model, x, state, stub=STUB * self._length, side=tuple(self._side))
         for row in self._cables.keys() - lines.keys():
             self._cables.pop(row)
         for row, line in lines.items():
@@ -292,6 +297,7 @@ class Scene:
             color = COLORS["cable slack"] if slack else tension_color(state.effort[row] / self.robot.effort_scale[row])
             radius = (0.006 if slack else 0.009) * self._length
             tube = _polyline(line).tube(radius=radius, n_sides=12, capping=True)
+            tube.point_data.active_normals = tube.point_data["TubeNormals"]
             bead = self._balls(line[:1], 0.018 * self._length)
             self._cables[row].show(tube.append_polydata(bead), color)
         self._effectors.show(self._balls(state.effector, 0.026 * self._length))
@@ -308,20 +314,21 @@ class Scene:
 
     def picture(self) -> np.ndarray:
         """Take the picture, shape (height, width, 3) uint8."""
-        self.plotter.render_window.Render()
+        self.window.Render()
         return np.array(self.plotter.screenshot(return_img=True), dtype=np.uint8)
 
     def close(self) -> None:
         """Close the window."""
-        self.plotter.render_window.RemoveRenderer(self.front)
+        for renderer in (self.middle, self.front):
+            self.window.RemoveRenderer(renderer)
         self.plotter.close()
 
     def _balls(self, centres: np.ndarray, radius: float) -> pyvista.PolyData:
-        ball = self._ball
         import pyvista
 
+        ball = self._ball
         points = (centres[:, None] + radius * ball.points).reshape(-1, 3)
-        faces = ball.regular_faces
+        faces: Any = np.asarray(ball.regular_faces)
         faces = (faces + ball.n_points * np.arange(len(centres))[:, None, None]).reshape(-1, 3)
         mesh = pyvista.PolyData.from_regular_faces(points, faces)
         mesh.point_data.active_normals = np.tile(ball.points, (len(centres), 1))

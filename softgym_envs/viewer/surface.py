@@ -73,8 +73,7 @@ class BodySurface:
         # Corners of triangles are one vertex if they share their node across a smooth edge. The neighbour runs
         # along the edge the other way, so the tail of one half edge is the head of the other.
         a, b = one[smooth], other[smooth]
-        after = np.arange(3 * len(corners)).reshape(-1, 3)
-        after = np.roll(after, -1, axis=1).ravel()
+        after = np.roll(np.arange(3 * len(corners)).reshape(-1, 3), -1, axis=1).ravel()
         rows, columns = np.concatenate([a, after[a]]), np.concatenate([after[b], b])
         graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(corners.size, corners.size))
         _, vertex = connected_components(graph, directed=False)
@@ -174,9 +173,8 @@ def slacken(path: np.ndarray, excess: float, side: Sequence[float], count: int =
         return path
     segments = np.diff(path, axis=0)
     lengths = np.linalg.norm(segments, axis=1)
-    side = np.asarray(side, dtype=float)
     tangents = segments / lengths[:, None]
-    across = side - tangents * (tangents @ side)[:, None]
+    across = np.asarray(side) - tangents * (tangents @ np.asarray(side))[:, None]
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
     # Beyond a quarter of the segment the formula fails and the picture with it.
     amplitude = np.minimum(lengths * np.sqrt(excess / lengths.sum()) / np.pi, 0.25 * lengths)
@@ -214,9 +212,8 @@ class ShapeFinder:
 
     @property
     def state(self) -> State:
-        """State of the finite-element model, wherever it was sent last."""
-        assert self._backend is not None
-        return self._backend.state
+        """State of the finite-element model, wherever `at` sent it last."""
+        return self._present.state
 
     def nodes(self, design: Mapping[str, float], state: State) -> np.ndarray:
         """Return the nodes [m] (n, 3) of a state of a design."""
@@ -230,21 +227,33 @@ class ShapeFinder:
         Where no equilibrium is found they are those of the last shape: a picture should not end a rollout.
         """
         self.load(design)
-        backend = self._backend
+        self._move(displacement)
+        nodes = self._present.state.nodes
+        assert nodes is not None
+        return nodes
+
+    @property
+    def _present(self) -> FEMBackend:
+        assert self._backend is not None, "load a design first"
+        return self._backend
+
+    def _move(self, displacement: np.ndarray | None) -> None:
+        backend = self._present
         if displacement is None:
             self._target = None
-            return backend.reset().nodes
+            backend.reset()
+            return
         if self._target is not None and np.array_equal(displacement, self._target):
-            return backend.state.nodes
+            return
         self._target = np.array(displacement, dtype=float)
         last = backend.state
         try:
-            return backend.step(self._target).nodes
+            backend.step(self._target)
+            return
         except ConvergenceError:
             pass
         try:  # a long way from the last shape may fail where the way from rest does not
             backend.reset()
-            return backend.step(self._target).nodes
+            backend.step(self._target)
         except ConvergenceError:
             backend.restore(last)
-            return last.nodes

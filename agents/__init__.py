@@ -1,0 +1,1 @@
+"""Agents: SAC training and evaluation, baselines (random, inverse QP)."""

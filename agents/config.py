@@ -1,0 +1,91 @@
+"""Configuration of environments and of SAC training."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field, field_validator
+
+from softgym_envs.config import Config
+from softgym_envs.envs.registration import ENVIRONMENTS
+
+if TYPE_CHECKING:
+    import gymnasium
+
+__all__ = ["EnvironmentConfig", "SACConfig", "TrainConfig"]
+
+
+class EnvironmentConfig(Config):
+    """An environment: its ID and the options of ``gymnasium.make``."""
+
+    id: str
+    backend: str = "surrogate"
+    design: dict[str, float] | None = None
+    sample_design: bool | list[str] = False
+    design_in_observation: bool | list[str] = False
+    action_mode: str = "increment"
+    robot_options: dict[str, Any] = {}
+    task_options: dict[str, Any] = {}
+    backend_options: dict[str, Any] = {}
+
+    @field_validator("id")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value not in ENVIRONMENTS:
+            raise ValueError(f"unknown environment '{value}'; allowed: {', '.join(ENVIRONMENTS)}")
+        return value
+
+    def _options(self, overrides: dict[str, Any]) -> dict[str, Any]:
+        options = self.model_dump(exclude={"id"})
+        options["robot_options"] = {**ENVIRONMENTS[self.id].robot_options, **self.robot_options}
+        return {**options, **overrides}
+
+    def make(self, **overrides: Any) -> gymnasium.Env:
+        """Return the environment; ``overrides`` replace options of ``gymnasium.make``."""
+        import gymnasium
+
+        import softgym_envs  # noqa: F401 - registers the IDs
+
+        return gymnasium.make(self.id, **self._options(overrides))
+
+    def make_vec(self, num_envs: int, **overrides: Any) -> gymnasium.vector.VectorEnv:
+        """Return the batched environment on the surrogate."""
+        import gymnasium
+
+        import softgym_envs  # noqa: F401 - registers the IDs
+
+        return gymnasium.make_vec(self.id, num_envs=num_envs, **self._options(overrides))
+
+
+class SACConfig(Config):
+    """Hyper-parameters of soft actor-critic, named as in stable-baselines3."""
+
+    learning_rate: float = Field(default=1e-3, gt=0)
+    batch_size: int = Field(default=256, gt=0)
+    buffer_size: int = Field(default=100_000, gt=0)
+    gamma: float = Field(default=0.95, gt=0, le=1)
+    tau: float = Field(default=0.01, gt=0, le=1)
+    learning_starts: int = Field(default=1_000, ge=0)
+    gradient_steps: int = Field(default=8, gt=0, description="per step of all environments together")
+    net_arch: list[int] = [128, 128]
+    ent_coef: float | str = "auto"
+    target_entropy: float | Literal["auto"] = "auto"
+
+    @field_validator("ent_coef")
+    @classmethod
+    def _entropy(cls, value: float | str) -> float | str:
+        if isinstance(value, str) and not value.startswith("auto"):
+            raise ValueError("must be a number, 'auto' or 'auto_<start>'")
+        return value
+
+
+class TrainConfig(Config):
+    """One SAC training run."""
+
+    environment: EnvironmentConfig
+    sac: SACConfig = SACConfig()
+    steps: int = Field(default=40_000, gt=0, description="environment steps, over all sub-environments")
+    num_envs: int = Field(default=16, gt=0)
+    seed: int = Field(default=0, ge=0)
+    evaluation_episodes: int = Field(default=64, gt=0)
+    report_every: int = Field(default=4_000, gt=0, description="environment steps between evaluations")

@@ -1,0 +1,91 @@
+"""Trained policies as files: safetensors and JSON, run without torch."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.errors import WeightsError
+from softgym_envs.storage import atomic_write, write_json
+
+__all__ = ["Policy", "read_tensors", "save_policy"]
+
+FORMAT = 1
+
+
+def save_policy(path: Path, tensors: dict[str, np.ndarray], card: dict[str, Any]) -> None:
+    """Write ``policy.safetensors`` and its JSON card beside it."""
+    from safetensors.numpy import save
+
+    with atomic_write(path) as stream:
+        stream.write(save({k: np.ascontiguousarray(v) for k, v in tensors.items()}))
+    write_json(path.with_suffix(".json"), {"format": FORMAT, **card})
+
+
+def read_tensors(path: str | Path) -> dict[str, np.ndarray]:
+    """Read a safetensors file.
+
+    Raises:
+        WeightsError: if it is missing, damaged or truncated.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    path = Path(path)
+    if not path.is_file():
+        raise WeightsError(f"policy '{path}' does not exist; train one with 'softgym train'")
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise WeightsError(f"policy '{path}' is damaged or truncated: {error}") from None
+
+
+class Policy:
+    """The mean action of a SAC actor.
+
+    Args:
+        path: ``policy.safetensors``, with its card beside it.
+
+    Raises:
+        WeightsError: if a file is missing, damaged or of another version.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        tensors = read_tensors(self.path)
+        card = self.path.with_suffix(".json")
+        try:
+            self.card = json.loads(card.read_text())
+        except (OSError, ValueError) as error:
+            raise WeightsError(f"policy card '{card}' cannot be read: {error}") from None
+        if not isinstance(self.card, dict) or self.card.get("format") != FORMAT:
+            raise WeightsError(f"policy card '{card}' is not of format {FORMAT}")
+        try:
+            self._hidden = []
+            k = 0
+            while f"actor.latent_pi.{k}.weight" in tensors:
+                self._hidden.append((tensors[f"actor.latent_pi.{k}.weight"].T, tensors[f"actor.latent_pi.{k}.bias"]))
+                k += 2  # activations sit between the linear layers
+            self._mean = tensors["actor.mu.weight"].T, tensors["actor.mu.bias"]
+        except KeyError as error:
+            raise WeightsError(f"policy '{self.path}' lacks tensor {error}") from None
+        self.observation_size = int((self._hidden[0][0] if self._hidden else self._mean[0]).shape[0])
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return actions (..., n_a) in [-1, 1] for observations (..., d).
+
+        Raises:
+            ValueError: for observations of another size than the policy was trained on.
+        """
+        x = np.asarray(observation, dtype=np.float32)
+        if x.shape[-1] != self.observation_size:
+            raise ValueError(
+                f"policy '{self.path.name}' takes observations of size {self.observation_size}, got {x.shape[-1]}: "
+                "was it trained with another design_in_observation or number of cables?"
+            )
+        for weight, bias in self._hidden:
+            x = np.maximum(x @ weight + bias, 0.0)
+        return np.tanh(x @ self._mean[0] + self._mean[1])

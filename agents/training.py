@@ -1,0 +1,270 @@
+"""SAC training with stable-baselines3 on the batched surrogate environment."""
+
+from __future__ import annotations
+
+import csv
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agents.config import TrainConfig
+from agents.evaluation import evaluate, sample_goals
+from agents.policy import read_tensors, save_policy
+from softgym_envs.config import provenance, save_resolved
+from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.storage import atomic_write
+
+if TYPE_CHECKING:
+    from stable_baselines3 import SAC
+
+__all__ = ["train"]
+
+_EVALUATION_SEED = 1_000_003
+_BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_CURVE = ("step", "seconds", "success_rate", "mean_distance", "worst_distance", "mean_return")
+
+
+def train(
+    config: TrainConfig,
+    folder: str | Path,
+    *,
+    initial: str | Path | None = None,
+    report: Callable[[int, float], bool] | None = None,
+    progress: bool = True,
+) -> Path:
+    """Train a SAC policy, or go on with an interrupted training in ``folder``.
+
+    Writes ``policy.safetensors`` (actor and critics) with its card, ``curve.csv``, TensorBoard logs, and a
+    ``checkpoint.safetensors`` from which an interrupted run resumes (weights, optimiser moments, replay buffer and
+    random states; running episodes start anew).
+
+    Args:
+        config: what to train.
+        folder: where the results go.
+        initial: policy to start from (actor and critics).
+        report: called after each evaluation with (step, success rate); True stops the training early.
+        progress: show a progress bar.
+
+    Returns:
+        The path of ``policy.safetensors``.
+
+    Raises:
+        DataError: if the folder holds the training of another configuration.
+        WeightsError: if ``initial`` or a checkpoint is damaged or does not fit.
+    """
+    import torch
+    import yaml
+    from tqdm import tqdm
+
+    torch.set_num_threads(1)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    policy_path = folder / "policy.safetensors"
+    resolved = folder / "config.yaml"
+    if resolved.exists():
+        if yaml.safe_load(resolved.read_text()) != config.model_dump(mode="json"):
+            raise DataError(f"'{folder}' holds a training with another configuration; use a new folder")
+        if policy_path.exists():
+            return policy_path
+    else:
+        save_resolved(folder, config)
+
+    model = _make_model(config, folder)
+    checkpoint = folder / "checkpoint.safetensors"
+    curve: list[dict[str, float]] = []
+    if checkpoint.exists():
+        curve = _restore(model, checkpoint)
+    elif initial is not None:
+        _load_weights(model, read_tensors(initial), Path(initial))
+    surrogate = config.environment.model_copy(update={"backend": "surrogate"})
+    goals = sample_goals(surrogate.model_copy(update={"sample_design": False}), config.evaluation_episodes, _EVALUATION_SEED)
+
+    start = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
+    bar = tqdm(total=config.steps, initial=model.num_timesteps, unit="step", desc=folder.name, disable=not progress)
+    stopped = False
+    with bar:
+        while model.num_timesteps < config.steps and not stopped:
+            target = min(config.steps, (model.num_timesteps // config.report_every + 1) * config.report_every)
+            _learn(model, target, bar)
+            scratch = folder / "latest.safetensors"
+            save_policy(scratch, _weights(model), {})
+            outcome = evaluate(scratch, surrogate, goals)
+            curve.append(
+                {
+                    "step": model.num_timesteps,
+                    "seconds": round(time.perf_counter() - start, 2),
+                    "success_rate": outcome.success_rate,
+                    "mean_distance": outcome.mean_distance,
+                    "worst_distance": outcome.worst_distance,
+                    "mean_return": outcome.mean_return,
+                }
+            )
+            bar.set_postfix_str(f"success {outcome.success_rate:.0%}, distance {1e3 * outcome.mean_distance:.2f} mm")
+            for name in ("success_rate", "mean_distance", "mean_return"):
+                model.logger.record(f"evaluation/{name}", curve[-1][name])
+            model.logger.dump(model.num_timesteps)
+            _write_curve(folder / "curve.csv", curve)
+            _save_checkpoint(model, checkpoint, curve)
+            stopped = report is not None and bool(report(model.num_timesteps, outcome.success_rate))
+    card = {
+        "config": config.model_dump(mode="json"),
+        "initial": None if initial is None else str(initial),
+        "steps": int(model.num_timesteps),
+        "stopped_early": stopped,
+        "curve": curve,
+        "provenance": provenance(),
+    }
+    save_policy(policy_path, _weights(model), card)
+    for leftover in (folder / "latest.safetensors", folder / "latest.json", checkpoint):
+        leftover.unlink(missing_ok=True)
+    model.get_env().close()  # type: ignore[union-attr]
+    return policy_path
+
+
+def _make_model(config: TrainConfig, folder: Path) -> SAC:
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.logger import configure
+
+    from agents.vec_env import SB3VecEnv
+
+    env = SB3VecEnv(config.environment.make_vec(config.num_envs))
+    sac = config.sac
+    model = SAC(
+        "MlpPolicy",
+        env,
+        learning_rate=sac.learning_rate,
+        batch_size=sac.batch_size,
+        buffer_size=min(sac.buffer_size, config.steps + config.num_envs),
+        gamma=sac.gamma,
+        tau=sac.tau,
+        learning_starts=sac.learning_starts,
+        train_freq=1,
+        gradient_steps=sac.gradient_steps,
+        ent_coef=sac.ent_coef,
+        target_entropy=sac.target_entropy,
+        policy_kwargs={"net_arch": list(sac.net_arch)},
+        seed=config.seed,
+        device="cpu",
+    )
+    model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
+    return model
+
+
+def _learn(model: SAC, target: int, bar: Any) -> None:
+    """Advance to ``target`` steps, showing them on the bar."""
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    class Tick(BaseCallback):
+        def _on_step(self) -> bool:
+            bar.update(self.training_env.num_envs)
+            return True
+
+    model.learn(target - model.num_timesteps, callback=Tick(), reset_num_timesteps=False, log_interval=20)
+
+
+def _weights(model: SAC) -> dict[str, np.ndarray]:
+    state = model.policy.state_dict()
+    tensors = {name: value.detach().cpu().numpy().copy() for name, value in state.items()}
+    if getattr(model, "log_ent_coef", None) is not None:
+        tensors["log_ent_coef"] = model.log_ent_coef.detach().cpu().numpy().copy()
+    return tensors
+
+
+def _load_weights(model: SAC, tensors: dict[str, np.ndarray], path: Path) -> None:
+    import torch
+
+    own = model.policy.state_dict()
+    for name, value in own.items():
+        if name not in tensors:
+            raise WeightsError(f"policy '{path}' lacks tensor '{name}'")
+        if tuple(tensors[name].shape) != tuple(value.shape):
+            raise WeightsError(
+                f"policy '{path}' does not fit: '{name}' has shape {tuple(tensors[name].shape)}, needed "
+                f"{tuple(value.shape)}; train it with the same net_arch, cables and design_in_observation"
+            )
+    model.policy.load_state_dict({name: torch.as_tensor(tensors[name]) for name in own})
+    if "log_ent_coef" in tensors and getattr(model, "log_ent_coef", None) is not None:
+        with torch.no_grad():
+            model.log_ent_coef.copy_(torch.as_tensor(tensors["log_ent_coef"]))
+
+
+def _optimisers(model: SAC) -> dict[str, Any]:
+    found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
+    if model.ent_coef_optimizer is not None:
+        found["entropy"] = model.ent_coef_optimizer
+    return found
+
+
+def _save_checkpoint(model: SAC, path: Path, curve: list[dict[str, float]]) -> None:
+    import torch
+    from safetensors.numpy import save
+
+    tensors = {f"weights/{name}": value for name, value in _weights(model).items()}
+    for name, optimiser in _optimisers(model).items():
+        for key, moments in optimiser.state_dict()["state"].items():
+            for part, value in moments.items():
+                tensors[f"optimiser/{name}/{key}/{part}"] = torch.as_tensor(value).cpu().numpy()
+    buffer: Any = model.replay_buffer
+    filled = buffer.buffer_size if buffer.full else buffer.pos
+    for name in _BUFFER:
+        tensors[f"buffer/{name}"] = getattr(buffer, name)[:filled]
+    tensors["random/torch"] = torch.get_rng_state().numpy()
+    _, keys, *position = np.random.get_state()  # noqa: NPY002 - stable-baselines3 samples with the global generator
+    tensors["random/numpy"] = np.asarray(keys)
+    vector_env: Any = model.get_env().env  # type: ignore[union-attr]
+    meta = {
+        "step": int(model.num_timesteps),
+        "updates": int(model._n_updates),
+        "position": int(buffer.pos),
+        "full": bool(buffer.full),
+        "numpy": [int(position[0]), int(position[1]), float(position[2])],
+        "environment": vector_env.np_random.bit_generator.state,
+        "curve": curve,
+    }
+    with atomic_write(path) as stream:
+        arrays = {k: np.ascontiguousarray(v) for k, v in tensors.items()}
+        stream.write(save(arrays, metadata={"state": json.dumps(meta)}))
+
+
+def _restore(model: SAC, path: Path) -> list[dict[str, float]]:
+    """Take up a checkpoint; returns the learning curve so far."""
+    import torch
+    from safetensors import safe_open
+
+    tensors = read_tensors(path)
+    with safe_open(path, framework="numpy") as opened:
+        meta = json.loads(opened.metadata()["state"])
+    _load_weights(model, {k.removeprefix("weights/"): v for k, v in tensors.items() if k.startswith("weights/")}, path)
+    for name, optimiser in _optimisers(model).items():
+        state = optimiser.state_dict()
+        moments: dict[int, dict[str, Any]] = {}
+        prefix = f"optimiser/{name}/"
+        for key, value in tensors.items():
+            if key.startswith(prefix):
+                index, part = key.removeprefix(prefix).split("/")
+                moments.setdefault(int(index), {})[part] = torch.as_tensor(value)
+        state["state"] = moments
+        optimiser.load_state_dict(state)
+    buffer: Any = model.replay_buffer
+    for name in _BUFFER:
+        stored = tensors[f"buffer/{name}"]
+        getattr(buffer, name)[: len(stored)] = stored
+    buffer.pos, buffer.full = meta["position"], meta["full"]
+    model.num_timesteps, model._n_updates = meta["step"], meta["updates"]
+    torch.set_rng_state(torch.as_tensor(tensors["random/torch"]))
+    np.random.set_state(("MT19937", tensors["random/numpy"], *meta["numpy"]))  # noqa: NPY002 - as above
+    env: Any = model.get_env()
+    env.env.reset(seed=0)
+    env.env.np_random.bit_generator.state = meta["environment"]
+    return meta["curve"]
+
+
+def _write_curve(path: Path, curve: list[dict[str, float]]) -> None:
+    with atomic_write(path, "w") as stream:
+        writer = csv.DictWriter(stream, _CURVE)
+        writer.writeheader()
+        writer.writerows(curve)

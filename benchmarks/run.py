@@ -1,0 +1,52 @@
+"""``softgym bench`` (or ``make bench``): run benchmarks, print them, and write one JSON file."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import click
+
+from benchmarks import accuracy, speed
+from softgym_envs.config import provenance
+from softgym_envs.errors import ConfigError
+from softgym_envs.storage import write_json
+
+__all__ = ["BENCHMARKS", "run"]
+
+BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
+    "fem_step": speed.fem_step,
+    "fem_profile": speed.fem_profile,
+    "notched_beam": speed.notched_beam,
+    "surrogate_step": speed.surrogate_step,
+    "inference": speed.inference,
+    "memory": speed.memory,
+    "test_set": accuracy.test_set,
+    "trajectories": accuracy.trajectories,
+    "slack": accuracy.slack_states,
+    "mesh_motion": accuracy.mesh_motion,
+}
+"""Registry of benchmarks."""
+
+
+def run(names: Sequence[str], output: str | Path) -> dict[str, dict[str, object]]:
+    """Run the named benchmarks (default: all) and write their results.
+
+    Raises:
+        ConfigError: for an unknown name.
+    """
+    for name in names:
+        if name not in BENCHMARKS:
+            raise ConfigError(f"unknown benchmark '{name}'; allowed: {', '.join(BENCHMARKS)}")
+    results: dict[str, dict[str, object]] = {}
+    for name in names or BENCHMARKS:
+        click.echo(f"\n{name}: {(BENCHMARKS[name].__doc__ or '').splitlines()[0]}")
+        results[name] = BENCHMARKS[name]()
+        for key, value in results[name].items():
+            click.echo(f"  {key:58s} {value:.6g}" if isinstance(value, float) else f"  {key:58s} {value}")
+        machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+        write_json(output, {"machine": machine, **provenance(), "results": results})
+    click.echo(f"\nwrote {output}")
+    return results

@@ -1,0 +1,200 @@
+"""How fast: medians on one thread."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+_BEAM = Path(__file__).resolve().parent.parent / "tests" / "data"
+
+
+def _median_seconds(work: Callable[[], object], repeats: int) -> float:
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def _random_walk(env, steps: int, seed: int) -> Callable[[], None]:
+    env.action_space.seed(seed)
+    actions = [env.action_space.sample() for _ in range(steps)]
+
+    def walk() -> None:
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+
+    return walk
+
+
+def fem_step() -> dict[str, object]:
+    """FEM environment steps per second, random cable increments up to 1 mm, W included; resets are counted."""
+    import gymnasium
+
+    import softgym_envs  # noqa: F401 - registers the IDs
+
+    result: dict[str, object] = {}
+    for cables in (1, 2):
+        env = gymnasium.make("SoftGym/FingerReach-v0", backend="fem", robot_options={"cables": cables})
+        env.reset(seed=0)
+        walk = _random_walk(env, 100, 0)
+        walk()
+        seconds = _median_seconds(walk, 5) / 100
+        model = env.unwrapped.backend.model
+        label = f"{cables} cable(s), {len(model.nodes)} nodes, {len(model.blocks[0].connectivity)} tetrahedra"
+        result[f"{label}: steps per second"] = 1.0 / seconds
+    return result
+
+
+def fem_profile() -> dict[str, object]:
+    """Where the time of a FEM step goes (milliseconds per step, default finger, increments up to 1 mm)."""
+    from softgym_envs.mechanics.statics import Statics
+    from softgym_envs.robots import make_robot
+
+    robot = make_robot("finger")
+    model = robot.build()
+    statics = Statics(model)
+    rng = np.random.default_rng(0)
+    commands = np.cumsum(rng.uniform(-1e-3, 1e-3, (200, 2)), axis=0) + 5e-3
+    commands = np.clip(commands, 0.0, 0.02)
+    statics.solve(commands[0])
+    spent = dict.fromkeys(("assembly", "factorisation", "solves", "warping"), 0.0)
+
+    def timed(name, function):
+        def call(*arguments):
+            start = time.perf_counter()
+            try:
+                return function(*arguments)
+            finally:
+                spent[name] += time.perf_counter() - start
+
+        return call
+
+    model.assemble = timed("assembly", model.assemble)  # type: ignore[method-assign]
+    model.warp = timed("warping", model.warp)  # type: ignore[method-assign]
+    model.solver.factorise = timed("factorisation", model.solver.factorise)  # type: ignore[method-assign]
+    model.solver.solve = timed("solves", model.solver.solve)  # type: ignore[method-assign]
+    start = time.perf_counter()
+    iterations = sum(statics.solve(command).iterations for command in commands)
+    total = time.perf_counter() - start
+    result: dict[str, object] = {f"{name} [ms]": 1e3 * value / len(commands) for name, value in spent.items()}
+    result["rest: Python and small algebra [ms]"] = 1e3 * (total - sum(spent.values())) / len(commands)
+    result["total [ms]"] = 1e3 * total / len(commands)
+    result["Newton iterations per step"] = iterations / len(commands)
+    return result
+
+
+def notched_beam() -> dict[str, object]:
+    """Equilibrium of the notched reference beam for a 10 mm pull from rest, in one increment."""
+    from softgym_envs.mechanics.model import MechanicalModel
+    from softgym_envs.mechanics.statics import Statics
+
+    data = np.load(_BEAM / "notched_lc6_mesh.npz")
+    model = MechanicalModel.from_mesh(
+        data["nodes"] * 1e-3, data["tets"], fixed=data["fixed"], young_modulus=3e6, poisson_ratio=0.3
+    )
+    model.add_cable("cable", data["cable_points"] * 1e-3, data["pull_point"] * 1e-3, unilateral=False)
+    statics = Statics(model)
+
+    def pull() -> None:
+        statics.reset()
+        statics.solve([0.01])
+
+    pull()
+    return {"milliseconds": 1e3 * _median_seconds(pull, 21), "milliseconds with SOFA v25.06 (published reference)": 440.0}
+
+
+def surrogate_step() -> dict[str, object]:
+    """Surrogate environment steps per second, random increments, resets counted."""
+    import gymnasium
+
+    import softgym_envs  # noqa: F401 - registers the IDs
+
+    result: dict[str, object] = {}
+    for cables in (1, 2):
+        options = {"cables": cables}
+        env = gymnasium.make("SoftGym/FingerReach-v0", robot_options=options)
+        env.reset(seed=0)
+        walk = _random_walk(env, 2000, 0)
+        walk()
+        result[f"{cables} cable(s), single: steps per second"] = 2000 / _median_seconds(walk, 5)
+        for count in (64, 1024):
+            batch = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=count, robot_options=options)
+            batch.reset(seed=0)
+            batch.action_space.seed(0)
+            actions = [batch.action_space.sample() for _ in range(60)]
+
+            def walk_batch(batch=batch, actions=actions) -> None:
+                for action in actions:
+                    batch.step(action)
+
+            walk_batch()
+            seconds = _median_seconds(walk_batch, 5)
+            result[f"{cables} cable(s), {count} at once: steps per second"] = count * len(actions) / seconds
+    return result
+
+
+def inference() -> dict[str, object]:
+    """Microseconds per state of the learned model: compiled kernel, the same network in NumPy, in ONNX-free torch."""
+    import torch
+
+    from softgym_envs.robots import make_robot
+    from softgym_envs.surrogate.model import _forward
+    from softgym_envs.surrogate.pretrained import pretrained_model
+
+    model = pretrained_model(make_robot("finger"))
+    net = model._nets["state"]  # type: ignore[attr-defined]
+    layers = [(np.concatenate([net._first, net._design]), net._bias)]
+    layers += list(zip(net._hidden, net._hidden_bias, strict=True)) + [(net._last, net._last_bias)]
+    torch.set_num_threads(1)
+    tensors = [(torch.as_tensor(w), torch.as_tensor(b)) for w, b in layers]
+
+    def in_torch(x):
+        for weight, bias in tensors[:-1]:
+            x = x @ weight + bias
+            x = x * torch.rsqrt(1.0 + x * x)
+        return x @ tensors[-1][0] + tensors[-1][1]
+
+    result: dict[str, object] = {}
+    rng = np.random.default_rng(0)
+    for count in (1, 256):
+        x = rng.uniform(-1, 1, (count, len(layers[0][0]))).astype(np.float32)
+        actuation, prepared = x[:, : model.count].copy(), net.prepare(x[:, model.count :])
+        tensor = torch.as_tensor(x)
+        repeats = 2000 // count + 10
+        candidates = {
+            "compiled kernel": lambda a=actuation, p=prepared: net(a, p),
+            "NumPy": lambda x=x: _forward(x, layers),
+            "torch": lambda t=tensor: in_torch(t),
+        }
+        for name, work in candidates.items():
+            work()
+            result[f"batch {count}, {name} [us per state]"] = 1e6 * _median_seconds(work, repeats) / count
+    return result
+
+
+def memory() -> dict[str, object]:
+    """Peak resident memory of a fresh process with one environment after 60 random steps [MB]."""
+    program = (
+        "import gymnasium, softgym_envs, resource, json, sys\n"
+        "env = gymnasium.make('SoftGym/FingerReach-v0', backend=sys.argv[1])\n"
+        "env.reset(seed=0)\n"
+        "for _ in range(60):\n"
+        "    if env.step(env.action_space.sample())[3]: env.reset()\n"
+        "print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))\n"
+    )
+    result: dict[str, object] = {}
+    for backend in ("fem", "surrogate"):
+        done = subprocess.run([sys.executable, "-c", program, backend], capture_output=True, text=True, check=True)
+        result[f"{backend} [MB]"] = float(json.loads(done.stdout.splitlines()[-1]))
+    return result

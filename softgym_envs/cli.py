@@ -1,0 +1,303 @@
+"""The command line: ``softgym <verb>``. Every verb calls a Python function of the same meaning."""
+
+from __future__ import annotations
+
+import os
+
+# One thread per process, set before any numerical library is loaded; more only slow these small problems down.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
+import json
+import sys
+from pathlib import Path
+from typing import Any, NoReturn
+
+import click
+
+from softgym_envs.errors import ConfigError, SoftGymError
+from softgym_envs.version import __version__
+
+__all__ = ["main"]
+
+
+def _fail(message: str) -> NoReturn:
+    click.echo(f"softgym: error: {' '.join(str(message).split())}", err=True)
+    sys.exit(2)
+
+
+def main() -> None:
+    """Entry point: errors of the user's input end with one line and status 2."""
+    import gymnasium
+
+    try:
+        cli(standalone_mode=False)
+    except click.exceptions.Exit as leave:
+        sys.exit(leave.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("stopped; the same command goes on where it was", err=True)
+        sys.exit(130)
+    except click.ClickException as error:
+        _fail(error.format_message())
+    except (SoftGymError, ValueError, gymnasium.error.Error) as error:
+        _fail(str(error))
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="softgym")
+def cli() -> None:
+    """Soft robots whose body and controller are optimised together."""
+
+
+def _assignments(pairs: tuple[str, ...], what: str) -> dict[str, float]:
+    """Read ``name=number`` options."""
+    values = {}
+    for pair in pairs:
+        name, separator, text = pair.partition("=")
+        try:
+            if not separator:
+                raise ValueError
+            values[name] = float(text)
+        except ValueError:
+            raise ConfigError(f"--{what} '{pair}' must look like name=number") from None
+    return values
+
+
+_config = click.option("--config", "config", type=click.Path(path_type=Path), required=True, help="YAML file.")
+_folder = click.option("--folder", type=click.Path(path_type=Path), required=True, help="Where results go.")
+_overrides = click.argument("overrides", nargs=-1)
+_quiet = click.option("--quiet", is_flag=True, help="No progress bars.")
+
+
+@cli.command("list")
+def list_() -> None:
+    """List environments, robots, backends and tasks."""
+    from softgym_envs.backends import BACKENDS
+    from softgym_envs.envs.registration import ENVIRONMENTS
+    from softgym_envs.envs.task import TASKS
+    from softgym_envs.robots import ROBOTS
+
+    click.echo("environments:")
+    for identifier, row in ENVIRONMENTS.items():
+        click.echo(f"  {identifier:28s} robot {row.robot}, task {row.task}, {row.max_episode_steps} steps")
+    for title, table in (("robots", ROBOTS), ("backends", BACKENDS), ("tasks", TASKS)):
+        click.echo(f"{title}: {', '.join(table)}")
+
+
+@cli.command()
+@click.argument("robot")
+@click.option("--option", "options", multiple=True, help="Robot option, name=value (repeat).")
+@click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
+@click.option("--picture", type=click.Path(path_type=Path), help="Write a PNG of the body.")
+def show(robot: str, options: tuple[str, ...], design: tuple[str, ...], picture: Path | None) -> None:
+    """Show a robot: its design space, actuators and mesh."""
+    import yaml
+
+    from softgym_envs.robots import make_robot
+
+    parsed = {}
+    for option in options:
+        name, separator, text = option.partition("=")
+        if not separator:
+            raise ConfigError(f"--option '{option}' must look like name=value")
+        parsed[name] = yaml.safe_load(text)
+    body = make_robot(robot, **parsed)
+    click.echo(f"{robot} ({body.variant})\n\ndesign variables:")
+    for variable in body.design_space.variables.values():
+        unit = "" if variable.unit == "1" else f" {variable.unit}"
+        bounds = f"[{variable.low:g}, {variable.high:g}]{unit}"
+        click.echo(f"  {variable.name:16s} {variable.baseline:<10g} {bounds:24s} {variable.description}")
+    click.echo("\nactuators:")
+    for actuator in body.actuators:
+        click.echo(
+            f"  {actuator.name:16s} {actuator.low:g} to {actuator.high:g} {actuator.unit}, "
+            f"at most {actuator.rate:g} {actuator.unit} a step"
+        )
+    chosen = _assignments(design, "design")
+    mesh = body.body(chosen)
+    model = body.build(chosen)
+    click.echo(
+        f"\nmesh: {len(mesh.nodes)} nodes, {len(mesh.tetrahedra)} tetrahedra ({mesh.origin}), "
+        f"volume {1e9 * model.volume:.0f} mm3, mass {1e3 * model.mass:.1f} g"
+    )
+    if picture is not None:
+        from PIL import Image
+
+        from softgym_envs.viewer.image import render_body
+
+        Image.fromarray(render_body(body, chosen, size=(960, 960))).save(picture)
+        click.echo(f"wrote {picture}")
+
+
+@cli.command()
+@click.argument("environment")
+@click.option("--agent", default="qp", show_default=True, help="qp, random or a policy file.")
+@click.option("--backend", default="surrogate", show_default=True)
+@click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
+@click.option("--seed", default=0, show_default=True)
+@click.option("--record", type=click.Path(path_type=Path), help="Write a rerun recording (.rrd).")
+def rollout(environment: str, agent: str, backend: str, design: tuple[str, ...], seed: int, record: Path | None) -> None:
+    """Run one episode and print what happened."""
+    import gymnasium
+
+    import softgym_envs  # noqa: F401 - registers the IDs
+    from agents.evaluation import make_agent
+
+    act = make_agent(agent, seed=seed)
+    chosen = _assignments(design, "design")
+    env = gymnasium.make(environment, backend=backend, design=chosen or None)
+    if record is not None:
+        from softgym_envs.viewer.recording import record_rollout
+
+        summary = record_rollout(env, act, record, seed=seed)
+        click.echo(json.dumps(summary, indent=2))
+        click.echo(f"wrote {record}; look at it with 'softgym view {record}'")
+        return
+    observation, info = env.reset(seed=seed)
+    total, step, ended = 0.0, 0, False
+    while not ended:
+        observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
+        total, step, ended = total + float(reward), step + 1, terminated or truncated
+    click.echo(f"{environment} on {backend}, agent {agent}: {step} steps, return {total:.2f}")
+    click.echo(f"final distance {1e3 * info['distance']:.3f} mm, success {info['is_success']}")
+    env.close()
+
+
+@cli.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+def view(recording: Path) -> None:
+    """Open a rerun recording in the viewer."""
+    import subprocess
+
+    if not recording.is_file():
+        raise ConfigError(f"recording '{recording}' does not exist; make one with 'softgym rollout ... --record'")
+    sys.exit(subprocess.call([sys.executable, "-m", "rerun", str(recording)]))
+
+
+@cli.command()
+@_config
+@_folder
+@_quiet
+@_overrides
+def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...]) -> None:
+    """Generate the datasets of a surrogate (train, validation, test), or finish interrupted ones."""
+    from softgym_envs.config import load_config
+    from softgym_envs.surrogate.training import FitConfig, generate
+
+    data = generate(load_config(config, FitConfig, overrides), folder, progress=not quiet)
+    for split, columns in data.items():
+        click.echo(f"{split}: {len(columns['rest'])} states of {int(columns['rest'].sum())} designs")
+
+
+@cli.command()
+@_config
+@_folder
+@click.option("--data", type=click.Path(path_type=Path), help="Folder of the datasets (default: FOLDER/data).")
+@_quiet
+@_overrides
+def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
+    """Make a surrogate: data, training, test; resumes what is there."""
+    from softgym_envs.config import load_config
+    from softgym_envs.surrogate.training import FitConfig
+    from softgym_envs.surrogate.training import fit as run
+
+    errors = run(load_config(config, FitConfig, overrides), folder, data or folder / "data", progress=not quiet)
+    click.echo(json.dumps(errors, indent=2))
+
+
+@cli.command()
+@_config
+@_folder
+@click.option("--initial", type=click.Path(path_type=Path), help="Policy to start from.")
+@_quiet
+@_overrides
+def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
+    """Train a SAC policy; resumes from its checkpoint."""
+    from agents.config import TrainConfig
+    from agents.training import train as run
+    from softgym_envs.config import load_config
+
+    path = run(load_config(config, TrainConfig, overrides), folder, initial=initial, progress=not quiet)
+    click.echo(f"wrote {path}")
+
+
+@cli.command()
+@_config
+@click.option("--agent", "agents", multiple=True, default=("qp", "random"), show_default=True, help="qp, random or a policy file (repeat).")
+@click.option("--backend", "backends", multiple=True, default=("surrogate",), show_default=True, help="Repeat for several.")
+@click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
+@click.option("--goals", default=200, show_default=True, help="Number of unseen goals.")
+@click.option("--seed", default=2_000_003, show_default=True, help="Seed of the goals.")
+@click.option("--output", type=click.Path(path_type=Path), help="Write everything as JSON.")
+@_overrides
+def evaluate(
+    config: Path,
+    agents: tuple[str, ...],
+    backends: tuple[str, ...],
+    design: tuple[str, ...],
+    goals: int,
+    seed: int,
+    output: Path | None,
+    overrides: tuple[str, ...],
+) -> None:
+    """Evaluate agents on the same unseen goals; CONFIG is the one they were trained with."""
+    from agents.config import TrainConfig
+    from agents.evaluation import evaluate as run
+    from agents.evaluation import sample_goals
+    from softgym_envs.config import load_config, provenance
+    from softgym_envs.storage import write_json
+
+    environment = load_config(config, TrainConfig, overrides).environment
+    chosen = _assignments(design, "design") or None
+    if goals < 1:
+        raise ConfigError(f"--goals {goals} must be at least 1")
+    points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
+    results: list[dict[str, Any]] = []
+    click.echo(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean mm':>9s} {'worst mm':>9s} {'return':>8s}")
+    for backend in backends:
+        for agent in agents:
+            physics = environment.model_copy(update={"backend": backend})
+            outcome = run(agent, physics, points, design=chosen, seed=seed)
+            results.append({"agent": agent, "backend": backend, **outcome.to_json()})
+            click.echo(
+                f"{agent[-34:]:34s} {backend:10s} {outcome.success_rate:8.1%} {1e3 * outcome.mean_distance:9.3f} "
+                f"{1e3 * outcome.worst_distance:9.3f} {outcome.mean_return:8.2f}"
+            )
+    if output is not None:
+        write_json(output, {"goals": goals, "seed": seed, "design": chosen, "results": results, **provenance()})
+        click.echo(f"wrote {output}")
+
+
+@cli.command()
+@_config
+@click.option("--folder", type=click.Path(path_type=Path), help="Where results go (default: results/<name>).")
+@click.option("--workers", type=int, help="Worker processes (default: the config's).")
+@_quiet
+@_overrides
+def codesign(config: Path, folder: Path | None, workers: int | None, quiet: bool, overrides: tuple[str, ...]) -> None:
+    """Optimise body and controller together; resumes, and ends with a report."""
+    from codesign.config import StudyConfig
+    from codesign.report import write_report
+    from codesign.study import run_study
+    from softgym_envs.config import load_config
+
+    study = load_config(config, StudyConfig, overrides)
+    folder = Path("results") / study.name if folder is None else folder
+    run_study(study, folder, workers=workers, progress=not quiet)
+    click.echo(f"report: {write_report(folder)}")
+
+
+@cli.command()
+@click.option("--output", type=click.Path(path_type=Path), default=Path("results/bench.json"), show_default=True)
+@click.argument("names", nargs=-1)
+def bench(output: Path, names: tuple[str, ...]) -> None:
+    """Measure speed and accuracy (all benchmarks, or those named); needs a source checkout."""
+    try:
+        from benchmarks.run import run
+    except ImportError:
+        raise ConfigError("benchmarks ship with the source checkout only; run this in its root") from None
+    run(names, output)
+
+
+if __name__ == "__main__":
+    main()
