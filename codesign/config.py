@@ -52,13 +52,10 @@ def robot_of(environment: EnvironmentConfig) -> Robot:
     """Return the family of bodies of an environment.
 
     Raises:
-        ValueError: for an unknown environment ID or a wrong option of the robot.
+        ValueError: for a wrong option of the robot.
     """
-    if environment.id not in ENVIRONMENTS:
-        raise ValueError(f"unknown environment '{environment.id}'; allowed: {', '.join(ENVIRONMENTS)}")
     row = ENVIRONMENTS[environment.id]
-    options = getattr(environment, "robot_options", None)
-    return make_robot(row.robot, **dict(row.robot_options if options is None else options))
+    return make_robot(row.robot, **{**row.robot_options, **environment.robot_options})
 
 
 def _check_options(kind: str, name: str, cls: type, options: dict[str, Any]) -> None:
@@ -137,10 +134,10 @@ class TrainingConfig(Config):
         sac: hyper-parameters.
     """
 
-    steps: int = Field(2500, ge=1)
+    steps: int = Field(2_500, ge=1)
     report_every: int = Field(500, ge=1)
-    evaluation_episodes: int = Field(20, ge=1)
-    num_envs: int = Field(1, ge=1)
+    evaluation_episodes: int = Field(32, ge=1)
+    num_envs: int = Field(16, ge=1)
     seed: int = Field(0, ge=0)
     sac: SACConfig = Field(default_factory=SACConfig)
 
@@ -178,7 +175,7 @@ class FinalistsConfig(Config):
 
     count: int = Field(3, ge=0)
     choose: Literal["surrogate", "fem"] = "surrogate"
-    fem_options: dict[str, Any] | None = None
+    fem_options: dict[str, Any] = Field(default_factory=dict)
 
 
 class StudyConfig(Config):
@@ -238,6 +235,10 @@ class StudyConfig(Config):
             raise ValueError("strategy 'warm_start' needs 'policy', the file of a trained design-conditioned policy")
         if self.strategy != "warm_start" and self.policy:
             raise ValueError(f"policy = '{self.policy}' is of no use to strategy '{self.strategy}'; remove it")
+        if self.strategy != "qp" and self.environment.backend != "surrogate":
+            raise ValueError(
+                f"environment.backend = '{self.environment.backend}' is for strategy 'qp' only; allowed: surrogate"
+            )
         if self.strategy == "qp" and self.pruner.name != "none":
             raise ValueError(f"pruner '{self.pruner.name}' has nothing to stop in strategy 'qp'; allowed: none")
         if self.strategy != "qp" and self.training.report_every > self.training.steps:
@@ -248,7 +249,7 @@ class StudyConfig(Config):
             raise ValueError(f"screen.goals = {self.screen.goals} exceeds goals.count = {self.goals.count}")
         if 1 + self.screen.kept > self.trials:
             raise ValueError(
-                f"trials = {self.trials} is too few for the baseline and the {self.screen.kept} bodies kept by the screen"
+                f"trials = {self.trials} is too few for the baseline and {self.screen.kept} bodies kept by the screen"
             )
         if self.finalists.count >= self.trials and self.trials > 1:
             raise ValueError(f"finalists.count = {self.finalists.count} must be below trials = {self.trials}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,18 +74,11 @@ def _path(folder: StudyFolder, finalist: Finalist, agent: str, backend: str, goa
 def finalist_jobs(folder: StudyFolder) -> list[Job]:
     """One job per body, controller and backend, the slow ones first."""
     config = folder.config
+    own = config.environment
+    options = {"surrogate": {}, "fem": config.finalists.fem_options, own.backend: own.backend_options}
     environments = {
-        "surrogate": config.environment.model_copy(
-            update={
-                "backend": "surrogate",
-                "backend_options": config.environment.backend_options
-                if config.environment.backend == "surrogate"
-                else None,
-            }
-        ),
-        "fem": config.environment.model_copy(
-            update={"backend": "fem", "backend_options": config.finalists.fem_options}
-        ),
+        backend: own.model_copy(update={"backend": backend, "backend_options": options[backend]})
+        for backend in BACKENDS
     }
 
     def make(finalist: Finalist, agent: str, backend: str, goals: str) -> dict[str, Any]:
@@ -105,7 +99,7 @@ def finalist_jobs(folder: StudyFolder) -> list[Job]:
                 tests.append((finalist.agents[0], "selection"))
             for agent, goals in tests:
                 arguments = (finalist, agent, backend, goals)
-                jobs.append(Job(_path(folder, *arguments), lambda a=arguments: make(*a)))  # type: ignore[misc]
+                jobs.append(Job(_path(folder, *arguments), partial(make, *arguments)))
     return jobs
 
 

@@ -24,7 +24,9 @@ EXTENSIBLE = ("name", "trials", "workers", "finalists")
 
 
 class StudyFolder:
-    """The folder of a study::
+    """The folder of a study.
+
+    It holds::
 
         config.yaml  provenance.json  goals.json
         journal.log                    Optuna's journal
@@ -122,9 +124,7 @@ def draw_goals(config: StudyConfig) -> dict[str, Any]:
         from softgym_envs.surrogate.pretrained import family_goals
 
         sizes = np.array([goals.count, goals.unseen_count, goals.training_count])
-        points = family_goals(
-            robot_of(config.environment), int(sizes.sum()), goals.seed, command_low=goals.command_low
-        )
+        points = family_goals(robot_of(config.environment), int(sizes.sum()), goals.seed, command_low=goals.command_low)
         selection, unseen, training = np.split(points, np.cumsum(sizes)[:-1])
         drawn = {"training": training, "selection": selection[:, None], "unseen": unseen[:, None]}
     return {"unit": "m", **{name: array.tolist() for name, array in drawn.items()}}

@@ -27,16 +27,20 @@ class Job:
 
 
 def run_jobs(folder: StudyFolder, jobs: Iterable[Job]) -> None:
-    """Do every job that is not done yet and that no other process is at."""
+    """Do every job that is not done yet; when this returns all are, here or by another process.
+
+    First those that no other process is at, then, where one was stopped, what it left.
+    """
     from filelock import Timeout
 
-    for job in jobs:
-        if job.path.exists():
-            continue
-        lock = folder.lock(f"{job.path.parent.name}-{job.path.stem}")
-        try:
-            with lock.acquire(timeout=0):
-                if not job.path.exists():
-                    write_json(job.path, job.make())
-        except Timeout:
-            continue
+    missing = list(jobs)
+    for timeout in (0, -1):
+        for job in missing:
+            if job.path.exists():
+                continue
+            try:
+                with folder.lock(f"{job.path.parent.name}-{job.path.stem}").acquire(timeout=timeout):
+                    if not job.path.exists():
+                        write_json(job.path, job.make())
+            except Timeout:
+                continue

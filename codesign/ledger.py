@@ -139,17 +139,12 @@ class Ledger:
 
     def claim(self) -> optuna.Trial | None:
         """Take the next trial, or None if the study has as many as were asked for."""
-        from optuna.trial import TrialState
-
         config = self.folder.config
         with self._lock:
-            self._recover()
-            trials = self.study.get_trials(deepcopy=False)
-            counted = sum(trial.state != TrialState.FAIL for trial in trials)
-            queued = any(trial.state == TrialState.WAITING for trial in trials)
-            if not queued and counted >= config.trials:
+            if not self._claimable():
                 return None
-            trial = open_study(self.folder, self._storage, len(trials)).ask(distributions(config))
+            number = len(self.study.get_trials(deepcopy=False))
+            trial = open_study(self.folder, self._storage, number).ask(distributions(config))
             trial.set_user_attr("worker", self.worker)
             trial.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
             if "origin" not in trial.user_attrs:
@@ -163,12 +158,30 @@ class Ledger:
         with self._lock:
             self._tell(result)
 
-    def recover(self) -> None:
-        """Take over what dead workers left behind."""
+    def left(self) -> int:
+        """Number of trials still to be finished, running ones included."""
+        from optuna.trial import TrialState
+
         with self._lock:
-            self._recover()
+            trials = self.study.get_trials(deepcopy=False)
+        done = sum(trial.state in (TrialState.COMPLETE, TrialState.PRUNED) for trial in trials)
+        queued = sum(trial.state in (TrialState.WAITING, TrialState.RUNNING) for trial in trials)
+        return max(self.folder.config.trials - done, queued)
+
+    def claimable(self) -> bool:
+        """Tell whether there is a trial to take, after taking over what dead workers left behind."""
+        with self._lock:
+            return self._claimable()
 
     # -- under the lock ---------------------------------------------------------------------------------------------
+
+    def _claimable(self) -> bool:
+        from optuna.trial import TrialState
+
+        self._recover()
+        trials = self.study.get_trials(deepcopy=False)
+        counted = sum(trial.state != TrialState.FAIL for trial in trials)
+        return counted < self.folder.config.trials or any(trial.state == TrialState.WAITING for trial in trials)
 
     def _tell(self, result: dict[str, Any]) -> None:
         from optuna.trial import TrialState

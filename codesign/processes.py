@@ -20,10 +20,11 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_
 
 def run_workers(
     folder: StudyFolder, phase: str, count: int, tick: Callable[[], None] = lambda: None, *, interval: float = 0.2
-) -> None:
+) -> str | None:
     """Run a phase of a study in worker processes of one thread each, and wait for all of them.
 
-    The workers end when this process does, however it ends.
+    The workers end when this process does, however it ends. A worker that was killed is reported only: another one may
+    have finished its work.
 
     Args:
         folder: the study.
@@ -32,8 +33,11 @@ def run_workers(
         tick: called every ``interval`` seconds, and once at the end.
         interval: [s].
 
+    Returns:
+        What ended a worker early, or None.
+
     Raises:
-        SoftGymError: if a worker ended with an error; the same error where it is one of the suite.
+        SoftGymError: if a worker ended with an error of the suite, or with one that is a bug.
     """
     root = str(Path(__file__).resolve().parent.parent)
     paths = [root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
@@ -47,6 +51,9 @@ def run_workers(
             while any(worker.poll() is None for worker in workers):
                 time.sleep(interval)
                 tick()
+                if any((worker.returncode or 0) > 0 for worker in workers):
+                    break
+            failed = [worker.returncode for worker in workers if worker.returncode]
         finally:
             # Closing its standard input ends a worker.
             for worker in workers:
@@ -55,10 +62,11 @@ def run_workers(
             for worker in workers:
                 worker.wait()
         tick()
-        failed = [worker.returncode for worker in workers if worker.returncode != 0]
-        if failed:
-            complaints.seek(0)
-            raise _failure(phase, failed[0], complaints.read())
+        for status in failed:
+            if status > 0:
+                complaints.seek(0)
+                raise _failure(phase, status, complaints.read())
+    return f"killed by signal {-failed[0]}" if failed else None
 
 
 def _failure(phase: str, status: int, text: str) -> errors.SoftGymError:
@@ -68,8 +76,5 @@ def _failure(phase: str, status: int, text: str) -> errors.SoftGymError:
     kind, separator, message = last.partition(": ")
     if status == 2 and separator and kind in errors.__all__:
         return getattr(errors, kind)(message)
-    if status < 0:
-        last = f"killed by signal {-status}"
-    elif len(lines) > 1:
-        sys.stderr.write(text)
-    return errors.SoftGymError(f"a worker of phase '{phase}' stopped: {last}; run the same command again to continue")
+    sys.stderr.write(text)
+    return errors.SoftGymError(f"a worker of phase '{phase}' stopped: {last}")

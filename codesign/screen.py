@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ def screen_jobs(folder: StudyFolder) -> list[Job]:
         return {"values": values, "qp": assess("qp", config.environment, goals, design)}
 
     return [
-        Job(folder.path / "screen" / f"{index:03d}.json", lambda values=values: make(values))  # type: ignore[misc]
+        Job(folder.path / "screen" / f"{index:03d}.json", partial(make, values))
         for index, values in enumerate(candidates(folder))
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -52,7 +53,8 @@ def assess(
         "mean_return": float(evaluation.mean_return),
         "distances": np.asarray(evaluation.distances, dtype=float).tolist(),
         "returns": np.asarray(evaluation.returns, dtype=float).tolist(),
-        "effort": float(np.mean(evaluation.effort)),
+        "successes": np.asarray(evaluation.successes, dtype=bool).tolist(),
+        "mean_effort": float(evaluation.efforts.mean()),
         "steps": int(evaluation.steps),
         "seconds": time.perf_counter() - started,
         "cpu_seconds": time.process_time() - cpu,
@@ -64,7 +66,7 @@ def training_config(folder: StudyFolder, design: Mapping[str, float]) -> TrainCo
     config, goals = folder.config, folder.goals["training"]
     update: dict[str, Any] = {"design": dict(design), "sample_design": False}
     if len(goals):
-        update["task_options"] = {**(config.environment.task_options or {}), "goals": goals.tolist()}
+        update["task_options"] = {**config.environment.task_options, "goals": goals.tolist()}
     training = config.training
     return TrainConfig(
         environment=config.environment.model_copy(update=update),
@@ -131,9 +133,7 @@ def run_trial(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
         result.update(state="infeasible", reason=str(error))
     if result["score"] is not None and not np.isfinite(result["score"]):
         result.update(state="infeasible", reason=f"the score is {result['score']}", score=None)
-    result.update(
-        seconds=time.perf_counter() - started, cpu_seconds=time.process_time() - cpu, finished_at=time.time()
-    )
+    result.update(seconds=time.perf_counter() - started, cpu_seconds=time.process_time() - cpu, finished_at=time.time())
     write_json(folder.trial(trial.number) / "result.json", result)
     return result
 
@@ -151,13 +151,15 @@ def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str
         report=reporter,
         progress=False,
     )
-    steps = max(reporter.curve, default=0) if reporter.pruned else config.training.steps
+    # A trial that goes on after its worker died may have been stopped before.
+    pruned = reporter.pruned or bool(json.loads(policy.with_suffix(".json").read_text()).get("stopped_early"))
+    steps = max(reporter.curve, default=0) if pruned else config.training.steps
     result.update(
         agent=Path(policy).resolve().relative_to(folder.path).as_posix(),
         curve=[[step, value] for step, value in sorted(reporter.curve.items())],
         training_steps=steps,
     )
-    if reporter.pruned:
+    if pruned:
         result.update(state="pruned", reason=f"stopped by the pruner after {steps} steps")
         return None
     evaluation = assess(policy, config.environment, folder.goals["selection"], result["design"])

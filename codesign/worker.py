@@ -38,7 +38,8 @@ def _end_with_parent() -> None:
     """End this process at once when its standard input closes, which is when its parent is gone or wants it to."""
 
     def watch() -> None:
-        sys.stdin.buffer.read()
+        while os.read(0, 1):  # not sys.stdin: its lock, held here, would abort the interpreter's own end
+            pass
         os._exit(3)
 
     threading.Thread(target=watch, daemon=True).start()

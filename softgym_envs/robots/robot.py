@@ -10,6 +10,7 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace
 from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.mechanics.constraints import EmbeddedPoints
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.meshing import BodyMesh
 from softgym_envs.robots.morphing import Feature, Morpher
@@ -123,6 +124,17 @@ class Robot(ABC):
             return BodyMesh(nodes, base.tetrahedra, base.triangles, base.surfaces, "morphed")
         fresh = self.mesh(complete)
         return BodyMesh(fresh.nodes, fresh.tetrahedra, fresh.triangles, fresh.surfaces, "remeshed")
+
+    def baseline_element(self, mesh: BodyMesh, point: np.ndarray) -> np.ndarray | None:
+        """Element nearest to a point [m] (3,) of the baseline body, as a hint for points outside a moved mesh.
+
+        Returns:
+            Its index, shape (1,), or None if ``mesh`` is not the baseline mesh moved.
+        """
+        if mesh.origin != "morphed" or self._morpher is None:
+            return None
+        base = self._morpher.mesh
+        return EmbeddedPoints(point, base.nodes, base.tetrahedra).elements
 
     def build(self, design: Mapping[str, float] | None = None) -> MechanicalModel:
         """Return the mechanical model of a design; missing variables take their baseline.

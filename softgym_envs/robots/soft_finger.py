@@ -204,5 +204,7 @@ class SoftFinger(Robot):
             points = np.array([[x, self.cable_height, z] for z in stations])
             pull_point = np.array([x, self.cable_height, 0.0])
             model.add_cable(actuator.name, points, pull_point, unilateral=self.unilateral)
-        model.add_effector("tip", np.array([0.0, design["height"] / 2, -3.0 * length]))
+        # The effector floats in front of the slanted tip, outside the body.
+        tip = np.array([0.0, design["height"] / 2, -3.0 * length])
+        model.add_effector("tip", tip, hint=self.baseline_element(mesh, self.effector_rest))
         return model

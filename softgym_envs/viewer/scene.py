@@ -289,7 +289,7 @@ class Scene:
         assert self._model is not None
         lines = cable_lines(self._model, x, state, stub=STUB * self._length, side=tuple(self._side))
         for row in self._cables.keys() - lines.keys():
-            self._cables.pop(row)
+            self._cables[row].show(None)
         for row, line in lines.items():
             if row not in self._cables:
                 self._cables[row] = _Part(self, "cable low", specular=0.3, faint=0.45)

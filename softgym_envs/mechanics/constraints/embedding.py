@@ -17,8 +17,8 @@ class EmbeddedPoints:
         points: reference positions [m], shape (p, 3).
         nodes: mesh nodes at rest [m], shape (n, 3).
         tetrahedra: corner indices, shape (m, 4).
-        hint: elements to prefer, shape (p,). A hinted element is kept while the point stays close to it, so that
-            the embedding changes smoothly when a mesh of the same topology is moved.
+        hint: elements from which points outside the mesh are extrapolated, shape (p,). The nearest element can
+            change abruptly when a mesh of the same topology is moved; a fixed one keeps the point's motion smooth.
 
     Attributes:
         elements: element of each point, shape (p,).
@@ -42,7 +42,7 @@ class EmbeddedPoints:
             barycentric = np.column_stack([1.0 - tail.sum(axis=1), tail])
             score = barycentric.min(axis=1)
             best = int(np.argmax(score))
-            if hint is not None and score[hint[i]] > score[best] - 0.5:
+            if hint is not None and score[best] < -1e-9:
                 best = int(hint[i])
             self.elements[i] = best
             self.weights[i] = barycentric[best]

@@ -1,0 +1,294 @@
+"""What a study found, as plain data: ``results.json``, ``trials.csv``, ``finalists.csv``."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shlex
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codesign.finalists import BACKENDS, Finalist, choose_winner, evaluations, finalists
+from codesign.folder import StudyFolder
+from codesign.ledger import open_study
+from codesign.objectives import OBJECTIVES
+from codesign.screen import screen_records
+from softgym_envs.config import provenance
+from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.envs.task import make_task
+from softgym_envs.storage import atomic_write, write_json
+
+__all__ = ["bootstrap_interval", "collect", "rank_correlation", "rate_interval", "write_results"]
+
+CONFIDENCE = 0.95
+
+
+def bootstrap_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of the mean of values, shape (n,)."""
+    from scipy.stats import bootstrap
+
+    values = np.asarray(values, dtype=float)
+    if len(values) < 2 or np.ptp(values) == 0.0:
+        return float(values.mean()), float(values.mean())
+    found = bootstrap(
+        (values,), np.mean, confidence_level=CONFIDENCE, method="percentile", rng=np.random.default_rng(0)
+    )
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def rate_interval(successes: int, count: int) -> tuple[float, float]:
+    """95 % Wilson interval of a success rate."""
+    from scipy.stats import binomtest
+
+    found = binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
+    return float(found.low), float(found.high)
+
+
+def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float | None:
+    """Spearman's rank correlation, or None with fewer than three pairs or without any variation."""
+    from scipy.stats import spearmanr
+
+    if len(first) < 3 or np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
+        return None
+    return float(spearmanr(first, second).statistic)
+
+
+def success_distance(folder: StudyFolder) -> float:
+    """Distance below which a goal counts as reached [m]."""
+    config = folder.config
+    task = make_task(ENVIRONMENTS[config.environment.id].task, config.robot, **config.environment.task_options)
+    return task.success_distance
+
+
+def _compare(baseline: Mapping[str, Any], winner: Mapping[str, Any]) -> dict[str, Any]:
+    """Winner minus baseline, goal by goal."""
+    distances = {"baseline": np.array(baseline["distances"]), "winner": np.array(winner["distances"])}
+    change = distances["winner"] - distances["baseline"]
+    gained = np.array(winner["successes"], dtype=float) - np.array(baseline["successes"], dtype=float)
+    return {
+        "backend": winner["backend"],
+        "agent": winner["agent"],
+        "goals": len(change),
+        **{
+            role: {
+                "success_rate": record["success_rate"],
+                "success_interval": rate_interval(sum(record["successes"]), len(change)),
+                "mean_distance": record["mean_distance"],
+                "distance_interval": bootstrap_interval(distances[role]),
+                "worst_distance": record["worst_distance"],
+                "mean_return": record["mean_return"],
+                "mean_effort": record["mean_effort"],
+            }
+            for role, record in (("baseline", baseline), ("winner", winner))
+        },
+        "success_change": float(gained.mean()),
+        "success_change_interval": bootstrap_interval(gained),
+        "distance_change": float(change.mean()),
+        "distance_change_interval": bootstrap_interval(change),
+        "goals_closer": int((change < 0.0).sum()),
+        "goals_farther": int((change > 0.0).sum()),
+    }
+
+
+def _transfer(records: list[dict[str, Any]], key: str) -> list[dict[str, Any]]:
+    """Surrogate against FEM over the finalists, for each controller: values, gap and rank correlation."""
+    objective = OBJECTIVES[key]
+    rows = []
+    for agent in ("sac", "qp"):
+        values = {
+            backend: {r["trial"]: objective.score(r) for r in records if (r["agent"], r["backend"]) == (agent, backend)}
+            for backend in BACKENDS
+        }
+        trials = sorted(set(values["surrogate"]) & set(values["fem"]))
+        if not trials:
+            continue
+        surrogate, fem = ([values[backend][t] * objective.sign for t in trials] for backend in BACKENDS)
+        rows.append(
+            {
+                "agent": agent,
+                "objective": key,
+                "trials": trials,
+                "surrogate": surrogate,
+                "fem": fem,
+                "mean_gap": float(np.mean(np.subtract(fem, surrogate))),
+                "worst_gap": float(np.max(np.abs(np.subtract(fem, surrogate)))),
+                "spearman": rank_correlation(surrogate, fem),
+            }
+        )
+    return rows
+
+
+def importance(folder: StudyFolder) -> dict[str, float]:
+    """How much each variable decides between good and bad bodies (PED-ANOVA), or nothing with too few trials."""
+    import optuna
+    from optuna.trial import TrialState
+
+    study = open_study(folder)
+    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if len(complete) < 8 or len(folder.config.variables) < 2 or len({trial.value for trial in complete}) < 3:
+        return {}
+    evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=0.25)
+    try:
+        found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    except (ValueError, RuntimeError):  # no quantile of the trials can be told apart
+        return {}
+    return {name: float(value) for name, value in found.items()}
+
+
+def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[str, Any]]) -> dict[str, Any]:
+    screened = [record["qp"] for record in screen_records(folder)]
+    judged = [trial[key] for trial in trials for key in ("qp", "evaluation") if trial[key] and trial["agent"] != key]
+    timing = folder.path / "timing.json"
+    return {
+        "training_steps": sum(trial["training_steps"] for trial in trials),
+        "selection_steps": sum(record.get("steps", 0) for record in judged),
+        "screen_steps": sum(record.get("steps", 0) for record in screened),
+        **{
+            f"test_steps_{backend}": sum(r.get("steps", 0) for r in tests if r["backend"] == backend)
+            for backend in BACKENDS
+        },
+        "cpu_seconds": {
+            "screen": sum(record.get("cpu_seconds", 0.0) for record in screened),
+            "trials": sum(trial["cpu_seconds"] for trial in trials),
+            "finalists": sum(record.get("cpu_seconds", 0.0) for record in tests),
+        },
+        "wall_seconds": json.loads(timing.read_text()) if timing.exists() else {},
+    }
+
+
+def _body(finalist: Finalist | None) -> dict[str, Any] | None:
+    if finalist is None:
+        return None
+    return {
+        "trial": finalist.number,
+        "design": finalist.design,
+        "score": finalist.score,
+        "policy": finalist.policy,
+    }
+
+
+def _command(folder: StudyFolder) -> str:
+    """The command line that ran the study."""
+    if Path(sys.argv[0]).name == "softgym" and "codesign" in sys.argv:
+        return shlex.join(["softgym", *sys.argv[1:]])
+    return f"softgym codesign --config {shlex.quote(os.path.relpath(folder.path / 'config.yaml'))}"
+
+
+def collect(folder: StudyFolder) -> dict[str, Any]:
+    """Gather everything that is known of a study [SI]; it need not be finished."""
+    config = folder.config
+    trials, tests = folder.results(), evaluations(folder)
+    good = [record for record in tests if "error" not in record]
+    unseen = [record for record in good if record["goals"] == "unseen"]
+    bodies = finalists(folder)
+    winner = choose_winner(folder, good)
+    baseline = next((body for body in bodies if body.role == "baseline"), None)
+    comparison = []
+    if winner is not None and baseline is not None:
+        found = {(r["trial"], r["agent"], r["backend"]): r for r in unseen}
+        for backend in reversed(BACKENDS):
+            for agent in winner.agents:
+                pair = [found.get((body.number, agent, backend)) for body in (baseline, winner)]
+                if pair[0] and pair[1]:
+                    comparison.append(_compare(pair[0], pair[1]))
+    states = [trial["state"] for trial in trials]
+    space = config.space
+    return {
+        "name": config.name,
+        "environment": config.environment.id,
+        "objective": config.objective,
+        "strategy": config.strategy,
+        "command": _command(folder),
+        "trials": {"asked": config.trials, **{s: states.count(s) for s in ("complete", "pruned", "infeasible")}},
+        "variables": [
+            {
+                "name": name,
+                "unit": space[name].unit,
+                "low": space[name].low,
+                "high": space[name].high,
+                "baseline": config.baseline[name],
+                "winner": None if winner is None else winner.design[name],
+                "optimised": name in config.variables,
+                "description": space[name].description,
+            }
+            for name in space.names
+        ],
+        "baseline": _body(baseline),
+        "winner": _body(winner),
+        "comparison": comparison,
+        "transfer": [row for key in OBJECTIVES for row in _transfer(unseen, key)],
+        "finalists": [
+            {"trial": body.number, "role": body.role, "design": body.design, "score": body.score} for body in bodies
+        ],
+        "evaluations": tests,
+        "importance": importance(folder),
+        "cost": _cost(folder, trials, tests),
+        "success_distance": success_distance(folder),
+        "provenance": provenance(),
+    }
+
+
+def _write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    rows = list(rows)
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    with atomic_write(path, "w") as stream:
+        writer = csv.DictWriter(stream, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _trial_row(trial: Mapping[str, Any], space_units: Mapping[str, str]) -> dict[str, Any]:
+    evaluation, qp = trial["evaluation"] or {}, trial["qp"]
+    return {
+        "trial": trial["number"],
+        "state": trial["state"],
+        "origin": trial["origin"],
+        **{f"{name} [{space_units[name]}]": value for name, value in trial["design"].items()},
+        "score": trial["score"],
+        "success_rate": evaluation.get("success_rate"),
+        "mean_distance [m]": evaluation.get("mean_distance"),
+        "mean_return": evaluation.get("mean_return"),
+        "qp_success_rate": qp.get("success_rate"),
+        "qp_mean_distance [m]": qp.get("mean_distance"),
+        "training_steps": trial["training_steps"],
+        "seconds": round(trial["seconds"], 3),
+        "cpu_seconds": round(trial["cpu_seconds"], 3),
+        "sampler_seed": trial["sampler_seed"],
+        "reason": trial["reason"],
+    }
+
+
+def write_results(folder: StudyFolder) -> dict[str, Any]:
+    """Write ``results.json``, ``trials.csv`` and ``finalists.csv``; return what is in the first."""
+    results = collect(folder)
+    write_json(folder.path / "results.json", results)
+    units = {variable["name"]: variable["unit"] for variable in results["variables"]}
+    _write_csv(folder.path / "trials.csv", (_trial_row(trial, units) for trial in folder.results()))
+    bodies = {body["trial"]: body for body in results["finalists"]}
+    _write_csv(
+        folder.path / "finalists.csv",
+        (
+            {
+                "trial": record["trial"],
+                "role": bodies[record["trial"]]["role"],
+                **{f"{name} [{units[name]}]": value for name, value in bodies[record["trial"]]["design"].items()},
+                "agent": record["agent"],
+                "backend": record["backend"],
+                "goals": record["goals"],
+                "success_rate": record.get("success_rate"),
+                "mean_distance [m]": record.get("mean_distance"),
+                "worst_distance [m]": record.get("worst_distance"),
+                "mean_return": record.get("mean_return"),
+                "mean_effort": record.get("mean_effort"),
+                "steps": record.get("steps"),
+                "error": record.get("error"),
+            }
+            for record in results["evaluations"]
+        ),
+    )
+    return results

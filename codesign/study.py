@@ -1,0 +1,191 @@
+"""Run a co-design study: screen, trials, check on FEM."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from codesign.config import StudyConfig
+from codesign.finalists import finalist_jobs
+from codesign.folder import StudyFolder
+from codesign.ledger import Ledger
+from codesign.objectives import OBJECTIVES
+from codesign.processes import run_workers
+from codesign.results import write_results
+from codesign.screen import kept_bodies, screen_jobs
+from softgym_envs.errors import ConfigError, SoftGymError
+from softgym_envs.storage import write_json
+
+__all__ = ["run_study"]
+
+
+def run_study(
+    config: StudyConfig, folder: str | Path, *, workers: int | None = None, progress: bool = True
+) -> dict[str, Any]:
+    """Run a study, or continue it: whatever is finished is kept, and nothing is done twice.
+
+    Several calls may work on one folder at the same time. A folder keeps its study; only the number of trials, of
+    workers and the finalists may change from call to call.
+
+    Args:
+        config: the study.
+        folder: where everything goes, see `StudyFolder`.
+        workers: processes, default those of the configuration.
+        progress: print a line per finished trial and test.
+
+    Returns:
+        What is in ``results.json``.
+
+    Raises:
+        ConfigError: if the folder holds another study, or the policy to start from is missing.
+        SoftGymError: if a worker was stopped by an error.
+    """
+    count = config.workers if workers is None else workers
+    if count < 1:
+        raise ConfigError(f"workers = {count} is out of bounds; allowed: 1 or more")
+    if config.policy is not None and not Path(config.policy).is_file():
+        raise ConfigError(f"policy '{config.policy}' does not exist; strategy 'warm_start' needs a trained policy file")
+    study = StudyFolder.create(folder, config)
+    printer = _Printer(study, enabled=progress)
+    try:
+        if config.screen.enabled:
+            with _timed(study, "screen"):
+                _run_screen(study, count, printer)
+        with _timed(study, "trials"):
+            _run_trials(study, count, printer)
+        if config.finalists.count:
+            with _timed(study, "finalists"):
+                _run_finalists(study, count, printer)
+    except KeyboardInterrupt:
+        done = len(study.results())
+        printer.say(f"interrupted: {done} of {config.trials} trials finished; run the same command again to continue")
+        raise
+    results = write_results(study)
+    printer.verdict(results)
+    return results
+
+
+def _run_screen(study: StudyFolder, workers: int, printer: _Printer) -> None:
+    jobs = screen_jobs(study)
+    missing = [job for job in jobs if not job.path.exists()]
+    if missing:
+        printer.say(f"screen: {len(missing)} bodies by the inverse QP")
+        stopped = run_workers(study, "screen", min(workers, len(missing)))
+        _demand(all(job.path.exists() for job in jobs), "screen", stopped)
+    kept = kept_bodies(study)
+    printer.say(f"screen: kept {len(kept)} of {len(jobs)} bodies")
+
+
+def _run_trials(study: StudyFolder, workers: int, printer: _Printer) -> None:
+    config = study.config
+    with Ledger(study) as ledger:
+        ledger.enqueue([("baseline", {name: config.baseline[name] for name in config.variables}), *kept_bodies(study)])
+        printer.trials(quiet=True)
+        if ledger.left():
+            finished = len(study.results())
+            printer.say(f"study '{config.name}': {config.trials} trials, {finished} of them finished before")
+        while ledger.left():
+            if ledger.claimable():
+                stopped = run_workers(study, "trials", min(workers, ledger.left()), printer.trials)
+                _demand(stopped is None or ledger.left() == 0, "trials", stopped)
+            else:  # another call on this folder is at the last ones
+                printer.trials()
+                time.sleep(0.5)
+
+
+def _run_finalists(study: StudyFolder, workers: int, printer: _Printer) -> None:
+    jobs = finalist_jobs(study)
+    missing = [job for job in jobs if not job.path.exists()]
+    if missing:
+        bodies = len({job.path.name.partition("-")[0] for job in jobs})
+        printer.say(f"test: {bodies} bodies on {study.config.goals.unseen_count} unseen goals, surrogate and FEM")
+        printer.tests(quiet=True)
+        stopped = run_workers(study, "finalists", min(workers, len(missing)), printer.tests)
+        _demand(all(job.path.exists() for job in jobs), "finalists", stopped)
+
+
+def _demand(done: bool, phase: str, stopped: str | None) -> None:
+    """Raise unless a phase is complete."""
+    if not done:
+        raise SoftGymError(f"a worker of phase '{phase}' was {stopped}; run the same command again to continue")
+
+
+@contextmanager
+def _timed(study: StudyFolder, phase: str) -> Iterator[None]:
+    """Add the time of a block to ``timing.json`` [s]."""
+    started = time.perf_counter()
+    try:
+        yield
+    finally:
+        path = study.path / "timing.json"
+        with study.lock("timing"):
+            timing = json.loads(path.read_text()) if path.exists() else {}
+            timing[phase] = timing.get(phase, 0.0) + time.perf_counter() - started
+            write_json(path, timing)
+
+
+class _Printer:
+    """Prints a line per finished trial and test."""
+
+    def __init__(self, study: StudyFolder, *, enabled: bool) -> None:
+        self.study = study
+        self.enabled = enabled
+        self.objective = OBJECTIVES[study.config.objective]
+        self._seen: set[str] = set()
+        self._best: tuple[float, int] | None = None
+
+    def say(self, line: str) -> None:
+        if self.enabled:
+            print(line, flush=True)
+
+    def trials(self, *, quiet: bool = False) -> None:
+        """Tell of trials that finished since the last call."""
+        fresh = [path for path in self.study.path.glob("trials/[0-9]*/result.json") if str(path) not in self._seen]
+        for path in sorted(fresh, key=lambda path: path.stat().st_mtime):
+            self._seen.add(str(path))
+            result = json.loads(path.read_text())
+            if result["score"] is not None and (self._best is None or result["score"] > self._best[0]):
+                self._best = (result["score"], result["number"])
+            if quiet:
+                continue
+            value = self.objective.text(result["score"]) if result["score"] is not None else result["state"]
+            best = "" if self._best is None else f", best {self.objective.text(self._best[0])} (trial {self._best[1]})"
+            done = sum("result.json" in name for name in self._seen)
+            label = self.objective.label.lower()
+            self.say(
+                f"[{done:>{len(str(self.study.config.trials))}}/{self.study.config.trials}] trial {result['number']} "
+                f"({result['origin']}): {label} {value}{best}, {result['seconds']:.1f} s"
+            )
+
+    def tests(self, *, quiet: bool = False) -> None:
+        """Tell of tests that finished since the last call."""
+        fresh = [path for path in self.study.path.glob("finalists/trial*.json") if str(path) not in self._seen]
+        for path in sorted(fresh, key=lambda path: path.stat().st_mtime):
+            self._seen.add(str(path))
+            record = json.loads(path.read_text())
+            if quiet:
+                continue
+            found = record.get("error") or (
+                f"success {100 * record['success_rate']:.1f} %, mean distance {1e3 * record['mean_distance']:.2f} mm"
+            )
+            which = f"{record['agent']} on {record['backend']}, {record['goals']} goals"
+            self.say(f"test: trial {record['trial']}, {which}: {found}")
+
+    def verdict(self, results: dict[str, Any]) -> None:
+        """Tell who won."""
+        if results["winner"] is None:
+            self.say("no winner: no trial was complete, or no finalists were asked for")
+            return
+        self.say(f"winner: trial {results['winner']['trial']}")
+        for row in results["comparison"]:
+            low, high = (1e3 * value for value in row["distance_change_interval"])
+            self.say(
+                f"  {row['agent']} on {row['backend']}, {row['goals']} unseen goals: success "
+                f"{100 * row['baseline']['success_rate']:.1f} -> {100 * row['winner']['success_rate']:.1f} %, distance "
+                f"{1e3 * row['baseline']['mean_distance']:.2f} -> {1e3 * row['winner']['mean_distance']:.2f} mm "
+                f"(change {1e3 * row['distance_change']:+.2f} mm, 95 % interval {low:+.2f} to {high:+.2f})"
+            )

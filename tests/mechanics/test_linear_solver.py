@@ -1,0 +1,116 @@
+"""Linear solvers: agreement on definite matrices, honesty on others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse import csc_matrix, random_array, tril
+
+from softgym_envs.mechanics.linear_solver import CholmodSolver, LinearSolver, SuperLUSolver, make_solver
+
+NAMES = ["cholmod", "superlu"]
+SIZE = 60
+
+
+def lower_of(matrix):
+    lower = tril(csc_matrix(matrix), format="csc")
+    lower.sort_indices()
+    return lower
+
+
+@pytest.fixture
+def definite(rng):
+    """A sparse symmetric positive definite matrix, dense, of condition about 100."""
+    half = random_array((SIZE, SIZE), density=0.1, rng=rng).toarray()
+    return half @ half.T + 0.1 * np.eye(SIZE)
+
+
+@pytest.fixture
+def indefinite(definite):
+    """The same pattern with a few negative eigenvalues, none near zero."""
+    values, vectors = np.linalg.eigh(definite)
+    shift = 0.5 * (values[SIZE // 3] + values[SIZE // 3 + 1])
+    matrix = definite - shift * np.eye(SIZE)
+    assert np.abs(np.linalg.eigvalsh(matrix)).min() > 1e-4
+    return matrix
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_solves_definite_systems(definite, rng, name):
+    lower = lower_of(definite)
+    solver = make_solver(name, lower.indptr, lower.indices)
+    assert solver.name == name
+    assert solver.size == SIZE
+    assert solver.factorise(lower.data)
+    rhs = rng.standard_normal((SIZE, 4))
+    kept = rhs.copy()
+    solution = solver.solve(rhs)
+    np.testing.assert_array_equal(rhs, kept)
+    np.testing.assert_allclose(definite @ solution, rhs, atol=1e-10)
+    np.testing.assert_allclose(solver.solve(rhs[:, :1]), solution[:, :1], atol=1e-12)
+
+
+def test_both_solvers_agree(definite, rng):
+    lower = lower_of(definite)
+    rhs = np.asfortranarray(rng.standard_normal((SIZE, 3)))
+    solutions = []
+    for cls in (CholmodSolver, SuperLUSolver):
+        solver = cls(lower.indptr, lower.indices)
+        assert solver.factorise(lower.data)
+        solutions.append(solver.solve(rhs))
+    np.testing.assert_allclose(*solutions, atol=1e-11 * np.abs(solutions[0]).max())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_analysis_serves_many_factorisations(definite, rng, name):
+    lower = lower_of(definite)
+    solver = make_solver(name, lower.indptr, lower.indices)
+    rhs = rng.standard_normal((SIZE, 1))
+    for scale in (1.0, 1e6, 1e-6):
+        assert solver.factorise(scale * lower.data)
+        np.testing.assert_allclose(scale * definite @ solver.solve(rhs), rhs, atol=1e-10)
+
+
+def test_cholmod_refuses_an_indefinite_matrix_and_recovers(definite, indefinite, rng):
+    lower, other = lower_of(definite), lower_of(indefinite)
+    np.testing.assert_array_equal(lower.indices, other.indices)
+    solver = CholmodSolver(lower.indptr, lower.indices)
+    assert not solver.factorise(other.data)
+    assert solver.factorise(lower.data)
+    rhs = rng.standard_normal((SIZE, 1))
+    np.testing.assert_allclose(definite @ solver.solve(rhs), rhs, atol=1e-10)
+
+
+def test_superlu_solves_an_indefinite_matrix(indefinite, rng):
+    lower = lower_of(indefinite)
+    solver = SuperLUSolver(lower.indptr, lower.indices)
+    assert solver.factorise(lower.data)
+    rhs = rng.standard_normal((SIZE, 2))
+    np.testing.assert_allclose(indefinite @ solver.solve(rhs), rhs, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_singular_matrix_is_refused(name):
+    lower = lower_of(np.diag([1.0, 0.0, 2.0]) + np.diag([1e-300] * 3))  # the pattern keeps its diagonal
+    values = np.where(lower.data < 1e-200, 0.0, lower.data)
+    assert not make_solver(name, lower.indptr, lower.indices).factorise(values)
+
+
+def test_auto_is_one_of_them(definite):
+    lower = lower_of(definite)
+    assert isinstance(make_solver("auto", lower.indptr, lower.indices), LinearSolver)
+
+
+def test_auto_works_without_cvxopt(definite, monkeypatch, rng):
+    monkeypatch.setitem(__import__("sys").modules, "cvxopt", None)
+    lower = lower_of(definite)
+    solver = make_solver("auto", lower.indptr, lower.indices)
+    assert solver.name == "superlu"
+    with pytest.raises(ImportError):
+        make_solver("cholmod", lower.indptr, lower.indices)
+
+
+def test_unknown_name_is_refused(definite):
+    lower = lower_of(definite)
+    with pytest.raises(ValueError, match=r"unknown linear solver 'magic'; allowed: auto, cholmod, superlu"):
+        make_solver("magic", lower.indptr, lower.indices)
