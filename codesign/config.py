@@ -105,16 +105,18 @@ class GoalsConfig(Config):
     """Three disjoint sets of goals: to train on, to choose bodies by, and unseen ones to test the choice.
 
     Attributes:
-        source: ``"family"``: effector positions that random bodies of the family reach, the same for every body;
-            ``"task"``: as the task draws them for the baseline body (for tasks whose goals are paths).
+        source: ``"family"``: effector positions that random bodies reach under random commands, the same for every
+            body; ``"task"``: as the task draws them for the baseline body (for tasks whose goals are paths).
+        vary: design variables in which those random bodies differ; default: those that are optimised.
         count: goals every trial is scored on.
         unseen_count: goals only the finalists are tested on.
         training_count: goals that training episodes draw from (``"family"`` only).
         seed: seed of all three.
-        command_low: goals need every actuator above this part of its range, in [0, 1) (``"family"`` only).
+        command_low: smallest random command, as a part of the range of its actuator, in [0, 1) (``"family"`` only).
     """
 
     source: Literal["family", "task"] = "family"
+    vary: tuple[str, ...] | None = Field(None, min_length=1)
     count: int = Field(40, ge=1)
     unseen_count: int = Field(30, ge=2)
     training_count: int = Field(300, ge=1)
@@ -229,7 +231,7 @@ class StudyConfig(Config):
         repeated = [name for name in self.variables if self.variables.count(name) > 1]
         if repeated:
             raise ValueError(f"variables: '{repeated[0]}' is named twice")
-        for name in self.variables:
+        for name in (*self.variables, *(self.goals.vary or ())):
             space[name]
         if self.strategy == "warm_start" and not self.policy:
             raise ValueError("strategy 'warm_start' needs 'policy', the file of a trained design-conditioned policy")

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from codesign.config import StudyConfig, robot_of
+from codesign.config import StudyConfig
+from codesign.goals import draw_goals
 from softgym_envs.config import load_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.storage import write_json
@@ -110,21 +111,3 @@ class StudyFolder:
         """Results of all finished trials, by number."""
         paths = sorted((self.path / "trials").glob("[0-9]*/result.json"))
         return [json.loads(path.read_text()) for path in paths]
-
-
-def draw_goals(config: StudyConfig) -> dict[str, Any]:
-    """Draw the three disjoint sets of goals [m] of a study."""
-    goals = config.goals
-    if goals.source == "task":
-        from agents.evaluation import sample_goals
-
-        both = sample_goals(config.environment, goals.count + goals.unseen_count, goals.seed)
-        drawn = {"training": np.zeros((0, 3)), "selection": both[: goals.count], "unseen": both[goals.count :]}
-    else:
-        from softgym_envs.surrogate.pretrained import family_goals
-
-        sizes = np.array([goals.count, goals.unseen_count, goals.training_count])
-        points = family_goals(robot_of(config.environment), int(sizes.sum()), goals.seed, command_low=goals.command_low)
-        selection, unseen, training = np.split(points, np.cumsum(sizes)[:-1])
-        drawn = {"training": training, "selection": selection[:, None], "unseen": unseen[:, None]}
-    return {"unit": "m", **{name: array.tolist() for name, array in drawn.items()}}

@@ -155,8 +155,9 @@ def _question(study: StudyFolder, results: Mapping[str, Any]) -> list[tuple[str,
     )
     direction = "as small as possible" if OBJECTIVES[config.objective].sign < 0 else "as large as possible"
     if goals.source == "family":
+        vary = ", ".join(config.variables if goals.vary is None else goals.vary).replace("_", " ")
         origin = (
-            "effector positions of random bodies of the family under random commands"
+            f"effector positions of random bodies (other {vary}) under random commands"
             + (f" above {100 * goals.command_low:.0f} % of their range" if goals.command_low else "")
             + ", the same for every body"
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import skfem
-from skfem.helpers import ddot, dot, sym_grad, trace
+from skfem.helpers import ddot, sym_grad, trace
 from skfem.models.elasticity import lame_parameters
 
 from softgym_envs.mechanics.model import MechanicalModel
@@ -73,23 +73,25 @@ def test_compliance_at_rest_is_that_of_linear_elasticity(box):
 def test_refinement_converges_to_quadratic_elements(box):
     """A beam under a small dead weight: linear tetrahedra lock, and less so the finer they are.
 
-    Quadratic tetrahedra, nearly converged on a coarse mesh, are the reference. Measured: the linear tip deflection is
-    25 %, 8.4 % and 4.1 % too small with 2, 4 and 6 cells across, the error falling as the square of the cell size.
+    Quadratic tetrahedra are the reference (their own change from 2 to 3 cells across is 0.9 %). Measured: the tip
+    deflection of linear ones is 51 %, 23 % and 7.0 % too small with 2, 4 and 8 cells across, and the order of the
+    error, 1.2 then 1.7, approaches two.
     """
     density, gravity = 1000.0, 1e-4  # a tip deflection of about 1e-7 m: far below geometric effects
-    coarse = box(SIZE, (10, 2, 2))
+    coarse = box(SIZE, (15, 3, 3))
     basis = basis_of(*coarse, skfem.ElementTetP2(), 2)
     force = (0.0, 0.0, -density * gravity)
     solution = skfem.solve(*skfem.condense(hooke.assemble(basis), body_force(basis, force), D=clamped(basis)))
     end = basis.nodal_dofs[2, np.isclose(basis.mesh.p[0], SIZE[0])]
     reference = solution[end].mean()
-    # Sanity of the reference itself: Timoshenko's beam, w = q L^4 / 8 E I + q L^2 / 2 k G A, to 2 %.
+    # Sanity of the reference itself: Timoshenko's beam, w = q L^4 / 8 E I + q L^2 / 2 k G A. It is 4 % softer, since
+    # the clamp here also holds the lateral contraction.
     area, inertia = SIZE[1] * SIZE[2], SIZE[1] * SIZE[2] ** 3 / 12
     load = -density * gravity * area
     beam = load * SIZE[0] ** 4 / (8 * YOUNG * inertia) + load * SIZE[0] ** 2 / (2 * 5 / 6 * MU * area)
-    assert reference == pytest.approx(beam, rel=0.02)
+    assert reference == pytest.approx(beam, rel=0.05)
     errors = []
-    for cells in (2, 4, 6):
+    for cells in (2, 4, 8):
         nodes, tetrahedra = box(SIZE, (5 * cells, cells, cells))
         model = MechanicalModel.from_mesh(
             nodes,
@@ -104,9 +106,10 @@ def test_refinement_converges_to_quadratic_elements(box):
         deflection = (x - nodes)[np.isclose(nodes[:, 0], SIZE[0]), 2].mean()
         errors.append(1.0 - deflection / reference)
     print("linear against quadratic tetrahedra, missing deflection:", errors)
-    assert 0.0 < errors[2] < 0.05
-    rates = np.log(np.array(errors[:-1]) / errors[1:]) / np.log([2.0, 1.5])
-    assert ((rates > 1.3) & (rates < 2.3)).all()
+    assert 0.0 < errors[2] < 0.08
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert 1.0 < orders[0] < orders[1] < 2.3
+    assert orders[1] > 1.5
 
 
 # -- large deflections ----------------------------------------------------------------------------------------------
@@ -201,9 +204,9 @@ def solve_by_scikit_fem(basis, law, load, steps):
 
 @pytest.mark.parametrize(("name", "law"), [("corotational", Corotational), ("stable_neo_hookean", NeoHookean)])
 def test_large_deflection_under_weight(box, name, law):
-    """The same energy on the same linear tetrahedra: node positions agree to 1e-10 m at a deflection of 5 cm."""
+    """The same energy on the same linear tetrahedra: at 6 cm of deflection nodes agree to 1e-10 m (measured: 1e-12)."""
     nodes, tetrahedra = box(SIZE, (8, 2, 2), jitter=0.2)
-    density, gravity = 1000.0, (3.0, 8.0, -30.0)
+    density, gravity = 1000.0, (20.0, 50.0, -150.0)
     model = MechanicalModel.from_mesh(
         nodes,
         tetrahedra,
@@ -232,4 +235,3 @@ def test_forms_are_linear_elasticity_at_rest(box):
     expected = 2 * MU * strain + LAME * np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     for law in (Corotational, NeoHookean):
         np.testing.assert_allclose(law(np.tile(np.eye(3), (5, 1, 1))).stress_change(dF), expected, rtol=1e-9)
-    assert dot(np.ones(3), np.ones(3)) == 3.0

@@ -1,0 +1,51 @@
+"""Goals that compare bodies: the same for all of them, whoever can reach them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from codesign.config import StudyConfig
+
+__all__ = ["draw_goals", "family_goals"]
+
+
+def family_goals(config: StudyConfig, count: int) -> np.ndarray:
+    """Effector positions [m] (count, 3) of random bodies under random commands, on the surrogate.
+
+    The bodies differ from the baseline of the study in the variables ``goals.vary``.
+    """
+    from softgym_envs.backends.surrogate import settle
+    from softgym_envs.surrogate.pretrained import pretrained_model
+
+    robot, goals = config.robot, config.goals
+    rng = np.random.default_rng(goals.seed)
+    vary = tuple(config.variables if goals.vary is None else goals.vary)
+    drawn = [robot.design_space.sample(rng, vary) for _ in range(count)]
+    designs = [[body[n] if n in vary else value for n, value in config.baseline.items()] for body in drawn]
+    low = robot.lower + goals.command_low * (robot.upper - robot.lower)
+    commands = rng.uniform(low, robot.upper, (count, len(low)))
+    model = pretrained_model(robot, config.environment.backend_options.get("weights"))
+    unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
+    settled = settle(model, model.context(np.array(designs)), commands, np.zeros_like(commands), unilateral)
+    return settled.effector[:, :3]
+
+
+def draw_goals(config: StudyConfig) -> dict[str, Any]:
+    """Draw the three disjoint sets of goals of a study [m], as plain data.
+
+    Returns:
+        ``training`` (k, 3), empty where the task draws its own; ``selection`` and ``unseen`` (k, p, 3).
+    """
+    goals = config.goals
+    count = goals.count + goals.unseen_count
+    if goals.source == "task":
+        from agents.evaluation import sample_goals
+
+        paths, training = sample_goals(config.environment, count, goals.seed), np.zeros((0, 3))
+    else:
+        points = family_goals(config, count + goals.training_count)
+        paths, training = points[:count, None], points[count:]
+    drawn = {"training": training, "selection": paths[: goals.count], "unseen": paths[goals.count :]}
+    return {"unit": "m", **{name: array.tolist() for name, array in drawn.items()}}

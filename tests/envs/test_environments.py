@@ -1,0 +1,232 @@
+"""Every environment ID on every backend: the contracts of Gymnasium, stable-baselines3 and this suite."""
+
+import copy
+import pickle
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import softgym_envs
+from softgym_envs.backends import BACKENDS
+from softgym_envs.errors import ConvergenceError, DesignError
+from softgym_envs.robots.robot import Robot
+
+CASES = [(identifier, backend) for identifier in softgym_envs.ENVIRONMENTS for backend in BACKENDS]
+
+
+def rollout(env, steps, seed):
+    """Observations and rewards of a seeded random walk."""
+    observation, _ = env.reset(seed=seed)
+    env.action_space.seed(seed)
+    rows = [observation]
+    rewards = []
+    for _ in range(steps):
+        observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        rows.append(observation)
+        rewards.append(reward)
+        if terminated or truncated:
+            rows.append(env.reset()[0])
+    return np.stack(rows), np.array(rewards)
+
+
+@pytest.mark.parametrize(("identifier", "backend"), CASES)
+def test_gymnasium_checker(identifier, backend):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(identifier, backend=backend)
+        check_env(env.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize(("identifier", "backend"), CASES)
+def test_stable_baselines_checker(identifier, backend):
+    from stable_baselines3.common.env_checker import check_env as sb3_check
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sb3_check(gymnasium.make(identifier, backend=backend), warn=True)
+
+
+@pytest.mark.parametrize(("identifier", "backend"), CASES)
+def test_same_seed_same_rollout_bit_for_bit(identifier, backend):
+    first = gymnasium.make(identifier, backend=backend, sample_design=("length", "joint_height"))
+    second = gymnasium.make(identifier, backend=backend, sample_design=("length", "joint_height"))
+    a, b, again = rollout(first, 6, 7), rollout(second, 6, 7), rollout(first, 6, 7)
+    assert (a[0] == b[0]).all() and (a[1] == b[1]).all()
+    assert (a[0] == again[0]).all() and (a[1] == again[1]).all()
+    other = rollout(second, 6, 8)
+    assert (other[0] != a[0]).any()
+
+
+@pytest.mark.parametrize(("identifier", "backend"), CASES)
+def test_pickle_deepcopy_and_spec(identifier, backend):
+    env = gymnasium.make(identifier, backend=backend, design={"length": 0.041}, design_in_observation=True)
+    expected = rollout(env, 3, 1)
+    for twin in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env)):
+        assert twin.unwrapped.design == env.unwrapped.design
+        assert (rollout(twin, 3, 1)[0] == expected[0]).all()
+    text = env.spec.to_json()
+    revived = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(text))
+    assert (rollout(revived, 3, 1)[0] == expected[0]).all()
+
+
+@pytest.mark.parametrize("identifier", softgym_envs.ENVIRONMENTS)
+@pytest.mark.parametrize("action_mode", ["increment", "absolute"])
+@pytest.mark.parametrize("cables", [1, 2])
+def test_bounds_time_limit_and_info(identifier, action_mode, cables):
+    env = gymnasium.make(
+        identifier,
+        action_mode=action_mode,
+        robot_options={"cables": cables},
+        design_in_observation=True,
+        sample_design=True,
+    )
+    limit = softgym_envs.ENVIRONMENTS[identifier].max_episode_steps
+    env.action_space.seed(3)
+    for episode in range(5):
+        observation, info = env.reset(seed=episode)
+        assert (env.unwrapped._unit_design == env.unwrapped.design_space.to_unit(env.unwrapped.design)).all()
+        truncated = False
+        steps = 0
+        while not truncated:
+            before = env.unwrapped.state.command
+            observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+            steps += 1
+            assert env.observation_space.contains(observation)
+            assert not terminated
+            assert 0.0 <= reward <= 1.0
+            assert (np.abs(env.unwrapped.state.command - before) <= env.unwrapped.robot.rates + 1e-15).all()
+        assert steps == limit
+    assert set(info) >= {"effector", "goal", "distance", "is_success", "reward_terms", "displacement", "effort"}
+    assert info["distance"] == pytest.approx(np.linalg.norm(info["effector"] - info["goal"]), abs=1e-12)
+    assert info["is_success"] == (info["distance"] < env.unwrapped.task.success_distance)
+    assert reward == pytest.approx(np.prod(list(info["reward_terms"].values())))
+    assert (info["effort"] >= 0.0).all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_design_in_make_and_reset(backend):
+    env = gymnasium.make("SoftGym/FingerReach-v0", backend=backend, design={"length": 0.041})
+    env.reset(seed=0)
+    unwrapped = env.unwrapped
+    assert unwrapped.design["length"] == 0.041
+    assert unwrapped.design["height"] == unwrapped.design_space["height"].baseline
+    assert unwrapped.state.effector[0, 2] == pytest.approx(-3 * 0.041, abs=2e-4)
+    env.reset(options={"design": {"length": 0.039, "height": 0.021}})
+    assert (unwrapped.design["length"], unwrapped.design["height"]) == (0.039, 0.021)
+    env.reset()
+    assert unwrapped.design["length"] == 0.041
+    goal = np.array([0.0, 0.05, -0.1])
+    _, info = env.reset(options={"goal": goal})
+    assert (info["goal"] == goal).all()
+
+
+def test_reset_does_not_rebuild_the_same_design(monkeypatch):
+    env = gymnasium.make("SoftGym/FingerReach-v0", backend="fem")
+    built = []
+    original = Robot.build
+    monkeypatch.setattr(Robot, "build", lambda self, design=None: built.append(design) or original(self, design))
+    model = env.unwrapped.backend.model
+    for seed in range(3):
+        env.reset(seed=seed)
+    assert built == [] and env.unwrapped.backend.model is model
+    env.reset(options={"design": {"length": 0.0405}})
+    assert len(built) == 1
+
+
+def test_backends_agree():
+    """The surrogate follows the FEM along a rollout, slack cables included, to a fraction of a millimetre."""
+    envs = [gymnasium.make("SoftGym/FingerReach-v0", backend=b, design={"joint_height": 0.007}) for b in ("fem", "surrogate")]
+    goal = np.array([0.0, 0.06, -0.09])
+    for env in envs:
+        env.reset(seed=0, options={"goal": goal})
+    rng = np.random.default_rng(0)
+    saw_slack = False
+    for _ in range(30):
+        action = np.array([1.0, rng.uniform(-1, 1)], dtype=np.float32)
+        infos = [env.step(action)[4] for env in envs]
+        saw_slack |= bool(envs[0].unwrapped.state.slack.any())
+        assert np.linalg.norm(infos[0]["effector"] - infos[1]["effector"]) < 1e-3
+        assert np.abs(infos[0]["effort"] - infos[1]["effort"]).max() < 1.0
+    assert saw_slack
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"backend": "magic"}, ValueError, ["magic", "fem", "surrogate"]),
+        ({"design": {"lenght": 0.04}}, DesignError, ["lenght", "length", "joint_height"]),
+        ({"design": {"length": 0.1}}, DesignError, ["length", "0.1", "0.038", "0.042", "m"]),
+        ({"design": {"length": float("nan")}}, DesignError, ["length", "nan", "finite"]),
+        ({"design": {"length": "long"}}, DesignError, ["length", "long", "number"]),
+        ({"sample_design": ["wing"]}, DesignError, ["wing", "length"]),
+        ({"action_mode": "torque"}, ValueError, ["torque", "increment", "absolute"]),
+        ({"robot_options": {"cables": 7}}, ValueError, ["cables", "7", "1, 2"]),
+        ({"robot_options": {"legs": 7}}, ValueError, ["legs"]),
+        ({"task_options": {"goals": "easy"}}, ValueError, ["easy", "reachable"]),
+        ({"backend_options": {"weights": "/nowhere"}}, ValueError, None),
+        ({"render_mode": "hologram"}, ValueError, ["hologram", "rgb_array"]),
+    ],
+)
+def test_bad_options_name_the_thing(options, error, words):
+    if words is None:
+        from softgym_envs.errors import WeightsError as error  # noqa: N813
+
+        words = ["nowhere", "does not exist"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Gymnasium warns of an unknown render mode before we refuse it
+        with pytest.raises(error) as caught:
+            gymnasium.make("SoftGym/FingerReach-v0", **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_bad_actions_and_reset_options(backend):
+    env = gymnasium.make("SoftGym/FingerReach-v0", backend=backend).unwrapped
+    env.reset(seed=0)
+    before = env.state
+    for action in ([np.nan, 0.0], [np.inf, 0.0], [0.0], [[0.0, 0.0]]):
+        with pytest.raises(ValueError, match="action"):
+            env.step(np.array(action))
+    assert env.state is before
+    with pytest.raises(ValueError, match="colour.*design, goal"):
+        env.reset(options={"colour": "red"})
+    with pytest.raises(ValueError, match="goal"):
+        env.reset(options={"goal": [0.0, np.nan, 0.0]})
+    with pytest.raises(DesignError, match="length"):
+        env.reset(options={"design": {"length": 1.0}})
+    env.reset()
+    assert np.isfinite(env.step(np.array([5.0, -5.0]))[0]).all()  # out of range is clipped
+
+
+def test_unsolvable_step_ends_the_episode(monkeypatch):
+    env = gymnasium.make("SoftGym/FingerReach-v0", backend="fem")
+    env.reset(seed=0)
+    backend = env.unwrapped.backend
+
+    def fail(command, mode="displacement"):
+        raise ConvergenceError("no equilibrium", fraction=0.5)
+
+    monkeypatch.setattr(backend, "step", fail)
+    before = env.unwrapped.state
+    observation, reward, terminated, truncated, info = env.step(np.ones(2, dtype=np.float32))
+    assert truncated and not terminated and reward == 0.0
+    assert info["converged"] is False and np.isfinite(observation).all()
+    assert env.unwrapped.state is before
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_render(backend):
+    env = gymnasium.make("SoftGym/FingerReach-v0", backend=backend, render_mode="rgb_array", render_size=(160, 120))
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (120, 160, 3) and first.dtype == np.uint8 and first.std() > 5
+    for _ in range(8):
+        env.step(np.array([1.0, 1.0], dtype=np.float32))
+    assert (env.render() != first).any()
+    env.close()

@@ -1,0 +1,101 @@
+"""The batched environment against the single one, and its adapter."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import softgym_envs
+from agents.vec_env import SB3VecEnv
+from softgym_envs.errors import DesignError
+
+
+@pytest.mark.parametrize("identifier", softgym_envs.ENVIRONMENTS)
+@pytest.mark.parametrize("cables", [1, 2])
+def test_batch_equals_single(identifier, cables):
+    design = {"length": 0.0411, "joint_height": 0.0068, "young_modulus": 2.0e6, "poisson_ratio": 0.41}
+    options = {"design": design, "design_in_observation": True, "robot_options": {"cables": cables}}
+    single = gymnasium.make(identifier, **options)
+    batch = gymnasium.make_vec(identifier, num_envs=3, **options)
+    goal = np.array([0.005, 0.05, -0.1])
+    a, _ = single.reset(seed=0, options={"goal": goal})
+    b, _ = batch.reset(seed=0, options={"goal": goal})
+    assert np.abs(b - a).max() < 1e-6
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        action = rng.uniform(-0.5, 1.0, cables).astype(np.float32)
+        a, reward, _, _, info = single.step(action)
+        b, rewards, terminated, truncated, infos = batch.step(np.tile(action, (3, 1)))
+        # Slack cables are found to a micrometre, on a path that may differ in its last step.
+        assert np.abs(b - a).max() < 5e-4
+        assert np.abs(rewards - reward).max() < 5e-3
+        assert np.abs(infos["effector"] - info["effector"]).max() < 1e-5
+        assert not terminated.any() and not truncated.any()
+
+
+def test_autoreset_and_final_info():
+    env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=4, sample_design=True, design_in_observation=True)
+    env.action_space.seed(0)
+    first, _ = env.reset(seed=1)
+    designs = env.unwrapped.designs.copy()
+    assert len(np.unique(designs[:, 0])) == 4
+    for step in range(50):
+        observation, _, _, truncated, info = env.step(env.action_space.sample())
+        assert env.observation_space.contains(observation)
+        assert truncated.all() == (step == 49)
+    assert len(info["final_obs"]) == 4 and info["_final_obs"].all()
+    assert (info["final_obs"][0] != observation[0]).any()
+    assert info["final_info"]["distance"].shape == (4,)
+    assert (env.unwrapped.designs != designs).any()
+    assert (info["displacement"] == 0.0).all()
+
+
+def test_seeds_repeat():
+    walks = []
+    for _ in range(2):
+        env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=5, sample_design=("length",))
+        env.action_space.seed(4)
+        rows = [env.reset(seed=4)[0]]
+        rows += [env.step(env.action_space.sample())[0] for _ in range(55)]
+        walks.append(np.stack(rows))
+    assert (walks[0] == walks[1]).all()
+
+
+def test_given_designs_hold_one_episode_at_least():
+    env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2)
+    env.reset(seed=0, options={"design": {"length": 0.0385}})
+    assert (env.unwrapped.designs[:, 0] == 0.0385).all()
+    env.reset()
+    assert (env.unwrapped.designs[:, 0] == 0.040).all()
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="fem.*surrogate"):
+        gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2, backend="fem")
+    env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2)
+    env.reset(seed=0)
+    for actions in (np.zeros((3, 2)), np.zeros(2), np.full((2, 2), np.nan)):
+        with pytest.raises(ValueError, match="action"):
+            env.step(actions)
+    with pytest.raises(ValueError, match="goal"):
+        env.reset(options={"goal": np.zeros((5, 1, 3))})
+    with pytest.raises(DesignError, match="height"):
+        env.reset(options={"design": {"height": 3.0}})
+
+
+def test_stable_baselines_adapter():
+    env = SB3VecEnv(gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=3))
+    env.seed(0)
+    observation = env.reset()
+    assert observation.shape == (3, 15)
+    rng = np.random.default_rng(0)
+    for step in range(50):
+        observation, reward, done, infos = env.step(rng.uniform(-1, 1, (3, 2)).astype(np.float32))
+        assert reward.dtype == np.float32
+        assert done.all() == (step == 49)
+    for info in infos:
+        assert info["TimeLimit.truncated"] is True
+        assert info["terminal_observation"].shape == (15,)
+        assert info["episode"]["l"] == 50
+    sync = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("SoftGym/FingerReach-v0")])
+    with pytest.raises(ValueError, match="autoreset"):
+        SB3VecEnv(sync)

@@ -1,0 +1,227 @@
+"""Learned models: structure that holds by construction, shipped accuracy, damaged files."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from softgym_envs.errors import WeightsError
+from softgym_envs.robots import make_robot
+from softgym_envs.surrogate.model import NETWORKS, ResidualModel, load_model
+from softgym_envs.surrogate.pretrained import family_goals, pretrained_folder, pretrained_model
+from softgym_envs.surrogate.training import FitConfig, fit
+
+CABLES = (1, 2)
+
+
+def random_bodies(robot, count, seed=0):
+    rng = np.random.default_rng(seed)
+    designs = np.array([list(robot.design_space.sample(rng).values()) for _ in range(count)])
+    return designs, rng.uniform(robot.lower, robot.upper, (count, len(robot.actuators)))
+
+
+def untrained(robot, seed=0):
+    """A residual model with random weights: what it guarantees must not depend on training."""
+    rng = np.random.default_rng(seed)
+    n = len(robot.actuators) + 3
+    entries = n * (n + 1) // 2
+    count = len(robot.actuators)
+
+    def layers(prefix, sizes):
+        tensors = {}
+        for k, (a, b) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+            tensors[f"{prefix}.{k}.weight"] = rng.normal(size=(b, a)).astype(np.float32) / np.sqrt(a)
+            tensors[f"{prefix}.{k}.bias"] = rng.normal(size=b).astype(np.float32)
+        return tensors
+
+    tensors = layers("rest", (5, 16, entries + 3)) | layers("state", (count + 5, 16, 16, n * count))
+    tensors |= layers("compliance", (count + 5, 16, 16, entries))
+    tensors |= {"rest_mean": rng.normal(size=entries + 3), "rest_scale": np.ones(entries + 3)}
+    tensors |= {"state_scale": np.ones(n * count), "compliance_scale": np.ones(entries)}
+    return ResidualModel(robot, tensors, {})
+
+
+@pytest.mark.parametrize("cables", CABLES)
+def test_residual_network_is_exact_at_rest_and_positive_definite_untrained(cables):
+    robot = make_robot("finger", cables=cables)
+    model = untrained(robot)
+    designs, displacement = random_bodies(robot, 500)
+    context = model.context(designs)
+    W = model.compliance(context, displacement)
+    assert (W == np.swapaxes(W, 1, 2)).all()
+    np.linalg.cholesky(W)  # raises if one is not positive definite
+    zero = np.zeros_like(displacement)
+    effort, effector = model.state(context, zero)
+    assert (effort == 0.0).all()
+    assert (effector == context.arrays["effector"]).all()
+    C0 = context.arrays["C0"]
+    W0 = model.compliance(context, zero)
+    assert np.allclose(W0 * context.stiffness[:, :, None], C0 @ np.swapaxes(C0, 1, 2), rtol=1e-6, atol=1e-6)
+    # The slope of the efforts at rest is the inverse of the rest compliance, up to the network's single precision.
+    h = 1e-6
+    for k in range(cables):
+        step = zero.copy()
+        step[:, k] = h
+        slope = model.state(context, step)[0] / h
+        K0 = np.linalg.inv(W0[:, :cables, :cables])
+        assert np.abs(slope - K0[:, :, k]).max() < 1e-2 * np.abs(K0).max()
+
+
+@pytest.mark.parametrize("cables", CABLES)
+def test_youngs_modulus_scales_exactly(cables):
+    robot = make_robot("finger", cables=cables)
+    model = pretrained_model(robot)
+    designs, displacement = random_bodies(robot, 50)
+    column = robot.design_space.names.index("young_modulus")
+    soft, stiff = designs.copy(), designs.copy()
+    soft[:, column], stiff[:, column] = 1.5e6, 6.0e6
+    a, b = model.context(soft), model.context(stiff)
+    (effort_a, effector_a), (effort_b, effector_b) = model.state(a, displacement), model.state(b, displacement)
+    assert (effector_a == effector_b).all()
+    assert np.allclose(4.0 * effort_a, effort_b, rtol=1e-12)
+    assert np.allclose(model.compliance(a, displacement), 4.0 * model.compliance(b, displacement), rtol=1e-12)
+
+
+@pytest.mark.parametrize("cables", CABLES)
+def test_condensed_model_is_consistent(cables):
+    robot = make_robot("finger", cables=cables)
+    model = pretrained_model(robot)
+    designs, displacement = random_bodies(robot, 20)
+    condensed = model.condensed(model.context(designs), displacement)
+    assert condensed.W.ea.shape == (20, 3, cables)
+    assert np.allclose(condensed.delta.a, displacement, atol=1e-15)
+    assert np.allclose(condensed.delta_free.a + np.einsum("bij,bj->bi", condensed.W.aa, condensed.lambda_.a), displacement)
+
+
+@pytest.mark.parametrize("cables", CABLES)
+def test_shipped_weights_keep_their_recorded_accuracy_on_fresh_fem_states(cables):
+    """Designs that were in no dataset; the bounds are those the project promises over the whole box."""
+    from softgym_envs.backends.fem import FEMBackend
+    from softgym_envs.backends.surrogate import SurrogateBackend
+
+    robot = make_robot("finger", cables=cables)
+    rng = np.random.default_rng(12345)
+    errors, relative = [], []
+    for _ in range(6):
+        design = robot.design_space.sample(rng)
+        fem, surrogate = FEMBackend(robot, design), SurrogateBackend(robot, design)
+        for command in rng.uniform(robot.lower, robot.upper, (4, cables)):
+            truth, guess = fem.step(command), surrogate.step(command)
+            errors.append(np.linalg.norm(truth.effector - guess.effector))
+            difference = truth.condensed.compliance - guess.condensed.compliance
+            relative.append(np.linalg.norm(difference) / np.linalg.norm(truth.condensed.compliance))
+    assert np.mean(errors) < 0.15e-3 and np.max(errors) < 1e-3
+    assert np.median(relative) < 0.02
+
+
+@pytest.mark.parametrize("cables", CABLES)
+def test_card_tells_where_the_weights_come_from(cables):
+    robot = make_robot("finger", cables=cables)
+    card = json.loads((pretrained_folder(robot) / "model.json").read_text())
+    assert card["network"] in NETWORKS
+    assert card["test"]["positive_definite"] == 1.0
+    assert card["states"]["test"] >= 2000
+    FitConfig.model_validate(card["config"])
+
+
+def test_effort_mode_inverts_displacement_mode():
+    from softgym_envs.backends.surrogate import SurrogateBackend
+
+    backend = SurrogateBackend(make_robot("finger"))
+    driven = backend.step(np.array([0.010, 0.009]))
+    backend.reset()
+    forced = backend.step(driven.effort, mode="effort")
+    assert np.abs(forced.displacement - driven.displacement).max() < 2e-6
+    with pytest.raises(ValueError, match=r"magnetic.*displacement.*effort"):
+        backend.step(driven.effort, mode="magnetic")
+
+
+def test_slack_cables_carry_nothing_and_reach_more():
+    from softgym_envs.backends.surrogate import SurrogateBackend
+
+    backend = SurrogateBackend(make_robot("finger"))
+    state = backend.step(np.array([0.015, 0.0]))
+    assert state.slack.tolist() == [False, True]
+    assert state.effort[1] == 0.0 and state.effort[0] > 0.0
+    assert state.displacement[0] == pytest.approx(0.015, abs=1e-5) and state.displacement[1] > 0.005
+    # The same place is found from elsewhere.
+    backend.step(np.array([0.02, 0.02]))
+    again = backend.step(np.array([0.015, 0.0]))
+    assert np.abs(again.displacement - state.displacement).max() < 5e-6
+    bilateral = SurrogateBackend(make_robot("finger", unilateral=False)).step(np.array([0.010, 0.0075]))
+    assert not bilateral.slack.any()
+
+
+def test_family_goals_repeat_and_belong_to_no_body():
+    robot = make_robot("finger")
+    goals = family_goals(robot, 20, seed=3, command_low=0.5)
+    assert goals.shape == (20, 3) and np.isfinite(goals).all()
+    assert (goals == family_goals(robot, 20, seed=3, command_low=0.5)).all()
+    assert (goals != family_goals(robot, 20, seed=4, command_low=0.5)).any()
+
+
+@pytest.fixture
+def copied(tmp_path):
+    robot = make_robot("finger")
+    shutil.copytree(pretrained_folder(robot), tmp_path / "weights")
+    return robot, tmp_path / "weights"
+
+
+def test_truncated_weights(copied):
+    robot, folder = copied
+    path = folder / "model.safetensors"
+    content = path.read_bytes()
+    for keep in (0, 7, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:keep])
+        with pytest.raises(WeightsError, match=r"model\.safetensors.*(damaged|truncated)"):
+            load_model(folder, robot)
+
+
+def test_missing_and_foreign_weights(copied):
+    robot, folder = copied
+    with pytest.raises(WeightsError, match=r"cables = 2, asked 1"):
+        load_model(folder, make_robot("finger", cables=1))
+    with pytest.raises(WeightsError, match="mesh_size"):
+        load_model(folder, make_robot("finger", mesh_size=0.005))
+    card = json.loads((folder / "model.json").read_text())
+    (folder / "model.json").write_text(json.dumps({**card, "network": "oracle"}))
+    with pytest.raises(WeightsError, match=r"oracle.*residual"):
+        load_model(folder, robot)
+    (folder / "model.json").write_text(json.dumps({**card, "format": 99}))
+    with pytest.raises(WeightsError, match="format 1"):
+        load_model(folder, robot)
+    (folder / "model.json").write_text("{")
+    with pytest.raises(WeightsError, match="JSON"):
+        load_model(folder, robot)
+    (folder / "model.json").unlink()
+    with pytest.raises(WeightsError, match=r"model\.json.*does not exist"):
+        load_model(folder, robot)
+
+
+@pytest.mark.parametrize("kind", sorted(NETWORKS))
+def test_fit_end_to_end(kind, tmp_path, tmp_path_factory):
+    """A tiny fit of each network learns something, ships a card, and can be loaded."""
+    config = FitConfig.model_validate(
+        {
+            "robot": "finger",
+            "robot_options": {"cables": 1},
+            "data": {
+                "train": {"groups": 10, "states": 6, "sequence": "halton", "seed": 0},
+                "validation": {"groups": 2, "states": 4, "seed": 1},
+                "test": {"groups": 2, "states": 4, "seed": 2},
+            },
+            "network": {"kind": kind, "width": 32, "depth": 2, "epochs": 60, "batch_size": 16},
+            "workers": 1,
+        }
+    )
+    shared = tmp_path_factory.getbasetemp() / "tiny_finger_data"
+    errors = fit(config, tmp_path / "model", shared, progress=False)
+    model = load_model(tmp_path / "model", make_robot("finger", cables=1))
+    assert model.network == kind
+    assert errors["states"] == 10
+    assert errors["effector_mean"] < 0.02  # the tip moves by up to 0.1 m
+    if kind == "residual":
+        assert errors["positive_definite"] == 1.0 and errors["asymmetry_worst"] == 0.0
+    history = np.load(tmp_path / "model" / "history.npz")
+    assert all(np.isfinite(history[name]).all() for name in history.files)
