@@ -7,7 +7,7 @@
 #
 # PYTHON=python3.12      another interpreter (3.11 to 3.13; requirements.lock is made for 3.11)
 # PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"    a small torch, without CUDA
-# ARGS="-k cable -x"     further arguments of pytest (make test) or of softgym bench (make bench)
+# ARGS="-k cable -x"     further arguments of pytest (make test), softgym bench (make bench) or pip (make lock)
 
 VENV ?= .venv
 WORKERS ?= 2
@@ -71,13 +71,14 @@ lint: $(VENV)/.stamp
 types: $(VENV)/.stamp
 	$(BIN)/mypy
 
-# The newest set that pyproject.toml allows, under the comment at the head of the present lock.
+# The newest set that pyproject.toml allows, under the comment at the head of the present lock. The CUDA packages of torch
+# are left out: pip adds them where the build of torch in use asks for them.
 lock:
 	rm -rf build/lock
 	$(PYTHON) -m venv build/lock
-	build/lock/bin/python -m pip install $(PIP_ARGS) --upgrade setuptools '.[test]'
-	{ sed '/^[^#]/,$$d' requirements.lock && build/lock/bin/python -m pip freeze --all --exclude pip \
-		--exclude wheel --exclude softgym-envs | sed 's/+[^+]*$$//'; } > build/requirements.lock
+	build/lock/bin/python -m pip install $(PIP_ARGS) --upgrade setuptools $(ARGS) -e '.[test]'
+	{ sed '/^[^#]/,$$d' requirements.lock && build/lock/bin/python -m pip freeze --all --exclude-editable \
+		| sed 's/+[^+]*$$//' | grep -vE '^(pip|wheel|triton|nvidia-.*|cuda-.*)=='; } > build/requirements.lock
 	mv build/requirements.lock requirements.lock
 	rm -rf build/lock
 

@@ -155,7 +155,9 @@ def evaluate(
                 count += 1
                 ended = terminated or truncated
             steps += count
-            rows.append((info["distance"], distance / count, total, info["is_success"] and info["converged"], effort / count))
+            rows.append(
+                (info["distance"], distance / count, total, info["is_success"] and info["converged"], effort / count)
+            )
     finally:
         env.close()
     columns = [np.array(column) for column in zip(*rows, strict=True)]

@@ -81,7 +81,9 @@ def train(
     elif initial is not None:
         _load_weights(model, read_tensors(initial), Path(initial))
     surrogate = config.environment.model_copy(update={"backend": "surrogate"})
-    goals = sample_goals(surrogate.model_copy(update={"sample_design": False}), config.evaluation_episodes, _EVALUATION_SEED)
+    goals = sample_goals(
+        surrogate.model_copy(update={"sample_design": False}), config.evaluation_episodes, _EVALUATION_SEED
+    )
 
     start = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
     bar = tqdm(total=config.steps, initial=model.num_timesteps, unit="step", desc=folder.name, disable=not progress)
@@ -169,7 +171,7 @@ def _learn(model: SAC, target: int, bar: Any) -> None:
 def _weights(model: SAC) -> dict[str, np.ndarray]:
     state = model.policy.state_dict()
     tensors = {name: value.detach().cpu().numpy().copy() for name, value in state.items()}
-    if getattr(model, "log_ent_coef", None) is not None:
+    if model.log_ent_coef is not None:
         tensors["log_ent_coef"] = model.log_ent_coef.detach().cpu().numpy().copy()
     return tensors
 
@@ -187,7 +189,7 @@ def _load_weights(model: SAC, tensors: dict[str, np.ndarray], path: Path) -> Non
                 f"{tuple(value.shape)}; train it with the same net_arch, cables and design_in_observation"
             )
     model.policy.load_state_dict({name: torch.as_tensor(tensors[name]) for name in own})
-    if "log_ent_coef" in tensors and getattr(model, "log_ent_coef", None) is not None:
+    if "log_ent_coef" in tensors and model.log_ent_coef is not None:
         with torch.no_grad():
             model.log_ent_coef.copy_(torch.as_tensor(tensors["log_ent_coef"]))
 

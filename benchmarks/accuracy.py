@@ -44,7 +44,12 @@ def trajectories() -> dict[str, object]:
 
     robot = make_robot("finger", cables=1)
     cases = [
-        (f"geometry {length}, {height}, {joint} mm", {"length": length, "height": height, "joint_height": joint}, 1e-3, published)
+        (
+            f"geometry {length}, {height}, {joint} mm",
+            {"length": length, "height": height, "joint_height": joint},
+            1e-3,
+            published,
+        )
         for length, height, joint, published in GEOMETRIES
     ] + [
         (f"elasticity {young} kPa, {nu}", {"young_modulus": young * 1e3, "poisson_ratio": nu}, 1.0, published)
@@ -110,7 +115,8 @@ def mesh_motion() -> dict[str, object]:
     for meshing in ("morph", "remesh"):
         robot = make_robot("finger", cables=1, meshing=meshing)
         line = [
-            FEMBackend(robot, {"joint_height": joint}).state.condensed.W.aa[0, 0] for joint in np.linspace(5e-3, 8e-3, 31)
+            FEMBackend(robot, {"joint_height": joint}).state.condensed.W.aa[0, 0]
+            for joint in np.linspace(5e-3, 8e-3, 31)
         ]
         noise = np.std(np.diff(line, 3)) / np.sqrt(20.0) / np.mean(line)  # sqrt of 1 + 9 + 9 + 1
         result[f"{meshing}: relative noise of W_aa"] = float(noise)

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +52,8 @@ def fem_step() -> dict[str, object]:
         walk = _random_walk(env, 100, 0)
         walk()
         seconds = _median_seconds(walk, 5) / 100
-        model = env.unwrapped.backend.model
+        unwrapped: Any = env.unwrapped
+        model = unwrapped.backend.model
         label = f"{cables} cable(s), {len(model.nodes)} nodes, {len(model.blocks[0].connectivity)} tetrahedra"
         result[f"{label}: steps per second"] = 1.0 / seconds
     return result
@@ -111,7 +114,10 @@ def notched_beam() -> dict[str, object]:
         statics.solve([0.01])
 
     pull()
-    return {"milliseconds": 1e3 * _median_seconds(pull, 21), "milliseconds with SOFA v25.06 (published reference)": 440.0}
+    return {
+        "milliseconds": 1e3 * _median_seconds(pull, 21),
+        "milliseconds with SOFA v25.06 (published reference)": 440.0,
+    }
 
 
 def surrogate_step() -> dict[str, object]:
@@ -172,10 +178,10 @@ def inference() -> dict[str, object]:
         actuation, prepared = x[:, : model.count].copy(), net.prepare(x[:, model.count :])
         tensor = torch.as_tensor(x)
         repeats = 2000 // count + 10
-        candidates = {
-            "compiled kernel": lambda a=actuation, p=prepared: net(a, p),
-            "NumPy": lambda x=x: _forward(x, layers),
-            "torch": lambda t=tensor: in_torch(t),
+        candidates: dict[str, Callable[[], object]] = {
+            "compiled kernel": partial(net, actuation, prepared),
+            "NumPy": partial(_forward, x, layers),
+            "torch": partial(in_torch, tensor),
         }
         for name, work in candidates.items():
             work()

@@ -76,7 +76,7 @@ class SamplerConfig(Config):
     """Who proposes bodies: ``name`` of `SAMPLERS`, ``seed``, and further arguments of its class."""
 
     name: Literal["tpe", "cmaes", "gp", "nsgaii", "qmc", "random"] = "tpe"
-    seed: int = Field(0, ge=0)
+    seed: int = Field(default=0, ge=0)
     options: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -116,12 +116,12 @@ class GoalsConfig(Config):
     """
 
     source: Literal["family", "task"] = "family"
-    vary: tuple[str, ...] | None = Field(None, min_length=1)
-    count: int = Field(40, ge=1)
-    unseen_count: int = Field(30, ge=2)
-    training_count: int = Field(300, ge=1)
-    seed: int = Field(0, ge=0)
-    command_low: float = Field(0.0, ge=0.0, lt=1.0)
+    vary: tuple[str, ...] | None = Field(default=None, min_length=1)
+    count: int = Field(default=40, ge=1)
+    unseen_count: int = Field(default=30, ge=2)
+    training_count: int = Field(default=300, ge=1)
+    seed: int = Field(default=0, ge=0)
+    command_low: float = Field(default=0.0, ge=0.0, lt=1.0)
 
 
 class TrainingConfig(Config):
@@ -136,11 +136,11 @@ class TrainingConfig(Config):
         sac: hyper-parameters.
     """
 
-    steps: int = Field(2_500, ge=1)
-    report_every: int = Field(500, ge=1)
-    evaluation_episodes: int = Field(32, ge=1)
-    num_envs: int = Field(16, ge=1)
-    seed: int = Field(0, ge=0)
+    steps: int = Field(default=2_500, ge=1)
+    report_every: int = Field(default=500, ge=1)
+    evaluation_episodes: int = Field(default=32, ge=1)
+    num_envs: int = Field(default=16, ge=1)
+    seed: int = Field(default=0, ge=0)
     sac: SACConfig = Field(default_factory=SACConfig)
 
 
@@ -155,9 +155,9 @@ class ScreenConfig(Config):
     """
 
     enabled: bool = False
-    candidates: int = Field(32, ge=2)
-    keep: float = Field(0.15, gt=0.0, le=1.0)
-    goals: int = Field(10, ge=1)
+    candidates: int = Field(default=32, ge=2)
+    keep: float = Field(default=0.15, gt=0.0, le=1.0)
+    goals: int = Field(default=10, ge=1)
 
     @property
     def kept(self) -> int:
@@ -175,7 +175,7 @@ class FinalistsConfig(Config):
         fem_options: options of the FEM backend.
     """
 
-    count: int = Field(3, ge=0)
+    count: int = Field(default=3, ge=0)
     choose: Literal["surrogate", "fem"] = "surrogate"
     fem_options: dict[str, Any] = Field(default_factory=dict)
 
@@ -209,7 +209,7 @@ class StudyConfig(Config):
     strategy: Literal["warm_start", "scratch", "qp"] = "warm_start"
     policy: str | None = None
     trials: int = Field(ge=1)
-    workers: int = Field(1, ge=1)
+    workers: int = Field(default=1, ge=1)
     sampler: SamplerConfig = Field(default_factory=SamplerConfig)
     pruner: PrunerConfig = Field(default_factory=PrunerConfig)
     goals: GoalsConfig = Field(default_factory=GoalsConfig)

@@ -34,6 +34,7 @@ class StudyFolder:
         screen/000.json ...            QP score of each candidate of the screen
         trials/0000/ ...               training of each trial, and its result.json once it is finished
         finalists/*.json               one evaluation each
+        account.json                   time spent, and the command
         locks/                         locks of the operating system: they die with their holder
         results.json  trials.csv  finalists.csv  report.html
 
@@ -90,6 +91,11 @@ class StudyFolder:
         """Goals [m] by use: ``training`` (k, 3), ``selection`` (k, p, 3), ``unseen`` (k, p, 3)."""
         stored = json.loads((self.path / "goals.json").read_text())
         return {name: np.array(stored[name], dtype=float) for name in ("training", "selection", "unseen")}
+
+    def account(self) -> dict[str, Any]:
+        """Command that last ran the study, and wall-clock time of each phase so far [s]."""
+        path = self.path / "account.json"
+        return json.loads(path.read_text()) if path.exists() else {"command": "", "wall_seconds": {}}
 
     def lock(self, name: str) -> BaseFileLock:
         """Return a lock shared by all processes of the study. The operating system frees it when its holder dies."""

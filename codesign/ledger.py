@@ -95,10 +95,10 @@ def open_study(
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = open_storage(folder) if storage is None else storage
-    parts = {"sampler": make_sampler(folder.config, number), "pruner": make_pruner(folder.config)}
+    sampler, pruner = make_sampler(folder.config, number), make_pruner(folder.config)
     if STUDY in optuna.get_all_study_names(storage):
-        return optuna.load_study(study_name=STUDY, storage=storage, **parts)
-    return optuna.create_study(study_name=STUDY, storage=storage, direction="maximize", **parts)
+        return optuna.load_study(study_name=STUDY, storage=storage, sampler=sampler, pruner=pruner)
+    return optuna.create_study(study_name=STUDY, storage=storage, direction="maximize", sampler=sampler, pruner=pruner)
 
 
 class Ledger:
@@ -209,9 +209,11 @@ class Ledger:
                 complete = set(trial.params) == set(self.folder.config.variables)
                 values = trial.params if complete else trial.system_attrs.get("fixed_params")
                 if values:  # else it died before its body was drawn: the next one is drawn in its place
-                    kept = {key: trial.user_attrs[key] for key in ("origin", "sampler_seed") if key in trial.user_attrs}
-                    origin = kept.pop("origin", f"sampler {trial.number}")
-                    self.study.enqueue_trial(values, user_attrs={"origin": origin, **kept, "replaces": trial.number})
+                    marks: dict[str, Any] = {"origin": f"sampler {trial.number}", "replaces": trial.number}
+                    for key in ("origin", "sampler_seed"):
+                        if key in trial.user_attrs:
+                            marks[key] = trial.user_attrs[key]
+                    self.study.enqueue_trial(values, user_attrs=marks)
             self.study.tell(trial.number, state=TrialState.FAIL)
 
     def _lives(self, worker: str | None) -> bool:

@@ -19,8 +19,10 @@ __all__ = [
     "curves",
     "history",
     "importance",
+    "overlay",
     "parallel",
     "picture",
+    "place",
     "present",
     "reached",
     "screen",
@@ -30,7 +32,7 @@ __all__ = [
 
 BASELINE, WINNER, OTHER, MUTED = "#64748b", "#0f766e", "#cbd5e1", "#94a3b8"
 AGENTS = {"sac": ("SAC", "o"), "qp": ("inverse QP", "s")}
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 9.5,
     "axes.edgecolor": "#94a3b8",
@@ -58,6 +60,14 @@ def present(value: float, unit: str) -> str:
     """Write a quantity [unit] the way people read it."""
     name, factor, decimals = shown_unit(unit)
     return f"{value * factor:.{decimals}f}{' ' + name if name else ''}"
+
+
+def place(value: float, variable: Mapping[str, Any]) -> float:
+    """Place of a value in the range of its variable, in [0, 1], on the variable's scale."""
+    low, high = variable["low"], variable["high"]
+    if variable["log"]:
+        return float(np.log(value / low) / np.log(high / low))
+    return (value - low) / (high - low)
 
 
 @contextmanager
@@ -164,14 +174,15 @@ def parallel(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) ->
     roles = _roles(results)
     scores = np.array([t["score"] for t in done])
     shown = np.array([objective.shown(score) for score in scores])
-    low, high = shown.min(), shown.max() if np.ptp(shown) else shown.min() + 1.0
+    worst, best = scores.min(), scores.max() if np.ptp(scores) else scores.min() + 1.0
     colours = matplotlib.colormaps["viridis_r" if objective.sign < 0 else "viridis"]
-    norm = Normalize(low, high)
+    ends = (objective.shown(worst), objective.shown(best))
+    norm = Normalize(min(ends), max(ends))
     with _figure(6.2, 3.2) as (figure, (ax,), out):
         ax.grid(False)
-        for trial, value in zip(done, shown, strict=True):
-            heights = [(trial["design"][v["name"]] - v["low"]) / (v["high"] - v["low"]) for v in variables]
-            heights.append((value - low) / (high - low))
+        for trial, score, value in zip(done, scores, shown, strict=True):
+            heights = [place(trial["design"][v["name"]], v) for v in variables]
+            heights.append((score - worst) / (best - worst))
             role = roles.get(trial["number"])
             ax.plot(
                 heights,
@@ -188,7 +199,7 @@ def parallel(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) ->
                     i, height, present(end, variable["unit"]), ha="center", va="center", fontsize=8, color="#475569"
                 )
         ax.axvline(len(variables), color="#94a3b8", linewidth=1.0, zorder=1)
-        for height, end in ((-0.05, low), (1.05, high)):
+        for height, end in zip((-0.05, 1.05), ends, strict=True):
             ax.text(len(variables), height, f"{end:.2f}", ha="center", va="center", fontsize=8, color="#475569")
         ax.set_xticks(range(len(variables) + 1), [v["name"].replace("_", " ") for v in variables] + [_axis(objective)])
         ax.set(yticks=[], ylim=(-0.12, 1.12))
@@ -198,6 +209,50 @@ def parallel(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) ->
         figure.colorbar(matplotlib.cm.ScalarMappable(norm, colours), ax=ax, label=_axis(objective), pad=0.02)
         if roles:
             ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2)
+    return out[0]
+
+
+def silhouette(nodes: np.ndarray, triangles: np.ndarray, extent: np.ndarray, pixels: int = 700) -> np.ndarray:
+    """Return where a body is in the plane of its two last coordinates, as an image (h, w) of 0 and 1.
+
+    Args:
+        nodes: [m], shape (n, 3).
+        triangles: its boundary, shape (t, 3).
+        extent: lower and upper corner of the image [m], shape (2, 2).
+        pixels: height of the image.
+    """
+    from PIL import Image, ImageDraw
+
+    scale = pixels / (extent[1, 1] - extent[0, 1])
+    image = Image.new("L", (round(scale * (extent[1, 0] - extent[0, 0])), pixels))
+    draw = ImageDraw.Draw(image)
+    for corners in (nodes[:, 1:][triangles] - extent[0]) * scale:
+        draw.polygon([(float(y), float(z)) for y, z in corners], fill=1)
+    return np.asarray(image)
+
+
+def overlay(shapes: Sequence[tuple[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]]]) -> str:
+    """Side views of baseline and winner over each other, to scale.
+
+    Args:
+        shapes: for each pose its caption and, by role, nodes [m] (n, 3), boundary triangles (t, 3) and effectors [m]
+            (k, 3).
+    """
+    with _figure(9.4, 4.4, len(shapes)) as (_, axes, out):
+        for ax, (caption, bodies) in zip(axes, shapes, strict=True):
+            points = np.concatenate([nodes[:, 1:] for nodes, _, _ in bodies.values()])
+            margin = 0.05 * np.ptp(points[:, 1])
+            extent = np.array([points.min(axis=0) - margin, points.max(axis=0) + margin])
+            for role, (nodes, triangles, effectors) in bodies.items():
+                colour = WINNER if role == "winner" else BASELINE
+                image = silhouette(nodes, triangles, extent)
+                grid = [1e3 * np.linspace(extent[0, k], extent[1, k], n) for k, n in enumerate(reversed(image.shape))]
+                ax.contourf(*grid, image, levels=[0.5, 1.5], colors=[colour], alpha=0.16)
+                ax.contour(*grid, image, levels=[0.5], colors=[colour], linewidths=1.3)
+                ax.scatter(*(1e3 * effectors[:, 1:].T), 30, colour, zorder=4, label=f"{role}, effector")
+            ax.set(xlabel="y [mm]", ylabel="z [mm]", aspect="equal")
+            ax.set_title(caption, fontsize=10, color="#334155")
+        axes[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
     return out[0]
 
 

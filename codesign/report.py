@@ -12,7 +12,7 @@ import yaml
 from codesign import plots
 from codesign.folder import StudyFolder
 from codesign.objectives import OBJECTIVES
-from codesign.plots import present, shown_unit
+from codesign.plots import place, present, shown_unit
 from codesign.results import rank_correlation, write_results
 from softgym_envs.storage import atomic_write
 
@@ -58,15 +58,12 @@ def write_report(folder: str | Path) -> Path:
 def _context(study: StudyFolder, results: dict[str, Any]) -> dict[str, Any]:
     trials = study.results()
     complete = any(trial["state"] == "complete" for trial in trials)
-    pictures, reason = _pictures(study, results)
     return {
         "r": results,
         "headline": _headline(results),
         "tiles": _tiles(results),
         "question": _question(study, results),
-        "poses": [pose for pose, _ in _poses(study)],
-        "pictures": pictures,
-        "no_pictures": reason,
+        **_pictures(study, results),
         "design": [_design_row(variable) for variable in results["variables"]],
         "comparison": [_comparison_row(row) for row in results["comparison"]],
         "figures": {"reached": plots.reached(results), "transfer": plots.transfer(results)},
@@ -151,7 +148,8 @@ def _question(study: StudyFolder, results: Mapping[str, Any]) -> list[tuple[str,
     goals = config.goals
     optimised = [variable for variable in results["variables"] if variable["optimised"]]
     ranges = "; ".join(
-        f"{v['name']} from {present(v['low'], v['unit'])} to {present(v['high'], v['unit'])}" for v in optimised
+        f"{v['name'].replace('_', ' ')} from {present(v['low'], v['unit'])} to {present(v['high'], v['unit'])}"
+        for v in optimised
     )
     direction = "as small as possible" if OBJECTIVES[config.objective].sign < 0 else "as large as possible"
     if goals.source == "family":
@@ -203,40 +201,54 @@ def _poses(study: StudyFolder) -> list[tuple[str, np.ndarray | None]]:
     return poses
 
 
-def _pictures(study: StudyFolder, results: Mapping[str, Any]) -> tuple[list[tuple[str, list[str]]], str]:
-    """Pictures of baseline and winner in each pose, or why there are none."""
-    from softgym_envs.viewer.image import ImageRenderer
-
-    baseline = study.config.baseline
-    bodies = {"baseline": baseline}
+def _pictures(study: StudyFolder, results: Mapping[str, Any]) -> dict[str, Any]:
+    """Pictures of baseline and winner in each pose, and their side views over each other, or why there are none."""
+    bodies = {"baseline": study.config.baseline}
     if results["winner"] is not None:
         bodies["winner"] = results["winner"]["design"]
+    poses = _poses(study)
+    context: dict[str, Any] = {"poses": [pose for pose, _ in poses], "pictures": [], "overlay": None, "no_pictures": ""}
     try:
-        renderer = ImageRenderer(study.config.robot, IMAGE_SIZE)
-        try:
-            return [
-                (
-                    role,
-                    [
-                        plots.picture(renderer.render_body(body, command, ghost=baseline if role == "winner" else None))
-                        for _, command in _poses(study)
-                    ],
-                )
-                for role, body in bodies.items()
-            ], ""
-        finally:
-            renderer.close()
+        context["pictures"] = _photographs(study, bodies)
+        context["overlay"] = plots.overlay(_shapes(study, bodies))
     except Exception as error:  # drawing needs a working OpenGL, a report does not
-        return [], f"No pictures: {type(error).__name__}: {error}"
+        context["no_pictures"] = f"No pictures: {type(error).__name__}: {error}"
+    return context
+
+
+def _photographs(study: StudyFolder, bodies: Mapping[str, dict[str, float]]) -> list[tuple[str, list[str]]]:
+    from softgym_envs.viewer.image import ImageRenderer
+
+    renderer = ImageRenderer(study.config.robot, IMAGE_SIZE)
+    try:
+        return [
+            (role, [plots.picture(renderer.render_body(body, command)) for _, command in _poses(study)])
+            for role, body in bodies.items()
+        ]
+    finally:
+        renderer.close()
+
+
+def _shapes(study: StudyFolder, bodies: Mapping[str, dict[str, float]]) -> list[tuple[str, dict[str, Any]]]:
+    """What `plots.overlay` draws: at rest and with all actuators at 50 %."""
+    from softgym_envs.viewer.surface import ShapeFinder, boundary_triangles
+
+    finder = ShapeFinder(study.config.robot)
+    shapes: list[tuple[str, dict[str, Any]]] = [(caption, {}) for caption, _ in _poses(study)[:2]]
+    for role, body in bodies.items():
+        model = finder.load(body)
+        solids = [block.connectivity for block in model.blocks if block.connectivity.shape[1] == 4]
+        triangles = boundary_triangles(np.concatenate(solids))
+        for (_, command), (_, drawn) in zip(_poses(study), shapes, strict=False):
+            nodes = finder.at(body, command)
+            drawn[role] = (nodes, triangles, finder.state.effector)
+    return shapes
 
 
 def _design_row(variable: Mapping[str, Any]) -> dict[str, Any]:
-    unit, low, high = variable["unit"], variable["low"], variable["high"]
+    unit = variable["unit"]
     baseline, winner = variable["baseline"], variable["winner"]
     name, factor, decimals = shown_unit(unit)
-
-    def place(value: float) -> float:
-        return round(100 * (value - low) / (high - low), 1)
 
     changed = winner is not None and winner != baseline
     return {
@@ -246,10 +258,10 @@ def _design_row(variable: Mapping[str, Any]) -> dict[str, Any]:
         "baseline": present(baseline, unit),
         "winner": "-" if winner is None else present(winner, unit),
         "change": f"{(winner - baseline) * factor:+.{decimals}f}{' ' + name if name else ''}" if changed else "-",
-        "low": present(low, unit),
-        "high": present(high, unit),
-        "baseline_place": place(baseline),
-        "winner_place": None if winner is None else place(winner),
+        "low": present(variable["low"], unit),
+        "high": present(variable["high"], unit),
+        "baseline_place": round(100 * place(baseline, variable), 1),
+        "winner_place": None if winner is None else round(100 * place(winner, variable), 1),
     }
 
 
@@ -276,7 +288,7 @@ def _comparison_row(row: Mapping[str, Any]) -> dict[str, Any]:
     for role in ("baseline", "winner"):
         cells.append(cell(_percent(row[role]["success_rate"]), row[role]["success_interval"], rate))
     change = row["success_change_interval"]
-    cells.append(cell(f"{100 * row['success_change']:+.1f} %", change, signed_rate, change[0] > 0.0))
+    cells.append(cell(f"{100 * row['success_change']:+.1f} pp", change, signed_rate, change[0] > 0.0))
     for role in ("baseline", "winner"):
         cells.append(cell(_mm(row[role]["mean_distance"]), row[role]["distance_interval"], length))
     change = row["distance_change_interval"]
@@ -325,7 +337,8 @@ def _transfer_row(row: Mapping[str, Any]) -> dict[str, Any]:
     objective = OBJECTIVES[row["objective"]]
 
     def gap(value: float, sign: str) -> str:
-        return f"{value * objective.scale:{sign}.2f} {objective.unit}"
+        shown = round(value * objective.scale, 2) + 0.0  # no negative zero
+        return f"{shown:{sign}.2f} {'pp' if objective.unit == '%' else objective.unit}"
 
     return {
         "agent": AGENTS[row["agent"]],
@@ -346,18 +359,18 @@ def _finalist_table(results: Mapping[str, Any]) -> dict[str, Any]:
     winner = None if results["winner"] is None else results["winner"]["trial"]
     rows = []
     for body in results["finalists"]:
-        cells = [present(body["design"][v["name"]], v["unit"]) for v in optimised]
-        cells.append(objective.text(body["score"]))
+        cells = [(present(body["design"][v["name"]], v["unit"]), "") for v in optimised]
+        cells.append((objective.text(body["score"]), ""))
         for kind in kinds:
             record = tests.get((body["trial"], *kind))
             if record is None or "error" in record:
-                cells.append("-" if record is None else "failed")
+                cells.append(("-" if record is None else "failed", ""))
             else:
-                cells.append(f"{100 * record['success_rate']:.0f} %, {_mm(record['mean_distance'])}")
+                cells.append((_percent(record["success_rate"]), _mm(record["mean_distance"])))
         is_winner = body["trial"] == winner
         role = "winner" if is_winner else "baseline" if body["role"] == "baseline" else ""
         rows.append({"trial": body["trial"], "role": role, "winner": is_winner, "cells": cells})
-    columns = [v["name"].replace("_", " ") for v in optimised] + [f"{objective.label} in the search"]
+    columns = [v["name"].replace("_", " ") for v in optimised] + [f"{objective.label} in search"]
     columns += [f"{AGENTS[agent]}, {BACKENDS[backend]}" for agent, backend in kinds]
     return {"finalist_columns": columns, "finalists": rows}
 
@@ -388,7 +401,8 @@ def _trial_table(trials: list[dict[str, Any]], results: Mapping[str, Any]) -> di
 def _cost_rows(cost: Mapping[str, Any]) -> list[dict[str, str]]:
     steps = {
         "screen": f"{cost['screen_steps']:,}",
-        "trials": f"{cost['training_steps']:,} of training, {cost['selection_steps']:,} of evaluation",
+        "trials": f"{cost['training_steps']:,} of training, {cost['report_steps']:,} of its reports, "
+        f"{cost['selection_steps']:,} of scores",
         "finalists": f"{cost['test_steps_fem']:,} on FEM, {cost['test_steps_surrogate']:,} on the surrogate",
     }
     titles = {"screen": "Screen by the inverse QP", "trials": "Trials", "finalists": "Final test"}

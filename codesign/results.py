@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
-import os
-import shlex
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -143,9 +139,12 @@ def importance(folder: StudyFolder) -> dict[str, float]:
 def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[str, Any]]) -> dict[str, Any]:
     screened = [record["qp"] for record in screen_records(folder)]
     judged = [trial[key] for trial in trials for key in ("qp", "evaluation") if trial[key] and trial["agent"] != key]
-    timing = folder.path / "timing.json"
+    config, row = folder.config, ENVIRONMENTS[folder.config.environment.id]
     return {
         "training_steps": sum(trial["training_steps"] for trial in trials),
+        "report_steps": sum(len(trial["curve"]) for trial in trials)
+        * config.training.evaluation_episodes
+        * row.max_episode_steps,
         "selection_steps": sum(record.get("steps", 0) for record in judged),
         "screen_steps": sum(record.get("steps", 0) for record in screened),
         **{
@@ -157,7 +156,7 @@ def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[st
             "trials": sum(trial["cpu_seconds"] for trial in trials),
             "finalists": sum(record.get("cpu_seconds", 0.0) for record in tests),
         },
-        "wall_seconds": json.loads(timing.read_text()) if timing.exists() else {},
+        "wall_seconds": folder.account()["wall_seconds"],
     }
 
 
@@ -170,13 +169,6 @@ def _body(finalist: Finalist | None) -> dict[str, Any] | None:
         "score": finalist.score,
         "policy": finalist.policy,
     }
-
-
-def _command(folder: StudyFolder) -> str:
-    """The command line that ran the study."""
-    if Path(sys.argv[0]).name == "softgym" and "codesign" in sys.argv:
-        return shlex.join(["softgym", *sys.argv[1:]])
-    return f"softgym codesign --config {shlex.quote(os.path.relpath(folder.path / 'config.yaml'))}"
 
 
 def collect(folder: StudyFolder) -> dict[str, Any]:
@@ -203,7 +195,7 @@ def collect(folder: StudyFolder) -> dict[str, Any]:
         "environment": config.environment.id,
         "objective": config.objective,
         "strategy": config.strategy,
-        "command": _command(folder),
+        "command": folder.account()["command"],
         "trials": {"asked": config.trials, **{s: states.count(s) for s in ("complete", "pruned", "infeasible")}},
         "variables": [
             {
@@ -211,6 +203,7 @@ def collect(folder: StudyFolder) -> dict[str, Any]:
                 "unit": space[name].unit,
                 "low": space[name].low,
                 "high": space[name].high,
+                "log": space[name].log,
                 "baseline": config.baseline[name],
                 "winner": None if winner is None else winner.design[name],
                 "optimised": name in config.variables,

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import shlex
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -116,16 +119,23 @@ def _demand(done: bool, phase: str, stopped: str | None) -> None:
 
 @contextmanager
 def _timed(study: StudyFolder, phase: str) -> Iterator[None]:
-    """Add the time of a block to ``timing.json`` [s]."""
+    """Add the time of a block to the account of the study [s]."""
     started = time.perf_counter()
     try:
         yield
     finally:
-        path = study.path / "timing.json"
-        with study.lock("timing"):
-            timing = json.loads(path.read_text()) if path.exists() else {}
-            timing[phase] = timing.get(phase, 0.0) + time.perf_counter() - started
-            write_json(path, timing)
+        with study.lock("account"):
+            account = study.account()
+            wall = account["wall_seconds"]
+            wall[phase] = wall.get(phase, 0.0) + time.perf_counter() - started
+            write_json(study.path / "account.json", {**account, "command": _command(study)})
+
+
+def _command(study: StudyFolder) -> str:
+    """The command line that runs the study."""
+    if Path(sys.argv[0]).name == "softgym" and "codesign" in sys.argv:
+        return shlex.join(["softgym", *sys.argv[1:]])
+    return f"softgym codesign --config {shlex.quote(os.path.relpath(study.path / 'config.yaml'))}"
 
 
 class _Printer:
@@ -152,13 +162,13 @@ class _Printer:
                 self._best = (result["score"], result["number"])
             if quiet:
                 continue
-            value = self.objective.text(result["score"]) if result["score"] is not None else result["state"]
+            label = self.objective.label.lower()
+            found = result["state"] if result["score"] is None else f"{label} {self.objective.text(result['score'])}"
             best = "" if self._best is None else f", best {self.objective.text(self._best[0])} (trial {self._best[1]})"
             done = sum("result.json" in name for name in self._seen)
-            label = self.objective.label.lower()
             self.say(
                 f"[{done:>{len(str(self.study.config.trials))}}/{self.study.config.trials}] trial {result['number']} "
-                f"({result['origin']}): {label} {value}{best}, {result['seconds']:.1f} s"
+                f"({result['origin']}): {found}{best}, {result['seconds']:.1f} s"
             )
 
     def tests(self, *, quiet: bool = False) -> None:

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import os
-
-# One thread per process, set before any numerical library is loaded; more only slow these small problems down.
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")
-
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any, NoReturn
@@ -29,7 +24,13 @@ def _fail(message: str) -> NoReturn:
 def main() -> None:
     """Entry point: errors of the user's input end with one line and status 2."""
     import gymnasium
+    from threadpoolctl import threadpool_limits
 
+    # One thread per process; more only slow these small problems down. The variables reach libraries loaded later and
+    # worker processes, the limit those that are here already.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    threadpool_limits(1)
     try:
         cli(standalone_mode=False)
     except click.exceptions.Exit as leave:
@@ -136,7 +137,9 @@ def show(robot: str, options: tuple[str, ...], design: tuple[str, ...], picture:
 @click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
 @click.option("--seed", default=0, show_default=True)
 @click.option("--record", type=click.Path(path_type=Path), help="Write a rerun recording (.rrd).")
-def rollout(environment: str, agent: str, backend: str, design: tuple[str, ...], seed: int, record: Path | None) -> None:
+def rollout(
+    environment: str, agent: str, backend: str, design: tuple[str, ...], seed: int, record: Path | None
+) -> None:
     """Run one episode and print what happened."""
     import gymnasium
 
@@ -223,8 +226,17 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
 
 @cli.command()
 @_config
-@click.option("--agent", "agents", multiple=True, default=("qp", "random"), show_default=True, help="qp, random or a policy file (repeat).")
-@click.option("--backend", "backends", multiple=True, default=("surrogate",), show_default=True, help="Repeat for several.")
+@click.option(
+    "--agent",
+    "agents",
+    multiple=True,
+    default=("qp", "random"),
+    show_default=True,
+    help="qp, random or a policy file (repeat).",
+)
+@click.option(
+    "--backend", "backends", multiple=True, default=("surrogate",), show_default=True, help="Repeat for several."
+)
 @click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
 @click.option("--goals", default=200, show_default=True, help="Number of unseen goals.")
 @click.option("--seed", default=2_000_003, show_default=True, help="Seed of the goals.")

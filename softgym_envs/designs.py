@@ -143,7 +143,10 @@ class DesignSpace:
             raise DesignError(f"a unit design has shape ({len(self)},), got {vector.shape}")
         if not np.isfinite(vector).all():
             raise DesignError(f"a unit design must be finite, got {vector.tolist()}")
-        return {name: float(variable.from_unit(u)) for (name, variable), u in zip(self.variables.items(), vector, strict=True)}
+        return {
+            name: float(variable.from_unit(u))
+            for (name, variable), u in zip(self.variables.items(), vector, strict=True)
+        }
 
     def sample(self, rng: np.random.Generator, names: tuple[str, ...] | None = None) -> dict[str, float]:
         """Draw a uniform design; variables not in ``names`` (default: all) keep their baseline."""

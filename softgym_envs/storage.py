@@ -5,12 +5,18 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
-__all__ = ["atomic_write", "cache_directory", "write_json"]
+from softgym_envs.errors import DataError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+__all__ = ["atomic_write", "cache_directory", "read_npz", "write_json"]
 
 
 @contextmanager
@@ -29,6 +35,24 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
+
+
+def read_npz(path: str | Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Read arrays by name from an npz file, without pickle.
+
+    Raises:
+        DataError: if the file is missing, truncated or lacks an array.
+    """
+    import numpy as np
+
+    try:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as data:
+            missing = sorted(set(names) - set(data.files))
+            if missing:
+                raise DataError(f"'{path}' lacks {', '.join(missing)}")
+            return {name: data[name] for name in names}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        raise DataError(f"'{path}' cannot be read: {error}") from error
 
 
 def write_json(path: str | Path, value: object) -> None:

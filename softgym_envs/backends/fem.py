@@ -46,6 +46,7 @@ class FEMBackend(Backend):
         return self.state
 
     def restore(self, state: State) -> None:
+        assert state.nodes is not None
         self._statics.restore(state.nodes, state.condensed.effort)
         self.state = state
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.complementarity import solve_complementarity
+from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.robot import Robot
 from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_model
@@ -179,8 +179,8 @@ class _SurrogateState(State):
         object.__setattr__(self, "_source", (model, context))
 
     @cached_property
-    def condensed(self) -> CondensedModel:  # type: ignore[override]
-        model, context = self._source
+    def condensed(self) -> CondensedModel:
+        model, context = self.__dict__["_source"]
         batch = model.condensed(context, self.displacement[None])
         # Slack cables carry no effort, whatever the network's last digits say.
         effort = batch.effort[0].copy()

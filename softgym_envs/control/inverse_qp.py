@@ -58,7 +58,9 @@ class InverseQP:
         self.unilateral = np.asarray(unilateral, dtype=bool)
         self.effort_weight = effort_weight
         self.step_weight = step_weight
-        self.max_effort = np.full(len(self.rates), np.inf) if max_effort is None else np.asarray(max_effort, dtype=float)
+        self.max_effort = (
+            np.full(len(self.rates), np.inf) if max_effort is None else np.asarray(max_effort, dtype=float)
+        )
         n = len(self.rates)
         # One inequality per actuator (its effort) beside the box of displacements.
         self._qp = proxqp.dense.QP(n, 0, n, True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -49,7 +49,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         render_size: width and height of an image [pixels].
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
 
     def __init__(
         self,
@@ -199,7 +199,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             "goal": goal.copy(),
             "distance": distance,
             "is_success": distance < self.task.success_distance,
-            "reward_terms": {k: float(v) for k, v in self.task.reward_terms(np.float64(distance), share).items()},
+            "reward_terms": {k: float(v) for k, v in self.task.reward_terms(np.asarray(distance), share).items()},
             "displacement": state.displacement.copy(),
             "effort": state.effort.copy(),
             "converged": True,

@@ -20,7 +20,11 @@ def bending_arc(robot: Robot, count: int = 25, angle: float = 0.5 * np.pi) -> np
     radius = robot.size * np.linspace(1.0, 0.8, count)
     offset = robot.effector_rest[1]
     return np.column_stack(
-        [np.zeros(count), offset * np.cos(theta) + radius * np.sin(theta), -radius * np.cos(theta) + offset * np.sin(theta)]
+        [
+            np.zeros(count),
+            offset * np.cos(theta) + radius * np.sin(theta),
+            -radius * np.cos(theta) + offset * np.sin(theta),
+        ]
     )
 
 

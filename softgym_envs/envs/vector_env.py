@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -40,7 +40,7 @@ class SoftRobotVectorEnv(VectorEnv):
         backend_options: options of the backend (``weights``).
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
     def __init__(
         self,
@@ -65,7 +65,9 @@ class SoftRobotVectorEnv(VectorEnv):
                 "(or gymnasium.make_vec(..., vectorization_mode='sync'))"
             )
         if render_mode is not None:
-            raise ValueError(f"render_mode = {render_mode!r} is not available in the batched environment; allowed: None")
+            raise ValueError(
+                f"render_mode = {render_mode!r} is not available in the batched environment; allowed: None"
+            )
         if num_envs < 1:
             raise ValueError(f"num_envs = {num_envs} must be at least 1")
         self.num_envs = num_envs
@@ -174,8 +176,15 @@ class SoftRobotVectorEnv(VectorEnv):
             goal = np.asarray(goal, dtype=float)
             if goal.ndim < 3:
                 goal = np.broadcast_to(goal.reshape(-1, 3), (self.num_envs, *goal.reshape(-1, 3).shape))
-            if goal.shape[0] != self.num_envs or goal.shape[1] == 0 or goal.shape[2:] != (3,) or not np.isfinite(goal).all():
-                raise ValueError(f"goal must be finite with shape (3,), (p, 3) or ({self.num_envs}, p, 3), got {goal.shape}")
+            if (
+                goal.shape[0] != self.num_envs
+                or goal.shape[1] == 0
+                or goal.shape[2:] != (3,)
+                or not np.isfinite(goal).all()
+            ):
+                raise ValueError(
+                    f"goal must be finite with shape (3,), (p, 3) or ({self.num_envs}, p, 3), got {goal.shape}"
+                )
         self._begin_episodes(np.arange(self.num_envs), options.get("design"), goal)
         self._changed = options.get("design") is not None
         return self._observe(), self._info()[0]
@@ -190,9 +199,7 @@ class SoftRobotVectorEnv(VectorEnv):
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
         self._command = self.interface.command(actions, self._command)
-        settled = settle(
-            self.model, self._context, self._command, self._displacement, self._unilateral, self._slack
-        )
+        settled = settle(self.model, self._context, self._command, self._displacement, self._unilateral, self._slack)
         self._displacement, self._effort, self._slack = settled.displacement, settled.effort, settled.slack
         self._effector = settled.effector[:, :3]
         self._steps += 1
@@ -242,4 +249,3 @@ class SoftRobotVectorEnv(VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing to free."""
-

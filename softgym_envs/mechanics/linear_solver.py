@@ -87,9 +87,7 @@ class SuperLUSolver(LinearSolver):
     def factorise(self, values: np.ndarray) -> bool:
         full = csc_matrix((values[self._source], self._rows, self._pointers), shape=(self.size, self.size))
         try:
-            self._lu = splu(
-                full, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options={"SymmetricMode": True}
-            )
+            self._lu = splu(full, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options={"SymmetricMode": True})
         except RuntimeError:  # exactly singular
             return False
         return True

@@ -125,7 +125,9 @@ class MechanicalModel:
         return cls(nodes, [block], fixed=fixed, gravity=gravity, solver=solver)
 
     @classmethod
-    def from_file(cls, path: str | Path, *, fixed_box: Sequence[float], scale: float = 1.0, **options) -> MechanicalModel:
+    def from_file(
+        cls, path: str | Path, *, fixed_box: Sequence[float], scale: float = 1.0, **options
+    ) -> MechanicalModel:
         """Make a model from a mesh file.
 
         Args:
@@ -136,7 +138,7 @@ class MechanicalModel:
         """
         nodes, tetrahedra = read_mesh(path, scale=scale)
         box = np.asarray(fixed_box, dtype=float).reshape(3, 2)
-        fixed = ((nodes >= box[:, 0]) & (nodes <= box[:, 1])).all(axis=1)
+        fixed = np.all((nodes >= box[:, 0]) & (nodes <= box[:, 1]), axis=1)
         return cls.from_mesh(nodes, tetrahedra, fixed=fixed, **options)
 
     def embed(self, points: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
@@ -236,9 +238,7 @@ class MechanicalModel:
         curved = [c for c, _ in self._rows if type(c).hessian is not Constraint.hessian]
         for constraint in curved:
             equations = self._equation[constraint.dofs]
-            stencils.append(
-                (np.repeat(equations, len(equations))[None], np.tile(equations, len(equations))[None])
-            )
+            stencils.append((np.repeat(equations, len(equations))[None], np.tile(equations, len(equations))[None]))
         keys = []
         for k, (rows, columns) in enumerate(stencils):
             low, high = np.minimum(rows, columns), np.maximum(rows, columns)
@@ -251,18 +251,17 @@ class MechanicalModel:
             keys.append(key)
         unique = np.unique(np.concatenate([key.ravel() for key in keys] + [np.arange(n) * (n + 1)]))
         unique = unique[unique >= 0]
-        maps = []
+        maps: list[np.ndarray] = []
         for key in keys:
             position = np.searchsorted(unique, key)
-            position[key < 0] = -1
-            maps.append(position.astype(np.int32))
+            maps.append(np.where(key < 0, -1, position).astype(np.int32))
         indptr = np.searchsorted(unique, np.arange(n + 1, dtype=np.int64) * n)
         indices = unique % n
         self._block_maps = maps[: len(self.blocks)]
-        self._constraint_maps = {}
-        for constraint, position in zip(curved, maps[len(self.blocks) :], strict=True):
-            keep = np.flatnonzero(position[0] >= 0)
-            self._constraint_maps[id(constraint)] = (keep, position[0][keep])
+        self._constraint_maps: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        for constraint, places in zip(curved, maps[len(self.blocks) :], strict=True):
+            keep = np.flatnonzero(places[0] >= 0)
+            self._constraint_maps[id(constraint)] = (keep, places[0][keep])
         self._values = np.empty(len(indices))
         self._gradient = np.empty_like(self.nodes)
         self._targets = []
@@ -317,6 +316,7 @@ class MechanicalModel:
             mapping = self._constraint_maps.get(id(constraint))
             if mapping is not None and part.any():
                 hessian = constraint.hessian(x, part)
+                assert hessian is not None
                 # Within one constraint every entry of the stencil has its own place.
                 values[mapping[1]] -= hessian.ravel()[mapping[0]]
             H[equations, rows] = constraint.jacobian(x)[:, keep].T

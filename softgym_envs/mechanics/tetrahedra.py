@@ -86,11 +86,7 @@ def _add_warped(x, step, connectivity, gradients, volumes, out):
         inverse = 1.0 / (f[0, 0] * c00 + f[0, 1] * c01 + f[0, 2] * c02)
         for i in range(3):
             # Row i of h = d F^-1, with F^-1 the transposed cofactors over the determinant.
-            h[i, 0] = inverse * (
-                d[i, 0] * c00
-                + d[i, 1] * c01
-                + d[i, 2] * c02
-            )
+            h[i, 0] = inverse * (d[i, 0] * c00 + d[i, 1] * c01 + d[i, 2] * c02)
             h[i, 1] = inverse * (
                 d[i, 0] * (f[0, 2] * f[2, 1] - f[0, 1] * f[2, 2])
                 + d[i, 1] * (f[0, 0] * f[2, 2] - f[0, 2] * f[2, 0])

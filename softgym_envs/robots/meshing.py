@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.errors import DataError, InfeasibleDesign
-from softgym_envs.storage import atomic_write, cache_directory
+from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
 __all__ = ["BodyMesh", "mesh_geometry"]
 
@@ -66,20 +66,15 @@ class BodyMesh:
         Raises:
             DataError: if the file is missing, truncated or of another format.
         """
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                if int(data["format"]) != _FORMAT:
-                    raise DataError(f"mesh '{path}' has format {int(data['format'])}, expected {_FORMAT}")
-                return cls(
-                    nodes=data["nodes"],
-                    tetrahedra=data["tetrahedra"].astype(np.int64),
-                    triangles=data["triangles"].astype(np.int64),
-                    surfaces=data["surfaces"].astype(np.int64),
-                )
-        except DataError:
-            raise
-        except Exception as error:
-            raise DataError(f"mesh '{path}' cannot be read: {error}") from error
+        data = read_npz(path, ("format", "nodes", "tetrahedra", "triangles", "surfaces"))
+        if int(data["format"]) != _FORMAT:
+            raise DataError(f"mesh '{path}' has format {int(data['format'])}, expected {_FORMAT}")
+        return cls(
+            nodes=data["nodes"],
+            tetrahedra=data["tetrahedra"].astype(np.int64),
+            triangles=data["triangles"].astype(np.int64),
+            surfaces=data["surfaces"].astype(np.int64),
+        )
 
 
 def mesh_geometry(
@@ -100,8 +95,11 @@ def mesh_geometry(
     parameters = {key: float(value) for key, value in sorted(parameters.items())}
     request = {"build": name, "parameters": parameters, "mesh_size": float(mesh_size)}
     # The geometry's source and constants are part of the key: an edited shape never meets an old mesh.
-    constants = {k: v for k, v in vars(sys.modules[build.__module__]).items() if k.isupper() and isinstance(v, int | float)}
-    source = inspect.getsource(build) + json.dumps(constants, sort_keys=True)
+    constants = {
+        k: v for k, v in vars(sys.modules[build.__module__]).items() if k.isupper() and isinstance(v, int | float)
+    }
+    # White space does not make another shape.
+    source = "".join(inspect.getsource(build).split()) + json.dumps(constants, sort_keys=True)
     key = hashlib.sha256((json.dumps(request, sort_keys=True) + source + str(_FORMAT)).encode()).hexdigest()[:24]
     for folder in (_SHIPPED, cache_directory("meshes")):
         path = folder / f"{key}.npz"
@@ -113,8 +111,8 @@ def mesh_geometry(
                     raise
                 path.unlink(missing_ok=True)  # a damaged cache entry is made again
     with tempfile.TemporaryDirectory() as scratch:
-        request["output"] = str(Path(scratch) / "mesh.npz")
-        command = [sys.executable, "-m", "softgym_envs.robots.meshing", json.dumps(request)]
+        output = Path(scratch) / "mesh.npz"
+        command = [sys.executable, "-m", "softgym_envs.robots.meshing", json.dumps({**request, "output": str(output)})]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         try:
             done = subprocess.run(
@@ -125,7 +123,7 @@ def mesh_geometry(
         if done.returncode != 0:
             reason = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
             raise InfeasibleDesign(f"the geometry cannot be meshed for {parameters}: {reason}")
-        mesh = BodyMesh.load(Path(request["output"]))
+        mesh = BodyMesh.load(output)
     mesh.save(path)
     return mesh
 

@@ -123,7 +123,10 @@ class Morpher:
             chosen = tuple(names[k] for k in np.flatnonzero(pattern))
             self._groups[chosen] = np.flatnonzero((on == pattern).all(axis=1))
         triangle_edges = np.unique(
-            np.sort(np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [0, 2]]]), axis=1),
+            np.sort(
+                np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [0, 2]]]),
+                axis=1,
+            ),
             axis=0,
         )
         shared = (on[triangle_edges[:, 0]] & on[triangle_edges[:, 1]]).sum(axis=1)

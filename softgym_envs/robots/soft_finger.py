@@ -63,7 +63,12 @@ def draw_finger(length: float, height: float, joint_height: float, slope: float)
     body, _ = occ.fuse(bar, [flange, *bellows])
     cavities = [half_turned(TEETH_RADIUS - WALL_THICKNESS, OUTER_RADIUS - WALL_THICKNESS, -j * length) for j in (1, 2)]
     corks = [
-        (3, occ.addBox(-OUTER_RADIUS, -1, -j * length - BELLOW_HEIGHT, 2 * OUTER_RADIUS, 1 + CORK_THICKNESS, 2 * BELLOW_HEIGHT))
+        (
+            3,
+            occ.addBox(
+                -OUTER_RADIUS, -1, -j * length - BELLOW_HEIGHT, 2 * OUTER_RADIUS, 1 + CORK_THICKNESS, 2 * BELLOW_HEIGHT
+            ),
+        )
         for j in (1, 2)
     ]
     hollows, _ = occ.cut(cavities, corks)
@@ -112,9 +117,7 @@ class SoftFinger(Robot):
             DesignVariable("height", 0.020, 0.022, 0.020, "m", "height of the segments across the bending axis"),
             DesignVariable("joint_height", 0.005, 0.008, 0.006, "m", "thickness of the hinges under the notches"),
             DesignVariable("young_modulus", 1.0e6, 1.0e7, 3.0e6, "Pa", "stiffness of the silicone", log=True),
-            DesignVariable(
-                "poisson_ratio", 0.30, 0.499, 0.30 if cables == 2 else 0.47, "1", "0.5 is incompressible"
-            ),
+            DesignVariable("poisson_ratio", 0.30, 0.499, 0.30 if cables == 2 else 0.47, "1", "0.5 is incompressible"),
         )
         self.stiffness_variable = None if any(gravity) else "young_modulus"
         self.effector_rest = np.array([0.0, 0.010, -0.120])

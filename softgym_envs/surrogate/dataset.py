@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import zipfile
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from softgym_envs.errors import DataError
 from softgym_envs.robots import make_robot
-from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.storage import atomic_write, read_npz, write_json
 from softgym_envs.surrogate.sampling import SamplingPlan, sample_group
 
 __all__ = ["COLUMNS", "generate_dataset", "load_dataset"]
@@ -22,14 +21,7 @@ _FORMAT = 1
 
 
 def _read_shard(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            missing = set(COLUMNS) - set(data.files)
-            if missing:
-                raise DataError(f"shard '{path}' lacks {sorted(missing)}")
-            shard = {name: data[name] for name in COLUMNS}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise DataError(f"shard '{path}' cannot be read: {error}") from error
+    shard = read_npz(path, COLUMNS)
     if not all(np.isfinite(v).all() for v in shard.values()):
         raise DataError(f"shard '{path}' holds values that are not finite")
     return shard
@@ -51,7 +43,7 @@ def _make_shard(job: tuple[str, dict, dict, int, int, str]) -> tuple[int, int]:
         raise DataError(f"every design of groups {first}..{last - 1} is infeasible")
     shard = {name: np.concatenate([part[name] for part in found]) for name in COLUMNS}
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, **shard)
+        np.savez_compressed(stream, allow_pickle=False, **shard)
     return len(shard["rest"]), len(parts) - len(found)
 
 

@@ -144,7 +144,7 @@ class SurrogateModel(ABC):
 
 
 def _layers(tensors: Mapping[str, np.ndarray], prefix: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    layers = []
+    layers: list[tuple[np.ndarray, np.ndarray]] = []
     while f"{prefix}.{len(layers)}.weight" in tensors:
         k = len(layers)
         # Stored as (out, in); used from the right, so transposed and contiguous.
@@ -298,7 +298,9 @@ class ResidualModel(SurrogateModel):
 
 
 class ThesisModel(SurrogateModel):
-    """The thesis' network (eq. 4.2, 4.11, 4.12): ReLU perceptrons G: design -> (W0, free0), F: (delta, W0, free0) -> (W, free).
+    """The thesis' network (eq. 4.2, 4.11, 4.12): two ReLU perceptrons.
+
+    G maps the design to (W0, free0), F maps (delta, W0, free0) to (W, free).
 
     Effector free displacements are relative to the effector at rest, as in the thesis' scenes. W is symmetric but not
     kept positive definite.

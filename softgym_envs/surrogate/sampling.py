@@ -63,8 +63,8 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> dict[str, np.n
 
     Returns:
         Arrays with one row per solved state: ``design`` (all variables), ``displacement``, ``effort``, ``effector``,
-        ``compliance`` (upper triangle of W, row by row), ``rest`` (1 for the rest state); None for an infeasible design.
-        States without an equilibrium are left out.
+        ``compliance`` (upper triangle of W, row by row), ``rest`` (1 for the rest state); None for an infeasible
+        design. States without an equilibrium are left out.
     """
     names = learned_variables(robot)
     space = robot.design_space

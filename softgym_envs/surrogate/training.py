@@ -165,7 +165,7 @@ def _log_cholesky(C: np.ndarray) -> np.ndarray:
 
 
 def _mean_scale(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of columns; a column that never changes has scale 0, so its mean is its prediction."""
+    """Mean and standard deviation of columns; a constant column has scale 0, so its mean is its prediction."""
     scale = values.std(axis=0)
     return values.mean(axis=0), np.where(scale > 1e-12 * np.abs(values).max(), scale, 0.0)
 
@@ -186,7 +186,8 @@ def _fit_residual(
     def tensor(x):
         return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
 
-    tensors, histories = {}, {}
+    tensors: dict[str, np.ndarray] = {}
+    histories: dict[str, list[dict[str, float]]] = {}
     # 1. The rest pair of a design.
     rest = {}
     for key, arrays in (("train", train), ("validation", validation)):
@@ -262,7 +263,9 @@ def _fit_residual(
         both = net_compliance(torch.cat([torch.cat([actuation, design], dim=1), at_rest]))
         return ((both[: len(design)] - both[len(design) :] - y) ** 2).mean()
 
-    histories["compliance"] = _optimise("compliance", net_compliance, compliance_loss, len(train.design), config, progress)
+    histories["compliance"] = _optimise(
+        "compliance", net_compliance, compliance_loss, len(train.design), config, progress
+    )
     tensors |= _weights(net_compliance, "compliance") | {"compliance_scale": compliance_scale}
     return tensors, histories
 
@@ -347,9 +350,7 @@ def test_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[str,
     }
 
 
-def generate(
-    config: FitConfig, data_folder: str | Path, *, progress: bool = True
-) -> dict[str, dict[str, np.ndarray]]:
+def generate(config: FitConfig, data_folder: str | Path, *, progress: bool = True) -> dict[str, dict[str, np.ndarray]]:
     """Generate the datasets ``train``, ``validation`` and ``test`` of a surrogate, or take up what is there."""
     return {
         split: generate_dataset(
@@ -417,7 +418,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     write_json(folder / "model.json", card)
     history = {f"{p}_{k}": np.array([row[k] for row in rows]) for p, rows in histories.items() for k in rows[0]}
     with atomic_write(folder / "history.npz") as stream:
-        np.savez_compressed(stream, **history)
+        np.savez_compressed(stream, allow_pickle=False, **history)
     save_resolved(folder, config)
     load_model(folder, robot)  # what was written can be read
     return errors

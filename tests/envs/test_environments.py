@@ -138,7 +138,10 @@ def test_reset_does_not_rebuild_the_same_design(monkeypatch):
 
 def test_backends_agree():
     """The surrogate follows the FEM along a rollout, slack cables included, to a fraction of a millimetre."""
-    envs = [gymnasium.make("SoftGym/FingerReach-v0", backend=b, design={"joint_height": 0.007}) for b in ("fem", "surrogate")]
+    envs = [
+        gymnasium.make("SoftGym/FingerReach-v0", backend=b, design={"joint_height": 0.007})
+        for b in ("fem", "surrogate")
+    ]
     goal = np.array([0.0, 0.06, -0.09])
     for env in envs:
         env.reset(seed=0, options={"goal": goal})

@@ -191,15 +191,15 @@ def test_points_outside_are_extrapolated_from_the_nearest_element(mesh, rng):
         np.testing.assert_allclose(every[element], weights, atol=1e-12)
 
 
-def test_a_hinted_element_is_kept_near_its_point_and_dropped_far_from_it(mesh):
+def test_a_hint_chooses_the_element_of_points_outside_only(mesh):
     nodes, tetrahedra = mesh
-    near = EmbeddedPoints(np.array([0.5, 0.52, 0.48]), nodes, tetrahedra).elements
-    kept = EmbeddedPoints(np.array([0.47, 0.5, 0.5]), nodes, tetrahedra, hint=near)
-    assert kept.elements == near
-    np.testing.assert_allclose(kept.positions(nodes), [[0.47, 0.5, 0.5]], atol=1e-13)
-    far = EmbeddedPoints(np.array([0.02, 0.03, 0.99]), nodes, tetrahedra, hint=near)
-    assert far.elements != near
-    assert (far.weights >= -1e-12).all()
+    inside, outside = np.array([0.47, 0.52, 0.48]), np.array([0.5, 0.4, 1.1])
+    far = EmbeddedPoints(np.array([0.02, 0.03, 0.01]), nodes, tetrahedra).elements
+    plain = EmbeddedPoints(np.stack([inside, outside]), nodes, tetrahedra)
+    hinted = EmbeddedPoints(np.stack([inside, outside]), nodes, tetrahedra, hint=np.repeat(far, 2))
+    assert hinted.elements[0] == plain.elements[0] != far[0]
+    assert hinted.elements[1] == far[0] != plain.elements[1]
+    np.testing.assert_allclose(hinted.positions(nodes), [inside, outside], atol=1e-12)
 
 
 def test_non_finite_points_are_refused(mesh):

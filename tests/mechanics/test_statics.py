@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.linear_solver import CholmodSolver
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.statics import Statics, _NotFound, solve_complementarity
+from softgym_envs.mechanics.statics import Statics, _NotFound
 
 # -- reference ------------------------------------------------------------------------------------------------------
 
@@ -133,14 +129,14 @@ def test_without_actuators_only_loads_act(box):
     model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=1e6)
     found = Statics(model).solve([])
     np.testing.assert_allclose(found.x, nodes, atol=1e-15)
-    model.nodal_loads[-1, 2] = -0.1
+    model.nodal_loads[-1, 2] = -0.5
     model.refresh_loads()
     assert Statics(model).solve([]).x[-1, 2] < nodes[-1, 2] - 1e-3
 
 
 def test_equilibrium_is_a_minimum_of_the_potential(beam, rng):
     """Independent of Newton: at prescribed tensions, nearby shapes have more energy less work."""
-    found = Statics(beam, tolerance=1e-12).solve([0.4, 0.3], "effort")
+    found = Statics(beam, tolerance=1e-12).solve([3.0, 2.5], "effort")
     assert np.abs(found.x - beam.nodes).max() > 0.01
 
     def potential(x):
@@ -229,50 +225,6 @@ def test_bilateral_and_unilateral_cables_together(fingers):
     assert pushing.delta[0] == pytest.approx(-0.003, abs=1e-11)
     assert pushing.delta[1] == pytest.approx(0.002, abs=1e-11)
     assert pushing.effort[0] < 0.0 < pushing.effort[1]
-
-
-# -- complementarity ------------------------------------------------------------------------------------------------
-
-
-def enumerate_complementarity(W, gap):
-    """The solution of ``0 <= y _|_ W y + gap >= 0`` by trying every set of active rows."""
-    m = len(gap)
-    scale = np.abs(gap).max(initial=0.0) + 1e-300
-    best, fault = np.zeros(m), np.inf
-    for active in itertools.product([False, True], repeat=m):
-        on = np.flatnonzero(active)
-        y = np.zeros(m)
-        y[on] = np.linalg.solve(W[np.ix_(on, on)], -gap[on])
-        wrong = max(-(y * np.diag(W)).min(initial=0.0), -(W @ y + gap).min(initial=0.0)) / scale
-        if wrong < fault:
-            best, fault = y, wrong
-    assert fault < 1e-9
-    return best
-
-
-@settings(max_examples=150, deadline=None)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    m=st.integers(1, 5),
-    compliance=st.sampled_from([1.0, 1e-4, 1e-9, 1e6]),
-    gap_size=st.sampled_from([1.0, 1e-3, 1e-8]),
-)
-def test_complementarity_against_enumeration(seed, m, compliance, gap_size):
-    rng = np.random.default_rng(seed)
-    half = rng.standard_normal((m, m + 2))
-    W = compliance * (half @ half.T + 0.01 * np.eye(m))
-    gap = gap_size * rng.standard_normal(m)
-    expected = enumerate_complementarity(W, gap)
-    found = solve_complementarity(W, gap)
-    assert (found >= 0.0).all()
-    # Condition numbers reach 1e4.
-    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9 * gap_size / compliance)
-
-
-def test_complementarity_with_nothing_to_do():
-    W = np.array([[2.0, 0.5], [0.5, 1.0]])
-    np.testing.assert_array_equal(solve_complementarity(W, np.array([0.1, 0.0])), 0.0)
-    np.testing.assert_allclose(solve_complementarity(W, np.array([-2.0, -0.5])), [1.0, 0.0], atol=1e-15)
 
 
 # -- failure --------------------------------------------------------------------------------------------------------

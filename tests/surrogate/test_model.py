@@ -91,7 +91,9 @@ def test_condensed_model_is_consistent(cables):
     condensed = model.condensed(model.context(designs), displacement)
     assert condensed.W.ea.shape == (20, 3, cables)
     assert np.allclose(condensed.delta.a, displacement, atol=1e-15)
-    assert np.allclose(condensed.delta_free.a + np.einsum("bij,bj->bi", condensed.W.aa, condensed.lambda_.a), displacement)
+    assert np.allclose(
+        condensed.delta_free.a + np.einsum("bij,bj->bi", condensed.W.aa, condensed.lambda_.a), displacement
+    )
 
 
 @pytest.mark.parametrize("cables", CABLES)

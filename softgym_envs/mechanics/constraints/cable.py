@@ -91,7 +91,7 @@ class Cable(Constraint):
         self.dofs = (3 * nodes[:, None] + np.arange(3)).ravel()
         self._gradient = np.empty(len(self.dofs))
         self._hessian = np.empty((len(self.dofs), len(self.dofs)))
-        self.rest_length: float | None = None
+        self.rest_length = float("nan")  # until attached
 
     def attach(self, rest: np.ndarray) -> None:
         """Take the rest length [m] at node positions ``rest``, shape (n, 3).
