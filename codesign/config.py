@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -24,6 +25,7 @@ __all__ = [
     "ScreenConfig",
     "StudyConfig",
     "TrainingConfig",
+    "construct",
     "robot_of",
 ]
 
@@ -58,6 +60,15 @@ def robot_of(environment: EnvironmentConfig) -> Robot:
     return make_robot(row.robot, **{**row.robot_options, **environment.robot_options})
 
 
+def construct(cls: type, options: dict[str, Any]) -> Any:
+    """Make a sampler or a pruner of Optuna. Naming one in a configuration is consent to its being experimental."""
+    from optuna.exceptions import ExperimentalWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        return cls(**options)
+
+
 def _check_options(kind: str, name: str, cls: type, options: dict[str, Any]) -> None:
     """Raise ValueError for a keyword that the constructor of a sampler or pruner does not take."""
     allowed = [key for key in inspect.signature(cls).parameters if key not in ("seed", "args", "kwargs")]
@@ -65,7 +76,7 @@ def _check_options(kind: str, name: str, cls: type, options: dict[str, Any]) -> 
         if key not in allowed:
             raise ValueError(f"unknown option '{key}' of {kind} '{name}'; allowed: {', '.join(allowed) or 'none'}")
     try:
-        cls(**options)
+        construct(cls, options)
     except ImportError as error:
         raise ValueError(f"{kind} '{name}' needs a package that is not installed: {error}") from None
     except TypeError as error:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from codesign.config import PRUNERS, SAMPLERS, StudyConfig
+from codesign.config import PRUNERS, SAMPLERS, StudyConfig, construct
 from codesign.folder import StudyFolder
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def make_sampler(config: StudyConfig, number: int) -> optuna.samplers.BaseSample
     sampler = config.sampler
     # A quasi-random sequence has one seed, and counts its points in the journal.
     seed = sampler.seed if sampler.name == "qmc" else trial_seed(config, number)
-    return getattr(optuna.samplers, SAMPLERS[sampler.name])(seed=seed, **sampler.options)
+    return construct(getattr(optuna.samplers, SAMPLERS[sampler.name]), {"seed": seed, **sampler.options})
 
 
 def trial_seed(config: StudyConfig, number: int) -> int:
@@ -51,7 +51,7 @@ def make_pruner(config: StudyConfig) -> optuna.pruners.BasePruner:
         options.setdefault("min_resource", config.training.report_every)
     if config.pruner.name == "hyperband":
         options.setdefault("max_resource", config.training.steps)
-    return getattr(optuna.pruners, PRUNERS[config.pruner.name])(**options)
+    return construct(getattr(optuna.pruners, PRUNERS[config.pruner.name]), options)
 
 
 def distributions(config: StudyConfig) -> dict[str, optuna.distributions.BaseDistribution]:

@@ -302,8 +302,8 @@ class ThesisModel(SurrogateModel):
 
     G maps the design to (W0, free0), F maps (delta, W0, free0) to (W, free).
 
-    Effector free displacements are relative to the effector at rest, as in the thesis' scenes. W is symmetric but not
-    kept positive definite.
+    Effector rows of free0 and free are absolute positions, which standardisation makes equivalent to the thesis'
+    displacements from a goal. W is symmetric but not kept positive definite.
     """
 
     network = "thesis"

@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
 from codesign.config import StudyConfig
+from codesign.folder import StudyFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = """
@@ -24,8 +23,7 @@ run_study(load_config(sys.argv[1], StudyConfig), sys.argv[2])
 """
 
 
-def tiny(**changes: Any) -> dict[str, Any]:
-    """Plain data of a tiny study."""
+def _tiny(**changes):
     return {
         "name": "tiny",
         "environment": {"id": "SoftGym/FingerReach-v0"},
@@ -39,14 +37,27 @@ def tiny(**changes: Any) -> dict[str, Any]:
     }
 
 
+@pytest.fixture(scope="session")
+def tiny():
+    """Function ``tiny(**changes)``: plain data of a tiny study."""
+    return _tiny
+
+
 @pytest.fixture
-def config() -> Callable[..., StudyConfig]:
-    return lambda **changes: StudyConfig.model_validate(tiny(**changes))
+def study(tmp_path):
+    """Function ``study(**changes) -> StudyFolder``: the folder of a tiny study in which nothing has run yet."""
+    return lambda **changes: StudyFolder.create(tmp_path / "study", StudyConfig.model_validate(_tiny(**changes)))
 
 
-def start_study(path: Path, folder: Path, data: dict[str, Any]) -> subprocess.Popen[str]:
-    """Run a study in a process of its own."""
-    path.write_text(yaml.safe_dump(data))
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", RUN, str(path), str(folder)]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+@pytest.fixture(scope="session")
+def start_study():
+    """Function ``start_study(folder, data)``: run a study in a process of its own."""
+
+    def start(folder, data):
+        path = folder.with_suffix(".yaml")
+        path.write_text(yaml.safe_dump(data))
+        command = [sys.executable, "-c", RUN, str(path), str(folder)]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    return start

@@ -1,0 +1,178 @@
+"""SAC training: files, resume, warm start, and what a damaged policy says."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from agents import training
+from agents.config import EnvironmentConfig, TrainConfig
+from agents.evaluation import evaluate, sample_goals
+from agents.policy import Policy
+from agents.training import train
+from softgym_envs.errors import DataError, WeightsError
+
+CONFIG = TrainConfig.model_validate(
+    {
+        "environment": {"id": "SoftGym/FingerReach-v0"},
+        "sac": {"net_arch": [16, 16], "batch_size": 32, "learning_starts": 64, "gradient_steps": 1},
+        "steps": 400,
+        "num_envs": 8,
+        "evaluation_episodes": 5,
+        "report_every": 200,
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("train")
+    return train(CONFIG, folder, progress=False)
+
+
+def test_training_leaves_policy_curve_logs_and_provenance(trained):
+    folder = trained.parent
+    assert trained.name == "policy.safetensors"
+    names = {p.name for p in folder.iterdir()}
+    assert names == {"policy.safetensors", "policy.json", "curve.csv", "config.yaml", "provenance.json", "tensorboard"}
+    with open(folder / "curve.csv") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [int(r["step"]) for r in rows] == [200, 400]
+    card = json.loads((folder / "policy.json").read_text())
+    assert card["config"]["seed"] == 0 and card["steps"] == 400 and card["provenance"]["versions"]["torch"]
+    assert list((folder / "tensorboard").iterdir())
+
+
+def test_policy_is_the_mean_action_of_the_actor(trained, tmp_path):
+    import torch
+
+    model = training._make_model(CONFIG, tmp_path)
+    training._load_weights(model, training.read_tensors(trained), trained)
+    observation = np.random.default_rng(0).uniform(-1, 1, (6, 15)).astype(np.float32)
+    with torch.no_grad():
+        expected = model.policy._predict(torch.as_tensor(observation), deterministic=True).numpy()
+    assert np.abs(Policy(trained)(observation) - expected).max() < 1e-5
+
+
+def test_same_seed_same_policy(trained, tmp_path):
+    again = train(CONFIG, tmp_path / "again", progress=False)
+    assert again.read_bytes() == trained.read_bytes()
+    other = train(CONFIG.model_copy(update={"seed": 1}), tmp_path / "other", progress=False)
+    assert other.read_bytes() != trained.read_bytes()
+
+
+def test_interrupted_training_resumes(tmp_path, monkeypatch):
+    original = training._learn
+    reached = []
+
+    def learn(model, target, bar):
+        if model.num_timesteps >= 200 and not reached:
+            reached.append(model.num_timesteps)
+            raise KeyboardInterrupt
+        original(model, target, bar)
+
+    monkeypatch.setattr(training, "_learn", learn)
+    with pytest.raises(KeyboardInterrupt):
+        train(CONFIG, tmp_path, progress=False)
+    assert (tmp_path / "checkpoint.safetensors").exists() and not (tmp_path / "policy.safetensors").exists()
+    steps = []
+    monkeypatch.setattr(
+        training, "_learn", lambda model, target, bar: (steps.append(model.num_timesteps), original(model, target, bar))
+    )
+    train(CONFIG, tmp_path, progress=False)
+    assert steps == [200]  # went on where it was
+    with open(tmp_path / "curve.csv") as stream:
+        assert [int(r["step"]) for r in csv.DictReader(stream)] == [200, 400]
+    before = (tmp_path / "policy.safetensors").stat().st_mtime_ns
+    train(CONFIG, tmp_path, progress=False)
+    assert (tmp_path / "policy.safetensors").stat().st_mtime_ns == before  # done is done
+
+
+def test_damaged_checkpoint_is_named(tmp_path, monkeypatch):
+    original = training._learn
+
+    def learn(model, target, bar):
+        if model.num_timesteps >= 200:
+            raise KeyboardInterrupt
+        original(model, target, bar)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "_learn", learn)
+        with pytest.raises(KeyboardInterrupt):
+            train(CONFIG, tmp_path, progress=False)
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(WeightsError, match=r"checkpoint\.safetensors.*damaged"):
+        train(CONFIG, tmp_path, progress=False)
+
+
+def test_another_configuration_does_not_mix(trained):
+    with pytest.raises(DataError, match="another configuration"):
+        train(CONFIG.model_copy(update={"steps": 800}), trained.parent, progress=False)
+
+
+def test_warm_start_and_early_stop(trained, tmp_path):
+    seen = []
+    config = CONFIG.model_copy(update={"seed": 5, "sac": CONFIG.sac.model_copy(update={"learning_rate": 1e-12})})
+    path = train(
+        config, tmp_path, initial=trained, progress=False, report=lambda step, score: seen.append((step, score)) or True
+    )
+    assert [step for step, _ in seen] == [200]
+    assert json.loads(path.with_suffix(".json").read_text())["stopped_early"] is True
+    x = np.random.default_rng(0).uniform(-1, 1, (4, 15)).astype(np.float32)
+    assert np.abs(Policy(path)(x) - Policy(trained)(x)).max() < 1e-4
+    wider = CONFIG.model_copy(update={"sac": CONFIG.sac.model_copy(update={"net_arch": [32, 32]})})
+    with pytest.raises(WeightsError, match="does not fit.*net_arch"):
+        train(wider, tmp_path / "wider", initial=trained, progress=False)
+
+
+def test_damaged_policies(trained, tmp_path):
+    with pytest.raises(WeightsError, match=r"nothing\.safetensors.*does not exist"):
+        Policy(tmp_path / "nothing.safetensors")
+    broken = tmp_path / "policy.safetensors"
+    broken.write_bytes(trained.read_bytes()[:100])
+    with pytest.raises(WeightsError, match="damaged or truncated"):
+        Policy(broken)
+    broken.write_bytes(trained.read_bytes())
+    with pytest.raises(WeightsError, match=r"policy\.json"):
+        Policy(broken)
+    with pytest.raises(ValueError, match=r"size 15, got 20.*design_in_observation"):
+        Policy(trained)(np.zeros(20))
+
+
+@pytest.mark.parametrize("backend", ["surrogate", "fem"])
+def test_qp_reaches_every_reachable_goal(backend):
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0", backend=backend)
+    goals = sample_goals(environment, 4, seed=3)
+    outcome = evaluate("qp", environment, goals)
+    assert outcome.success_rate == 1.0 and outcome.worst_distance < 1e-4
+    assert outcome.steps == 200
+    assert outcome.mean_distance < evaluate("random", environment, goals).mean_distance
+
+
+def test_batched_and_single_evaluation_agree(trained):
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0")
+    goals = sample_goals(environment, 3, seed=1)
+    design = {"length": 0.0395, "joint_height": 0.0074}
+    batched = evaluate(trained, environment, goals, design=design)
+    env = environment.make()
+    policy = Policy(trained)
+    for i, goal in enumerate(goals):
+        observation, info = env.reset(options={"design": design, "goal": goal})
+        total, truncated = 0.0, False
+        while not truncated:
+            observation, reward, _, truncated, info = env.step(policy(observation))
+            total += reward
+        assert batched.distances[i] == pytest.approx(info["distance"], abs=2e-5)
+        assert batched.returns[i] == pytest.approx(total, abs=0.05)
+
+
+def test_goals_repeat_and_belong_to_the_body():
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0")
+    goals = sample_goals(environment, 5, seed=2)
+    assert goals.shape == (5, 1, 3)
+    assert (goals == sample_goals(environment, 5, seed=2)).all()
+    assert (goals != sample_goals(environment, 5, seed=2, design={"length": 0.042})).any()
+    track = EnvironmentConfig(id="SoftGym/FingerTrack-v0")
+    assert sample_goals(track, 2, seed=0).shape == (2, 25, 3)

@@ -1,0 +1,96 @@
+"""Malformed studies give one clear line that names the thing and what is allowed."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+
+from codesign.config import StudyConfig
+from codesign.study import run_study
+from softgym_envs.config import load_config
+from softgym_envs.errors import ConfigError
+
+BAD = {
+    "unknown key": ({"colour": "red"}, "colour", "variables"),
+    "unknown variable": ({"variables": ["width"]}, "width", "joint_height"),
+    "repeated variable": ({"variables": ["height", "height"]}, "height", "twice"),
+    "no variable": ({"variables": []}, "variables", "at least 1"),
+    "unknown environment": ({"environment": {"id": "SoftGym/Nose-v0"}}, "Nose", "FingerReach"),
+    "design out of bounds": (
+        {"environment": {"id": "SoftGym/FingerReach-v0", "design": {"height": 1.0}}},
+        "height",
+        "0.02 to 0.022",
+    ),
+    "sampled design": (
+        {"environment": {"id": "SoftGym/FingerReach-v0", "sample_design": True}},
+        "sample_design",
+        "false",
+    ),
+    "unknown sampler": ({"sampler": {"name": "magic"}}, "sampler.name", "'tpe'"),
+    "unknown sampler option": ({"sampler": {"name": "tpe", "options": {"wings": 2}}}, "wings", "n_startup_trials"),
+    "unknown pruner": ({"pruner": {"name": "shears"}}, "pruner.name", "'median'"),
+    "missing pruner option": (
+        {"pruner": {"name": "percentile"}, "strategy": "scratch"},
+        "pruner 'percentile'",
+        "percentile",
+    ),
+    "pruner without reports": ({"pruner": {"name": "median"}}, "median", "none"),
+    "unknown objective": ({"objective": "beauty"}, "objective", "'success_rate'"),
+    "unknown strategy": ({"strategy": "luck"}, "strategy", "'scratch'"),
+    "no policy": ({"strategy": "warm_start"}, "policy", "warm_start"),
+    "useless policy": ({"policy": "a.safetensors"}, "a.safetensors", "qp"),
+    "no trials": ({"trials": 0}, "trials", "greater than or equal to 1"),
+    "infinite": ({"goals": {"command_low": float("nan")}}, "command_low", "0"),
+    "too many finalists": ({"finalists": {"count": 6}}, "finalists.count = 6", "trials = 6"),
+    "screen keeps too many": ({"screen": {"enabled": True, "candidates": 100, "keep": 0.5}}, "50 bodies", "trials = 6"),
+    "screen with too many goals": ({"screen": {"enabled": True, "goals": 9}}, "screen.goals = 9", "goals.count = 6"),
+    "reports too rare": (
+        {"strategy": "scratch", "training": {"steps": 100, "report_every": 200}},
+        "report_every = 200",
+        "steps = 100",
+    ),
+    "training on FEM": (
+        {"strategy": "scratch", "environment": {"id": "SoftGym/FingerReach-v0", "backend": "fem"}},
+        "fem",
+        "surrogate",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_malformed(name, tmp_path, tiny):
+    changes, thing, allowed = BAD[name]
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump(tiny(**changes)))
+    with pytest.raises(ConfigError) as caught:
+        load_config(path, StudyConfig)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert thing in message
+    assert allowed in message
+
+
+def test_demo_configs_are_well_formed():
+    for name in ("finger_reach", "finger_reach_scratch"):
+        config = load_config(f"configs/codesign/{name}.yaml", StudyConfig)
+        assert config.variables == ("length", "height", "joint_height")
+
+
+def test_missing_policy(tmp_path, tiny):
+    config = StudyConfig.model_validate(tiny(strategy="warm_start", policy=str(tmp_path / "none.safetensors")))
+    with pytest.raises(ConfigError, match=r"none\.safetensors.*does not exist"):
+        run_study(config, tmp_path / "study")
+
+
+def test_folder_keeps_its_study(study):
+    first = study()
+    with pytest.raises(ConfigError, match="another 'variables'"):
+        study(variables=["length"])
+    assert study(trials=7).config.trials == 7
+    assert (first.goals["selection"].shape, first.goals["unseen"].shape) == ((6, 1, 3), (3, 1, 3))
+
+
+def test_goals_differ(study):
+    goals = study().goals
+    points = [tuple(point) for name in ("training", "selection", "unseen") for point in goals[name].reshape(-1, 3)]
+    assert len(set(points)) == len(points) == 13

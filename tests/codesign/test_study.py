@@ -1,0 +1,175 @@
+"""Whole studies in real processes: interrupted, killed, shared, continued."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import time
+from collections import Counter
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from codesign.config import StudyConfig
+from codesign.folder import StudyFolder
+from codesign.ledger import open_study
+from codesign.report import write_report
+from codesign.results import bootstrap_interval, rank_correlation, rate_interval
+from codesign.study import run_study
+
+TRIALS = 8
+
+
+def results_in(folder):
+    return {path.parent.name: path.read_bytes() for path in folder.glob("trials/[0-9]*/result.json")}
+
+
+def wait_for(condition, process, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < end, "it takes too long"
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, tiny, start_study):
+    """A study that was interrupted, then shared by two calls of which one was killed, then continued."""
+    folder = tmp_path_factory.mktemp("codesign") / "study"
+    data = tiny(
+        trials=TRIALS,
+        workers=2,
+        goals={"count": 15, "unseen_count": 3, "training_count": 2},
+        screen={"enabled": True, "candidates": 3, "keep": 0.7, "goals": 2},
+        finalists={"count": 1},
+    )
+    first = start_study(folder, data)
+    wait_for(lambda: results_in(folder), first)
+    first.send_signal(signal.SIGINT)
+    output, _ = first.communicate(timeout=30)
+    interrupted = results_in(folder)
+
+    second, third = start_study(folder, data), start_study(folder, {**data, "workers": 1})
+    wait_for(lambda: len(results_in(folder)) >= len(interrupted) + 2, second)
+    second.kill()
+    second.communicate(timeout=30)
+    killed = results_in(folder)
+    third.communicate(timeout=60)
+    returned = run_study(StudyConfig.model_validate(data), folder, progress=False)
+    return SimpleNamespace(
+        folder=StudyFolder(folder), output=output, interrupted=interrupted, killed=killed, third=third, results=returned
+    )
+
+
+def test_interruption_tells_how_to_go_on(finished):
+    assert "run the same command again to continue" in finished.output
+    assert 1 <= len(finished.interrupted) < TRIALS
+
+
+def test_nothing_is_lost_or_duplicated(finished):
+    now = results_in(finished.folder.path)
+    assert len(now) == TRIALS
+    for before in (finished.interrupted, finished.killed):
+        assert before.items() <= now.items()
+    trials = open_study(finished.folder).trials
+    counted = [trial for trial in trials if trial.state.name != "FAIL"]
+    assert [trial.state.name for trial in counted] == ["COMPLETE"] * TRIALS
+    assert {f"{trial.number:04d}" for trial in counted} == set(now)
+    origins = Counter(trial.user_attrs["origin"] for trial in counted)
+    assert set(origins.values()) == {1}
+    assert {"baseline"} < set(origins)
+    assert sum(origin.startswith("screen") for origin in origins) == 2
+    assert len({tuple(trial.params.values()) for trial in counted}) == TRIALS
+    for trial in counted:
+        assert json.loads(now[f"{trial.number:04d}"])["score"] == trial.value
+
+
+def test_the_other_call_finished_the_study(finished):
+    assert finished.third.returncode == 0
+
+
+def test_continuing_a_finished_study_does_nothing(finished):
+    before = {path: path.stat().st_mtime_ns for path in finished.folder.path.glob("*/**/*.json")}
+    assert run_study(finished.folder.config, finished.folder.path, progress=False)["trials"]["complete"] == TRIALS
+    assert {path: path.stat().st_mtime_ns for path in finished.folder.path.glob("*/**/*.json")} == before
+
+
+def test_winner_is_the_best_of_the_search(finished):
+    best = max(finished.folder.results(), key=lambda result: result["score"])
+    assert finished.results["winner"]["trial"] == best["number"]
+    assert finished.results["baseline"]["design"] == finished.folder.config.baseline
+    # The inverse QP reads both physics alike: the surrogate is good to a tenth of a millimetre.
+    for row in finished.results["transfer"]:
+        if row["objective"] == "mean_distance":
+            assert row["worst_gap"] < 5e-4
+    assert [row["backend"] for row in finished.results["comparison"]] == ["fem", "surrogate"]
+
+
+class Balance(HTMLParser):
+    """Fails on a tag that is not closed."""
+
+    VOID = frozenset({"meta", "img", "br"})
+
+    def __init__(self):
+        super().__init__()
+        self.open = []
+        self.text = []
+        self.sources = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in self.VOID:
+            self.open.append(tag)
+        self.sources += [value for key, value in attrs if key in ("src", "href")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def test_report(finished):
+    path = write_report(finished.folder.path)
+    page = Balance()
+    page.feed(path.read_text())
+    assert page.open == []
+    assert len(page.sources) > 8
+    assert all(source.startswith("data:image/") for source in page.sources)
+    text = " ".join(page.text)
+    row = finished.results["comparison"][0]
+    for role in ("baseline", "winner"):
+        assert f"{1e3 * row[role]['mean_distance']:.2f} mm" in text
+        assert f"{100 * row[role]['success_rate']:.1f} %" in text
+    for variable in finished.results["variables"][1:3]:
+        assert f"{1e3 * variable['winner']:.2f} mm" in text
+    assert "softgym codesign --config" in text
+    assert "nan" not in text.lower().replace("nanmean", "").split()
+
+
+def test_tables(finished):
+    folder = finished.folder.path
+    assert json.loads((folder / "results.json").read_text())["trials"]["complete"] == TRIALS
+    with (folder / "trials.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == TRIALS
+    assert float(rows[0]["height [m]"]) == pytest.approx(
+        finished.folder.result(int(rows[0]["trial"]))["design"]["height"]
+    )
+    with (folder / "finalists.csv").open() as stream:
+        assert {(row["role"], row["backend"]) for row in csv.DictReader(stream)} == {
+            (role, backend) for role in ("baseline", "finalist") for backend in ("fem", "surrogate")
+        }
+
+
+def test_statistics(rng):
+    values = rng.normal(1.0, 0.1, 200)
+    low, high = bootstrap_interval(values)
+    assert low < values.mean() < high
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(200), rel=0.1)
+    assert bootstrap_interval([2.0, 2.0]) == (2.0, 2.0)
+    assert rate_interval(10, 10)[0] == pytest.approx(0.7225, abs=1e-3)
+    assert rank_correlation([1, 2, 3], [10, 20, 15]) == pytest.approx(0.5)
+    assert rank_correlation([1, 1, 1], [1, 2, 3]) is None

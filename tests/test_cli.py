@@ -1,0 +1,125 @@
+"""The command line: every verb, and one clear line with status 2 for bad input."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from softgym_envs import cli
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def run(monkeypatch, capsys, *arguments):
+    """Run the command line in this process; returns (status, stdout, stderr)."""
+    monkeypatch.setattr(sys, "argv", ["softgym", *map(str, arguments)])
+    status = 0
+    try:
+        cli.main()
+    except SystemExit as leave:
+        status = leave.code or 0
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+def test_list_and_show(monkeypatch, capsys, tmp_path):
+    status, out, _ = run(monkeypatch, capsys, "list")
+    assert status == 0 and "SoftGym/FingerReach-v0" in out and "surrogate" in out
+    picture = tmp_path / "body.png"
+    status, out, _ = run(monkeypatch, capsys, "show", "finger", "--design", "length=0.041", "--picture", picture)
+    assert status == 0 and "joint_height" in out and "nodes" in out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_rollout_evaluate_and_record(monkeypatch, capsys, tmp_path):
+    status, out, _ = run(monkeypatch, capsys, "rollout", "SoftGym/FingerReach-v0", "--backend", "fem")
+    assert status == 0 and "success True" in out
+    recording = tmp_path / "episode.rrd"
+    status, out, _ = run(monkeypatch, capsys, "rollout", "SoftGym/FingerTrack-v0", "--record", recording)
+    assert status == 0 and recording.stat().st_size > 10_000
+    config = ROOT / "configs" / "agents" / "finger_reach.yaml"
+    output = tmp_path / "table.json"
+    status, out, _ = run(monkeypatch, capsys, "evaluate", "--config", config, "--goals", 4, "--output", output)
+    assert status == 0
+    table = json.loads(output.read_text())
+    assert {r["agent"] for r in table["results"]} == {"qp", "random"}
+    assert table["results"][0]["success_rate"] == 1.0
+
+
+def test_dataset_fit_and_train(monkeypatch, capsys, tmp_path):
+    tiny = ["workers=1", "network.epochs=3", "network.width=16", "robot_options.cables=1"]
+    tiny += [f"data.{s}.groups=2" for s in ("train", "validation", "test")]
+    tiny += [f"data.{s}.states=3" for s in ("train", "validation", "test")]
+    config = ROOT / "configs" / "surrogate" / "finger_1cable.yaml"
+    data = tmp_path / "data"
+    status, out, err = run(monkeypatch, capsys, "dataset", "--config", config, "--folder", data, "--quiet", *tiny)
+    assert status == 0, err
+    assert "train: 8 states of 2 designs" in out
+    fitted = tmp_path / "fit"
+    arguments = ["fit", "--config", config, "--folder", fitted, "--data", data, "--quiet", *tiny]
+    status, out, err = run(monkeypatch, capsys, *arguments)
+    assert status == 0, err
+    assert "effector_mean" in out and (fitted / "model.safetensors").exists()
+    config = ROOT / "configs" / "agents" / "finger_reach.yaml"
+    small = ["steps=64", "num_envs=8", "report_every=64", "evaluation_episodes=2", "sac.net_arch=[8]", "sac.learning_starts=16"]
+    arguments = ["train", "--config", config, "--folder", tmp_path / "sac", "--quiet", *small]
+    status, out, err = run(monkeypatch, capsys, *arguments)
+    assert status == 0, err
+    assert (tmp_path / "sac" / "policy.safetensors").exists()
+
+
+CONFIG = "configs/agents/finger_reach.yaml"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["show", "octopus"], ["octopus", "finger"]),
+        (["show", "finger", "--design", "length=1"], ["length", "0.038", "0.042"]),
+        (["show", "finger", "--design", "size=1"], ["size", "length"]),
+        (["show", "finger", "--design", "length"], ["length", "name=number"]),
+        (["show", "finger", "--option", "cables=9"], ["cables", "1, 2"]),
+        (["rollout", "SoftGym/Nothing-v0"], ["Nothing"]),
+        (["rollout", "SoftGym/FingerReach-v0", "--backend", "magic"], ["magic", "fem, surrogate"]),
+        (["rollout", "SoftGym/FingerReach-v0", "--agent", "nowhere.safetensors"], ["nowhere.safetensors"]),
+        (["rollout", "SoftGym/FingerReach-v0", "--design", "height=nan"], ["height", "finite"]),
+        (["view", "nowhere.rrd"], ["nowhere.rrd", "does not exist"]),
+        (["train", "--config", "nowhere.yaml", "--folder", "x"], ["nowhere.yaml"]),
+        (["train", "--config", CONFIG, "--folder", "x", "stesp=3"], ["stesp", "steps"]),
+        (["train", "--config", CONFIG, "--folder", "x", "steps=-3"], ["steps", "-3", "greater than 0"]),
+        (["train", "--config", CONFIG, "--folder", "x", "steps"], ["steps", "key=value"]),
+        (["train", "--config", CONFIG, "--folder", "x", "environment.id=Foo-v0"], ["Foo-v0", "FingerReach"]),
+        (["train", "--config", CONFIG, "--folder", "x", "sac.gamma=2"], ["sac.gamma", "2"]),
+        (["evaluate", "--config", CONFIG, "--goals", "0"], ["goals", "0"]),
+        (["fit", "--config", CONFIG, "--folder", "x"], ["robot", "required"]),
+        (["frobnicate"], ["frobnicate"]),
+        (["bench", "nothing"], ["nothing"]),
+    ],
+)
+def test_bad_input_is_one_line_and_status_two(monkeypatch, capsys, tmp_path, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    arguments = [str(ROOT / a) if a == CONFIG else a for a in arguments]
+    status, _, err = run(monkeypatch, capsys, *arguments)
+    assert status == 2
+    lines = [line for line in err.splitlines() if line.strip()]
+    assert len(lines) == 1 and lines[0].startswith("softgym: error: ")
+    for word in words:
+        assert word in lines[0]
+    assert list(tmp_path.iterdir()) == []  # nothing half-made is left
+
+
+@pytest.mark.parametrize("text", ["steps: [1, 2", "- a\n- b\n", "steps: {a: 1}", "\x00\x01"])
+def test_malformed_files(monkeypatch, capsys, tmp_path, text):
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    status, _, err = run(monkeypatch, capsys, "train", "--config", path, "--folder", tmp_path / "x")
+    assert status == 2 and len(err.strip().splitlines()) == 1 and "config.yaml" in err
+
+
+def test_console_module_runs():
+    done = subprocess.run(
+        [sys.executable, "-m", "softgym_envs.cli", "--version"], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert "0.1.0" in done.stdout
