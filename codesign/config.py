@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import warnings
 from typing import Any, Literal
@@ -77,8 +78,6 @@ def _check_options(kind: str, name: str, cls: type, options: dict[str, Any]) -> 
             raise ValueError(f"unknown option '{key}' of {kind} '{name}'; allowed: {', '.join(allowed) or 'none'}")
     try:
         construct(cls, options)
-    except ImportError as error:
-        raise ValueError(f"{kind} '{name}' needs a package that is not installed: {error}") from None
     except TypeError as error:
         raise ValueError(f"{kind} '{name}': {error}") from None
 
@@ -94,6 +93,9 @@ class SamplerConfig(Config):
     def _known_options(self) -> SamplerConfig:
         import optuna
 
+        if self.name == "cmaes" and importlib.util.find_spec("cmaes") is None:
+            others = ", ".join(name for name in SAMPLERS if name != "cmaes")
+            raise ValueError(f"sampler 'cmaes' needs the package cmaes (pip install cmaes); allowed without: {others}")
         _check_options("sampler", self.name, getattr(optuna.samplers, SAMPLERS[self.name]), self.options)
         return self
 
@@ -195,7 +197,8 @@ class StudyConfig(Config):
     """A co-design study.
 
     Attributes:
-        name: title of the study and its report.
+        name: of the study, and of its folder.
+        title: of the report; default: the name.
         environment: robot, task and backend of the trials. Its ``design`` (default: the robot's baseline) is the
             baseline body of the study and gives the variables that are not optimised.
         variables: names of the design variables to optimise.
@@ -213,7 +216,8 @@ class StudyConfig(Config):
         finalists: check on FEM.
     """
 
-    name: str = Field(min_length=1)
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    title: str = ""
     environment: EnvironmentConfig
     variables: tuple[str, ...] = Field(min_length=1)
     objective: Literal["success_rate", "mean_distance", "mean_return"] = "mean_distance"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["StudyFolder"]
 
 # What may change between two runs of one study.
-EXTENSIBLE = ("name", "trials", "workers", "finalists")
+EXTENSIBLE = ("name", "title", "trials", "workers", "finalists")
 
 
 class StudyFolder:

@@ -117,12 +117,16 @@ def history(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> 
             part = [t for t in done if t["origin"].startswith(kind) and roles.get(t["number"]) != "winner"]
             if part:
                 values = [objective.shown(t["score"]) for t in part]
-                ax.scatter([t["number"] for t in part], values, 26, colour, marker=marker, label=f"from the {kind}", zorder=3)
+                ax.scatter(
+                    [t["number"] for t in part], values, 26, colour, marker=marker, label=f"from the {kind}", zorder=3
+                )
         for trial in done:
             if (role := roles.get(trial["number"])) is not None:
                 colour = WINNER if role == "winner" else BASELINE
                 value = objective.shown(trial["score"])
-                ax.scatter(trial["number"], value, 95, colour, marker="*" if role == "winner" else "P", label=role, zorder=5)
+                ax.scatter(
+                    trial["number"], value, 95, colour, marker="*" if role == "winner" else "P", label=role, zorder=5
+                )
         best = np.maximum.accumulate([t["score"] for t in done])
         ax.step(
             [t["number"] for t in done],
@@ -282,7 +286,9 @@ def screen(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> s
             role = roles.get(trial["number"])
             colour = {"winner": WINNER, "baseline": BASELINE}.get(role or "", MUTED)
             x, y = (objective.shown(objective.score(trial[key])) for key in ("qp", "evaluation"))
-            ax.scatter(x, y, 80 if role else 26, colour, marker="*" if role else "o", label=role, zorder=4 if role else 3)
+            ax.scatter(
+                x, y, 80 if role else 26, colour, marker="*" if role else "o", label=role, zorder=4 if role else 3
+            )
         ax.set(xlabel=f"inverse QP: {_axis(objective).lower()}", ylabel=f"SAC: {_axis(objective).lower()}")
         ax.legend(fontsize=8)
     return out[0]

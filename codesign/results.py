@@ -192,6 +192,7 @@ def collect(folder: StudyFolder) -> dict[str, Any]:
     space = config.space
     return {
         "name": config.name,
+        "title": config.title or config.name,
         "environment": config.environment.id,
         "objective": config.objective,
         "strategy": config.strategy,

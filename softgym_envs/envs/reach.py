@@ -19,13 +19,17 @@ class Reach(Task):
             from whatever the body is, which makes bodies comparable.
         command_low: smallest command of a reachable goal, as a fraction of the actuator range; 0.5 asks for goals
             deep in the workspace.
+        spread: largest random shift of a reachable goal along each axis [m]; some goals then lie off the workspace,
+            and the best an agent can do is to come near.
     """
 
     name = "reach"
     success_distance = 0.002
     horizon = 1
 
-    def __init__(self, robot: Robot, *, goals: str | np.ndarray = "reachable", command_low: float = 0.0) -> None:
+    def __init__(
+        self, robot: Robot, *, goals: str | np.ndarray = "reachable", command_low: float = 0.0, spread: float = 0.0
+    ) -> None:
         super().__init__(robot)
         if isinstance(goals, str):
             if goals != "reachable":
@@ -37,10 +41,14 @@ class Reach(Task):
                 raise ValueError("goals must be at least one finite point of shape (3,)")
         if not 0.0 <= command_low < 1.0:
             raise ValueError(f"command_low = {command_low} is out of bounds; allowed: [0, 1)")
+        if not (np.isfinite(spread) and spread >= 0.0):
+            raise ValueError(f"spread = {spread} m must be non-negative and finite")
         self.command_low = command_low
+        self.spread = spread
 
     def sample(self, rng: np.random.Generator, count: int, kinematics: Kinematics) -> np.ndarray:
         if self.fixed_goals is not None:
             return self.fixed_goals[rng.integers(len(self.fixed_goals), size=count)][:, None]
         low = self.robot.lower + self.command_low * (self.robot.upper - self.robot.lower)
-        return kinematics(rng.uniform(low, self.robot.upper, (count, len(low))))[:, None]
+        goals = kinematics(rng.uniform(low, self.robot.upper, (count, len(low))))
+        return (goals + rng.uniform(-self.spread, self.spread, goals.shape))[:, None]

@@ -11,6 +11,7 @@ from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError
 
 BAD = {
+    "name that is no folder": ({"name": "../x"}, "name", "pattern"),
     "unknown key": ({"colour": "red"}, "colour", "variables"),
     "unknown variable": ({"variables": ["width"]}, "width", "joint_height"),
     "repeated variable": ({"variables": ["height", "height"]}, "height", "twice"),
@@ -42,7 +43,11 @@ BAD = {
     "no trials": ({"trials": 0}, "trials", "greater than or equal to 1"),
     "infinite": ({"goals": {"command_low": float("nan")}}, "command_low", "0"),
     "too many finalists": ({"finalists": {"count": 6}}, "finalists.count = 6", "trials = 6"),
-    "screen keeps too many": ({"screen": {"enabled": True, "candidates": 100, "keep": 0.5}}, "50 bodies", "trials = 6"),
+    "screen keeps too many": (
+        {"screen": {"enabled": True, "candidates": 100, "keep": 0.5, "goals": 3}},
+        "50 bodies",
+        "trials = 6",
+    ),
     "screen with too many goals": ({"screen": {"enabled": True, "goals": 9}}, "screen.goals = 9", "goals.count = 6"),
     "reports too rare": (
         {"strategy": "scratch", "training": {"steps": 100, "report_every": 200}},

@@ -14,11 +14,14 @@ import numpy as np
 import pytest
 
 from codesign.config import StudyConfig
+from codesign.finalists import choose_winner, evaluations, finalist_jobs
 from codesign.folder import StudyFolder
 from codesign.ledger import open_study
 from codesign.report import write_report
 from codesign.results import bootstrap_interval, rank_correlation, rate_interval
 from codesign.study import run_study
+from softgym_envs.errors import WeightsError
+from softgym_envs.storage import write_json
 
 TRIALS = 8
 
@@ -162,6 +165,43 @@ def test_tables(finished):
         assert {(row["role"], row["backend"]) for row in csv.DictReader(stream)} == {
             (role, backend) for role in ("baseline", "finalist") for backend in ("fem", "surrogate")
         }
+
+
+@pytest.mark.parametrize("choose, winner", [("surrogate", 2), ("fem", 1)])
+def test_who_names_the_winner(choose, winner, study):
+    folder = study(finalists={"count": 2, "choose": choose})
+
+    def record(distance):
+        return {"success_rate": 0.5, "mean_distance": distance, "mean_return": 1.0}
+
+    for number, (searched, tested) in enumerate([(3e-3, 3e-3), (2e-3, 1e-3), (1e-3, 2e-3)]):
+        write_json(
+            folder.trial(number) / "result.json",
+            {
+                "number": number,
+                "origin": "baseline" if number == 0 else f"sampler {number}",
+                "state": "complete",
+                "design": folder.config.baseline,
+                "agent": "qp",
+                "score": -searched,
+                "evaluation": record(searched),
+            },
+        )
+        path = folder.path / "finalists" / f"trial{number:04d}-qp-fem-selection.json"
+        write_json(path, {"trial": number, "agent": "qp", "backend": "fem", "goals": "selection", **record(tested)})
+    assert choose_winner(folder, evaluations(folder)).number == winner
+    goals = {job.path.stem.rpartition("-")[2] for job in finalist_jobs(folder)}
+    assert goals == ({"unseen", "selection"} if choose == "fem" else {"unseen"})
+
+
+def test_error_of_a_worker_is_one_line(tmp_path, tiny):
+    policy = tmp_path / "policy.safetensors"
+    policy.write_bytes(b"not a policy")
+    config = StudyConfig.model_validate(tiny(strategy="warm_start", policy=str(policy)))
+    with pytest.raises(WeightsError) as caught:
+        run_study(config, tmp_path / "study", progress=False)
+    assert "policy.safetensors" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_statistics(rng):

@@ -90,8 +90,8 @@ def test_finger_has_its_published_size():
     assert (one.nodes.shape[0], one.tetrahedra.shape[0]) == pytest.approx((485, 1600), rel=0.03)
     assert volume(two) == pytest.approx(35e-6, rel=0.03)
     low, high = two.nodes.min(axis=0), two.nodes.max(axis=0)
-    np.testing.assert_allclose(low[[0, 2]], [-0.01175, -0.120], atol=1e-9)
-    assert high[0] == pytest.approx(0.01175, abs=1e-9)
+    np.testing.assert_allclose(low[[0, 2]], [-0.01475, -0.120], atol=1e-9)  # the bellows are the widest part
+    assert high[0] == pytest.approx(0.01475, abs=1e-9)
     assert high[1] == pytest.approx(0.023, abs=1e-9)  # the flange, 3 mm above the body
     assert high[2] == pytest.approx(0.0, abs=1e-9)
 
@@ -174,8 +174,8 @@ def test_compliance_is_smooth_along_design_lines(robot):
     """Entries of W, relative to its diagonal, bend but do not jump (measured: 5e-5 of 2e-3 per step and less)."""
     for name in robot.design_space.names:
         variable = robot.design_space[name]
-        # Two percent of the box in eleven steps, in the middle of it.
-        values = variable.from_unit(np.linspace(0.1, 0.14, 11))
+        # Steps of 0.2 % of the box, in the middle of it.
+        values = variable.from_unit(np.linspace(0.1, 0.124, 7))
         W = compliances(robot, name, values)
         first = np.abs(np.diff(W, axis=0)).max()
         second = np.abs(np.diff(W, 2, axis=0)).max()

@@ -1,0 +1,121 @@
+"""Who imports whom: rooms import downwards only, and the suite is imported without anything heavy."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("softgym_envs", "agents", "codesign")
+
+# From the bottom to the top. A room imports from rooms below it and from itself.
+LAYERS = [
+    {"softgym_envs.version", "softgym_envs.errors"},
+    {"softgym_envs.storage"},
+    {"softgym_envs.designs", "softgym_envs.config"},
+    {"softgym_envs.mechanics"},
+    {"softgym_envs.robots"},
+    {"softgym_envs.surrogate"},
+    {"softgym_envs.backends"},
+    {"softgym_envs.control"},
+    {"softgym_envs.envs"},
+    {"agents"},
+    {"codesign"},
+    {"softgym_envs.viewer"},
+    {"softgym_envs.cli"},
+]
+LEVEL = {room: level for level, layer in enumerate(LAYERS) for room in layer}
+# Pictures are made where they are asked for: inside functions, and only there.
+LAZY = {("softgym_envs.envs", "softgym_envs.viewer"), ("codesign", "softgym_envs.viewer")}
+HEAVY = ("torch", "gmsh", "stable_baselines3", "optuna", "rerun", "pyvista", "vtk", "numba", "scipy", "matplotlib")
+
+FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+
+
+def module_name(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room_of(module):
+    """The room of a module's dotted name; the package softgym_envs itself has none."""
+    parts = module.split(".")
+    if parts[0] != "softgym_envs":
+        return parts[0]
+    return ".".join(parts[:2]) if len(parts) > 1 else None
+
+
+def imports_of(path):
+    """Modules of this project that a file imports, each with whether it happens inside a function only."""
+    tree = ast.parse(path.read_text())
+    lazy = {
+        id(node)
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for node in ast.walk(function)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            # ``from softgym_envs import errors`` imports a module, ``from softgym_envs.errors import X`` a name.
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            if name.split(".")[0] in PACKAGES:
+                yield name, id(node) in lazy, node.lineno
+
+
+def test_the_rooms_are_known():
+    rooms = {room_of(module_name(path)) for path in FILES} - {None}
+    assert rooms <= set(LEVEL), rooms - set(LEVEL)
+    assert len(FILES) > 30
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_name)
+def test_imports_go_downwards(path):
+    module = module_name(path)
+    here = room_of(module)
+    for name, lazy, line in imports_of(path):
+        there = room_of(name)
+        if here is None:
+            # ``softgym_envs/__init__.py`` registers the environments, and nothing else.
+            assert there in ("softgym_envs.envs", "softgym_envs.version"), f"line {line}: {name}"
+            continue
+        if there not in LEVEL or there == here:
+            continue
+        allowed = LEVEL[there] < LEVEL[here] or (lazy and (here, there) in LAZY)
+        assert allowed, f"{module}, line {line}: {here} must not import {name}"
+
+
+def test_the_checker_sees_a_forbidden_import(tmp_path):
+    path = tmp_path / "bad.py"
+    path.write_text("from softgym_envs import viewer\n\ndef f():\n    import agents.training\n    from softgym_envs.envs import x\n")
+    found = [(name, lazy) for name, lazy, _ in imports_of(path)]
+    assert found == [("softgym_envs.viewer", False), ("agents.training", True), ("softgym_envs.envs.x", True)]
+    assert [room_of(name) for name, _ in found] == ["softgym_envs.viewer", "agents", "softgym_envs.envs"]
+
+
+def loaded_by(statement):
+    """Heavy packages in ``sys.modules`` after a statement in a fresh process."""
+    code = f"import sys; {statement}; print(*(m for m in {HEAVY} if m in sys.modules))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    return done.stdout.split()
+
+
+@pytest.mark.parametrize("module", ["softgym_envs", "softgym_envs.cli"])
+def test_importing_the_suite_is_light(module):
+    assert loaded_by(f"import {module}") == []
+
+
+def test_the_light_import_registers_the_environments():
+    statement = "import gymnasium, softgym_envs; assert any(i.startswith('SoftGym/') for i in gymnasium.registry)"
+    assert loaded_by(statement) == []
