@@ -7,11 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.statics import Statics
 from softgym_envs.robots import make_robot
+
+# The same examples on every machine, however busy it is.
+settings.register_profile("softgym", deadline=None, derandomize=True)
+settings.load_profile("softgym")
 
 DATA = Path(__file__).parent / "data"
 

@@ -97,7 +97,9 @@ def test_imports_go_downwards(path):
 
 def test_the_checker_sees_a_forbidden_import(tmp_path):
     path = tmp_path / "bad.py"
-    path.write_text("from softgym_envs import viewer\n\ndef f():\n    import agents.training\n    from softgym_envs.envs import x\n")
+    path.write_text(
+        "from softgym_envs import viewer\n\ndef f():\n    import agents.training\n    from softgym_envs.envs import x\n"
+    )
     found = [(name, lazy) for name, lazy, _ in imports_of(path)]
     assert found == [("softgym_envs.viewer", False), ("agents.training", True), ("softgym_envs.envs.x", True)]
     assert [room_of(name) for name, _ in found] == ["softgym_envs.viewer", "agents", "softgym_envs.envs"]

@@ -38,9 +38,7 @@ class LinearRobot:
         effort = solve_complementarity(self.W[None, :3, :3], -command[None], self.unilateral)[0]
         self.command, self.slack = command, effort <= 0.0
         effort = np.concatenate([effort, np.zeros(3)])
-        self.model = CondensedModel(
-            self.W, np.concatenate([np.zeros(3), self.rest]), effort, (("a", 3), ("e", 3))
-        )
+        self.model = CondensedModel(self.W, np.concatenate([np.zeros(3), self.rest]), effort, (("a", 3), ("e", 3)))
         self.effector = self.model.delta.e
         return self.effector
 

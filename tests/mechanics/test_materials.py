@@ -143,7 +143,8 @@ def test_infinite_gradients_are_counted(material):
 
 
 @pytest.mark.parametrize(
-    ("young", "poisson"), [(0.0, 0.3), (-1.0, 0.3), (np.nan, 0.3), (np.inf, 0.3), (1e6, 0.5), (1e6, -1.0), (1e6, np.nan)]
+    ("young", "poisson"),
+    [(0.0, 0.3), (-1.0, 0.3), (np.nan, 0.3), (np.inf, 0.3), (1e6, 0.5), (1e6, -1.0), (1e6, np.nan)],
 )
 def test_impossible_elasticity_is_refused(young, poisson):
     with pytest.raises(ValueError, match=r"young_modulus|poisson_ratio"):

@@ -134,11 +134,7 @@ class Corotational:
         spin = (inner - np.swapaxes(inner, -1, -2)) / (self.s[..., :, None] + self.s[..., None, :])
         dR = self.U @ spin @ self.Vt
         dtrace = (self.R * dF).sum(axis=(-1, -2))
-        return (
-            2 * MU * (dF - dR)
-            + LAME * self.excess[..., None, None] * dR
-            + LAME * dtrace[..., None, None] * self.R
-        )
+        return 2 * MU * (dF - dR) + LAME * self.excess[..., None, None] * dR + LAME * dtrace[..., None, None] * self.R
 
 
 class NeoHookean:

@@ -27,9 +27,7 @@ def test_notched_beam_agrees_with_reference_equilibria(notched):
     assert model.volume == pytest.approx(35200e-9, rel=1e-6)
     statics = Statics(model)
     assert len(notched.displacements) == 7
-    for displacement, positions, force in zip(
-        notched.displacements, notched.positions, notched.forces, strict=True
-    ):
+    for displacement, positions, force in zip(notched.displacements, notched.positions, notched.forces, strict=True):
         found = statics.solve([displacement])  # positive is shortening
         print(
             f"{displacement * 1e3:4.1f} mm: {np.abs(found.x - positions).max() * 1e3:.1e} mm, "
@@ -169,7 +167,9 @@ def test_a_mirrored_command_gives_a_mirrored_tip(fingers):
 # -- slack ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("target", [(0.02, 0.0), (0.0, 0.02), (0.003, 0.015), (-0.01, 0.004), (-0.01, -0.002), (0.01, 0.01)])
+@pytest.mark.parametrize(
+    "target", [(0.02, 0.0), (0.0, 0.02), (0.003, 0.015), (-0.01, 0.004), (-0.01, -0.002), (0.01, 0.01)]
+)
 @pytest.mark.parametrize("material", ["corotational", "stable_neo_hookean"])
 def test_unilateral_cables_are_complementary(fingers, material, target):
     _, model = fingers(2, material)

@@ -42,7 +42,9 @@ def cube(box):
     nodes, tetrahedra = box((1, 1, 1), (3, 3, 3), jitter=0.2)
     edges = nodes[tetrahedra][:, 1:] - nodes[tetrahedra][:, :1]
     tetrahedra[np.linalg.det(edges) < 0] = tetrahedra[np.linalg.det(edges) < 0][:, [0, 2, 1, 3]]
-    faces = np.sort(np.concatenate([tetrahedra[:, [a, b, c]] for a, b, c in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))]))
+    faces = np.sort(
+        np.concatenate([tetrahedra[:, [a, b, c]] for a, b, c in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))])
+    )
     triangles, count = np.unique(faces, axis=0, return_counts=True)
     triangles = triangles[count == 1]
     middle = nodes[triangles].mean(axis=1)
