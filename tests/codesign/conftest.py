@@ -15,10 +15,12 @@ from codesign.folder import StudyFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = """
+import signal
 import sys
 from codesign.config import StudyConfig
 from codesign.study import run_study
 from softgym_envs.config import load_config
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a parent in the background has it ignored
 run_study(load_config(sys.argv[1], StudyConfig), sys.argv[2])
 """
 

@@ -23,14 +23,14 @@ from codesign.study import run_study
 from softgym_envs.errors import WeightsError
 from softgym_envs.storage import write_json
 
-TRIALS = 8
+TRIALS = 7
 
 
 def results_in(folder):
     return {path.parent.name: path.read_bytes() for path in folder.glob("trials/[0-9]*/result.json")}
 
 
-def wait_for(condition, process, seconds=60.0):
+def wait_for(condition, process, seconds=120.0):
     end = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, process.stdout.read()
@@ -45,22 +45,22 @@ def finished(tmp_path_factory, tiny, start_study):
     data = tiny(
         trials=TRIALS,
         workers=2,
-        goals={"count": 15, "unseen_count": 3, "training_count": 2},
+        goals={"count": 12, "unseen_count": 2, "training_count": 2},
         screen={"enabled": True, "candidates": 3, "keep": 0.7, "goals": 2},
         finalists={"count": 1},
     )
     first = start_study(folder, data)
     wait_for(lambda: results_in(folder), first)
     first.send_signal(signal.SIGINT)
-    output, _ = first.communicate(timeout=30)
+    output, _ = first.communicate(timeout=120)
     interrupted = results_in(folder)
 
     second, third = start_study(folder, data), start_study(folder, {**data, "workers": 1})
     wait_for(lambda: len(results_in(folder)) >= len(interrupted) + 2, second)
     second.kill()
-    second.communicate(timeout=30)
+    second.communicate(timeout=120)
     killed = results_in(folder)
-    third.communicate(timeout=60)
+    third.communicate(timeout=120)
     returned = run_study(StudyConfig.model_validate(data), folder, progress=False)
     return SimpleNamespace(
         folder=StudyFolder(folder), output=output, interrupted=interrupted, killed=killed, third=third, results=returned

@@ -7,6 +7,7 @@ equilibria to 1e-14 m, a round-off of about 1e-8.
 
 from __future__ import annotations
 
+import copy
 import pickle
 
 import numpy as np
@@ -181,3 +182,9 @@ def test_a_condensed_model_can_be_pickled(batch):
     again = pickle.loads(pickle.dumps(batch))
     np.testing.assert_array_equal(again.W.ae, batch.W.ae)
     assert again.roles == batch.roles
+
+
+def test_views_by_role_can_be_copied(batch):
+    for view in (batch.W, batch.delta_free):
+        for again in (copy.copy(view), copy.deepcopy(view), pickle.loads(pickle.dumps(view))):
+            np.testing.assert_array_equal(np.asarray(again), np.asarray(view))
