@@ -61,6 +61,7 @@ class SACConfig(Config):
     """Hyper-parameters of soft actor-critic, named as in stable-baselines3."""
 
     learning_rate: float = Field(default=1e-3, gt=0)
+    final_learning_rate: float = Field(default=1e-4, gt=0, description="reached linearly at the last step")
     batch_size: int = Field(default=256, gt=0)
     buffer_size: int = Field(default=100_000, gt=0)
     gamma: float = Field(default=0.95, gt=0, le=1)

@@ -152,6 +152,9 @@ def _make_model(config: TrainConfig, folder: Path) -> SAC:
         seed=config.seed,
         device="cpu",
     )
+    # stable-baselines3 counts progress within one call of learn(); ours spans the whole training.
+    fall = sac.final_learning_rate - sac.learning_rate
+    model.lr_schedule = lambda _: sac.learning_rate + fall * min(model.num_timesteps / config.steps, 1.0)
     model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
     return model
 

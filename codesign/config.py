@@ -26,6 +26,7 @@ __all__ = [
     "ScreenConfig",
     "StudyConfig",
     "TrainingConfig",
+    "ZoneConfig",
     "construct",
     "robot_of",
 ]
@@ -114,27 +115,50 @@ class PrunerConfig(Config):
         return self
 
 
+class ZoneConfig(Config):
+    """A box of space [m] in which goals are spread evenly."""
+
+    center: tuple[float, float, float]
+    half_size: tuple[float, float, float]
+
+    @field_validator("half_size")
+    @classmethod
+    def _positive(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not all(size >= 0.0 for size in value):
+            raise ValueError("must be three lengths of at least 0 m")
+        return value
+
+
 class GoalsConfig(Config):
     """Three disjoint sets of goals: to train on, to choose bodies by, and unseen ones to test the choice.
 
     Attributes:
         source: ``"family"``: effector positions that random bodies reach under random commands, the same for every
-            body; ``"task"``: as the task draws them for the baseline body (for tasks whose goals are paths).
+            body; ``"zone"``: points of a box in space, the work zone a designer has in mind, whether any body reaches
+            them or not; ``"task"``: as the task draws them for the baseline body (for tasks whose goals are paths).
+        zone: the box, for ``"zone"``.
         vary: design variables in which those random bodies differ; default: those that are optimised.
         count: goals every trial is scored on.
         unseen_count: goals only the finalists are tested on.
-        training_count: goals that training episodes draw from (``"family"`` only).
+        training_count: goals that training episodes draw from (not for ``"task"``).
         seed: seed of all three.
         command_low: smallest random command, as a part of the range of its actuator, in [0, 1) (``"family"`` only).
     """
 
-    source: Literal["family", "task"] = "family"
+    source: Literal["family", "zone", "task"] = "family"
+    zone: ZoneConfig | None = None
     vary: tuple[str, ...] | None = Field(default=None, min_length=1)
     count: int = Field(default=40, ge=1)
     unseen_count: int = Field(default=30, ge=2)
     training_count: int = Field(default=300, ge=1)
     seed: int = Field(default=0, ge=0)
     command_low: float = Field(default=0.0, ge=0.0, lt=1.0)
+
+    @model_validator(mode="after")
+    def _zone_where_needed(self) -> GoalsConfig:
+        if (self.source == "zone") != (self.zone is not None):
+            raise ValueError("'zone' (center, half_size) belongs to source 'zone', and to it alone")
+        return self
 
 
 class TrainingConfig(Config):

@@ -8,7 +8,7 @@ import numpy as np
 
 from codesign.config import StudyConfig
 
-__all__ = ["draw_goals", "family_goals"]
+__all__ = ["draw_goals", "family_goals", "zone_goals"]
 
 
 def family_goals(config: StudyConfig, count: int) -> np.ndarray:
@@ -32,6 +32,18 @@ def family_goals(config: StudyConfig, count: int) -> np.ndarray:
     return settled.effector[:, :3]
 
 
+def zone_goals(config: StudyConfig, count: int) -> np.ndarray:
+    """Points [m] (count, 3) spread evenly (scrambled Halton) over the work zone of a study."""
+    from scipy.stats import qmc
+
+    zone = config.goals.zone
+    assert zone is not None  # the configuration was checked
+    unit = qmc.Halton(3, rng=np.random.default_rng(config.goals.seed)).random(count)
+    # Shuffled, so that any part of them fills the zone.
+    np.random.default_rng([config.goals.seed, 1]).shuffle(unit)
+    return np.asarray(zone.center) + (2.0 * unit - 1.0) * np.asarray(zone.half_size)
+
+
 def draw_goals(config: StudyConfig) -> dict[str, Any]:
     """Draw the three disjoint sets of goals of a study [m], as plain data.
 
@@ -45,7 +57,8 @@ def draw_goals(config: StudyConfig) -> dict[str, Any]:
 
         paths, training = sample_goals(config.environment, count, goals.seed), np.zeros((0, 3))
     else:
-        points = family_goals(config, count + goals.training_count)
+        draw = family_goals if goals.source == "family" else zone_goals
+        points = draw(config, count + goals.training_count)
         paths, training = points[:count, None], points[count:]
     drawn = {"training": training, "selection": paths[: goals.count], "unseen": paths[goals.count :]}
     return {"unit": "m", **{name: array.tolist() for name, array in drawn.items()}}

@@ -159,6 +159,10 @@ def _question(study: StudyFolder, results: Mapping[str, Any]) -> list[tuple[str,
             + (f" above {100 * goals.command_low:.0f} % of their range" if goals.command_low else "")
             + ", the same for every body"
         )
+    elif goals.zone is not None:
+        center = ", ".join(f"{1e3 * v:g}" for v in goals.zone.center)
+        half = ", ".join(f"{1e3 * v:g}" for v in goals.zone.half_size)
+        origin = f"spread over a work zone about ({center}) mm, half size ({half}) mm, the same for every body"
     else:
         origin = "drawn as the task draws them for the baseline body, the same for every body"
     done = ", ".join(f"{results['trials'][s]} {s}" for s in ("complete", "pruned", "infeasible"))

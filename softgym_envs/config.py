@@ -82,7 +82,7 @@ def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> Model
         if first["type"] == "extra_forbidden":
             allowed = _allowed(model, [part for part in first["loc"][:-1] if isinstance(part, str)])
             message = f"unknown key; allowed: {allowed}" if allowed else "unknown key"
-        elif first["type"] != "missing":
+        elif first["type"] != "missing" and not isinstance(first["input"], dict):
             message += f", got {first['input']!r}"
         others = error.error_count() - 1
         more = f" (and {others} more)" if others else ""

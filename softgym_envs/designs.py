@@ -40,6 +40,8 @@ class DesignVariable:
     log: bool = False
 
     def __post_init__(self) -> None:
+        if not (math.isfinite(self.low) and math.isfinite(self.high)):
+            raise DesignError(f"design variable '{self.name}': low {self.low} and high {self.high} must be finite")
         if not self.low < self.high:
             raise DesignError(f"design variable '{self.name}': low {self.low} must be below high {self.high}")
         if not self.low <= self.baseline <= self.high:
@@ -55,7 +57,7 @@ class DesignVariable:
         allowed = f"allowed: {self.low:g} to {self.high:g}{unit}"
         try:
             number = float(value)  # type: ignore[arg-type]
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise DesignError(f"design variable '{self.name}' = {value!r} is not a number; {allowed}") from None
         if not math.isfinite(number):
             raise DesignError(f"design variable '{self.name}' = {number} is not finite; {allowed}")
@@ -74,8 +76,8 @@ class DesignVariable:
         return 2.0 * (value - low) / (high - low) - 1.0
 
     def from_unit(self, unit_value: float | np.ndarray) -> np.ndarray:
-        """Map [-1, 1] to [low, high]."""
-        fraction = 0.5 * (np.asarray(unit_value) + 1.0)
+        """Map [-1, 1] to [low, high]; values outside are clipped."""
+        fraction = 0.5 * (np.clip(unit_value, -1.0, 1.0) + 1.0)
         if self.log:
             value = np.exp(math.log(self.low) + fraction * math.log(self.high / self.low))
         else:

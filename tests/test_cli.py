@@ -63,7 +63,14 @@ def test_dataset_fit_and_train(monkeypatch, capsys, tmp_path):
     assert status == 0, err
     assert "effector_mean" in out and (fitted / "model.safetensors").exists()
     config = ROOT / "configs" / "agents" / "finger_reach.yaml"
-    small = ["steps=64", "num_envs=8", "report_every=64", "evaluation_episodes=2", "sac.net_arch=[8]", "sac.learning_starts=16"]
+    small = [
+        "steps=64",
+        "num_envs=8",
+        "report_every=64",
+        "evaluation_episodes=2",
+        "sac.net_arch=[8]",
+        "sac.learning_starts=16",
+    ]
     arguments = ["train", "--config", config, "--folder", tmp_path / "sac", "--quiet", *small]
     status, out, err = run(monkeypatch, capsys, *arguments)
     assert status == 0, err

@@ -90,6 +90,8 @@ class InverseQP:
         delta, effort = condensed.delta, condensed.lambda_.a
         if goal.shape != delta.e.shape or not np.isfinite(goal).all():
             raise ValueError(f"goal must be {delta.e.size} finite coordinates, got {goal.tolist()}")
+        if not (np.isfinite(condensed.compliance).all() and np.isfinite(delta.array).all()):
+            raise ValueError("the condensed model holds values that are not finite")
         slack = np.zeros(len(command), dtype=bool) if slack is None else slack
         Waa, Wea = condensed.W.aa, condensed.W.ea
         stiffness = np.linalg.inv(Waa)

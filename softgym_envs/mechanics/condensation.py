@@ -31,6 +31,8 @@ class RoleVector:
         self.slices = slices
 
     def __getattr__(self, role: str) -> np.ndarray:
+        if role in self.__slots__:  # while being copied or unpickled
+            raise AttributeError(role)
         try:
             return self.array[..., self.slices[role]]
         except KeyError:
@@ -50,6 +52,8 @@ class RoleMatrix:
         self.slices = slices
 
     def __getattr__(self, roles: str) -> np.ndarray:
+        if roles in self.__slots__:  # while being copied or unpickled
+            raise AttributeError(roles)
         if len(roles) == 2 and roles[0] in self.slices and roles[1] in self.slices:
             return self.array[..., self.slices[roles[0]], self.slices[roles[1]]]
         raise AttributeError(f"no block '{roles}'; roles: {', '.join(self.slices)}")

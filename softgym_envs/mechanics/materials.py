@@ -86,7 +86,7 @@ def _corotational(F, mu, lame, energy, stress, tangent):
     for e in range(F.shape[0]):
         f = F[e]
         determinant = _cofactor(f, c)
-        if not determinant > 0.0:  # also true for NaN
+        if not 0.0 < determinant < np.inf:  # also true for NaN
             bad += 1
             continue
         # Polar rotation by Newton's iteration with norm scaling (Higham 1986): quadratic, to round-off.
@@ -192,7 +192,7 @@ def _stable_neo_hookean(F, mu, lame, energy, stress, tangent):
         la = lame[e] + 5.0 / 6.0 * mu[e]
         alpha = 1.0 + m / la - m / (4.0 * la)
         J = _cofactor(f, c)
-        if not J > 0.0:
+        if not 0.0 < J < np.inf:
             bad += 1
             continue
         ic = 0.0

@@ -32,6 +32,12 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[np.ndarray, np.n
     path = Path(path)
     if not path.is_file():
         raise DataError(f"mesh file '{path}' does not exist")
+    if path.suffix.lower() == ".msh":
+        # meshio looks for the end of a cut-off section of these formats (Gmsh, and Ansys in brackets) for ever.
+        content = path.read_bytes()
+        whole = content.rstrip().endswith(b")") or (b"$EndNodes" in content and b"$EndElements" in content)
+        if not whole:
+            raise DataError(f"mesh file '{path}' is truncated: a section does not end")
     try:
         mesh = meshio.read(path)
     except (Exception, SystemExit) as error:  # meshio leaves with SystemExit on some malformed files
@@ -41,8 +47,20 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[np.ndarray, np.n
         found = sorted({block.type for block in mesh.cells})
         raise DataError(f"mesh file '{path}' holds no tetrahedra (cell type 'tetra'); found {found}")
     tetrahedra = np.concatenate(blocks)
+    if tetrahedra.size and not 0 <= tetrahedra.min() <= tetrahedra.max() < len(mesh.points):
+        raise DataError(
+            f"mesh file '{path}': tetrahedra refer to nodes {tetrahedra.min()}..{tetrahedra.max()}, "
+            f"it has {len(mesh.points)}"
+        )
     used, renumbered = np.unique(tetrahedra, return_inverse=True)
     return np.asarray(mesh.points, dtype=float)[used, :3] * scale, renumbered.reshape(tetrahedra.shape)
+
+
+def _check_nodes(nodes: np.ndarray) -> np.ndarray:
+    nodes = np.ascontiguousarray(nodes, dtype=float)
+    if nodes.ndim != 2 or nodes.shape[1] != 3 or not np.isfinite(nodes).all():
+        raise ValueError(f"nodes must be finite with shape (n, 3), got shape {nodes.shape}")
+    return nodes
 
 
 class MechanicalModel:
@@ -70,12 +88,11 @@ class MechanicalModel:
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         solver: str = "auto",
     ) -> None:
-        self.nodes = np.ascontiguousarray(nodes, dtype=float)
-        if self.nodes.ndim != 2 or self.nodes.shape[1] != 3 or not np.isfinite(self.nodes).all():
-            raise ValueError(f"nodes must be finite with shape (n, 3), got shape {self.nodes.shape}")
+        self.nodes = _check_nodes(nodes)
         self.blocks = list(blocks)
         mask = np.zeros(len(self.nodes), dtype=bool)
-        mask[np.asarray(fixed)] = True
+        chosen = np.asarray(fixed)
+        mask[chosen if chosen.size else chosen.astype(int)] = True
         if not mask.any():
             raise ValueError("no node is fixed: the body could float away; pass the clamped nodes as 'fixed'")
         used = np.zeros(len(self.nodes), dtype=bool)
@@ -113,7 +130,7 @@ class MechanicalModel:
         solver: str = "auto",
     ) -> MechanicalModel:
         """Make a model of one material from any tetrahedral mesh: nodes [m] (n, 3), tetrahedra (m, 4)."""
-        nodes = np.ascontiguousarray(nodes, dtype=float)
+        nodes = _check_nodes(nodes)
         block = Tetrahedra(
             nodes,
             tetrahedra,

@@ -57,7 +57,7 @@ class Statics:
         model: the body.
         tolerance: largest correction of any node left at convergence [m].
         max_iterations: Newton iterations per load increment.
-        max_halvings: how often a load increment is halved before giving up.
+        max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the way.
 
     Attributes:
         x: present node positions [m], shape (n, 3).
@@ -226,7 +226,7 @@ class Statics:
         goal = np.zeros(self.model.size)
         goal[:count] = target
         # A slack cable's reached displacement exceeds its command: the path starts from the command's side.
-        done, size, iterations, increments, halvings = 0.0, 1.0, 0, 0, 0
+        done, size, iterations, increments = 0.0, 1.0, 0, 0
         while done < 1.0:
             level = min(1.0, done + size)
             kept = self.x, self.effort
@@ -234,9 +234,8 @@ class Statics:
                 iterations += self._newton(start + level * (goal - start), driven)
             except _NotFound:
                 self.restore(*kept)
-                halvings += 1
                 size *= 0.5
-                if halvings > self.max_halvings or not self._linearise():
+                if size < 0.5**self.max_halvings or not self._linearise():
                     reached = ", ".join(f"{v:.6g}" for v in (start + done * (goal - start))[:count])
                     wanted = ", ".join(f"{v:.6g}" for v in target)
                     raise ConvergenceError(
@@ -247,7 +246,6 @@ class Statics:
                 continue
             increments += 1
             done = level
-            halvings = max(0, halvings - 1)
             size *= 1.5
         return self._state(driven, iterations, increments)
 

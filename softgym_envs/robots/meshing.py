@@ -26,6 +26,7 @@ from softgym_envs.storage import atomic_write, cache_directory, read_npz
 __all__ = ["BodyMesh", "mesh_geometry"]
 
 _FORMAT = 2
+_BROKEN = 3  # exit status of the meshing process when gmsh itself is missing or does not load
 _SHIPPED = Path(__file__).parent / "meshes"
 
 
@@ -90,6 +91,7 @@ def mesh_geometry(
 
     Raises:
         InfeasibleDesign: if the geometry cannot be drawn or meshed, or takes too long.
+        RuntimeError: if gmsh cannot be imported.
     """
     name = f"{build.__module__}:{build.__qualname__}"
     parameters = {key: float(value) for key, value in sorted(parameters.items())}
@@ -120,6 +122,8 @@ def mesh_geometry(
             )
         except subprocess.TimeoutExpired:
             raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s for {parameters}") from None
+        if done.returncode == _BROKEN:
+            raise RuntimeError(f"gmsh cannot be used: {done.stderr.strip().splitlines()[-1]}")
         if done.returncode != 0:
             reason = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
             raise InfeasibleDesign(f"the geometry cannot be meshed for {parameters}: {reason}")
@@ -181,4 +185,8 @@ def _mesh_here(request: dict) -> BodyMesh:
 
 if __name__ == "__main__":
     arguments = json.loads(sys.argv[1])
-    _mesh_here(arguments).save(Path(arguments["output"]))
+    try:
+        _mesh_here(arguments).save(Path(arguments["output"]))
+    except (ImportError, OSError) as problem:  # OSError: a system library that gmsh needs is missing
+        print(problem, file=sys.stderr)
+        sys.exit(_BROKEN)

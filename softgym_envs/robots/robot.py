@@ -11,6 +11,7 @@ import numpy as np
 from softgym_envs.designs import DesignSpace
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.constraints import EmbeddedPoints
+from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.meshing import BodyMesh
 from softgym_envs.robots.morphing import Feature, Morpher
@@ -66,11 +67,24 @@ class Robot(ABC):
     #: Smallest element quality, relative to the baseline mesh, that a moved mesh may have before it is remeshed.
     quality_bound = 0.3
 
-    def __init__(self, *, mesh_size: float, meshing: str = "morph") -> None:
+    def __init__(
+        self,
+        *,
+        mesh_size: float,
+        meshing: str = "morph",
+        material: str = "corotational",
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
         if meshing not in ("morph", "remesh"):
             raise ValueError(f"meshing = {meshing!r} is unknown; allowed: 'morph', 'remesh'")
         if not (np.isfinite(mesh_size) and mesh_size > 0):
             raise ValueError(f"mesh_size = {mesh_size} m must be positive and finite")
+        if material not in MATERIALS:
+            raise ValueError(f"unknown material '{material}'; allowed: {', '.join(MATERIALS)}")
+        if len(gravity) != 3 or not np.isfinite(gravity).all():
+            raise ValueError(f"gravity must be three finite numbers [m/s2], got {gravity!r}")
+        self.material = material
+        self.gravity = gravity
         self.mesh_size = float(mesh_size)
         self.meshing = meshing
         self._morpher: Morpher | None = None

@@ -104,11 +104,9 @@ class SoftFinger(Robot):
     ) -> None:
         if cables not in (1, 2):
             raise ValueError(f"cables = {cables!r} is unknown; allowed: 1, 2")
-        super().__init__(mesh_size=mesh_size, meshing=meshing)
+        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity)
         self.cables = cables
-        self.material = material
         self.unilateral = unilateral
-        self.gravity = gravity
         self.slope = math.radians(45.0 if cables == 2 else 30.0)
         self.cable_height = 15.33e-3 if cables == 2 else 17.75e-3
         self.cable_offsets = (-5.0e-3, 5.0e-3) if cables == 2 else (0.0,)

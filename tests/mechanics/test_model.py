@@ -207,6 +207,8 @@ def test_negatively_oriented_elements_are_turned(box):
     mirrored[::3] = mirrored[::3][:, [1, 0, 2, 3]]
     plain, turned = (MechanicalModel.from_mesh(nodes, t, fixed=[0]) for t in (tetrahedra, mirrored))
     assert turned.volume == pytest.approx(1.0, rel=1e-12)
+    corners = nodes[turned.blocks[0].connectivity]
+    assert (np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0.0).all()
     x = nodes * [1.1, 1.0, 0.95]
     assert turned.energy(x) == pytest.approx(plain.energy(x), rel=1e-12)
 
@@ -295,10 +297,20 @@ def mesh_in_millimetres(box):
     return meshio.Mesh(np.vstack([nodes, [[1e3, 1e3, 1e3]]]), [("triangle", [[0, 1, 2]]), ("tetra", tetrahedra)])
 
 
-@pytest.mark.parametrize("name", ["beam.vtk", "beam.msh", "beam.vtu", "beam.mesh"])
-def test_model_from_a_file(tmp_path, mesh_in_millimetres, name):
+# File name and the format meshio writes: ``.msh`` is gmsh's, and Ansys' too.
+FORMATS = [
+    ("beam.vtk", None),
+    ("beam.msh", "gmsh22"),
+    ("ansys.msh", "ansys"),
+    ("beam.vtu", None),
+    ("beam.mesh", None),
+]
+
+
+@pytest.mark.parametrize(("name", "written_as"), FORMATS)
+def test_model_from_a_file(tmp_path, mesh_in_millimetres, name, written_as):
     path = tmp_path / name
-    mesh_in_millimetres.write(path)
+    mesh_in_millimetres.write(path, file_format=written_as)
     box = (-1e-6, 1e-6, -1, 1, -1, 1)
     model = MechanicalModel.from_file(path, fixed_box=box, scale=1e-3, density=1000.0)
     assert model.volume == pytest.approx(0.1 * 0.02 * 0.02, rel=1e-9)
@@ -309,6 +321,26 @@ def test_model_from_a_file(tmp_path, mesh_in_millimetres, name):
     nodes, tetrahedra = read_mesh(path)
     np.testing.assert_allclose(nodes, mesh_in_millimetres.points[:-1], atol=1e-9)
     np.testing.assert_array_equal(tetrahedra, mesh_in_millimetres.cells_dict["tetra"])
+
+
+@pytest.mark.parametrize("binary", [0, 1])
+def test_model_from_a_file_of_gmsh(tmp_path, binary):
+    """A file as gmsh itself writes it (format 4.1), with nodes of curves and a surface mesh beside the solid one."""
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize(interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("Mesh.Binary", binary)
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 20.0)
+        gmsh.model.occ.addBox(0, 0, 0, 100, 20, 20)
+        gmsh.model.occ.synchronize()
+        gmsh.model.mesh.generate(3)
+        gmsh.write(str(tmp_path / "beam.msh"))
+    finally:
+        gmsh.finalize()
+    model = MechanicalModel.from_file(tmp_path / "beam.msh", fixed_box=(-1e-6, 1e-6, -1, 1, -1, 1), scale=1e-3)
+    assert model.volume == pytest.approx(0.1 * 0.02 * 0.02, rel=1e-9)
+    assert 4 <= model.fixed.sum() < len(model.nodes)
 
 
 def test_a_box_that_fixes_nothing_is_refused(tmp_path, mesh_in_millimetres):
@@ -342,11 +374,11 @@ def no_endless_reading():
     signal.signal(signal.SIGALRM, previous)
 
 
-@pytest.mark.parametrize("name", ["beam.vtk", "beam.msh", "beam.vtu", "beam.mesh"])
-@pytest.mark.parametrize("kept", [0.0, 0.02, 0.4, 0.44, 0.7, 0.98])
-def test_truncated_file(tmp_path, no_endless_reading, mesh_in_millimetres, name, kept):
+@pytest.mark.parametrize(("name", "written_as"), FORMATS)
+@pytest.mark.parametrize("kept", [0.0, 0.02, 0.4, 0.7, 0.95])
+def test_truncated_file(tmp_path, no_endless_reading, mesh_in_millimetres, name, written_as, kept):
     path = tmp_path / name
-    mesh_in_millimetres.write(path)
+    mesh_in_millimetres.write(path, file_format=written_as)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
     with pytest.raises(DataError, match=name):

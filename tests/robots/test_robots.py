@@ -129,6 +129,20 @@ def test_bodies_at_the_corners_and_inside_of_the_design_box(robot, rng):
     assert origins.count("morphed") >= 0.75 * len(designs)
 
 
+def test_effectors_outside_the_body_hang_on_one_element(robot, rng):
+    """The nearest element changes from design to design; an effector that changed with it would jump."""
+    (base,) = robot.build().constraints["e"]
+    if base.embedding.weights.min() > -1e-9:
+        pytest.skip("the effector is inside the body")
+    for _ in range(8):
+        design = robot.design_space.sample(rng)
+        mesh = robot.body(design)
+        (effector,) = robot.equip(mesh, design).constraints["e"]
+        if mesh.origin == "morphed" and effector.embedding.weights.min() < -1e-9:
+            np.testing.assert_array_equal(effector.embedding.elements, base.embedding.elements)
+            assert np.abs(effector.embedding.weights - base.embedding.weights).max() < 0.5
+
+
 def test_baseline_body_is_the_mesh_not_moved(robot):
     mesh = robot.body()
     assert mesh.origin == "morphed"

@@ -9,7 +9,7 @@ import pytest
 from softgym_envs.errors import WeightsError
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.model import NETWORKS, ResidualModel, load_model
-from softgym_envs.surrogate.pretrained import family_goals, pretrained_folder, pretrained_model
+from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
 from softgym_envs.surrogate.training import FitConfig, fit
 
 CABLES = (1, 2)
@@ -153,14 +153,6 @@ def test_slack_cables_carry_nothing_and_reach_more():
     assert np.abs(again.displacement - state.displacement).max() < 5e-6
     bilateral = SurrogateBackend(make_robot("finger", unilateral=False)).step(np.array([0.010, 0.0075]))
     assert not bilateral.slack.any()
-
-
-def test_family_goals_repeat_and_belong_to_no_body():
-    robot = make_robot("finger")
-    goals = family_goals(robot, 20, seed=3, command_low=0.5)
-    assert goals.shape == (20, 3) and np.isfinite(goals).all()
-    assert (goals == family_goals(robot, 20, seed=3, command_low=0.5)).all()
-    assert (goals != family_goals(robot, 20, seed=4, command_low=0.5)).any()
 
 
 @pytest.fixture
