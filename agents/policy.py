@@ -11,9 +11,28 @@ import numpy as np
 from softgym_envs.errors import WeightsError
 from softgym_envs.storage import atomic_write, write_json
 
-__all__ = ["Policy", "read_tensors", "save_policy"]
+__all__ = ["Policy", "policy_path", "read_tensors", "save_policy"]
 
 FORMAT = 1
+_SHIPPED = Path(__file__).parent / "weights"
+
+
+def policy_path(policy: str | Path) -> Path:
+    """Return the file of a policy: a path, or the name of one that ships in ``agents/weights``.
+
+    Raises:
+        WeightsError: if there is neither.
+    """
+    path = Path(policy)
+    if path.suffix == ".safetensors":
+        if not path.is_file():
+            raise WeightsError(f"policy '{path}' does not exist; train one with 'softgym train'")
+        return path
+    shipped = _SHIPPED / str(policy) / "policy.safetensors"
+    if not shipped.is_file():
+        names = sorted(p.parent.name for p in _SHIPPED.glob("*/policy.safetensors"))
+        raise WeightsError(f"unknown policy '{policy}'; allowed: a .safetensors file or one of {', '.join(names)}")
+    return shipped
 
 
 def save_policy(path: Path, tensors: dict[str, np.ndarray], card: dict[str, Any]) -> None:
@@ -35,8 +54,6 @@ def read_tensors(path: str | Path) -> dict[str, np.ndarray]:
     from safetensors.numpy import load_file
 
     path = Path(path)
-    if not path.is_file():
-        raise WeightsError(f"policy '{path}' does not exist; train one with 'softgym train'")
     try:
         return load_file(path)
     except (SafetensorError, OSError, ValueError) as error:
@@ -47,14 +64,14 @@ class Policy:
     """The mean action of a SAC actor.
 
     Args:
-        path: ``policy.safetensors``, with its card beside it.
+        path: ``policy.safetensors``, with its card beside it, or the name of a shipped policy.
 
     Raises:
         WeightsError: if a file is missing, damaged or of another version.
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+        self.path = policy_path(path)
         tensors = read_tensors(self.path)
         card = self.path.with_suffix(".json")
         try:

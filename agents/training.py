@@ -13,7 +13,7 @@ import numpy as np
 
 from agents.config import TrainConfig
 from agents.evaluation import evaluate, sample_goals
-from agents.policy import read_tensors, save_policy
+from agents.policy import policy_path, read_tensors, save_policy
 from softgym_envs.config import provenance, save_resolved
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.storage import atomic_write
@@ -45,7 +45,7 @@ def train(
     Args:
         config: what to train.
         folder: where the results go.
-        initial: policy to start from (actor and critics).
+        initial: policy to start from (actor and critics): a file or the name of a shipped one.
         report: called after each evaluation with (step, success rate); True stops the training early.
         progress: show a progress bar.
 
@@ -79,7 +79,8 @@ def train(
     if checkpoint.exists():
         curve = _restore(model, checkpoint)
     elif initial is not None:
-        _load_weights(model, read_tensors(initial), Path(initial))
+        start_from = policy_path(initial)
+        _load_weights(model, read_tensors(start_from), start_from)
     surrogate = config.environment.model_copy(update={"backend": "surrogate"})
     goals = sample_goals(
         surrogate.model_copy(update={"sample_design": False}), config.evaluation_episodes, _EVALUATION_SEED

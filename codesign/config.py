@@ -229,7 +229,7 @@ class StudyConfig(Config):
         objective: what is optimised: success rate and return upwards, mean final distance downwards.
         strategy: ``"warm_start"`` fine-tunes a design-conditioned policy in each trial, ``"scratch"`` trains a new one,
             ``"qp"`` trains none and scores a body by the inverse QP.
-        policy: design-conditioned policy to start from, for ``"warm_start"``.
+        policy: design-conditioned policy to start from, for ``"warm_start"``: a file or the name of a shipped one.
         trials: number of bodies, the baseline and those of the screen included.
         workers: processes, one thread each.
         sampler: who proposes bodies.

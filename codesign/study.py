@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from agents.policy import policy_path
 from codesign.config import StudyConfig
 from codesign.finalists import finalist_jobs
 from codesign.folder import StudyFolder
@@ -44,14 +45,15 @@ def run_study(
         What is in ``results.json``.
 
     Raises:
-        ConfigError: if the folder holds another study, or the policy to start from is missing.
+        ConfigError: if the folder holds another study, or the number of workers is not positive.
+        WeightsError: if the policy to start from is missing.
         SoftGymError: if a worker was stopped by an error.
     """
     count = config.workers if workers is None else workers
     if count < 1:
         raise ConfigError(f"workers = {count} is out of bounds; allowed: 1 or more")
-    if config.policy is not None and not Path(config.policy).is_file():
-        raise ConfigError(f"policy '{config.policy}' does not exist; strategy 'warm_start' needs a trained policy file")
+    if config.policy is not None:
+        policy_path(config.policy)  # a missing one is told before anything starts
     study = StudyFolder.create(folder, config)
     printer = _Printer(study, enabled=progress)
     try:

@@ -147,7 +147,7 @@ def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str
     policy = train(
         training_config(folder, result["design"]),
         folder.trial(trial.number),
-        initial=Path(config.policy) if config.strategy == "warm_start" and config.policy else None,
+        initial=config.policy if config.strategy == "warm_start" else None,
         report=reporter,
         progress=False,
     )

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.statics import Equilibrium, Statics
 from softgym_envs.robots.robot import Robot
@@ -33,16 +34,21 @@ class FEMBackend(Backend):
         complete = self.design if design is None else self.robot.design_space.complete(design)
         if complete != self.design:
             model = self.robot.build(complete)
-            self._statics = Statics(model)
+            statics = Statics(model)
             zero = np.zeros(len(self.robot.actuators))
-            self._rest = self._state(self._statics.solve(zero, "effort"), zero)
-            self.model, self.design = model, dict(complete)
+            self._rest = self._state(statics.solve(zero, "effort"), zero)
+            self.model, self._statics, self.design = model, statics, dict(complete)
         self.restore(self._rest)
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement") -> State:
         command = np.asarray(command, dtype=float)
-        self.state = self._state(self._statics.solve(command, mode), command)
+        try:
+            equilibrium = self._statics.solve(command, mode)
+        except ConvergenceError:
+            self.restore(self.state)
+            raise
+        self.state = self._state(equilibrium, command)
         return self.state
 
     def restore(self, state: State) -> None:

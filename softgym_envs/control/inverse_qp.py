@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError
@@ -61,15 +63,19 @@ class InverseQP:
         self.max_effort = (
             np.full(len(self.rates), np.inf) if max_effort is None else np.asarray(max_effort, dtype=float)
         )
+        self._proxqp = proxqp
+        self._qp: Any = None
+
+    def _make_qp(self) -> Any:
+        """A new solver; one that failed would warm-start from its bad result."""
         n = len(self.rates)
         # One inequality per actuator (its effort) beside the box of displacements.
-        self._qp = proxqp.dense.QP(n, 0, n, True)
-        self._qp.settings.eps_abs = 1e-9
-        self._qp.settings.eps_rel = 0.0
-        self._qp.settings.max_iter = 1000
-        self._qp.settings.initial_guess = proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
-        self._solved = proxqp.QPSolverOutput.PROXQP_SOLVED
-        self._started = False
+        qp = self._proxqp.dense.QP(n, 0, n, True)
+        qp.settings.eps_abs = 1e-9
+        qp.settings.eps_rel = 0.0
+        qp.settings.max_iter = 200
+        qp.settings.initial_guess = self._proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
+        return qp
 
     def solve(
         self, condensed: CondensedModel, goal: np.ndarray, command: np.ndarray, slack: np.ndarray | None = None
@@ -125,13 +131,14 @@ class InverseQP:
             box_low,
             box_high,
         )
-        if self._started:
-            self._qp.update(*arguments)
-        else:
+        if self._qp is None:
+            self._qp = self._make_qp()
             self._qp.init(*arguments)
-            self._started = True
+        else:
+            self._qp.update(*arguments)
         self._qp.solve()
-        if self._qp.results.info.status != self._solved:
-            self._started = False
-            raise ConvergenceError(f"ProxQP stopped with {self._qp.results.info.status} for goal {goal.tolist()} m")
-        return np.clip(delta.a + self._qp.results.x * scale, low, high)
+        results = self._qp.results
+        if results.info.status != self._proxqp.QPSolverOutput.PROXQP_SOLVED:
+            self._qp = None
+            raise ConvergenceError(f"ProxQP stopped with {results.info.status} for goal {goal.tolist()} m")
+        return np.clip(delta.a + results.x * scale, low, high)

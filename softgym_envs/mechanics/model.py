@@ -32,14 +32,18 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[np.ndarray, np.n
     path = Path(path)
     if not path.is_file():
         raise DataError(f"mesh file '{path}' does not exist")
-    if path.suffix.lower() == ".msh":
-        # meshio looks for the end of a cut-off section of these formats (Gmsh, and Ansys in brackets) for ever.
+    suffix = path.suffix.lower()
+    file_format = None
+    if suffix == ".off":
+        raise DataError(f"mesh file '{path}' holds no tetrahedra: the format .off is for surfaces")
+    if suffix == ".msh":
+        # Two programs use this suffix. meshio tries Ansys first, and looks for the end of a cut-off section for ever.
         content = path.read_bytes()
-        whole = content.rstrip().endswith(b")") or (b"$EndNodes" in content and b"$EndElements" in content)
-        if not whole:
-            raise DataError(f"mesh file '{path}' is truncated: a section does not end")
+        file_format = "gmsh" if content.lstrip().startswith(b"$") else "ansys"
+        if file_format == "ansys" and not content.rstrip().endswith(b")"):
+            raise DataError(f"mesh file '{path}' is neither a Gmsh mesh nor a whole Ansys mesh")
     try:
-        mesh = meshio.read(path)
+        mesh = meshio.read(path, file_format=file_format)
     except (Exception, SystemExit) as error:  # meshio leaves with SystemExit on some malformed files
         raise DataError(f"mesh file '{path}' cannot be read: {error}") from error
     blocks = [block.data for block in mesh.cells if block.type == "tetra"]
@@ -77,6 +81,7 @@ class MechanicalModel:
 
     Attributes:
         constraints: constraint objects by role letter: ``"a"`` actuators, ``"e"`` effectors, ``"c"`` contacts.
+        load_factor: part of the dead loads that `assemble` applies, for continuation.
     """
 
     def __init__(
@@ -108,6 +113,8 @@ class MechanicalModel:
         self._solver: LinearSolver | None = None
         self._poisson: LinearSolver | None = None
         self._free_nodes = np.flatnonzero(~self.fixed)
+        self.load_factor = 1.0
+        self.loads_version = 0
         self.nodal_loads = np.zeros_like(self.nodes)
         self.gravity_forces = np.zeros_like(self.nodes)
         self._block_masses = [block.density * block.volumes for block in self.blocks]
@@ -181,7 +188,6 @@ class MechanicalModel:
     ) -> Cable:
         """Add a cable actuator through ``points`` [m] (p, 3), ordered from the pull point to the anchor."""
         cable = Cable(name, self.embed(points, hint), pull_point, unilateral=unilateral)
-        cable.attach(self.nodes)
         self.add("a", cable)
         return cable
 
@@ -194,7 +200,10 @@ class MechanicalModel:
     # -- loads ------------------------------------------------------------------------------------------------------
 
     def set_gravity(self, gravity: Sequence[float]) -> None:
-        """Set the acceleration of gravity [m/s2], shape (3,). Masses come from the density of the blocks."""
+        """Set the acceleration of gravity [m/s2], shape (3,). Masses come from the density of the blocks.
+
+        A `Statics` in use notices. After a change of ``nodal_loads`` call `refresh_loads`.
+        """
         acceleration = np.asarray(gravity, dtype=float)
         if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
             raise ValueError(f"gravity must be three finite numbers, got {gravity!r}")
@@ -204,6 +213,7 @@ class MechanicalModel:
                 share = np.repeat(masses / 4.0, 4)
                 nodal = np.bincount(block.connectivity.ravel(), weights=share, minlength=len(self.nodes))
                 self.gravity_forces += nodal[:, None] * acceleration
+        self.refresh_loads()
 
     @property
     def loads(self) -> np.ndarray:
@@ -286,7 +296,6 @@ class MechanicalModel:
             equations = self._equation[constraint.dofs]
             keep = np.flatnonzero(equations >= 0)
             self._targets.append((keep, equations[keep]))
-        self._loads = self.loads
         self._solver = make_solver(self._solver_name, indptr, indices)
 
     @property
@@ -321,7 +330,7 @@ class MechanicalModel:
         """
         self.prepare()
         gradient, values = self._gradient, self._values
-        np.negative(self._loads, out=gradient)
+        np.multiply(self._loads, -self.load_factor, out=gradient)
         values[:] = 0.0
         for block, scatter in zip(self.blocks, self._block_maps, strict=True):
             if block.add(x, gradient, values, scatter)[1]:
@@ -376,5 +385,6 @@ class MechanicalModel:
         return solver
 
     def refresh_loads(self) -> None:
-        """Take over changed gravity or nodal loads."""
+        """Take over changed ``nodal_loads``."""
         self._loads = self.loads
+        self.loads_version += 1

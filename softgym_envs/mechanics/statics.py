@@ -33,6 +33,8 @@ class Equilibrium:
         delta: constraint values of all rows, shape (size,).
         effort: efforts of all rows, shape (size,).
         slack: per actuator row, True where a unilateral actuator hangs slack.
+        stable: the tangent is positive definite: the state is stable whatever drives the actuators. Where it is not, a
+            displacement-driven state may still be.
         iterations: Newton iterations spent, over all load increments.
         increments: load increments used.
     """
@@ -42,6 +44,7 @@ class Equilibrium:
     delta: np.ndarray
     effort: np.ndarray
     slack: np.ndarray
+    stable: bool
     iterations: int
     increments: int
 
@@ -81,18 +84,21 @@ class Statics:
         self._actuators = sum(c.size for c in model.constraints["a"])
         self.unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
         self._fallback: SuperLUSolver | None = None
+        self._loads_version = model.loads_version
         self.reset()
 
     def reset(self) -> None:
         """Go back to the undeformed shape with no effort. The equilibrium under loads is found by `solve`."""
         self.x = self.model.nodes.copy()
         self.effort = np.zeros(self.model.size)
+        self._load_factor = 0.0  # part of the dead loads the present state carries
         self._fresh = False
 
     def restore(self, x: np.ndarray, effort: np.ndarray) -> None:
         """Start the next solve from node positions ``x`` (n, 3) and efforts (size,) of all rows."""
         self.x = x.copy()
         self.effort = effort.copy()
+        self._load_factor = 1.0
         self._fresh = False
 
     # -- one linearisation ------------------------------------------------------------------------------------------
@@ -182,6 +188,9 @@ class Statics:
                 finished = self.model.assemble(closer, effort + next_effort)
                 if finished is not None:
                     x, effort, assembled = closer, effort + next_effort, finished
+                else:  # the failed assembly has used the buffers
+                    assembled = self.model.assemble(x, effort)
+                    assert assembled is not None
             self.x, self.effort = x, effort
             if not self._factorise(assembled):
                 raise _NotFound
@@ -217,6 +226,10 @@ class Statics:
             raise ValueError(f"mode must be 'displacement' or 'effort' (one, or {count} of them), got {mode!r}")
         driven = np.array([i for i, m in enumerate(modes) if m == "displacement"], dtype=int)
         forced = np.array([i for i, m in enumerate(modes) if m == "effort"], dtype=int)
+        if self._loads_version != self.model.loads_version:
+            self._loads_version = self.model.loads_version
+            self._fresh = False
+        self.model.load_factor = self._load_factor
         if not self._fresh and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
@@ -227,13 +240,20 @@ class Statics:
         goal[:count] = target
         # A slack cable's reached displacement exceeds its command: the path starts from the command's side.
         done, size, iterations, increments = 0.0, 1.0, 0, 0
+        start_loads = self._load_factor
         while done < 1.0:
             level = min(1.0, done + size)
-            kept = self.x, self.effort
+            kept = self.x, self.effort, self._load_factor
+            factor = start_loads + level * (1.0 - start_loads)
+            if factor != self.model.load_factor:
+                self.model.load_factor = factor
+                self._fresh = False
             try:
                 iterations += self._newton(start + level * (goal - start), driven)
             except _NotFound:
-                self.restore(*kept)
+                self.x, self.effort, self._load_factor = kept
+                self.model.load_factor = self._load_factor
+                self._fresh = False
                 size *= 0.5
                 if size < 0.5**self.max_halvings or not self._linearise():
                     reached = ", ".join(f"{v:.6g}" for v in (start + done * (goal - start))[:count])
@@ -245,7 +265,7 @@ class Statics:
                     ) from None
                 continue
             increments += 1
-            done = level
+            done, self._load_factor = level, factor
             size *= 1.5
         return self._state(driven, iterations, increments)
 
@@ -260,4 +280,13 @@ class Statics:
             effort=effort,
             roles=self.model.roles,
         )
-        return Equilibrium(self.x.copy(), condensed, self._delta.copy(), effort, slack, iterations, increments)
+        return Equilibrium(
+            x=self.x.copy(),
+            condensed=condensed,
+            delta=self._delta.copy(),
+            effort=effort,
+            slack=slack,
+            stable=self._active is self.model.solver,
+            iterations=iterations,
+            increments=increments,
+        )

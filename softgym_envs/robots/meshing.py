@@ -13,6 +13,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -128,7 +129,10 @@ def mesh_geometry(
             reason = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
             raise InfeasibleDesign(f"the geometry cannot be meshed for {parameters}: {reason}")
         mesh = BodyMesh.load(output)
-    mesh.save(path)
+    try:
+        mesh.save(path)
+    except OSError as error:
+        warnings.warn(f"the mesh is not kept, its cache '{path.parent}' cannot be written: {error}", stacklevel=2)
     return mesh
 
 

@@ -64,7 +64,7 @@ class Robot(ABC):
     effort_scale: np.ndarray
     stiffness_variable: str | None = None
 
-    #: Smallest element quality, relative to the baseline mesh, that a moved mesh may have before it is remeshed.
+    #: Smallest element quality, relative to the reference mesh, that a moved mesh may have before it is remeshed.
     quality_bound = 0.3
 
     def __init__(
@@ -113,14 +113,19 @@ class Robot(ABC):
     def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Make the model of a meshed body: material, boundary conditions, actuators, effectors, contacts."""
 
+    @property
+    def reference_design(self) -> dict[str, float]:
+        """The design whose mesh is moved to all others: the baseline, or one nearer the middle of the box."""
+        return self.design_space.baseline
+
     def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
-        """Rough displacement [m] (n, 3) of the baseline nodes to a design; it only starts the mesh motion."""
+        """Rough displacement [m] (n, 3) of the reference nodes to a design; it only starts the mesh motion."""
         return np.zeros_like(nodes)
 
     # -- what follows from it ---------------------------------------------------------------------------------------
 
     def body(self, design: Mapping[str, float] | None = None) -> BodyMesh:
-        """Return the mesh of a design: the baseline mesh moved, or a new one when its quality falls too low.
+        """Return the mesh of a design: the reference mesh moved, or a new one when its quality falls too low.
 
         Raises:
             DesignError: for a malformed design.
@@ -129,9 +134,9 @@ class Robot(ABC):
         complete = self.design_space.complete(design)
         if self.meshing == "remesh":
             return self.mesh(complete)
-        baseline = self.design_space.baseline
         if self._morpher is None:
-            self._morpher = Morpher(self.mesh(baseline), self.features(baseline))
+            reference = self.reference_design
+            self._morpher = Morpher(self.mesh(reference), self.features(reference))
         base = self._morpher.mesh
         nodes = self._morpher.move(self.features(complete), self.guess(base.nodes, complete))
         if self._morpher.quality(nodes) >= self.quality_bound:
@@ -139,11 +144,11 @@ class Robot(ABC):
         fresh = self.mesh(complete)
         return BodyMesh(fresh.nodes, fresh.tetrahedra, fresh.triangles, fresh.surfaces, "remeshed")
 
-    def baseline_element(self, mesh: BodyMesh, point: np.ndarray) -> np.ndarray | None:
-        """Element nearest to a point [m] (3,) of the baseline body, as a hint for points outside a moved mesh.
+    def reference_element(self, mesh: BodyMesh, point: np.ndarray) -> np.ndarray | None:
+        """Element nearest to a point [m] (3,) of the reference body, as a hint for points outside a moved mesh.
 
         Returns:
-            Its index, shape (1,), or None if ``mesh`` is not the baseline mesh moved.
+            Its index, shape (1,), or None if ``mesh`` is not the reference mesh moved.
         """
         if mesh.origin != "morphed" or self._morpher is None:
             return None

@@ -22,7 +22,6 @@ def make_cable(nodes, tetrahedra):
     # Two points share an element, one lies outside the mesh.
     points = np.array([[0.2, 0.3, 0.4], [0.22, 0.31, 0.41], [0.7, 0.5, 0.8], [1.1, 0.4, 0.6]])
     cable = Cable("cable", EmbeddedPoints(points, nodes, tetrahedra), np.array([-0.3, 0.1, 0.2]))
-    cable.attach(nodes)
     return cable
 
 
@@ -121,7 +120,6 @@ def test_cable_at_rest_has_its_polyline_length_and_no_displacement(mesh):
 def test_shortening_is_positive_and_tension_pulls_the_anchor_towards_the_pull_point(mesh):
     nodes, tetrahedra = mesh
     cable = Cable("c", EmbeddedPoints(np.array([[0.9, 0.5, 0.5]]), nodes, tetrahedra), np.array([-1.0, 0.5, 0.5]))
-    cable.attach(nodes)
     assert cable.value(nodes - [0.1, 0.0, 0.0])[0] == pytest.approx(0.1, rel=1e-12)
     assert cable.value(nodes + [0.1, 0.0, 0.0])[0] == pytest.approx(-0.1, rel=1e-12)
     force = cable.jacobian(nodes)[0].reshape(-1, 3).sum(axis=0)  # of unit tension on the body
@@ -140,9 +138,9 @@ def test_cable_with_a_segment_of_zero_length_is_refused(mesh):
     nodes, tetrahedra = mesh
     twice = np.array([[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
     with pytest.raises(ValueError, match="zero length"):
-        Cable("c", EmbeddedPoints(twice, nodes, tetrahedra), np.zeros(3)).attach(nodes)
+        Cable("c", EmbeddedPoints(twice, nodes, tetrahedra), np.zeros(3))
     with pytest.raises(ValueError, match="cable 'c'"):
-        Cable("c", EmbeddedPoints(twice[:1], nodes, tetrahedra), np.full(3, np.nan)).attach(nodes)
+        Cable("c", EmbeddedPoints(twice[:1], nodes, tetrahedra), np.full(3, np.nan))
 
 
 # -- point ----------------------------------------------------------------------------------------------------------

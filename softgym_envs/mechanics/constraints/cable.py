@@ -75,6 +75,9 @@ class Cable(Constraint):
         embedding: the points in order from the pull point to the anchor.
         pull_point: fixed point where the cable leaves the body [m], shape (3,).
         unilateral: a real cable cannot push. False lets it, as some published scenes do.
+
+    Raises:
+        ValueError: if two successive points coincide.
     """
 
     size = 1
@@ -91,18 +94,10 @@ class Cable(Constraint):
         self.dofs = (3 * nodes[:, None] + np.arange(3)).ravel()
         self._gradient = np.empty(len(self.dofs))
         self._hessian = np.empty((len(self.dofs), len(self.dofs)))
-        self.rest_length = float("nan")  # until attached
-
-    def attach(self, rest: np.ndarray) -> None:
-        """Take the rest length [m] at node positions ``rest``, shape (n, 3).
-
-        Raises:
-            ValueError: if two successive points coincide.
-        """
-        path = self.path(rest)
-        segments = np.linalg.norm(np.diff(path, axis=0), axis=1)
+        rest = np.vstack([self.pull_point, embedding.points])
+        segments = np.linalg.norm(np.diff(rest, axis=0), axis=1)
         if not (segments > 1e-9).all():
-            raise ValueError(f"cable '{self.name}' has a segment of zero length: points {path.tolist()} m")
+            raise ValueError(f"cable '{name}' has a segment of zero length: points {rest.tolist()} m")
         self.rest_length = float(segments.sum())
 
     def path(self, x: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ class EmbeddedPoints:
             change abruptly when a mesh of the same topology is moved; a fixed one keeps the point's motion smooth.
 
     Attributes:
+        points: reference positions [m], shape (p, 3).
         elements: element of each point, shape (p,).
         weights: barycentric coordinates, shape (p, 4).
         node_ids: corner nodes, shape (p, 4).
@@ -32,6 +33,7 @@ class EmbeddedPoints:
         points = np.atleast_2d(np.asarray(points, dtype=float))
         if not np.isfinite(points).all():
             raise ValueError(f"embedded points must be finite, got {points.tolist()}")
+        self.points = points
         corners = nodes[tetrahedra]
         edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
         inverse = np.linalg.inv(edges)
