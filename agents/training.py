@@ -63,13 +63,13 @@ def train(
     torch.set_num_threads(1)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    policy_path = folder / "policy.safetensors"
+    result = folder / "policy.safetensors"
     resolved = folder / "config.yaml"
     if resolved.exists():
         if yaml.safe_load(resolved.read_text()) != config.model_dump(mode="json"):
             raise DataError(f"'{folder}' holds a training with another configuration; use a new folder")
-        if policy_path.exists():
-            return policy_path
+        if result.exists():
+            return result
     else:
         save_resolved(folder, config)
 
@@ -121,11 +121,11 @@ def train(
         "curve": curve,
         "provenance": provenance(),
     }
-    save_policy(policy_path, _weights(model), card)
+    save_policy(result, _weights(model), card)
     for leftover in (folder / "latest.safetensors", folder / "latest.json", checkpoint):
         leftover.unlink(missing_ok=True)
     model.get_env().close()  # type: ignore[union-attr]
-    return policy_path
+    return result
 
 
 def _make_model(config: TrainConfig, folder: Path) -> SAC:

@@ -114,7 +114,9 @@ def test_another_configuration_does_not_mix(trained):
 
 def test_warm_start_and_early_stop(trained, tmp_path):
     seen = []
-    config = CONFIG.model_copy(update={"seed": 5, "sac": CONFIG.sac.model_copy(update={"learning_rate": 1e-12})})
+    config = CONFIG.model_copy(
+        update={"seed": 5, "sac": CONFIG.sac.model_copy(update={"learning_rate": 1e-12, "final_learning_rate": 1e-12})}
+    )
     path = train(
         config, tmp_path, initial=trained, progress=False, report=lambda step, score: seen.append((step, score)) or True
     )

@@ -8,7 +8,7 @@ import yaml
 from codesign.config import StudyConfig
 from codesign.study import run_study
 from softgym_envs.config import load_config
-from softgym_envs.errors import ConfigError
+from softgym_envs.errors import ConfigError, WeightsError
 
 BAD = {
     "name that is no folder": ({"name": "../x"}, "name", "pattern"),
@@ -83,8 +83,12 @@ def test_demo_configs_are_well_formed():
 
 def test_missing_policy(tmp_path, tiny):
     config = StudyConfig.model_validate(tiny(strategy="warm_start", policy=str(tmp_path / "none.safetensors")))
-    with pytest.raises(ConfigError, match=r"none\.safetensors.*does not exist"):
+    with pytest.raises(WeightsError, match=r"none\.safetensors.*does not exist"):
         run_study(config, tmp_path / "study")
+    config = StudyConfig.model_validate(tiny(strategy="warm_start", policy="nobody"))
+    with pytest.raises(WeightsError, match=r"unknown policy 'nobody'.*finger_reach_designs"):
+        run_study(config, tmp_path / "study")
+    assert not (tmp_path / "study").exists()
 
 
 def test_folder_keeps_its_study(study):
