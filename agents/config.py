@@ -35,6 +35,11 @@ class EnvironmentConfig(Config):
             raise ValueError(f"unknown environment '{value}'; allowed: {', '.join(ENVIRONMENTS)}")
         return value
 
+    def on(self, backend: str) -> EnvironmentConfig:
+        """The same environment on another backend; options of the present backend do not apply there."""
+        options = self.backend_options if backend == self.backend else {}
+        return self.model_copy(update={"backend": backend, "backend_options": options})
+
     def _options(self, overrides: dict[str, Any]) -> dict[str, Any]:
         options = self.model_dump(exclude={"id"})
         options["robot_options"] = {**ENVIRONMENTS[self.id].robot_options, **self.robot_options}
@@ -75,8 +80,21 @@ class SACConfig(Config):
     @field_validator("ent_coef")
     @classmethod
     def _entropy(cls, value: float | str) -> float | str:
-        if isinstance(value, str) and not value.startswith("auto"):
-            raise ValueError("must be a number, 'auto' or 'auto_<start>'")
+        if isinstance(value, str) and value != "auto":
+            start = value.removeprefix("auto_")
+            try:
+                positive = value.startswith("auto_") and float(start) > 0.0
+            except ValueError:
+                positive = False
+            if not positive:
+                raise ValueError("must be a number, 'auto' or 'auto_<positive start>'")
+        return value
+
+    @field_validator("net_arch")
+    @classmethod
+    def _layers(cls, value: list[int]) -> list[int]:
+        if any(width < 1 for width in value):
+            raise ValueError("must be positive widths")
         return value
 
 
@@ -88,5 +106,6 @@ class TrainConfig(Config):
     steps: int = Field(default=40_000, gt=0, description="environment steps, over all sub-environments")
     num_envs: int = Field(default=16, gt=0)
     seed: int = Field(default=0, ge=0)
+    initial: str | None = Field(default=None, description="policy to start from: a file or the name of a shipped one")
     evaluation_episodes: int = Field(default=64, gt=0)
     report_every: int = Field(default=4_000, gt=0, description="environment steps between evaluations")

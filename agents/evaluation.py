@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -90,7 +91,7 @@ def sample_goals(
         env.close()
 
 
-def make_agent(agent: str | Path, robot: Any = None, seed: int = 0) -> Agent:
+def make_agent(agent: str | Path, seed: int = 0) -> Agent:
     """Return ``agent(observation, env.unwrapped) -> action`` for ``"qp"``, ``"random"`` or a policy file."""
     if agent == "random":
         rng = np.random.default_rng(seed)
@@ -98,15 +99,18 @@ def make_agent(agent: str | Path, robot: Any = None, seed: int = 0) -> Agent:
     if agent == "qp":
         from softgym_envs.control import InverseQP
 
-        controllers: dict[int, InverseQP] = {}
+        controllers: WeakKeyDictionary[Any, InverseQP] = WeakKeyDictionary()
 
         def control(observation: np.ndarray, env: Any) -> np.ndarray:
-            if id(env) not in controllers:
+            state = env.state
+            if env not in controllers or not state.command.any():  # a fresh one for each episode
                 body = env.robot
                 unilateral = np.array([actuator.unilateral for actuator in body.actuators])
-                controllers[id(env)] = InverseQP(body.lower, body.upper, body.rates, unilateral)
-            state = env.state
-            command = controllers[id(env)].solve(state.condensed, env.goal, state.command, state.slack)
+                controllers[env] = InverseQP(body.lower, body.upper, body.rates, unilateral)
+            try:
+                command = controllers[env].solve(state.condensed, env.goal, state.command, state.slack)
+            except ConvergenceError:  # a QP that fails holds still
+                command = state.command
             return env.interface.action(command, state.command)
 
         return control
@@ -119,7 +123,7 @@ def evaluate(
     environment: EnvironmentConfig,
     goals: np.ndarray,
     *,
-    design: dict[str, float] | None = None,
+    design: dict[str, float] | Sequence[dict[str, float]] | None = None,
     seed: int = 0,
 ) -> Evaluation:
     """Run one episode per goal.
@@ -128,7 +132,7 @@ def evaluate(
         agent: ``"qp"``, ``"random"`` or the path of a policy.
         environment: where; its ``backend`` decides the physics.
         goals: goals or paths of goals [m], shape (n, 3) or (n, p, 3).
-        design: the body (default: the environment's).
+        design: the body, or one for each goal (default: the environment's).
         seed: seed of the random agent and of the environment.
     """
     goals = np.asarray(goals, dtype=float)
@@ -136,18 +140,16 @@ def evaluate(
     if agent not in ("qp", "random") and environment.backend == "surrogate":
         return _evaluate_batch(Policy(agent), environment, goals, design, seed)
     env = environment.make(sample_design=False)
-    act = make_agent(agent, seed=seed)
+    act = make_agent(agent, seed)
     rows = []
     steps = 0
     try:
-        for path in goals:
-            observation, info = env.reset(seed=seed, options={"design": design, "goal": path})
+        for index, path in enumerate(goals):
+            body = design if design is None or isinstance(design, dict) else design[index]
+            observation, info = env.reset(seed=seed, options={"design": body, "goal": path})
             total, effort, distance, count, ended = 0.0, 0.0, 0.0, 0, False
             while not ended:
-                try:
-                    action = act(observation, env.unwrapped)
-                except ConvergenceError:  # a QP that fails holds still
-                    action = np.zeros(env.action_space.shape or (), dtype=np.float32)
+                action = act(observation, env.unwrapped)
                 observation, reward, terminated, truncated, info = env.step(action)
                 total += float(reward)
                 effort += float(np.abs(info["effort"]).mean())
@@ -165,7 +167,11 @@ def evaluate(
 
 
 def _evaluate_batch(
-    policy: Policy, environment: EnvironmentConfig, goals: np.ndarray, design: dict[str, float] | None, seed: int
+    policy: Policy,
+    environment: EnvironmentConfig,
+    goals: np.ndarray,
+    design: dict[str, float] | Sequence[dict[str, float]] | None,
+    seed: int,
 ) -> Evaluation:
     """All episodes at once on the batched surrogate environment."""
     count = len(goals)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.config import TrainConfig
-from agents.evaluation import evaluate, sample_goals
+from agents.evaluation import Evaluation, evaluate, sample_goals
 from agents.policy import policy_path, read_tensors, save_policy
 from softgym_envs.config import provenance, save_resolved
 from softgym_envs.errors import DataError, WeightsError
@@ -33,7 +33,7 @@ def train(
     folder: str | Path,
     *,
     initial: str | Path | None = None,
-    report: Callable[[int, float], bool] | None = None,
+    report: Callable[[int, Evaluation], bool] | None = None,
     progress: bool = True,
 ) -> Path:
     """Train a SAC policy, or go on with an interrupted training in ``folder``.
@@ -45,8 +45,9 @@ def train(
     Args:
         config: what to train.
         folder: where the results go.
-        initial: policy to start from (actor and critics): a file or the name of a shipped one.
-        report: called after each evaluation with (step, success rate); True stops the training early.
+        initial: policy to start from (actor and critics): a file or the name of a shipped one; overrides that of the
+            configuration.
+        report: called after each evaluation with its step and outcome; True stops the training early.
         progress: show a progress bar.
 
     Returns:
@@ -61,6 +62,8 @@ def train(
     from tqdm import tqdm
 
     torch.set_num_threads(1)
+    if initial is not None:
+        config = config.model_copy(update={"initial": str(initial)})
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     result = folder / "policy.safetensors"
@@ -78,13 +81,10 @@ def train(
     curve: list[dict[str, float]] = []
     if checkpoint.exists():
         curve = _restore(model, checkpoint)
-    elif initial is not None:
-        start_from = policy_path(initial)
+    elif config.initial is not None:
+        start_from = policy_path(config.initial)
         _load_weights(model, read_tensors(start_from), start_from)
-    surrogate = config.environment.model_copy(update={"backend": "surrogate"})
-    goals = sample_goals(
-        surrogate.model_copy(update={"sample_design": False}), config.evaluation_episodes, _EVALUATION_SEED
-    )
+    designs, goals = _evaluation_set(config)
 
     start = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
     bar = tqdm(total=config.steps, initial=model.num_timesteps, unit="step", desc=folder.name, disable=not progress)
@@ -95,7 +95,7 @@ def train(
             _learn(model, target, bar)
             scratch = folder / "latest.safetensors"
             save_policy(scratch, _weights(model), {})
-            outcome = evaluate(scratch, surrogate, goals)
+            outcome = evaluate(scratch, config.environment, goals, design=designs)
             curve.append(
                 {
                     "step": model.num_timesteps,
@@ -112,10 +112,9 @@ def train(
             model.logger.dump(model.num_timesteps)
             _write_curve(folder / "curve.csv", curve)
             _save_checkpoint(model, checkpoint, curve)
-            stopped = report is not None and bool(report(model.num_timesteps, outcome.success_rate))
+            stopped = report is not None and bool(report(model.num_timesteps, outcome))
     card = {
         "config": config.model_dump(mode="json"),
-        "initial": None if initial is None else str(initial),
         "steps": int(model.num_timesteps),
         "stopped_early": stopped,
         "curve": curve,
@@ -126,6 +125,21 @@ def train(
         leftover.unlink(missing_ok=True)
     model.get_env().close()  # type: ignore[union-attr]
     return result
+
+
+def _evaluation_set(config: TrainConfig) -> tuple[list[dict[str, float]] | None, np.ndarray]:
+    """Bodies and goals of the learning curve: a body for each goal where bodies are sampled, else the one body."""
+    environment, count = config.environment, config.evaluation_episodes
+    if not environment.sample_design:
+        return None, sample_goals(environment, count, _EVALUATION_SEED)
+    env = environment.make()
+    designs, goals = [], []
+    for i in range(count):
+        env.reset(seed=_EVALUATION_SEED if i == 0 else None)
+        designs.append(env.unwrapped.design)  # type: ignore[attr-defined]
+        goals.append(env.unwrapped.path.copy())  # type: ignore[attr-defined]
+    env.close()
+    return designs, np.stack(goals)
 
 
 def _make_model(config: TrainConfig, folder: Path) -> SAC:
@@ -229,6 +243,7 @@ def _save_checkpoint(model: SAC, path: Path, curve: list[dict[str, float]]) -> N
         "full": bool(buffer.full),
         "numpy": [int(position[0]), int(position[1]), float(position[2])],
         "environment": vector_env.np_random.bit_generator.state,
+        "actions": model.action_space.np_random.bit_generator.state,
         "curve": curve,
     }
     with atomic_write(path) as stream:
@@ -266,6 +281,8 @@ def _restore(model: SAC, path: Path) -> list[dict[str, float]]:
     env: Any = model.get_env()
     env.env.reset(seed=0)
     env.env.np_random.bit_generator.state = meta["environment"]
+    env.cancel_seed()  # else the first reset would start the random goals and bodies anew
+    model.action_space.np_random.bit_generator.state = meta["actions"]
     return meta["curve"]
 
 

@@ -40,6 +40,10 @@ class SB3VecEnv(VecEnv):
         self._seed = seed
         return [seed] * self.num_envs
 
+    def cancel_seed(self) -> None:
+        """Forget a seed that waits for the next reset."""
+        self._seed = None
+
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
 
@@ -64,7 +68,9 @@ class SB3VecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self.env, attr_name, None)] * len(list(self._get_indices(indices)))
+        # stable-baselines3 asks for render_mode of any environment; other names must exist.
+        value = getattr(self.env, attr_name, None) if attr_name == "render_mode" else getattr(self.env, attr_name)
+        return [value] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         setattr(self.env, attr_name, value)

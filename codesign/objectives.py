@@ -31,8 +31,8 @@ class Objective:
         """Score of a stored evaluation, larger is better [SI]."""
         return self.sign * float(record[self.key])
 
-    def shown(self, score: float) -> float:
-        """The value of the objective behind a score, in ``unit``."""
+    def shown(self, score: Any) -> Any:
+        """The value of the objective behind a score, or an array of them, in ``unit``."""
         return self.sign * score * self.scale
 
     def text(self, score: float | None) -> str:

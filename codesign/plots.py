@@ -153,15 +153,16 @@ def curves(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> s
     trained = [t for t in trials if t["curve"]]
     if not trained:
         return None
+    objective = OBJECTIVES[results["objective"]]
     roles = _roles(results)
     with _figure(6.2, 3.2) as (_, (ax,), out):
         for trial in sorted(trained, key=lambda t: t["number"] in roles):
-            steps, values = np.array(trial["curve"], dtype=float).T
+            steps, scores = np.array(trial["curve"], dtype=float).T
             role = roles.get(trial["number"])
             colour = {"winner": WINNER, "baseline": BASELINE}.get(role or "", OTHER)
             style = {"marker": ".", "markersize": 4, "linestyle": "--" if trial["state"] == "pruned" else "-"}
-            ax.plot(steps, 100 * values, color=colour, label=role, linewidth=2.2 if role else 1.1, **style)
-        ax.set(xlabel="environment steps of training", ylabel="success while training [%]")
+            ax.plot(steps, objective.shown(scores), color=colour, label=role, linewidth=2.2 if role else 1.1, **style)
+        ax.set(xlabel="environment steps of training", ylabel=f"{_axis(objective)} in training")
         if roles:
             ax.legend(fontsize=8)
     return out[0]

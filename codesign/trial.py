@@ -12,12 +12,14 @@ import numpy as np
 
 from agents.config import EnvironmentConfig, TrainConfig
 from codesign.folder import StudyFolder
-from codesign.objectives import OBJECTIVES
+from codesign.objectives import OBJECTIVES, Objective
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import write_json
 
 if TYPE_CHECKING:
     import optuna
+
+    from agents.evaluation import Evaluation
 
 __all__ = ["assess", "run_trial"]
 
@@ -82,14 +84,16 @@ def training_config(folder: StudyFolder, design: Mapping[str, float]) -> TrainCo
 class _Reporter:
     """Passes learning progress on to the pruner, and keeps the learning curve."""
 
-    def __init__(self, trial: optuna.Trial) -> None:
+    def __init__(self, trial: optuna.Trial, objective: Objective) -> None:
         self.trial = trial
+        self.objective = objective
         self.curve: dict[int, float] = dict(trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values)
         self.pruned = False
         # Everything is compared with the baseline, so it is always trained to the end.
         self.prunable = trial.user_attrs.get("origin") != "baseline"
 
-    def __call__(self, step: int, value: float) -> bool:
+    def __call__(self, step: int, outcome: Evaluation) -> bool:
+        value = self.objective.score(outcome.to_json())
         if step not in self.curve and np.isfinite(value):
             self.curve[step] = float(value)
             self.trial.report(float(value), step)
@@ -143,7 +147,7 @@ def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str
     from agents.training import train
 
     config = folder.config
-    reporter = _Reporter(trial)
+    reporter = _Reporter(trial, OBJECTIVES[config.objective])
     policy = train(
         training_config(folder, result["design"]),
         folder.trial(trial.number),

@@ -40,7 +40,7 @@ def main() -> None:
         sys.exit(130)
     except click.ClickException as error:
         _fail(error.format_message())
-    except (SoftGymError, ValueError, gymnasium.error.Error) as error:
+    except (SoftGymError, ValueError, OSError, gymnasium.error.Error) as error:
         _fail(str(error))
 
 
@@ -92,8 +92,7 @@ def list_() -> None:
 @click.option("--picture", type=click.Path(path_type=Path), help="Write a PNG of the body.")
 def show(robot: str, options: tuple[str, ...], design: tuple[str, ...], picture: Path | None) -> None:
     """Show a robot: its design space, actuators and mesh."""
-    import yaml
-
+    from softgym_envs.config import read_value
     from softgym_envs.robots import make_robot
 
     parsed = {}
@@ -101,7 +100,7 @@ def show(robot: str, options: tuple[str, ...], design: tuple[str, ...], picture:
         name, separator, text = option.partition("=")
         if not separator:
             raise ConfigError(f"--option '{option}' must look like name=value")
-        parsed[name] = yaml.safe_load(text)
+        parsed[name] = read_value(text)
     body = make_robot(robot, **parsed)
     click.echo(f"{robot} ({body.variant})\n\ndesign variables:")
     for variable in body.design_space.variables.values():
@@ -145,10 +144,16 @@ def rollout(
 
     import softgym_envs  # noqa: F401 - registers the IDs
     from agents.evaluation import make_agent
+    from agents.policy import Policy
 
-    act = make_agent(agent, seed=seed)
+    act = make_agent(agent, seed)
     chosen = _assignments(design, "design")
-    env = gymnasium.make(environment, backend=backend, design=chosen or None)
+    options: dict[str, Any] = {}
+    if agent not in ("qp", "random"):
+        # A policy sees and does what it was trained to see and do.
+        trained = Policy(agent).card["config"]["environment"]
+        options = {name: trained[name] for name in ("design_in_observation", "action_mode", "robot_options")}
+    env = gymnasium.make(environment, backend=backend, design=chosen or None, **options)
     if record is not None:
         from softgym_envs.viewer.recording import record_rollout
 
@@ -268,15 +273,15 @@ def evaluate(
     click.echo(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean mm':>9s} {'worst mm':>9s} {'return':>8s}")
     for backend in backends:
         for agent in agents:
-            physics = environment.model_copy(update={"backend": backend})
-            outcome = run(agent, physics, points, design=chosen, seed=seed)
+            outcome = run(agent, environment.on(backend), points, design=chosen, seed=seed)
             results.append({"agent": agent, "backend": backend, **outcome.to_json()})
             click.echo(
                 f"{agent[-34:]:34s} {backend:10s} {outcome.success_rate:8.1%} {1e3 * outcome.mean_distance:9.3f} "
                 f"{1e3 * outcome.worst_distance:9.3f} {outcome.mean_return:8.2f}"
             )
     if output is not None:
-        write_json(output, {"goals": goals, "seed": seed, "design": chosen, "results": results, **provenance()})
+        asked = {"environment": environment.model_dump(mode="json"), "goals": goals, "seed": seed, "design": chosen}
+        write_json(output, {**asked, **provenance(), "results": results})
         click.echo(f"wrote {output}")
 
 

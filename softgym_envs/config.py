@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import subprocess
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -17,13 +18,29 @@ from softgym_envs.errors import ConfigError
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.version import __version__
 
-__all__ = ["Config", "load_config", "provenance", "save_resolved"]
+__all__ = ["Config", "check_config", "load_config", "read_value", "provenance", "save_resolved"]
 
 
 class Config(BaseModel):
     """Base of all configurations: unknown keys are errors, values do not change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=False)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML whose numbers are those of YAML 1.2 and JSON: ``1e-3`` is a number here, in PyYAML a word."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$"),
+    list("-+0123456789."),
+)
+
+
+def read_value(text: str) -> Any:
+    """Read YAML text; raises `yaml.YAMLError`."""
+    return yaml.load(text, Loader=_Loader)
 
 
 ModelT = TypeVar("ModelT", bound=Config)
@@ -44,7 +61,7 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
     if path is not None:
         path = Path(path)
         try:
-            data = yaml.safe_load(path.read_text())
+            data = read_value(path.read_text())
         except OSError as error:
             raise ConfigError(f"config '{path}' cannot be read: {error.strerror or error}") from None
         except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -65,7 +82,7 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
             if not isinstance(node, dict):
                 raise ConfigError(f"override '{override}': '{parent}' is a value, not a group of keys")
         try:
-            node[last] = yaml.safe_load(text)
+            node[last] = read_value(text)
         except yaml.YAMLError:
             raise ConfigError(f"override '{override}': the value is not valid YAML") from None
     return check_config(model, data, f"config '{path}'" if path is not None else "config")

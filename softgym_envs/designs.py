@@ -129,6 +129,11 @@ class DesignSpace:
         checked = {name: self[name].check(value) for name, value in design.items()}
         return {**self.baseline, **checked}
 
+    def override(self, base: Mapping[str, float], design: Mapping[str, float]) -> dict[str, float]:
+        """Return the complete design ``base`` with the variables of a partial ``design`` put in, validated."""
+        complete = self.complete(design)
+        return {**base, **{name: complete[name] for name in design}}
+
     def to_unit(self, design: Mapping[str, float]) -> np.ndarray:
         """Return the design as a vector in [-1, 1], shape (len(self),)."""
         full = self.complete(design)

@@ -8,6 +8,7 @@ __all__ = [
     "DataError",
     "DesignError",
     "InfeasibleDesign",
+    "MeshingError",
     "SoftGymError",
     "WeightsError",
 ]
@@ -26,6 +27,10 @@ class InfeasibleDesign(SoftGymError):
 
     This is a result for an optimiser, never a crash.
     """
+
+
+class MeshingError(SoftGymError):
+    """The mesh generator is missing or does not load: an error of the installation, not of a design."""
 
 
 class ConvergenceError(SoftGymError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -26,8 +27,10 @@ def make_backend(name: str, robot: Robot, **options: object) -> Backend:
     """
     if name not in BACKENDS:
         raise ValueError(f"unknown backend '{name}'; allowed: {', '.join(BACKENDS)}")
-    module, _, cls = BACKENDS[name].partition(":")
+    module, _, name_of_class = BACKENDS[name].partition(":")
+    cls = getattr(import_module(module), name_of_class)
     try:
-        return getattr(import_module(module), cls)(robot, **options)
+        inspect.signature(cls).bind(robot, **options)
     except TypeError as error:
         raise ValueError(f"backend '{name}': {error}") from None
+    return cls(robot, **options)

@@ -25,6 +25,7 @@ class State:
         effector: effector positions [m], shape (k, 3).
         slack: actuators that hang slack, shape (n_a,).
         condensed: condensed model at the state.
+        stable: the state is stable whatever drives the actuators (always True on the surrogate, which knows no other).
         nodes: deformed nodes [m], shape (n, 3), where the backend has them.
     """
 
@@ -35,6 +36,7 @@ class State:
     slack: np.ndarray
     condensed: CondensedModel
     nodes: np.ndarray | None = None
+    stable: bool = True
 
 
 class Backend(ABC):
@@ -65,10 +67,11 @@ class Backend(ABC):
 
         Args:
             command: actuator displacements, or efforts.
-            mode: ``"displacement"`` or ``"effort"``.
+            mode: ``"displacement"`` or ``"effort"``; an effort on an actuator that cannot push is not negative.
 
         Raises:
             ConvergenceError: if no equilibrium is found; the present state is kept.
+            ValueError: for a malformed command.
         """
 
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:

@@ -66,4 +66,5 @@ class FEMBackend(Backend):
             slack=equilibrium.slack,
             condensed=condensed,
             nodes=equilibrium.x,
+            stable=equilibrium.stable,
         )

@@ -25,12 +25,21 @@ TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Settled:
-    """Batched states: ``displacement`` and ``effort`` (B, n_a), ``effector`` (B, n_e), ``slack`` (B, n_a)."""
+    """Batched states.
+
+    Attributes:
+        displacement: reached actuator displacements, shape (B, n_a).
+        effort: actuator efforts, shape (B, n_a).
+        effector: effector coordinates [m], shape (B, n_e).
+        slack: slack actuators, shape (B, n_a).
+        converged: whether the state was found, shape (B,); the other rows are not to be used.
+    """
 
     displacement: np.ndarray
     effort: np.ndarray
     effector: np.ndarray
     slack: np.ndarray
+    converged: np.ndarray
 
 
 def settle(
@@ -61,8 +70,9 @@ def settle(
     effort, effector = model.state(context, guess)
     wrong = unilateral & ((effort < 0.0) | (guess > target))
     loose = np.zeros(guess.shape, dtype=bool)
+    converged = np.isfinite(effort).all(axis=1)
     if not wrong.any():
-        return Settled(guess, effort, effector, loose)
+        return Settled(guess, effort, effector, loose, converged)
     searched = np.flatnonzero(wrong.any(axis=1))
     rows = searched
     displacement = guess.copy()
@@ -74,21 +84,24 @@ def settle(
             W = model.compliance(part, displacement[rows])[:, : model.count, : model.count]
         present = effort[rows]
         gap = displacement[rows] - (W @ present[:, :, None])[:, :, 0] - target[rows]
-        taut = solve_complementarity(W, gap, unilateral)
+        try:
+            taut = solve_complementarity(W, gap, unilateral)
+        except np.linalg.LinAlgError:  # a network that does not keep W positive definite
+            break
         # Far steps are cut: the network is only asked where its neighbourhood of known states reaches.
         step = np.minimum(np.maximum((W @ (taut - present)[:, :, None])[:, :, 0], -limit), limit)
         displacement[rows] += step
         moving = np.abs(step).max(axis=1) > TOLERANCE
         # A last step below the tolerance is taken without asking the model again.
         effort[rows[~moving]] = taut[~moving]
-        if not moving.any():
+        rows, W, part = rows[moving], W[moving], part.rows(moving)
+        if len(rows) == 0:
             break
-        if not moving.all():
-            rows, W, part = rows[moving], W[moving], part.rows(moving)
         effort[rows], effector[rows] = model.state(part, displacement[rows])
+    converged[rows] = False
     loose[searched] = unilateral & (displacement[searched] > target[searched] + 10.0 * TOLERANCE)
     effort = np.where(loose, 0.0, np.where(unilateral, np.maximum(effort, 0.0), effort))
-    return Settled(displacement, effort, effector, loose)
+    return Settled(displacement, effort, effector, loose, converged)
 
 
 class SurrogateBackend(Backend):
@@ -117,7 +130,9 @@ class SurrogateBackend(Backend):
             self.design = dict(complete)
             zero = np.zeros((1, self.model.count))
             effort, effector = self.model.state(self._context, zero)
-            self._rest = self._state(zero[0], Settled(zero, effort, effector, zero.astype(bool)))
+            self._rest = self._state(
+                zero[0], Settled(zero, effort, effector, zero.astype(bool), np.ones(1, dtype=bool))
+            )
         self.state = self._rest
         return self.state
 
@@ -134,7 +149,11 @@ class SurrogateBackend(Backend):
                 self._unilateral,
                 self.state.slack[None],
             )
+            if not settled.converged[0]:
+                raise ConvergenceError(f"the surrogate finds no state for commands {command.tolist()}")
         elif mode == "effort":
+            if (command[self._unilateral] < 0.0).any():
+                raise ValueError(f"efforts {command.tolist()} must not be negative: the actuators cannot push")
             settled = self._under_effort(command)
         else:
             raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
@@ -150,7 +169,9 @@ class SurrogateBackend(Backend):
             W = self.model.compliance(self._context, displacement)[0, : self.model.count, : self.model.count]
             step = np.clip(W @ (effort - found[0]), -limit, limit)
             if np.abs(step).max() < TOLERANCE:
-                return Settled(displacement, found, effector, np.zeros_like(displacement, dtype=bool))
+                return Settled(
+                    displacement, found, effector, np.zeros_like(displacement, dtype=bool), np.ones(1, dtype=bool)
+                )
             displacement = displacement + step
         raise ConvergenceError(f"the surrogate finds no displacement for efforts {effort.tolist()} N")
 

@@ -25,6 +25,7 @@ class InverseQP:
         effort >= 0 for unilateral actuators,  lower <= delta_a <= upper,  |delta_a - command| <= rate.
 
     Regularisation: three definitions of eps circulate in the group's codes; this one makes the weights pure numbers.
+    The defaults are far below the 0.01 that some use: with it the finger stops 0.5 mm short of a goal 50 mm away.
     ``effort_weight`` decides between redundant actuators and moves the result towards rest by about that fraction of
     the way from it; ``step_weight`` only slows the last part of the approach and has no steady error.
 
@@ -113,7 +114,7 @@ class InverseQP:
         norm = float(np.trace(hessian)) or length**2
         low = np.maximum(self.lower, command - self.rates)
         high = np.minimum(self.upper, command + self.rates)
-        # Standing still is always allowed, so the problem is always feasible, round-off of delta or not.
+        # Standing still is allowed (unless it exceeds max_effort), so the problem is feasible, round-off or not.
         box_low = np.minimum(low - delta.a, 0.0) / scale
         # A slack cable's reached displacement is not held by its command.
         box_high = np.where(slack, 1e3, np.maximum(high - delta.a, 0.0) / scale)

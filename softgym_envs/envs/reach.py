@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgym_envs.envs.task import Kinematics, Task
+from softgym_envs.envs.task import Kinematics, Task, check_goals
 from softgym_envs.robots.robot import Robot
 
 __all__ = ["Reach"]
@@ -36,9 +36,7 @@ class Reach(Task):
                 raise ValueError(f"goals = {goals!r} is unknown; allowed: 'reachable' or an array of shape (k, 3)")
             self.fixed_goals = None
         else:
-            self.fixed_goals = np.asarray(goals, dtype=float).reshape(-1, 3)
-            if len(self.fixed_goals) == 0 or not np.isfinite(self.fixed_goals).all():
-                raise ValueError("goals must be at least one finite point of shape (3,)")
+            self.fixed_goals = check_goals(goals, "goals")
         if not 0.0 <= command_low < 1.0:
             raise ValueError(f"command_low = {command_low} is out of bounds; allowed: [0, 1)")
         if not (np.isfinite(spread) and spread >= 0.0):

@@ -13,7 +13,7 @@ from softgym_envs.backends import make_backend
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.designs import DesignSpace
 from softgym_envs.envs.interface import Interface
-from softgym_envs.envs.task import make_task
+from softgym_envs.envs.task import check_goals, make_task
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots import make_robot
 
@@ -115,7 +115,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
     @property
     def goal(self) -> np.ndarray:
         """The present goal [m], shape (3,)."""
-        return self.task.goals(self._path[None], np.array([self._step]))[0]
+        return self.task.goals(self._path[None], np.array([len(self._path)]), np.array([self._step]))[0]
 
     @property
     def path(self) -> np.ndarray:
@@ -142,7 +142,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if unknown:
             raise ValueError(f"unknown reset option '{sorted(unknown)[0]}'; allowed: design, goal")
         if options.get("design") is not None:
-            design = self.design_space.complete({**self._fixed_design, **self.design_space.complete(options["design"])})
+            design = self.design_space.override(self._fixed_design, options["design"])
         elif self._sampled:
             drawn = self.design_space.sample(self.np_random, self._sampled)
             design = {**self._fixed_design, **{name: drawn[name] for name in self._sampled}}
@@ -155,9 +155,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if goal is None:
             self._path = self.task.sample(self.np_random, 1, self._kinematics)[0]
         else:
-            self._path = np.asarray(goal, dtype=float).reshape(-1, 3)
-            if len(self._path) == 0 or not np.isfinite(self._path).all():
-                raise ValueError(f"goal = {goal!r} must be finite with shape (3,) or (p, 3)")
+            self._path = check_goals(goal, "goal")
         self._step = 0
         return self._observe()
 
@@ -202,6 +200,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             "reward_terms": {k: float(v) for k, v in self.task.reward_terms(np.asarray(distance), share).items()},
             "displacement": state.displacement.copy(),
             "effort": state.effort.copy(),
+            "stable": state.stable,
             "converged": True,
         }
         observation = self.interface.observe(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from importlib import import_module
@@ -10,7 +11,7 @@ import numpy as np
 
 from softgym_envs.robots.robot import Robot
 
-__all__ = ["TASKS", "Task", "make_task", "tolerance"]
+__all__ = ["TASKS", "Task", "check_goals", "make_task", "tolerance"]
 
 TASKS: dict[str, str] = {
     "reach": "softgym_envs.envs.reach:Reach",
@@ -26,6 +27,27 @@ def tolerance(x: np.ndarray, bound: float, margin: float) -> np.ndarray:
     """Return 1 for ``x <= bound``, falling as 1 / (1 + 9 ((x - bound) / margin)^2): 0.1 at ``bound + margin``."""
     excess = np.maximum(x - bound, 0.0) / margin
     return 1.0 / (1.0 + 9.0 * excess * excess)
+
+
+def check_goals(goals: object, name: str, leading: tuple[int, ...] = ()) -> np.ndarray:
+    """Return goals [m] as an array (*leading, p, 3); a single point (*leading, 3) becomes a path of one.
+
+    Raises:
+        ValueError: for another shape or a value that is not finite.
+    """
+    try:
+        array = np.asarray(goals, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be points [m] of shape (3,) or (p, 3), got {goals!r}") from None
+    n = len(leading)
+    if array.shape == (*leading, 3):
+        array = array[..., None, :]
+    if array.ndim != n + 2 or array.shape[:n] != leading or array.shape[-1] != 3 or array.shape[-2] == 0:
+        shape = "".join(f"{size}, " for size in leading)
+        raise ValueError(f"{name} must have shape ({shape}3) or ({shape}p, 3), got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {array.tolist()}")
+    return array
 
 
 class Task(ABC):
@@ -48,12 +70,17 @@ class Task(ABC):
     def sample(self, rng: np.random.Generator, count: int, kinematics: Kinematics) -> np.ndarray:
         """Draw the goals of ``count`` episodes: paths [m], shape (count, p, 3); p = 1 for a fixed goal."""
 
-    def goals(self, paths: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Goals [m] (B, 3) at control steps (B,) of paths (B, p, 3), which are spread over the horizon."""
-        count = paths.shape[1]
-        if count == 1:
+    def goals(self, paths: np.ndarray, counts: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """Goals [m] (B, 3) at control steps (B,) of paths (B, p, 3), which are spread over the horizon.
+
+        Args:
+            paths: goals of each episode; row b has ``counts[b] <= p`` of them.
+            counts: shape (B,).
+            steps: shape (B,).
+        """
+        if paths.shape[1] == 1:
             return paths[:, 0]
-        index = np.minimum(steps * count // max(self.horizon, 1), count - 1)
+        index = np.minimum(steps * counts // self.horizon, counts - 1)
         return paths[np.arange(len(paths)), index]
 
     def reward_terms(self, distance: np.ndarray, effort_share: np.ndarray) -> dict[str, np.ndarray]:
@@ -77,8 +104,10 @@ def make_task(name: str, robot: Robot, **options: object) -> Task:
     """
     if name not in TASKS:
         raise ValueError(f"unknown task '{name}'; allowed: {', '.join(TASKS)}")
-    module, _, cls = TASKS[name].partition(":")
+    module, _, name_of_class = TASKS[name].partition(":")
+    cls = getattr(import_module(module), name_of_class)
     try:
-        return getattr(import_module(module), cls)(robot, **options)
+        inspect.signature(cls).bind(robot, **options)
     except TypeError as error:
         raise ValueError(f"task '{name}': {error}") from None
+    return cls(robot, **options)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgym_envs.envs.task import Kinematics, Task
+from softgym_envs.envs.task import Kinematics, Task, check_goals
 from softgym_envs.robots.robot import Robot
 
 __all__ = ["Track", "bending_arc"]
@@ -43,9 +43,7 @@ class Track(Task):
 
     def __init__(self, robot: Robot, *, path: np.ndarray | None = None, jitter: float = 0.0) -> None:
         super().__init__(robot)
-        self.path = bending_arc(robot) if path is None else np.asarray(path, dtype=float).reshape(-1, 3)
-        if len(self.path) == 0 or not np.isfinite(self.path).all():
-            raise ValueError("path must be at least one finite point of shape (3,)")
+        self.path = bending_arc(robot) if path is None else check_goals(path, "path")
         if not (np.isfinite(jitter) and jitter >= 0.0):
             raise ValueError(f"jitter = {jitter} m must be non-negative and finite")
         self.jitter = jitter

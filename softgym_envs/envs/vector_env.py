@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from softgym_envs.backends.surrogate import settle
 from softgym_envs.envs.interface import Interface
 from softgym_envs.envs.soft_robot_env import design_names
-from softgym_envs.envs.task import make_task
+from softgym_envs.envs.task import check_goals, make_task
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.pretrained import pretrained_model
 
@@ -100,8 +100,10 @@ class SoftRobotVectorEnv(VectorEnv):
         self._effector = np.zeros((num_envs, 3))
         self._slack = np.zeros((num_envs, n), dtype=bool)
         self._paths = np.zeros((num_envs, 1, 3))
+        self._counts = np.ones(num_envs, dtype=np.int64)  # goals in each path
+        self._converged = np.ones(num_envs, dtype=bool)
         self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._changed = False  # bodies were given in reset and are not the fixed one
+        self._changed = np.zeros(num_envs, dtype=bool)  # bodies that were given in reset and are not the fixed one
         self._begin_bodies(np.arange(num_envs))
 
     # -- bodies -----------------------------------------------------------------------------------------------------
@@ -118,34 +120,45 @@ class SoftRobotVectorEnv(VectorEnv):
             self._unit_design[index, column] = self.design_space[name].to_unit(values)
 
     def _begin_episodes(
-        self, index: np.ndarray, design: Mapping[str, float] | None = None, goal: np.ndarray | None = None
+        self,
+        index: np.ndarray,
+        design: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+        goal: np.ndarray | None = None,
     ) -> None:
         """Start episodes in the sub-environments ``index``."""
         if design is not None:
-            self.designs[index] = list({**self._fixed_design, **self.design_space.complete(design)}.values())
+            designs = [design] * len(index) if isinstance(design, Mapping) else list(design)
+            if len(designs) != len(index):
+                raise ValueError(f"design must be one body or a list of {len(index)}, got {len(designs)}")
+            self.designs[index] = [list(self.design_space.override(self._fixed_design, d).values()) for d in designs]
             self._begin_bodies(index)
+            self._changed[index] = True
         elif self._sampled:
             names = self.design_space.names
             for name in self._sampled:
                 draws = self.np_random.uniform(-1.0, 1.0, len(index))
                 self.designs[index, names.index(name)] = self.design_space[name].from_unit(draws)
             self._begin_bodies(index)
-        elif self._changed:
+        elif self._changed[index].any():
             self.designs[index] = list(self._fixed_design.values())
             self._begin_bodies(index)
+            self._changed[index] = False
         self._command[index] = 0.0
         self._displacement[index] = 0.0
         self._effort[index] = self._rest_effort[index]
         self._effector[index] = self._rest_effector[index]
         self._slack[index] = False
+        self._converged[index] = True
         self._steps[index] = 0
         if goal is not None:
             paths = goal
         else:
             paths = self.task.sample(self.np_random, len(index), lambda commands: self._kinematics(index, commands))
-        if paths.shape[1] != self._paths.shape[1]:
-            self._paths = np.zeros((self.num_envs, *paths.shape[1:]))
-        self._paths[index] = paths
+        missing = paths.shape[1] - self._paths.shape[1]
+        if missing > 0:
+            self._paths = np.pad(self._paths, ((0, 0), (0, missing), (0, 0)))
+        self._paths[index, : paths.shape[1]] = paths
+        self._counts[index] = paths.shape[1]
 
     def _kinematics(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
         context = self._context.rows(index)
@@ -158,7 +171,8 @@ class SoftRobotVectorEnv(VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode in every sub-environment; ``options`` as for `SoftRobotEnv.reset`.
 
-        ``"design"`` is the body of all of them; ``"goal"`` may have a leading dimension of ``num_envs``.
+        ``"design"`` is the body of all of them, or a list of ``num_envs`` bodies; ``"goal"`` is a point (3,) or a path
+        (p, 3) for all of them, or a path for each (num_envs, p, 3).
 
         Raises:
             DesignError: for a malformed design.
@@ -173,20 +187,10 @@ class SoftRobotVectorEnv(VectorEnv):
             raise ValueError(f"unknown reset option '{sorted(unknown)[0]}'; allowed: design, goal")
         goal = options.get("goal")
         if goal is not None:
-            goal = np.asarray(goal, dtype=float)
-            if goal.ndim < 3:
-                goal = np.broadcast_to(goal.reshape(-1, 3), (self.num_envs, *goal.reshape(-1, 3).shape))
-            if (
-                goal.shape[0] != self.num_envs
-                or goal.shape[1] == 0
-                or goal.shape[2:] != (3,)
-                or not np.isfinite(goal).all()
-            ):
-                raise ValueError(
-                    f"goal must be finite with shape (3,), (p, 3) or ({self.num_envs}, p, 3), got {goal.shape}"
-                )
+            shared = np.ndim(goal) < 3
+            goal = check_goals(goal, "goal", () if shared else (self.num_envs,))
+            goal = np.broadcast_to(goal, (self.num_envs, *goal.shape[-2:]))
         self._begin_episodes(np.arange(self.num_envs), options.get("design"), goal)
-        self._changed = options.get("design") is not None
         return self._observe(), self._info()[0]
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -198,17 +202,27 @@ class SoftRobotVectorEnv(VectorEnv):
         actions = self.interface.check_action(actions)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
-        self._command = self.interface.command(actions, self._command)
-        settled = settle(self.model, self._context, self._command, self._displacement, self._unilateral, self._slack)
-        self._displacement, self._effort, self._slack = settled.displacement, settled.effort, settled.slack
-        self._effector = settled.effector[:, :3]
+        command = self.interface.command(actions, self._command)
+        settled = settle(self.model, self._context, command, self._displacement, self._unilateral, self._slack)
+        self._converged = settled.converged.copy()
+        if settled.converged.all():
+            self._command, self._displacement = command, settled.displacement
+            self._effort, self._slack, self._effector = settled.effort, settled.slack, settled.effector[:, :3]
+        else:  # rows without a state stay where they were, and their episodes end
+            found = settled.converged[:, None]
+            self._command = np.where(found, command, self._command)
+            self._displacement = np.where(found, settled.displacement, self._displacement)
+            self._effort = np.where(found, settled.effort, self._effort)
+            self._slack = np.where(found, settled.slack, self._slack)
+            self._effector = np.where(found, settled.effector[:, :3], self._effector)
         self._steps += 1
         info, reward = self._info()
         observation = self._observe()
-        truncated = self._steps >= self.max_episode_steps
+        reward = np.where(self._converged, reward, 0.0)
+        truncated = (self._steps >= self.max_episode_steps) | ~self._converged
         ended = np.flatnonzero(truncated)
         if len(ended):
-            final_info = {k: v for k, v in info.items() if not k.startswith("_")}
+            final_info = info
             final_obs = np.full(self.num_envs, None, dtype=object)
             for i in ended:
                 final_obs[i] = observation[i].copy()
@@ -219,7 +233,7 @@ class SoftRobotVectorEnv(VectorEnv):
         return observation, reward, np.zeros(self.num_envs, dtype=bool), truncated, info
 
     def _goals(self) -> np.ndarray:
-        return self.task.goals(self._paths, self._steps)
+        return self.task.goals(self._paths, self._counts, self._steps)
 
     def _observe(self) -> np.ndarray:
         return self.interface.observe(
@@ -243,6 +257,8 @@ class SoftRobotVectorEnv(VectorEnv):
             "reward_terms": terms,
             "displacement": self._displacement.copy(),
             "effort": self._effort.copy(),
+            "stable": present,
+            "converged": self._converged.copy(),
         }
         info |= {f"_{name}": present for name in tuple(info)}
         return info, reward

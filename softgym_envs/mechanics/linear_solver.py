@@ -34,6 +34,11 @@ class LinearSolver(ABC):
             False if this method cannot factorise it (not positive definite, or singular).
         """
 
+    @property
+    @abstractmethod
+    def positive_definite(self) -> bool:
+        """Whether the last factorised matrix is positive definite."""
+
     @abstractmethod
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Solve for the columns of ``rhs``, shape (n, k), with the last factorisation."""
@@ -61,6 +66,10 @@ class CholmodSolver(LinearSolver):
         except ArithmeticError:
             return False
         return True
+
+    @property
+    def positive_definite(self) -> bool:
+        return True  # it factorises no other
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         solution = self._matrix(np.asfortranarray(rhs))
@@ -91,6 +100,11 @@ class SuperLUSolver(LinearSolver):
         except RuntimeError:  # exactly singular
             return False
         return True
+
+    @property
+    def positive_definite(self) -> bool:
+        # Without row exchanges the pivots have the signs of the eigenvalues (Sylvester).
+        return bool((self._lu.perm_r == self._lu.perm_c).all() and (self._lu.U.diagonal() > 0.0).all())
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         return self._lu.solve(np.ascontiguousarray(rhs))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_matrix, tril
@@ -81,7 +82,9 @@ class MechanicalModel:
 
     Attributes:
         constraints: constraint objects by role letter: ``"a"`` actuators, ``"e"`` effectors, ``"c"`` contacts.
-        load_factor: part of the dead loads that `assemble` applies, for continuation.
+        applied_loads: dead loads that `assemble` applies [N], shape (n, 3); a solver may bring them on in steps.
+        version: grows with every change of loads or constraints.
+        factor_owner: who factorised ``solver`` last; several solvers may share a model.
     """
 
     def __init__(
@@ -113,8 +116,8 @@ class MechanicalModel:
         self._solver: LinearSolver | None = None
         self._poisson: LinearSolver | None = None
         self._free_nodes = np.flatnonzero(~self.fixed)
-        self.load_factor = 1.0
-        self.loads_version = 0
+        self.version = 0
+        self.factor_owner: object | None = None
         self.nodal_loads = np.zeros_like(self.nodes)
         self.gravity_forces = np.zeros_like(self.nodes)
         self._block_masses = [block.density * block.volumes for block in self.blocks]
@@ -161,7 +164,10 @@ class MechanicalModel:
             **options: as for `from_mesh`.
         """
         nodes, tetrahedra = read_mesh(path, scale=scale)
-        box = np.asarray(fixed_box, dtype=float).reshape(3, 2)
+        box = np.asarray(fixed_box, dtype=float)
+        if box.shape != (6,):
+            raise ValueError(f"fixed_box must be xmin, xmax, ymin, ymax, zmin, zmax, got {fixed_box!r}")
+        box = box.reshape(3, 2)
         fixed = np.all((nodes >= box[:, 0]) & (nodes <= box[:, 1]), axis=1)
         return cls.from_mesh(nodes, tetrahedra, fixed=fixed, **options)
 
@@ -175,6 +181,7 @@ class MechanicalModel:
             raise ValueError(f"unknown role '{role}'; allowed: {', '.join(self.constraints)}")
         self.constraints[role].append(constraint)
         self._solver = None
+        self.version += 1
         return constraint
 
     def add_cable(
@@ -285,10 +292,15 @@ class MechanicalModel:
         indptr = np.searchsorted(unique, np.arange(n + 1, dtype=np.int64) * n)
         indices = unique % n
         self._block_maps = maps[: len(self.blocks)]
-        self._constraint_maps: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        for constraint, places in zip(curved, maps[len(self.blocks) :], strict=True):
-            keep = np.flatnonzero(places[0] >= 0)
-            self._constraint_maps[id(constraint)] = (keep, places[0][keep])
+        hessian_maps = iter(maps[len(self.blocks) :])
+        self._hessian_maps: list[tuple[np.ndarray, np.ndarray] | None] = []
+        for constraint, _ in self._rows:
+            if constraint in curved:
+                places = next(hessian_maps)[0]
+                keep = np.flatnonzero(places >= 0)
+                self._hessian_maps.append((keep, places[keep]))
+            else:
+                self._hessian_maps.append(None)
         self._values = np.empty(len(indices))
         self._gradient = np.empty_like(self.nodes)
         self._targets = []
@@ -297,6 +309,10 @@ class MechanicalModel:
             keep = np.flatnonzero(equations >= 0)
             self._targets.append((keep, equations[keep]))
         self._solver = make_solver(self._solver_name, indptr, indices)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the factorisations, which cannot be copied and are made again when needed."""
+        return {**self.__dict__, "_solver": None, "_poisson": None, "factor_owner": None}
 
     @property
     def solver(self) -> LinearSolver:
@@ -330,16 +346,17 @@ class MechanicalModel:
         """
         self.prepare()
         gradient, values = self._gradient, self._values
-        np.multiply(self._loads, -self.load_factor, out=gradient)
+        np.negative(self.applied_loads, out=gradient)
         values[:] = 0.0
         for block, scatter in zip(self.blocks, self._block_maps, strict=True):
             if block.add(x, gradient, values, scatter)[1]:
                 return None
         H = np.zeros((len(self.free_dofs), self.size), order="F")
         delta = np.empty(self.size)
-        for (constraint, rows), (keep, equations) in zip(self._rows, self._targets, strict=True):
+        for (constraint, rows), (keep, equations), mapping in zip(
+            self._rows, self._targets, self._hessian_maps, strict=True
+        ):
             part = effort[rows]
-            mapping = self._constraint_maps.get(id(constraint))
             if mapping is not None and part.any():
                 hessian = constraint.hessian(x, part)
                 assert hessian is not None
@@ -386,5 +403,5 @@ class MechanicalModel:
 
     def refresh_loads(self) -> None:
         """Take over changed ``nodal_loads``."""
-        self._loads = self.loads
-        self.loads_version += 1
+        self.applied_loads = self.loads
+        self.version += 1

@@ -84,21 +84,21 @@ class Statics:
         self._actuators = sum(c.size for c in model.constraints["a"])
         self.unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
         self._fallback: SuperLUSolver | None = None
-        self._loads_version = model.loads_version
+        self._version = model.version
         self.reset()
 
     def reset(self) -> None:
         """Go back to the undeformed shape with no effort. The equilibrium under loads is found by `solve`."""
         self.x = self.model.nodes.copy()
         self.effort = np.zeros(self.model.size)
-        self._load_factor = 0.0  # part of the dead loads the present state carries
+        self._carried = np.zeros_like(self.x)  # dead loads that the present state carries
         self._fresh = False
 
     def restore(self, x: np.ndarray, effort: np.ndarray) -> None:
         """Start the next solve from node positions ``x`` (n, 3) and efforts (size,) of all rows."""
         self.x = x.copy()
         self.effort = effort.copy()
-        self._load_factor = 1.0
+        self._carried = self.model.loads
         self._fresh = False
 
     # -- one linearisation ------------------------------------------------------------------------------------------
@@ -113,6 +113,7 @@ class Statics:
     def _factorise(self, assembled: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]) -> bool:
         self._residual, values, self._H, self._delta = assembled
         solver = self.model.solver
+        self.model.factor_owner = self
         if solver.factorise(values):
             self._active = solver
         else:
@@ -145,20 +146,20 @@ class Statics:
             gap = delta[driven] - target[driven] - H.T @ Ar + self._W[np.ix_(driven, forced)] @ step_effort[forced]
             W = self._W[np.ix_(driven, driven)]
             unilateral = self.unilateral[driven]
-            if not unilateral.any():
-                step_effort[driven] = np.linalg.solve(W, -gap)
-            else:
-                try:
+            try:
+                if unilateral.any():
                     new = solve_complementarity(W[None], (gap - W @ effort[driven])[None], unilateral)[0]
-                except np.linalg.LinAlgError:  # unstable: W is indefinite and the answer not unique
-                    raise _NotFound from None
-                step_effort[driven] = new - effort[driven]
+                    step_effort[driven] = new - effort[driven]
+                else:
+                    step_effort[driven] = np.linalg.solve(W, -gap)
+            except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (actuators that do the same)
+                raise _NotFound from None
         return self._AH @ step_effort - Ar, step_effort
 
     # -- Newton -----------------------------------------------------------------------------------------------------
 
     def _newton(self, target: np.ndarray, driven: np.ndarray) -> int:
-        """Converge at one load level; returns the iterations. Leaves the state untouched by raising `_NotFound`."""
+        """Converge at one load level; returns the iterations. After `_NotFound` the caller restores the state."""
         if not self._fresh and not self._linearise():
             raise _NotFound
         step_q, step_effort = self._correction(self._Ar, self._delta, self.effort, target, driven)
@@ -213,7 +214,8 @@ class Statics:
 
         Raises:
             ConvergenceError: with the fraction of the increment that was reached; the last converged state is kept.
-            ValueError: for a wrong shape, a non-finite value or an unknown mode.
+            ValueError: for a wrong shape, a non-finite value, an unknown mode, or a negative effort on an actuator that
+                cannot push.
         """
         count = self._actuators
         target = np.asarray(target, dtype=float)
@@ -226,10 +228,13 @@ class Statics:
             raise ValueError(f"mode must be 'displacement' or 'effort' (one, or {count} of them), got {mode!r}")
         driven = np.array([i for i, m in enumerate(modes) if m == "displacement"], dtype=int)
         forced = np.array([i for i, m in enumerate(modes) if m == "effort"], dtype=int)
-        if self._loads_version != self.model.loads_version:
-            self._loads_version = self.model.loads_version
+        for row in forced[self.unilateral[forced]] if len(forced) else forced:
+            if target[row] < 0.0:
+                raise ValueError(f"effort {target[row]:g} on actuator row {row} must not be negative: it cannot push")
+        if self._version != self.model.version or self.model.factor_owner is not self:
+            self._version = self.model.version
             self._fresh = False
-        self.model.load_factor = self._load_factor
+        self.model.applied_loads = self._carried
         if not self._fresh and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
@@ -238,24 +243,26 @@ class Statics:
         start[driven], start[forced] = self._delta[driven], self.effort[forced]
         goal = np.zeros(self.model.size)
         goal[:count] = target
-        # A slack cable's reached displacement exceeds its command: the path starts from the command's side.
         done, size, iterations, increments = 0.0, 1.0, 0, 0
-        start_loads = self._load_factor
+        loads, start_loads = self.model.loads, self._carried
+        ramped = bool((loads != start_loads).any())
         while done < 1.0:
             level = min(1.0, done + size)
-            kept = self.x, self.effort, self._load_factor
-            factor = start_loads + level * (1.0 - start_loads)
-            if factor != self.model.load_factor:
-                self.model.load_factor = factor
+            kept = self.x, self.effort
+            if ramped:
+                self.model.applied_loads = start_loads + level * (loads - start_loads)
                 self._fresh = False
             try:
                 iterations += self._newton(start + level * (goal - start), driven)
-            except _NotFound:
-                self.x, self.effort, self._load_factor = kept
-                self.model.load_factor = self._load_factor
+            except BaseException as problem:
+                # Whatever stopped it, also Ctrl-C, the last equilibrium stands.
+                self.x, self.effort = kept
+                self.model.applied_loads = self._carried
                 self._fresh = False
-                size *= 0.5
-                if size < 0.5**self.max_halvings or not self._linearise():
+                if not isinstance(problem, _NotFound):
+                    raise
+                size = 0.5 * (level - done)
+                if size < 0.5**self.max_halvings or not (ramped or self._linearise()):
                     reached = ", ".join(f"{v:.6g}" for v in (start + done * (goal - start))[:count])
                     wanted = ", ".join(f"{v:.6g}" for v in target)
                     raise ConvergenceError(
@@ -265,15 +272,16 @@ class Statics:
                     ) from None
                 continue
             increments += 1
-            done, self._load_factor = level, factor
+            done, self._carried = level, self.model.applied_loads
             size *= 1.5
-        return self._state(driven, iterations, increments)
+        return self._state(target, driven, iterations, increments)
 
-    def _state(self, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
+    def _state(self, target: np.ndarray, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
         effort = self.effort.copy()
         slack = np.zeros(self._actuators, dtype=bool)
         rows = driven[self.unilateral[driven]] if len(driven) else driven
-        slack[rows] = effort[rows] <= 0.0
+        # At rest round-off would decide by the effort alone.
+        slack[rows] = (effort[rows] <= 0.0) & (self._delta[rows] > target[rows] + 1e-9)
         condensed = CondensedModel(
             compliance=self._W.copy(),
             free=self._delta - self._W @ effort,
@@ -286,7 +294,7 @@ class Statics:
             delta=self._delta.copy(),
             effort=effort,
             slack=slack,
-            stable=self._active is self.model.solver,
+            stable=self._active.positive_definite,
             iterations=iterations,
             increments=increments,
         )

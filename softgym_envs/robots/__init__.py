@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -24,8 +25,10 @@ def make_robot(name: str, **options: object) -> Robot:
     """
     if name not in ROBOTS:
         raise ValueError(f"unknown robot '{name}'; allowed: {', '.join(ROBOTS)}")
-    module, _, cls = ROBOTS[name].partition(":")
+    module, _, name_of_class = ROBOTS[name].partition(":")
+    cls = getattr(import_module(module), name_of_class)
     try:
-        return getattr(import_module(module), cls)(**options)
+        inspect.signature(cls).bind(**options)
     except TypeError as error:
         raise ValueError(f"robot '{name}': {error}") from None
+    return cls(**options)

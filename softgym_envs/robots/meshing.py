@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.errors import DataError, InfeasibleDesign
+from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
 from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
 __all__ = ["BodyMesh", "mesh_geometry"]
@@ -92,7 +92,7 @@ def mesh_geometry(
 
     Raises:
         InfeasibleDesign: if the geometry cannot be drawn or meshed, or takes too long.
-        RuntimeError: if gmsh cannot be imported.
+        MeshingError: if gmsh cannot be imported.
     """
     name = f"{build.__module__}:{build.__qualname__}"
     parameters = {key: float(value) for key, value in sorted(parameters.items())}
@@ -124,7 +124,7 @@ def mesh_geometry(
         except subprocess.TimeoutExpired:
             raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s for {parameters}") from None
         if done.returncode == _BROKEN:
-            raise RuntimeError(f"gmsh cannot be used: {done.stderr.strip().splitlines()[-1]}")
+            raise MeshingError(f"gmsh cannot be used: {done.stderr.strip().splitlines()[-1]}")
         if done.returncode != 0:
             reason = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
             raise InfeasibleDesign(f"the geometry cannot be meshed for {parameters}: {reason}")

@@ -163,11 +163,10 @@ class Robot(ABC):
             InfeasibleDesign: if the geometry cannot exist.
         """
         complete = self.design_space.complete(design)
+        mesh = self.body(complete)
         try:
-            return self.equip(self.body(complete), complete)
+            return self.equip(mesh, complete)
         except ValueError as error:
-            if isinstance(error, InfeasibleDesign):
-                raise
             shown = {name: round(value, 9) for name, value in complete.items()}
             raise InfeasibleDesign(f"robot '{self.name}' cannot be built for {shown}: {error}") from error
 

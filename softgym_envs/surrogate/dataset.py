@@ -96,6 +96,7 @@ def generate_dataset(
             "compliance": "upper triangle of W over actuators then effectors, row by row",
         },
     }
+    manifest = json.loads(json.dumps(manifest))  # as it will be read again: tuples are lists there
     path = folder / "manifest.json"
     if path.exists():
         kept = _read_manifest(path)

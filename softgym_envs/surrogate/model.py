@@ -232,7 +232,7 @@ class _ActuatedNet:
 
 
 class ResidualModel(SurrogateModel):
-    """Structured network: exact at rest, W always symmetric positive definite.
+    """Structured network: equal to its rest pair at rest, W always symmetric positive definite.
 
     A rest network G gives, for a design, the Cholesky factor ``C0`` of the rest compliance and the effector at rest.
     A state network N and a compliance network M act as residuals that vanish at rest by construction:
@@ -379,6 +379,14 @@ def load_model(folder: str | Path, robot: Robot) -> SurrogateModel:
             + ", ".join(f"{k} = {found.get(k)!r}, asked {wanted[k]!r}" for k in different)
             + "; use backend='fem' or train weights with 'softgym fit'"
         )
+    bounds = {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()}
+    ranges = [[actuator.low, actuator.high] for actuator in robot.actuators]
+    for name, found, wanted in (
+        ("design_variables", card.get("design_variables"), bounds),
+        ("actuators", card.get("actuators"), ranges),
+    ):
+        if found != wanted:
+            raise WeightsError(f"weights '{folder.name}' were trained for other {name}: {found}, asked {wanted}")
     try:
         tensors = load_file(weights_path)
     except (SafetensorError, OSError, ValueError) as error:

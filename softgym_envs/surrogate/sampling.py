@@ -63,21 +63,22 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> dict[str, np.n
 
     Returns:
         Arrays with one row per solved state: ``design`` (all variables), ``displacement``, ``effort``, ``effector``,
-        ``compliance`` (upper triangle of W, row by row), ``rest`` (1 for the rest state); None for an infeasible
-        design. States without an equilibrium are left out.
+        ``compliance`` (upper triangle of W, row by row), ``rest`` (1 for the rest state); None for a design that
+        is infeasible or has no equilibrium at rest. States without an equilibrium are left out.
     """
     names = learned_variables(robot)
     space = robot.design_space
     unit = 2.0 * plan.unit_points(len(names), group, 1, 0)[0] - 1.0
     design = space.complete({name: float(space[name].from_unit(u)) for name, u in zip(names, unit, strict=True)})
+    zero = np.zeros(len(robot.actuators))
     try:
         statics = Statics(robot.build(design))
-    except InfeasibleDesign:
+        rows: list[Equilibrium] = [statics.solve(zero, "effort")]
+    except (InfeasibleDesign, ConvergenceError):
         return None
     count = len(robot.actuators)
     fractions = plan.unit_points(count, group * plan.states, plan.states, 1)
     rng = np.random.default_rng([plan.seed, 2, group])
-    rows: list[Equilibrium] = [statics.solve(np.zeros(count), "effort")]
     for fraction in fractions:
         try:
             equilibrium = statics.solve(robot.lower + fraction * (robot.upper - robot.lower))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import math
+import shutil
 import time
 from pathlib import Path
 from typing import Any, Literal
@@ -89,42 +92,81 @@ def _weights(net, prefix: str) -> dict[str, np.ndarray]:
     return tensors
 
 
-def _optimise(name: str, net, loss, train_size: int, config: NetworkConfig, progress: bool) -> list[dict[str, float]]:
-    """Adam with a cosine rate, early stop and the best epoch by validation loss.
+class _Trainer:
+    """Trains the parts of a model one after the other; a finished part is kept on disk and not trained again.
 
-    ``loss(indices | None)`` is the loss on training rows, or on the validation set for None.
+    Args:
+        config: hyper-parameters.
+        seed: of weights and batches; each part starts from it, so a resumed run equals an uninterrupted one.
+        folder: where finished parts are kept.
+        key: what the parts depend on (configuration and data); parts of another key are trained anew.
+        progress: show progress bars.
     """
-    import copy
 
-    import torch
-    from tqdm import tqdm
+    def __init__(self, config: NetworkConfig, seed: int, folder: Path, key: str, progress: bool) -> None:
+        self.config, self.seed, self.folder, self.key, self.progress = config, seed, folder, key, progress
 
-    optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.epochs, config.learning_rate * 1e-3)
-    best, best_state, best_epoch, history = float("inf"), copy.deepcopy(net.state_dict()), 0, []
-    bar = tqdm(range(config.epochs), desc=name, unit="epoch", disable=not progress)
-    for epoch in bar:
-        order = torch.randperm(train_size)
-        total = 0.0
-        for first in range(0, train_size, config.batch_size):
-            rows = order[first : first + config.batch_size]
-            value = loss(rows)
-            optimiser.zero_grad()
-            value.backward()
-            optimiser.step()
-            total += value.item() * len(rows)
-        schedule.step()
-        with torch.no_grad():
-            validation = float(loss(None))
-        history.append({"epoch": epoch, "train": total / train_size, "validation": validation})
-        bar.set_postfix_str(f"train {total / train_size:.2e}, validation {validation:.2e}")
-        if validation < best:
-            best, best_state, best_epoch = validation, copy.deepcopy(net.state_dict()), epoch
-        elif epoch - best_epoch >= config.patience:
-            break
-    bar.close()
-    net.load_state_dict(best_state)
-    return history
+    def perceptron(self, inputs: int, outputs: int, width: int, depth: int, activation: str):
+        """A new network with seeded weights."""
+        import torch
+
+        torch.manual_seed(self.seed)
+        return _perceptron(inputs, outputs, width, depth, activation)
+
+    def optimise(self, name: str, net, loss, train_size: int, **changes: int) -> list[dict[str, float]]:
+        """Adam with a cosine rate, early stop and the best epoch by validation loss; returns the history.
+
+        ``loss(indices | None)`` is the loss on training rows, or on the validation set for None.
+
+        Raises:
+            DataError: if the training diverges.
+        """
+        import copy
+
+        import torch
+        from safetensors.torch import load, save
+        from tqdm import tqdm
+
+        path = self.folder / f"{name}-{self.key}.safetensors"
+        history_path = path.with_suffix(".json")
+        if path.exists() and history_path.exists():
+            net.load_state_dict(load(path.read_bytes()))
+            return json.loads(history_path.read_text())
+        config = self.config.model_copy(update=changes)
+        torch.manual_seed(self.seed)
+        optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.epochs, config.learning_rate * 1e-3)
+        best, best_state, best_epoch, history = float("inf"), net.state_dict(), 0, []
+        bar = tqdm(range(config.epochs), desc=name, unit="epoch", disable=not self.progress)
+        for epoch in bar:
+            order = torch.randperm(train_size)
+            total = 0.0
+            for first in range(0, train_size, config.batch_size):
+                rows = order[first : first + config.batch_size]
+                value = loss(rows)
+                optimiser.zero_grad()
+                value.backward()
+                optimiser.step()
+                total += value.item() * len(rows)
+            schedule.step()
+            with torch.no_grad():
+                validation = float(loss(None))
+            if not math.isfinite(validation):
+                bar.close()
+                raise DataError(f"training of '{name}' diverged at epoch {epoch}: the validation loss is {validation}")
+            history.append({"epoch": epoch, "train": total / train_size, "validation": validation})
+            bar.set_postfix_str(f"train {total / train_size:.2e}, validation {validation:.2e}")
+            if validation < best:
+                best, best_state, best_epoch = validation, copy.deepcopy(net.state_dict()), epoch
+            elif epoch - best_epoch >= config.patience:
+                break
+        bar.close()
+        net.load_state_dict(best_state)
+        # The history goes first: the part counts as finished when its weights are there.
+        write_json(history_path, history)
+        with atomic_write(path) as stream:
+            stream.write(save(best_state))
+        return history
 
 
 class _Arrays:
@@ -148,6 +190,10 @@ class _Arrays:
         self.W[:, upper[1], upper[0]] = data["compliance"]
         self.W *= factor[:, None, None]
         # The rest row of each row's own body: groups start with it.
+        if np.abs(data["displacement"][data["rest"]]).max() > 1e-9:
+            raise DataError(
+                "bodies at rest have displaced actuators (gravity?); the networks need displacement 0 at rest"
+            )
         starts = np.flatnonzero(data["rest"])
         if len(starts) == 0 or starts[0] != 0:
             raise DataError("the dataset has no rest state at its beginning")
@@ -175,11 +221,12 @@ def _standardise(values: np.ndarray, mean: np.ndarray | float, scale: np.ndarray
 
 
 def _fit_residual(
-    robot: Robot, train: _Arrays, validation: _Arrays, config: NetworkConfig, progress: bool
+    robot: Robot, train: _Arrays, validation: _Arrays, trainer: _Trainer
 ) -> tuple[dict[str, np.ndarray], dict[str, list[dict[str, float]]]]:
     """Train the three parts of `ResidualModel`."""
     import torch
 
+    config = trainer.config
     count = len(robot.actuators)
     a, e = slice(0, count), slice(count, None)
 
@@ -197,7 +244,7 @@ def _fit_residual(
     mean, scale = _mean_scale(rest["train"][1])
     inputs = {k: tensor(v[0]) for k, v in rest.items()}
     targets = {k: tensor(_standardise(v[1], mean, scale)) for k, v in rest.items()}
-    net = _perceptron(train.design.shape[1], len(mean), 64, 2, "algebraic")
+    net = trainer.perceptron(train.design.shape[1], len(mean), 64, 2, "algebraic")
 
     def rest_loss(rows):
         key = "validation" if rows is None else "train"
@@ -205,10 +252,15 @@ def _fit_residual(
         return ((net(x) - y) ** 2).mean()
 
     # Few rows, cheap epochs: many more of them, in small batches.
-    rest_config = config.model_copy(
-        update={"epochs": 4 * config.epochs, "patience": 4 * config.patience, "batch_size": min(128, config.batch_size)}
+    histories["rest"] = trainer.optimise(
+        "rest",
+        net,
+        rest_loss,
+        len(rest["train"][0]),
+        epochs=4 * config.epochs,
+        patience=4 * config.patience,
+        batch_size=min(128, config.batch_size),
     )
-    histories["rest"] = _optimise("rest", net, rest_loss, len(rest["train"][0]), rest_config, progress)
     tensors |= _weights(net, "rest") | {"rest_mean": mean, "rest_scale": scale}
 
     # 2. Efforts and effectors, as a residual of the rest slopes.
@@ -225,7 +277,9 @@ def _fit_residual(
     y_scale = parts["train"][4].std(dim=0)
     state_scale = np.abs(slopes[0]).mean(axis=0).reshape(-1)
     state_scale_t = tensor(state_scale)
-    net_state = _perceptron(count + train.design.shape[1], len(state_scale), config.width, config.depth, "algebraic")
+    net_state = trainer.perceptron(
+        count + train.design.shape[1], len(state_scale), config.width, config.depth, "algebraic"
+    )
 
     def state_loss(rows):
         actuation, design, displacement, slope, y = (
@@ -237,7 +291,7 @@ def _fit_residual(
         predicted = ((slope + residual.reshape(slope.shape)) @ displacement[:, :, None])[:, :, 0]
         return (((predicted - y) / y_scale) ** 2).mean()
 
-    histories["state"] = _optimise("state", net_state, state_loss, len(train.design), config, progress)
+    histories["state"] = trainer.optimise("state", net_state, state_loss, len(train.design))
     tensors |= _weights(net_state, "state") | {"state_scale": state_scale}
 
     # 3. The compliance, whitened by its rest value.
@@ -249,7 +303,7 @@ def _fit_residual(
         whitened[key] = _log_cholesky(T)
     compliance_scale = _mean_scale(whitened["train"])[1]
     wanted = {k: tensor(_standardise(v, 0.0, compliance_scale)) for k, v in whitened.items()}
-    net_compliance = _perceptron(
+    net_compliance = trainer.perceptron(
         count + train.design.shape[1], len(compliance_scale), config.width, config.depth, "algebraic"
     )
 
@@ -263,18 +317,18 @@ def _fit_residual(
         both = net_compliance(torch.cat([torch.cat([actuation, design], dim=1), at_rest]))
         return ((both[: len(design)] - both[len(design) :] - y) ** 2).mean()
 
-    histories["compliance"] = _optimise(
-        "compliance", net_compliance, compliance_loss, len(train.design), config, progress
-    )
+    histories["compliance"] = trainer.optimise("compliance", net_compliance, compliance_loss, len(train.design))
     tensors |= _weights(net_compliance, "compliance") | {"compliance_scale": compliance_scale}
     return tensors, histories
 
 
 def _fit_thesis(
-    robot: Robot, train: _Arrays, validation: _Arrays, config: NetworkConfig, progress: bool
+    robot: Robot, train: _Arrays, validation: _Arrays, trainer: _Trainer
 ) -> tuple[dict[str, np.ndarray], dict[str, list[dict[str, float]]]]:
     """Train the thesis' G and F on standardised (W upper triangle, delta_free)."""
     import torch
+
+    config = trainer.config
 
     def tensor(x):
         return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
@@ -295,8 +349,8 @@ def _fit_thesis(
     rest = {k: tensor(_standardise(y[k][v.rest_of], rest_mean, rest_scale)) for k, v in arrays.items()}
     main_in = {k: torch.cat([tensor(v.actuation), rest[k]], dim=1) for k, v in arrays.items()}
     main_out = {k: tensor(_standardise(y[k], main_mean, main_scale)) for k in arrays}
-    net_rest = _perceptron(train.design.shape[1], len(rest_mean), config.width, config.depth, "relu")
-    net_main = _perceptron(main_in["train"].shape[1], len(main_mean), config.width, config.depth, "relu")
+    net_rest = trainer.perceptron(train.design.shape[1], len(rest_mean), config.width, config.depth, "relu")
+    net_main = trainer.perceptron(main_in["train"].shape[1], len(main_mean), config.width, config.depth, "relu")
 
     def loss_of(net, x, target, rows_of=None):
         def loss(rows):
@@ -309,8 +363,8 @@ def _fit_thesis(
 
     rest_rows = torch.as_tensor(train.rest_rows)
     histories = {
-        "rest": _optimise("G", net_rest, loss_of(net_rest, design, rest, rest_rows), len(rest_rows), config, progress),
-        "main": _optimise("F", net_main, loss_of(net_main, main_in, main_out), len(train.design), config, progress),
+        "rest": trainer.optimise("G", net_rest, loss_of(net_rest, design, rest, rest_rows), len(rest_rows)),
+        "main": trainer.optimise("F", net_main, loss_of(net_main, main_in, main_out), len(train.design)),
     }
     tensors = _weights(net_rest, "rest") | _weights(net_main, "main")
     tensors |= {"rest_mean": rest_mean, "rest_scale": rest_scale, "main_mean": main_mean, "main_scale": main_scale}
@@ -352,6 +406,7 @@ def test_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[str,
 
 def generate(config: FitConfig, data_folder: str | Path, *, progress: bool = True) -> dict[str, dict[str, np.ndarray]]:
     """Generate the datasets ``train``, ``validation`` and ``test`` of a surrogate, or take up what is there."""
+    save_resolved(data_folder, config)
     return {
         split: generate_dataset(
             Path(data_folder) / split,
@@ -383,29 +438,38 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     folder, data_folder = Path(folder), Path(data_folder)
     robot = make_robot(config.robot, **config.robot_options)
     data = generate(config, data_folder, progress=progress)
-    torch.set_num_threads(config.workers)
-    torch.manual_seed(config.seed)
-    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
-    arrays = {split: _Arrays(robot, data[split], features) for split in ("train", "validation")}
-    start = time.perf_counter()
-    trainer = {"residual": _fit_residual, "thesis": _fit_thesis}[config.network.kind]
-    tensors, histories = trainer(robot, arrays["train"], arrays["validation"], config.network, progress)
-    seconds = time.perf_counter() - start
-    model = NETWORKS[config.network.kind](robot, tensors, {})
-    errors = test_errors(model, data["test"])
     digest = hashlib.sha256()
     for split in data.values():
         for column in split.values():
             digest.update(np.ascontiguousarray(column).tobytes())
+    asked = {"config": config.model_dump(mode="json", exclude={"workers"}), "data_sha256": digest.hexdigest()}
+    card_path = folder / "model.json"
+    if card_path.exists():
+        model = load_model(folder, robot)
+        same = all(model.card["config"].get(k) == v for k, v in asked["config"].items())
+        if same and model.card["data_sha256"] == asked["data_sha256"]:
+            return model.card["test"]
+    torch.set_num_threads(config.workers)
+    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
+    arrays = {split: _Arrays(robot, data[split], features) for split in ("train", "validation")}
+    key = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:12]
+    trainer = _Trainer(config.network, config.seed, folder / "parts", key, progress)
+    start = time.perf_counter()
+    fit_network = {"residual": _fit_residual, "thesis": _fit_thesis}[config.network.kind]
+    tensors, histories = fit_network(robot, arrays["train"], arrays["validation"], trainer)
+    seconds = time.perf_counter() - start
+    model = NETWORKS[config.network.kind](robot, tensors, {})
+    errors = test_errors(model, data["test"])
     card = {
         "format": FORMAT,
         "network": config.network.kind,
         "robot": robot.name,
         "signature": robot.signature,
         "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
+        "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
         "config": config.model_dump(mode="json"),
         "states": {split: len(columns["rest"]) for split, columns in data.items()},
-        "data_sha256": digest.hexdigest(),
+        "data_sha256": asked["data_sha256"],
         "training_seconds": round(seconds, 1),
         "best_validation": {part: min(row["validation"] for row in rows) for part, rows in histories.items()},
         "test": errors,
@@ -421,4 +485,5 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         np.savez_compressed(stream, allow_pickle=False, **history)
     save_resolved(folder, config)
     load_model(folder, robot)  # what was written can be read
+    shutil.rmtree(trainer.folder, ignore_errors=True)
     return errors

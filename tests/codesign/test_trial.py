@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 
 from codesign.ledger import Ledger
+from codesign.objectives import OBJECTIVES
 from codesign.trial import run_trial
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+
+
+def outcome_of(score):
+    """An evaluation of which every objective has this score."""
+    return SimpleNamespace(to_json=lambda: {key: score * objective.sign for key, objective in OBJECTIVES.items()})
 
 
 @pytest.fixture
@@ -26,7 +32,7 @@ def pretend(monkeypatch):
         folder.mkdir(parents=True, exist_ok=True)
         stopped = False
         for k, value in enumerate(called.reports):
-            stopped = stopped or report((k + 1) * config.report_every, value)
+            stopped = stopped or report((k + 1) * config.report_every, outcome_of(value))
         policy = folder / "policy.safetensors"
         policy.write_bytes(b"")
         policy.with_suffix(".json").write_text(json.dumps({"stopped_early": stopped}))
