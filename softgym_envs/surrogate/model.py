@@ -381,12 +381,9 @@ def load_model(folder: str | Path, robot: Robot) -> SurrogateModel:
         )
     bounds = {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()}
     ranges = [[actuator.low, actuator.high] for actuator in robot.actuators]
-    for name, found, wanted in (
-        ("design_variables", card.get("design_variables"), bounds),
-        ("actuators", card.get("actuators"), ranges),
-    ):
-        if found != wanted:
-            raise WeightsError(f"weights '{folder.name}' were trained for other {name}: {found}, asked {wanted}")
+    for name, asked in (("design_variables", bounds), ("actuators", ranges)):
+        if card.get(name) != asked:
+            raise WeightsError(f"weights '{folder.name}' are for other {name}: {card.get(name)}, asked {asked}")
     try:
         tensors = load_file(weights_path)
     except (SafetensorError, OSError, ValueError) as error:

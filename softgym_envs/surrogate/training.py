@@ -442,7 +442,10 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     for split in data.values():
         for column in split.values():
             digest.update(np.ascontiguousarray(column).tobytes())
-    asked = {"config": config.model_dump(mode="json", exclude={"workers"}), "data_sha256": digest.hexdigest()}
+    asked: dict[str, Any] = {
+        "config": config.model_dump(mode="json", exclude={"workers"}),
+        "data_sha256": digest.hexdigest(),
+    }
     card_path = folder / "model.json"
     if card_path.exists():
         model = load_model(folder, robot)
