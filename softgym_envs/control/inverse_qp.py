@@ -25,7 +25,8 @@ class InverseQP:
         effort >= 0 for unilateral actuators,  lower <= delta_a <= upper,  |delta_a - command| <= rate.
 
     Regularisation: three definitions of eps circulate in the group's codes; this one makes the weights pure numbers.
-    The defaults are far below the 0.01 that some use: with it the finger stops 0.58 mm short of a goal 54 mm away, with 1e-5 0.6 um.
+    The defaults are far below the 0.01 that some use: with that the finger stops 0.58 mm short of a goal 54 mm away,
+    with 1e-5 it stops 0.6 um short.
     ``effort_weight`` decides between redundant actuators and moves the result towards rest by about that fraction of
     the way from it; ``step_weight`` only slows the last part of the approach and has no steady error.
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,10 @@ from agents.config import EnvironmentConfig, TrainConfig
 from agents.evaluation import evaluate, sample_goals
 from agents.policy import Policy
 from agents.training import train
+from softgym_envs.config import load_config
 from softgym_envs.errors import DataError, WeightsError
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 CONFIG = TrainConfig.model_validate(
     {
@@ -80,6 +84,12 @@ def test_interrupted_training_resumes(tmp_path, monkeypatch):
     monkeypatch.setattr(
         training, "_learn", lambda model, target, bar: (steps.append(model.num_timesteps), original(model, target, bar))
     )
+    fresh = training._make_model(CONFIG, tmp_path / "fresh")
+    resumed = training._make_model(CONFIG, tmp_path / "resumed")
+    training._restore(resumed, tmp_path / "checkpoint.safetensors")
+    for model in (fresh, resumed):
+        model.env.reset()
+    assert (fresh.env.env.unwrapped._paths != resumed.env.env.unwrapped._paths).all()  # new goals, not the first ones
     train(CONFIG, tmp_path, progress=False)
     assert steps == [200]  # went on where it was
     with open(tmp_path / "curve.csv") as stream:
@@ -118,7 +128,11 @@ def test_warm_start_and_early_stop(trained, tmp_path):
         update={"seed": 5, "sac": CONFIG.sac.model_copy(update={"learning_rate": 1e-12, "final_learning_rate": 1e-12})}
     )
     path = train(
-        config, tmp_path, initial=trained, progress=False, report=lambda step, score: seen.append((step, score)) or True
+        config,
+        tmp_path,
+        initial=trained,
+        progress=False,
+        report=lambda step, outcome: seen.append((step, outcome.success_rate)) or True,
     )
     assert [step for step, _ in seen] == [200]
     assert json.loads(path.with_suffix(".json").read_text())["stopped_early"] is True
@@ -178,3 +192,23 @@ def test_goals_repeat_and_belong_to_the_body():
     assert (goals != sample_goals(environment, 5, seed=2, design={"length": 0.042})).any()
     track = EnvironmentConfig(id="SoftGym/FingerTrack-v0")
     assert sample_goals(track, 2, seed=0).shape == (2, 25, 3)
+
+
+@pytest.mark.parametrize("name", ["finger_reach", "finger_reach_designs"])
+def test_shipped_policies_were_made_by_the_shipped_configs(name):
+    config = load_config(CONFIGS / "agents" / f"{name}.yaml", TrainConfig)
+    card = Policy(name).card
+    assert card["config"] == config.model_dump(mode="json")
+    assert card["steps"] == config.steps and not card["stopped_early"]
+    with pytest.raises(WeightsError, match="unknown policy 'octopus'.*finger_reach"):
+        Policy("octopus")
+
+
+def test_each_goal_may_have_its_own_body(trained):
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0")
+    designs = [{"length": 0.0385}, {"length": 0.0415, "height": 0.0215}]
+    goals = sample_goals(environment, 2, seed=1)
+    both = evaluate(trained, environment, goals, design=designs)
+    for i, design in enumerate(designs):
+        one = evaluate(trained, environment, goals[i : i + 1], design=design)
+        assert both.distances[i] == pytest.approx(one.distances[0], abs=1e-6)

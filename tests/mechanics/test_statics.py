@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -333,3 +335,60 @@ def test_heavy_dead_loads_are_found_from_rest(fingers):
 
 def test_cholmod_is_the_default_where_it_is_installed(notched):
     assert isinstance(notched_beam(notched).solver, CholmodSolver)
+
+
+def test_loads_that_change_after_a_solve_are_brought_on_in_steps(fingers):
+    robot, _ = fingers(2, "corotational")
+    model = robot.build({"young_modulus": 1.0e6, "poisson_ratio": 0.499})
+    statics = Statics(model)
+    statics.solve([0.0, 0.0], "effort")
+    model.set_gravity((0.0, 200.0, 200.0))
+    changed = statics.solve([0.0, 0.0], "effort")
+    assert changed.increments > 1  # it does not go at once
+    np.testing.assert_allclose(changed.x, Statics(model).solve([0.0, 0.0], "effort").x, rtol=0, atol=1e-8)
+
+
+def test_two_statics_share_a_model(fingers):
+    _, model = fingers(2, "corotational")
+    first, second = Statics(model), Statics(model)
+    first.solve([0.005, 0.004])
+    second.solve([0.012, 0.001])
+    again = first.solve([0.006, 0.005])
+    fresh = Statics(model).solve([0.006, 0.005])
+    np.testing.assert_allclose(again.x, fresh.x, rtol=0, atol=1e-9)
+    assert again.iterations <= 3  # it did not start from the other's tangent
+
+
+def test_a_copied_model_is_whole(fingers):
+    _, model = fingers(2, "corotational")
+    expected = Statics(model).solve([0.01, 0.01])
+    found = Statics(copy.deepcopy(model)).solve([0.01, 0.01])
+    np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-12)
+    assert found.increments == expected.increments
+
+
+def test_a_cable_cannot_be_told_to_push(fingers):
+    _, model = fingers(2, "corotational")
+    with pytest.raises(ValueError, match=r"effort -3 on actuator row 1.*cannot push"):
+        Statics(model).solve([1.0, -3.0], "effort")
+
+
+def test_at_rest_no_cable_is_slack(fingers):
+    _, model = fingers(2, "corotational")
+    state = Statics(model).solve([0.0, 0.0])
+    assert not state.slack.any() and state.stable
+
+
+@pytest.mark.parametrize("solver", ["cholmod", "superlu"])
+def test_a_column_beyond_its_buckling_load_is_not_stable(box, solver):
+    nodes, tetrahedra = box((0.1, 0.01, 0.01), (10, 2, 2))
+    model = MechanicalModel.from_mesh(
+        nodes, tetrahedra, fixed=nodes[:, 0] < 1e-9, young_modulus=1e6, poisson_ratio=0.3, solver=solver
+    )
+    line = np.column_stack([np.linspace(0.01, 0.1, 10), np.full(10, 0.005), np.full(10, 0.005)])
+    # Straight from the clamp, through the axis: its tension compresses the column.
+    model.add_cable("axis", line[-1:], np.array([-0.01, 0.005, 0.005]))
+    euler = np.pi**2 * 1e6 * (0.01**4 / 12) / (2 * 0.1) ** 2
+    statics = Statics(model)
+    assert statics.solve([0.2 * euler], "effort").stable
+    assert not statics.solve([20.0 * euler], "effort").stable

@@ -2,10 +2,12 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from softgym_envs.config import load_config
 from softgym_envs.errors import WeightsError
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.model import NETWORKS, ResidualModel, load_model
@@ -13,6 +15,7 @@ from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_mode
 from softgym_envs.surrogate.training import FitConfig, fit
 
 CABLES = (1, 2)
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "surrogate"
 
 
 def random_bodies(robot, count, seed=0):
@@ -124,7 +127,8 @@ def test_card_tells_where_the_weights_come_from(cables):
     assert card["network"] in NETWORKS
     assert card["test"]["positive_definite"] == 1.0
     assert card["states"]["test"] >= 2000
-    FitConfig.model_validate(card["config"])
+    config = load_config(CONFIGS / f"{robot.variant}.yaml", FitConfig)
+    assert card["config"] == config.model_dump(mode="json")
 
 
 def test_effort_mode_inverts_displacement_mode():
