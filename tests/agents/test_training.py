@@ -127,13 +127,12 @@ def test_warm_start_and_early_stop(trained, tmp_path):
     config = CONFIG.model_copy(
         update={"seed": 5, "sac": CONFIG.sac.model_copy(update={"learning_rate": 1e-12, "final_learning_rate": 1e-12})}
     )
-    path = train(
-        config,
-        tmp_path,
-        initial=trained,
-        progress=False,
-        report=lambda step, outcome: seen.append((step, outcome.success_rate)) or True,
-    )
+
+    def report(step, outcome):
+        seen.append((step, outcome.success_rate))
+        return True
+
+    path = train(config, tmp_path, initial=trained, progress=False, report=report)
     assert [step for step, _ in seen] == [200]
     assert json.loads(path.with_suffix(".json").read_text())["stopped_early"] is True
     x = np.random.default_rng(0).uniform(-1, 1, (4, 15)).astype(np.float32)
