@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from softgym_envs.registry import make_registered
 
 if TYPE_CHECKING:
     from softgym_envs.backends.backend import Backend
@@ -25,12 +25,4 @@ def make_backend(name: str, robot: Robot, **options: object) -> Backend:
     Raises:
         ValueError: for an unknown name or a wrong option.
     """
-    if name not in BACKENDS:
-        raise ValueError(f"unknown backend '{name}'; allowed: {', '.join(BACKENDS)}")
-    module, _, name_of_class = BACKENDS[name].partition(":")
-    cls = getattr(import_module(module), name_of_class)
-    try:
-        inspect.signature(cls).bind(robot, **options)
-    except TypeError as error:
-        raise ValueError(f"backend '{name}': {error}") from None
-    return cls(robot, **options)
+    return make_registered("backend", BACKENDS, name, robot, **options)

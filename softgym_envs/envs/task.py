@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from importlib import import_module
 
 import numpy as np
 
+from softgym_envs.registry import make_registered
 from softgym_envs.robots.robot import Robot
 
 __all__ = ["TASKS", "Task", "check_goals", "make_task", "tolerance"]
@@ -102,12 +101,4 @@ def make_task(name: str, robot: Robot, **options: object) -> Task:
     Raises:
         ValueError: for an unknown name or a wrong option.
     """
-    if name not in TASKS:
-        raise ValueError(f"unknown task '{name}'; allowed: {', '.join(TASKS)}")
-    module, _, name_of_class = TASKS[name].partition(":")
-    cls = getattr(import_module(module), name_of_class)
-    try:
-        inspect.signature(cls).bind(robot, **options)
-    except TypeError as error:
-        raise ValueError(f"task '{name}': {error}") from None
-    return cls(robot, **options)
+    return make_registered("task", TASKS, name, robot, **options)

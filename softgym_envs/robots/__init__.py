@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from softgym_envs.registry import make_registered
 
 if TYPE_CHECKING:
     from softgym_envs.robots.robot import Robot
@@ -23,12 +23,4 @@ def make_robot(name: str, **options: object) -> Robot:
     Raises:
         ValueError: for an unknown name or a wrong option.
     """
-    if name not in ROBOTS:
-        raise ValueError(f"unknown robot '{name}'; allowed: {', '.join(ROBOTS)}")
-    module, _, name_of_class = ROBOTS[name].partition(":")
-    cls = getattr(import_module(module), name_of_class)
-    try:
-        inspect.signature(cls).bind(**options)
-    except TypeError as error:
-        raise ValueError(f"robot '{name}': {error}") from None
-    return cls(**options)
+    return make_registered("robot", ROBOTS, name, **options)
