@@ -78,7 +78,7 @@ class Robot(ABC):
         if meshing not in ("morph", "remesh"):
             raise ValueError(f"meshing = {meshing!r} is unknown; allowed: 'morph', 'remesh'")
         if not (isinstance(mesh_size, int | float) and 0.0 < mesh_size < np.inf):
-            raise ValueError(f"robot '{self.name}': mesh_size = {mesh_size!r} m must be a positive finite number")
+            raise ValueError(f"robot '{self.name}': mesh_size = {mesh_size!r} m must be positive: a finite number")
         if material not in MATERIALS:
             raise ValueError(f"unknown material '{material}'; allowed: {', '.join(MATERIALS)}")
         if len(gravity) != 3 or not np.isfinite(gravity).all():
