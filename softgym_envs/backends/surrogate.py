@@ -73,31 +73,32 @@ def settle(
     converged = np.isfinite(effort).all(axis=1)
     if not wrong.any():
         return Settled(guess, effort, effector, loose, converged)
-    searched = np.flatnonzero(wrong.any(axis=1))
-    rows = searched
     displacement = guess.copy()
+    searched = np.flatnonzero(wrong.any(axis=1))
+    # Working copies of the rows still searched; they are written back as their search ends.
+    rows, d, e, wanted = searched, guess[searched], effort[searched], target[searched]
+    part = context if len(rows) == len(guess) else context.rows(rows)
     limit = 0.25 * (model.robot.upper - model.robot.lower)
     for iteration in range(max_iterations):
         if iteration % 4 == 0:
             # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
-            part = context.rows(rows)
-            W = model.compliance(part, displacement[rows])[:, : model.count, : model.count]
-        present = effort[rows]
-        gap = displacement[rows] - (W @ present[:, :, None])[:, :, 0] - target[rows]
+            W = model.compliance(part, d)[:, : model.count, : model.count]
         try:
-            taut = solve_complementarity(W, gap, unilateral)
+            taut = solve_complementarity(W, d - np.matmul(W, e[:, :, None])[:, :, 0] - wanted, unilateral)
         except np.linalg.LinAlgError:  # a network that does not keep W positive definite
             break
         # Far steps are cut: the network is only asked where its neighbourhood of known states reaches.
-        step = np.minimum(np.maximum((W @ (taut - present)[:, :, None])[:, :, 0], -limit), limit)
-        displacement[rows] += step
-        moving = np.abs(step).max(axis=1) > TOLERANCE
-        # A last step below the tolerance is taken without asking the model again.
-        effort[rows[~moving]] = taut[~moving]
-        rows, W, part = rows[moving], W[moving], part.rows(moving)
-        if len(rows) == 0:
-            break
-        effort[rows], effector[rows] = model.state(part, displacement[rows])
+        step = np.minimum(np.maximum(np.matmul(W, (taut - e)[:, :, None])[:, :, 0], -limit), limit)
+        d = d + step
+        moving = (np.abs(step) > TOLERANCE).any(axis=1)
+        if not moving.all():
+            # A last step below the tolerance is taken without asking the model again.
+            displacement[rows[~moving]], effort[rows[~moving]] = d[~moving], taut[~moving]
+            rows = rows[moving]
+            if len(rows) == 0:
+                break
+            d, wanted, W, part = d[moving], wanted[moving], W[moving], part.rows(moving)
+        e, effector[rows] = model.state(part, d)
     converged[rows] = False
     loose[searched] = unilateral & (displacement[searched] > target[searched] + 10.0 * TOLERANCE)
     effort = np.where(loose, 0.0, np.where(unilateral, np.maximum(effort, 0.0), effort))
