@@ -291,7 +291,8 @@ def screen(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> s
                 x, y, 80 if role else 26, colour, marker="*" if role else "o", label=role, zorder=4 if role else 3
             )
         ax.set(xlabel=f"inverse QP: {_axis(objective).lower()}", ylabel=f"SAC: {_axis(objective).lower()}")
-        ax.legend(fontsize=8)
+        if roles:
+            ax.legend(fontsize=8)
     return out[0]
 
 

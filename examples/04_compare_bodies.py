@@ -9,8 +9,8 @@ from softgym_envs.robots import make_robot
 from softgym_envs.viewer.image import render_bodies
 
 robot = make_robot("finger")
-designs = [{}, {"length": 0.0381, "height": 0.0215, "joint_height": 0.0066}]
-image = render_bodies(robot, designs, np.array([0.020, 0.017]), (480, 480), texts=["baseline", "shorter and thicker"])
+designs = [{}, {"length": 0.03807, "height": 0.02161, "joint_height": 0.00745}]
+image = render_bodies(robot, designs, np.array([0.020, 0.017]), (480, 480), texts=["baseline", "co-designed"])
 path = sys.argv[1] if len(sys.argv) > 1 else "/tmp/bodies.png"
 Image.fromarray(image).save(path)
 print(f"wrote {path}, {image.shape[1]} x {image.shape[0]}")
