@@ -10,14 +10,14 @@ from softgym_envs.robots.robot import Robot
 __all__ = ["Track", "bending_arc"]
 
 
-def bending_arc(robot: Robot, count: int = 25, angle: float = 0.5 * np.pi) -> np.ndarray:
-    """Goals [m] (count, 3) of a tip swinging on a circle about the base: the thesis' quarter circle (Fig. 4.3).
+def bending_arc(robot: Robot, count: int = 25, angle: float = np.pi / 3) -> np.ndarray:
+    """Goals [m] (count, 3) of a tip that bends about the base, after the closing motion of the thesis (Fig. 4.3).
 
-    The radius shrinks linearly to 0.8 of the rest length, as a bending body's does; its end is outside the workspace
-    of the baseline finger, as in the thesis.
+    The radius shrinks as that of the bending finger does, ``1 - 0.7 (theta / 90 deg)^2`` of the rest length (within
+    2 mm of the baseline's workspace up to 45 degrees); the end of the path is outside the workspace, as in the thesis.
     """
     theta = np.linspace(0.0, angle, count)
-    radius = robot.size * np.linspace(1.0, 0.8, count)
+    radius = robot.size * (1.0 - 0.7 * (theta / (0.5 * np.pi)) ** 2)
     offset = robot.effector_rest[1]
     return np.column_stack(
         [
