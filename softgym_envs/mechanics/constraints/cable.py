@@ -12,8 +12,8 @@ __all__ = ["Cable"]
 
 
 @njit(cache=True)
-def _cable_length(x, ids, weights, pull, slot, k, length_gradient, length_hessian, want_hessian):
-    """Length of the polyline pull -> p0 -> p1 ..., its gradient (k,) and hessian (k, k) over the stencil."""
+def _cable_length(x, ids, weights, pull, slot, length_gradient, length_hessian, want_hessian):
+    """Length of the polyline pull -> p0 -> p1 ..., its gradient and hessian over the stencil."""
     count = ids.shape[0]
     points = np.zeros((count + 1, 3))
     points[0] = pull
@@ -111,7 +111,6 @@ class Cable(Constraint):
             self.embedding.weights,
             self.pull_point,
             self._slot,
-            len(self.dofs),
             self._gradient,
             self._hessian,
             want_hessian,
