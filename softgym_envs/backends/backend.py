@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,6 +25,7 @@ class State:
         effector: effector positions [m], shape (k, 3).
         slack: actuators that hang slack, shape (n_a,).
         condensed: condensed model at the state.
+        bonds: forces in the bonds of the body, in the order of its model [N], empty where it has none.
         stable: the state is stable whatever drives the actuators (always True on the surrogate, which knows no other).
         nodes: deformed nodes [m], shape (n, 3), where the backend has them.
     """
@@ -36,6 +37,7 @@ class State:
     slack: np.ndarray
     condensed: CondensedModel
     nodes: np.ndarray | None = None
+    bonds: np.ndarray = field(default_factory=lambda: np.zeros(0))
     stable: bool = True
 
 

@@ -53,7 +53,7 @@ class FEMBackend(Backend):
 
     def restore(self, state: State) -> None:
         assert state.nodes is not None
-        self._statics.restore(state.nodes, state.condensed.effort)
+        self._statics.restore(state.nodes, np.concatenate([state.condensed.effort, state.bonds]))
         self.state = state
 
     def _state(self, equilibrium: Equilibrium, command: np.ndarray) -> State:
@@ -66,5 +66,6 @@ class FEMBackend(Backend):
             slack=equilibrium.slack,
             condensed=condensed,
             nodes=equilibrium.x,
+            bonds=equilibrium.effort[len(condensed.effort) :],
             stable=equilibrium.stable,
         )

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numba import njit
 
-__all__ = ["MATERIALS", "Corotational", "Material", "StableNeoHookean", "lame_parameters"]
+__all__ = ["MATERIALS", "Corotational", "Material", "StableNeoHookean", "lame_parameters", "resolve_material"]
 
 
 def lame_parameters(young_modulus: float, poisson_ratio: float) -> tuple[float, float]:
@@ -56,6 +56,17 @@ class Material(ABC):
 
         Returns:
             The number of inverted (det F <= 0) or non-finite gradients; the outputs are meaningless if not 0.
+        """
+
+    @abstractmethod
+    def dilation(self, F: np.ndarray, dilation: np.ndarray, gradient: np.ndarray, hessian: np.ndarray) -> None:
+        """Fill the measure of volume change that Lame's first parameter acts on: psi = psi(mu, 0) + lambda / 2 theta^2.
+
+        Args:
+            F: deformation gradients, shape (m, 9), none inverted.
+            dilation: output theta, shape (m,).
+            gradient: output d theta / dF, shape (m, 9).
+            hessian: output d2 theta / dF2, shape (m, 9, 9).
         """
 
 
@@ -180,6 +191,14 @@ class Corotational(Material):
     def evaluate(self, F, mu, lame, energy, stress, tangent):  # noqa: D102
         return _corotational(F, mu, lame, energy, stress, tangent)
 
+    def dilation(self, F, dilation, gradient, hessian):
+        # With mu = -1/2 the stress is R - F and the tangent dR/dF - I.
+        count = len(F)
+        _corotational(F, np.full(count, -0.5), np.zeros(count), dilation, gradient, hessian)
+        gradient += F
+        hessian += np.eye(9)
+        dilation[:] = np.einsum("mk,mk->m", gradient, F) - 3.0
+
 
 @njit(cache=True, error_model="numpy")
 def _stable_neo_hookean(F, mu, lame, energy, stress, tangent):
@@ -224,6 +243,13 @@ def _stable_neo_hookean(F, mu, lame, energy, stress, tangent):
     return bad
 
 
+_LEVI_CIVITA = np.zeros((3, 3, 3))
+_LEVI_CIVITA[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
+_LEVI_CIVITA[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1.0
+# d2 det F / dF_ia dF_jb = eps_ijk eps_abc F_kc
+_DETERMINANT_CURVATURE = np.einsum("ijk,abc->kciajb", _LEVI_CIVITA, _LEVI_CIVITA).reshape(9, 81)
+
+
 class StableNeoHookean(Material):
     """Stable neo-Hookean solid of Smith, de Goes and Kim 2018 (eq. 14), for large strain."""
 
@@ -232,6 +258,26 @@ class StableNeoHookean(Material):
     def evaluate(self, F, mu, lame, energy, stress, tangent):  # noqa: D102
         return _stable_neo_hookean(F, mu, lame, energy, stress, tangent)
 
+    def dilation(self, F, dilation, gradient, hessian):
+        f = F.reshape(-1, 3, 3)
+        dilation[:] = np.linalg.det(f) - 1.0
+        for i in range(3):
+            gradient[:, 3 * i : 3 * i + 3] = np.cross(f[:, (i + 1) % 3], f[:, (i + 2) % 3])
+        hessian[:] = (F @ _DETERMINANT_CURVATURE).reshape(-1, 9, 9)
+
 
 MATERIALS: dict[str, Material] = {material.name: material for material in (Corotational(), StableNeoHookean())}
 """Registry of materials by name."""
+
+
+def resolve_material(material: str | Material) -> Material:
+    """Return a material given itself or its name.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    if isinstance(material, Material):
+        return material
+    if material not in MATERIALS:
+        raise ValueError(f"unknown material '{material}'; allowed: {', '.join(MATERIALS)}")
+    return MATERIALS[material]

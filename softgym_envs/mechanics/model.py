@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba import njit
 from scipy.sparse import csc_matrix, tril
+from scipy.sparse.csgraph import connected_components
 
 from softgym_envs.errors import DataError
+from softgym_envs.mechanics.block import ElementBlock
 from softgym_envs.mechanics.constraints import Cable, Constraint, EmbeddedPoints, Point
+from softgym_envs.mechanics.frames import Frames, KinematicMap
 from softgym_envs.mechanics.linear_solver import LinearSolver, make_solver
 from softgym_envs.mechanics.materials import Material
-from softgym_envs.mechanics.tetrahedra import Tetrahedra
+from softgym_envs.mechanics.tetrahedra import SolidBlock, Tetrahedra
 
 __all__ = ["MechanicalModel", "read_mesh"]
 
@@ -68,21 +72,38 @@ def _check_nodes(nodes: np.ndarray) -> np.ndarray:
     return nodes
 
 
-class MechanicalModel:
-    """A soft body with actuators, effectors and contact points.
+@njit(cache=True)
+def _subtract_entries(values, places, entries):
+    for k in range(places.shape[0]):
+        if places[k] >= 0:
+            values[places[k]] -= entries[k]
 
-    Fixed nodes are eliminated. The sparsity pattern, the scatter map and the symbolic factorisation are made once.
+
+class MechanicalModel:
+    """Soft bodies, beams and rigid parts with actuators, effectors, contact points, sensors and bonds.
+
+    The state is one array ``x`` of rows (n, 3): a row for each mesh node, four for each frame (see `frames`). Fixed
+    nodes are eliminated, carried ones follow their frame. The sparsity pattern, the scatter map and the symbolic
+    factorisation are made once.
 
     Args:
-        nodes: rest positions [m], shape (n, 3).
+        nodes: rest rows [m], shape (n, 3).
         blocks: element blocks.
-        fixed: indices or boolean mask of the clamped nodes.
+        fixed: indices or boolean mask (n,) of the clamped nodes, or a mask (n, 3) by axis; for a frame, its origin.
+        frames: first row of each frame, shape (f,).
+        carried: mesh nodes that move with a frame: index of the frame -> rows.
+        fixed_spin: boolean mask of spin components (about the axes of space) that frames do not have, shape (f,) or
+            (f, 3); default none.
         gravity: acceleration [m/s2], shape (3,).
         solver: name of the linear solver, see `make_solver`.
 
     Attributes:
-        constraints: constraint objects by role letter: ``"a"`` actuators, ``"e"`` effectors, ``"c"`` contacts.
+        constraints: constraint objects by role letter: ``"a"`` actuators, ``"e"`` effectors, ``"c"`` contacts,
+            ``"s"`` sensors (measured, never loaded), ``"b"`` bonds (held at zero, not part of the condensed model).
         applied_loads: dead loads that `assemble` applies [N], shape (n, 3); a solver may bring them on in steps.
+        equations: number of independent degrees of freedom.
+        free_dofs: rows' degrees of freedom (3 * row + axis) that are equations of their own; spins come after them.
+        dof_scale: length [m] that a unit of each equation moves: 1 for nodes, an arm for spins, shape (equations,).
         version: grows with every change of loads or constraints.
         factor_owner: who factorised ``solver`` last; several solvers may share a model.
     """
@@ -90,37 +111,65 @@ class MechanicalModel:
     def __init__(
         self,
         nodes: np.ndarray,
-        blocks: Sequence[Tetrahedra],
+        blocks: Sequence[ElementBlock],
         *,
         fixed: np.ndarray,
+        frames: Sequence[int] | np.ndarray = (),
+        carried: Mapping[int, np.ndarray] | None = None,
+        fixed_spin: np.ndarray | None = None,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         solver: str = "auto",
     ) -> None:
         self.nodes = _check_nodes(nodes)
         self.blocks = list(blocks)
-        mask = np.zeros(len(self.nodes), dtype=bool)
+        n = len(self.nodes)
+        self.frames = Frames(self.nodes, np.asarray(frames), carried)
+        mask = np.zeros((n, 3), dtype=bool)
         chosen = np.asarray(fixed)
         mask[chosen if chosen.size else chosen.astype(int)] = True
+        spin_mask = np.zeros((len(self.frames), 3), dtype=bool)
+        if fixed_spin is not None:
+            flags = np.asarray(fixed_spin, dtype=bool)
+            spin_mask[:] = flags[:, None] if flags.ndim == 1 else flags
         if not mask.any():
             raise ValueError("no node is fixed: the body could float away; pass the clamped nodes as 'fixed'")
-        used = np.zeros(len(self.nodes), dtype=bool)
+        used = np.zeros(n, dtype=bool)
         for block in self.blocks:
-            used[block.connectivity] = True
+            used[block.nodes_used] = True
+        used[self.frames.rows] = True
         # Nodes without elements have no stiffness; holding them keeps the tangent regular.
-        self.fixed = mask | ~used
-        self.free_dofs = np.flatnonzero(np.repeat(~self.fixed, 3))
-        self._equation = np.full(3 * len(self.nodes), -1, dtype=np.int64)
+        mask |= ~used[:, None]
+        is_carried = np.zeros(n, dtype=bool)
+        is_carried[self.frames.carried] = True
+        self.fixed = mask.all(axis=1) & ~is_carried
+        self.free_dofs = np.flatnonzero(~(mask | is_carried[:, None]).ravel())
+        free_spins = np.flatnonzero(~spin_mask.ravel())
+        self.equations = len(self.free_dofs) + len(free_spins)
+        #: Number of each degree of freedom of the rows: equations first, then components of carried rows; -1 if fixed.
+        self._equation = np.full(3 * n, -1, dtype=np.int64)
         self._equation[self.free_dofs] = np.arange(len(self.free_dofs))
-        self.constraints: dict[str, list[Constraint]] = {"a": [], "e": [], "c": []}
+        carried_dofs = (3 * self.frames.carried[:, None] + np.arange(3)).ravel()
+        self._equation[carried_dofs] = self.equations + np.arange(len(carried_dofs))
+        spin = np.full(spin_mask.size, -1, dtype=np.int64)
+        spin[free_spins] = len(self.free_dofs) + np.arange(len(free_spins))
+        self._spin_equation = spin.reshape(-1, 3)
+        self._map: KinematicMap | None = None
+        if len(self.frames):
+            origin = self._equation[3 * self.frames.rows[:, None] + np.arange(3)]
+            self._map = KinematicMap(self.frames, origin, self._spin_equation, self.equations)
+        extent = float(np.linalg.norm(np.ptp(self.nodes[~is_carried], axis=0)))
+        self.dof_scale = np.ones(self.equations)
+        self.dof_scale[len(self.free_dofs) :] = 0.1 * extent
+        self._fixed_components = mask & ~is_carried[:, None]
+        self.constraints: dict[str, list[Constraint]] = {"a": [], "e": [], "c": [], "s": [], "b": []}
         self._solver_name = solver
         self._solver: LinearSolver | None = None
         self._poisson: LinearSolver | None = None
-        self._free_nodes = np.flatnonzero(~self.fixed)
+        self._bond_stiffness: float | None = None
         self.version = 0
         self.factor_owner: object | None = None
         self.nodal_loads = np.zeros_like(self.nodes)
         self.gravity_forces = np.zeros_like(self.nodes)
-        self._block_masses = [block.density * block.volumes for block in self.blocks]
         self.set_gravity(gravity)
 
     # -- making one -------------------------------------------------------------------------------------------------
@@ -171,12 +220,17 @@ class MechanicalModel:
         fixed = np.all((nodes >= box[:, 0]) & (nodes <= box[:, 1]), axis=1)
         return cls.from_mesh(nodes, tetrahedra, fixed=fixed, **options)
 
-    def embed(self, points: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
-        """Embed points [m], shape (p, 3), in the first element block."""
-        return EmbeddedPoints(points, self.nodes, self.blocks[0].connectivity, hint)
+    @property
+    def solids(self) -> list[SolidBlock]:
+        """The blocks of solid elements."""
+        return [block for block in self.blocks if isinstance(block, SolidBlock)]
+
+    def embed(self, points: np.ndarray, hint: np.ndarray | None = None, *, block: int = 0) -> EmbeddedPoints:
+        """Embed points [m], shape (p, 3), in a solid block (its number among `solids`)."""
+        return self.solids[block].embed(points, self.nodes, hint)
 
     def add(self, role: str, constraint: Constraint) -> Constraint:
-        """Add a constraint under a role letter: a (actuator), e (effector), c (contact)."""
+        """Add a constraint under a role letter: a actuator, e effector, c contact, s sensor, b bond."""
         if role not in self.constraints:
             raise ValueError(f"unknown role '{role}'; allowed: {', '.join(self.constraints)}")
         self.constraints[role].append(constraint)
@@ -216,10 +270,8 @@ class MechanicalModel:
             raise ValueError(f"gravity must be three finite numbers, got {gravity!r}")
         self.gravity_forces[:] = 0.0
         if acceleration.any():
-            for block, masses in zip(self.blocks, self._block_masses, strict=True):
-                share = np.repeat(masses / 4.0, 4)
-                nodal = np.bincount(block.connectivity.ravel(), weights=share, minlength=len(self.nodes))
-                self.gravity_forces += nodal[:, None] * acceleration
+            for block in self.blocks:
+                self.gravity_forces += block.nodal_masses(len(self.nodes))[:, None] * acceleration
         self.refresh_loads()
 
     @property
@@ -230,18 +282,18 @@ class MechanicalModel:
     @property
     def mass(self) -> float:
         """Mass [kg]."""
-        return float(sum(masses.sum() for masses in self._block_masses))
+        return float(sum(block.mass for block in self.blocks))
 
     @property
     def volume(self) -> float:
         """Rest volume [m3]."""
-        return float(sum(block.volumes.sum() for block in self.blocks))
+        return float(sum(block.volume for block in self.blocks))
 
     # -- constraints ------------------------------------------------------------------------------------------------
 
     @property
     def roles(self) -> tuple[tuple[str, int], ...]:
-        """Role letters present and their row counts, in order."""
+        """Role letters present and their row counts, in order; bonds come last."""
         sizes = ((letter, sum(c.size for c in group)) for letter, group in self.constraints.items())
         return tuple((letter, size) for letter, size in sizes if size)
 
@@ -263,52 +315,67 @@ class MechanicalModel:
             return
         self._rows = self.rows
         self.size = sum(size for _, size in self.roles)
-        n = len(self.free_dofs)
-        stencils = []
+        self._bonds = [(c, rows) for c, rows in self._rows if c in self.constraints["b"]]
+        n = self.equations
+        stencils, shares = [], []
         for block in self.blocks:
-            dofs = (3 * block.connectivity[:, :, None] + np.arange(3)).reshape(len(block.connectivity), 12)
-            r, s = np.tril_indices(12)
-            stencils.append((self._equation[dofs[:, r]], self._equation[dofs[:, s]]))
+            shares.append(len(block.stencils()))
+            for rows, columns in block.stencils():
+                first, second = self._equation[rows], self._equation[columns]
+                stencils.append((first, second, (first >= 0) & (second >= 0)))
         curved = [c for c, _ in self._rows if type(c).hessian is not Constraint.hessian]
         for constraint in curved:
-            equations = self._equation[constraint.dofs]
-            stencils.append((np.repeat(equations, len(equations))[None], np.tile(equations, len(equations))[None]))
+            first, second = (self._equation[dofs] for dofs in constraint.hessian_pattern())
+            # Both halves are listed, the upper one is left out.
+            stencils.append((first, second, (second >= 0) & (first >= second)))
+        for constraint, _ in self._bonds:
+            k = len(constraint.dofs)
+            first, second = (self._equation[d] for d in (np.repeat(constraint.dofs, k), np.tile(constraint.dofs, k)))
+            stencils.append((first, second, (second >= 0) & (first >= second)))
+        # Keys of entries: column-major in the lower triangle; those that touch a carried row come later.
+        total = n + 3 * len(self.frames.carried)
         keys = []
-        for k, (rows, columns) in enumerate(stencils):
-            low, high = np.minimum(rows, columns), np.maximum(rows, columns)
-            valid = low >= 0
-            if k >= len(self.blocks):
-                # Constraint hessians are stored whole; their upper half is left out.
-                valid &= rows >= columns
-            key = low * n + high  # column-major key of the lower triangle
+        for first, second, valid in stencils:
+            key = np.minimum(first, second) * total + np.maximum(first, second)
             key[~valid] = -1
             keys.append(key)
-        unique = np.unique(np.concatenate([key.ravel() for key in keys] + [np.arange(n) * (n + 1)]))
-        unique = unique[unique >= 0]
+        seen = np.unique(np.concatenate([key.ravel() for key in keys] + [np.arange(n) * (total + 1)]))
+        seen = seen[seen >= 0]
+        high = seen % total
+        direct, extra = seen[high < n], seen[high >= n]
+        expanded = spins = np.empty((0, 2), dtype=np.int64)
+        if self._map is not None:
+            expanded = self._map.plan(extra // total, extra % total)
+            spins = self._map.spin_pairs
+        pairs = np.concatenate([expanded, spins[spins[:, 0] >= 0]])
+        direct = np.unique(np.concatenate([direct, pairs[:, 0] * total + pairs[:, 1]]))
+        self._entries = len(direct)
+        if self._map is not None:
+            spin_target = np.searchsorted(direct, spins[:, 0] * total + spins[:, 1])
+            self._map.set_targets(
+                np.searchsorted(direct, expanded[:, 0] * total + expanded[:, 1]),
+                np.where(spins[:, 0] >= 0, spin_target, -1),
+            )
         maps: list[np.ndarray] = []
         for key in keys:
-            position = np.searchsorted(unique, key)
-            maps.append(np.where(key < 0, -1, position).astype(np.int32))
-        indptr = np.searchsorted(unique, np.arange(n + 1, dtype=np.int64) * n)
-        indices = unique % n
-        self._block_maps = maps[: len(self.blocks)]
-        hessian_maps = iter(maps[len(self.blocks) :])
-        self._hessian_maps: list[tuple[np.ndarray, np.ndarray] | None] = []
-        for constraint, _ in self._rows:
-            if constraint in curved:
-                places = next(hessian_maps)[0]
-                keep = np.flatnonzero(places >= 0)
-                self._hessian_maps.append((keep, places[keep]))
-            else:
-                self._hessian_maps.append(None)
-        self._values = np.empty(len(indices))
+            place = np.searchsorted(direct, key)
+            if len(extra):
+                touches = key % total >= n
+                place = np.where(touches, self._entries + np.searchsorted(extra, key), place)
+            maps.append(np.where(key < 0, -1, place).astype(np.int32))
+        following = iter(maps)
+        self._block_maps = [[next(following) for _ in range(share)] for share in shares]
+        self._hessian_maps = [next(following) if c in curved else None for c, _ in self._rows]
+        self._bond_maps = [next(following) for _ in self._bonds]
+        indptr = np.searchsorted(direct, np.arange(n + 1, dtype=np.int64) * total)
+        self._values = np.empty(self._entries + len(extra))
         self._gradient = np.empty_like(self.nodes)
         self._targets = []
         for constraint, _ in self._rows:
             equations = self._equation[constraint.dofs]
             keep = np.flatnonzero(equations >= 0)
             self._targets.append((keep, equations[keep]))
-        self._solver = make_solver(self._solver_name, indptr, indices)
+        self._solver = make_solver(self._solver_name, indptr, direct % total)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the factorisations, which cannot be copied and are made again when needed."""
@@ -338,8 +405,10 @@ class MechanicalModel:
         """Evaluate the equilibrium at positions ``x`` (n, 3) under the efforts (size,) of all constraint rows.
 
         Returns:
-            residual: ``grad E - sum effort_i grad delta_i`` over the free dofs, shape (N,);
-            tangent: lower-triangle values of its derivative (a buffer, overwritten by the next call);
+            residual: ``grad E - sum effort_i grad delta_i`` over the equations, shape (N,);
+            tangent: lower-triangle values of its derivative (a buffer, overwritten by the next call), to which
+                `bond_stiffness` times ``H_b H_b^T`` of the bonds is added: without it a part that only bonds hold
+                would make it singular, and on motions that keep the bonds it changes nothing;
             H: constraint gradients, shape (N, size), Fortran order;
             delta: constraint values, shape (size,);
             or None if an element is inverted.
@@ -351,7 +420,8 @@ class MechanicalModel:
         for block, scatter in zip(self.blocks, self._block_maps, strict=True):
             if block.add(x, gradient, values, scatter)[1]:
                 return None
-        H = np.zeros((len(self.free_dofs), self.size), order="F")
+        n = self.equations
+        H = np.zeros((n + 3 * len(self.frames.carried), self.size), order="F")
         delta = np.empty(self.size)
         for (constraint, rows), (keep, equations), mapping in zip(
             self._rows, self._targets, self._hessian_maps, strict=True
@@ -360,45 +430,104 @@ class MechanicalModel:
             if mapping is not None and part.any():
                 hessian = constraint.hessian(x, part)
                 assert hessian is not None
-                # Within one constraint every entry of the stencil has its own place.
-                values[mapping[1]] -= hessian.ravel()[mapping[0]]
+                _subtract_entries(values, mapping, hessian.ravel())
             H[equations, rows] = constraint.jacobian(x)[:, keep].T
             delta[rows] = constraint.value(x)
-        residual = gradient.ravel()[self.free_dofs]
+        residual = np.zeros(n)
+        residual[: len(self.free_dofs)] = gradient.ravel()[self.free_dofs]
+        if self._map is not None:
+            arms = self._map.linearise(x)
+            pull = gradient[self.frames.carried]
+            if effort.any():
+                pull = pull - (H[n:] @ effort).reshape(-1, 3)
+            turning = self._map.matrix.T
+            residual += turning @ gradient[self.frames.carried].ravel()
+            H = np.asfortranarray(H[:n] + turning @ H[n:])
+            self._add_bonds(x, values)
+            self._map.expand(values, self._entries)
+            self._map.add_curvature(values, arms, pull)
+        else:
+            self._add_bonds(x, values)
         if effort.any():
-            residual = residual - H @ effort
-        return residual, values, H, delta
+            residual -= H @ effort
+        return residual, values[: self._entries], H, delta
+
+    @property
+    def bond_stiffness(self) -> float:
+        """Stiffness [N/m] of the term that bonds add to the tangent; any positive one gives the same equilibrium.
+
+        It is high beside that of elements, so that the tangent is positive definite where the bonded body is stable.
+        """
+        if self._bond_stiffness is None:
+            stiffness = [block.stiffness for block in self.blocks]
+            self._bond_stiffness = 100.0 * float(np.mean(stiffness)) if stiffness else 1.0
+        return self._bond_stiffness
+
+    def _add_bonds(self, x: np.ndarray, values: np.ndarray) -> None:
+        for (bond, _), places in zip(self._bonds, self._bond_maps, strict=True):
+            jacobian = bond.jacobian(x)
+            _subtract_entries(values, places, (-self.bond_stiffness * (jacobian.T @ jacobian)).ravel())
 
     def warp(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Bend a linear ``step`` of the free dofs (N,) from ``x`` (n, 3) into one that turns elements, shape (n, 3).
+        """Bend a linear ``step`` of the equations (N,) from ``x`` (n, 3) into a displacement of all rows, shape (n, 3).
 
-        Rotation-strain warping (Huang et al. 2011): every element is turned by the exponential of the step's spin
-        and strained by its symmetric part, and the nodes follow in the least-squares sense (a Poisson problem
-        factorised once). It equals the linear step to first order, so Newton's method keeps its quadratic
+        Frames turn by the exponential of their spin, and what they carry follows. For solids, rotation-strain warping
+        (Huang et al. 2011): every element is turned by the exponential of the step's spin and strained by its
+        symmetric part, and the nodes follow in the least-squares sense (a Poisson problem factorised once); beams
+        alike, along their axis. It equals the linear step to first order, so Newton's method keeps its quadratic
         convergence, and takes far larger steps in bending.
         """
         self.prepare()
         full = np.zeros_like(self.nodes)
-        full.ravel()[self.free_dofs] = step
+        full.ravel()[self.free_dofs] = step[: len(self.free_dofs)]
+        linear = full
+        if self._map is not None:
+            spins = np.zeros_like(self._spin_equation, dtype=float)
+            free = self._spin_equation >= 0
+            spins[free] = step[self._spin_equation[free]]
+            linear = full.copy()
+            self._map.linearise(x)
+            linear[self.frames.carried] = (self._map.matrix @ step).reshape(-1, 3)
+            self.frames.displace(x, full[self.frames.rows], spins, full)
         rhs = np.zeros_like(self.nodes)
         for block in self.blocks:
-            block.add_warped(x, full, rhs)
+            block.add_warped(x, linear, rhs)
         if self._poisson is None:
             self._poisson = self._make_poisson()
-        free = self._free_nodes
-        full[free] = self._poisson.solve(rhs[free])
+        free = self._warped_nodes
+        right = rhs[free]
+        if self._poisson_coupling is not None:
+            right = right - self._poisson_coupling @ full[self._known_nodes]
+        full[free] = self._poisson.solve(right)
+        full[self._fixed_components] = 0.0
         return full
 
     def _make_poisson(self) -> LinearSolver:
         entries = [block.laplacian_entries() for block in self.blocks]
         rows, columns, values = (np.concatenate(parts) for parts in zip(*entries, strict=True))
         n = len(self.nodes)
-        free = self._free_nodes
-        lower = tril(csc_matrix((values, (rows, columns)), shape=(n, n))[free][:, free], format="csc")
+        laplacian = csc_matrix((values, (rows, columns)), shape=(n, n))
+        touched = np.zeros(n, dtype=bool)
+        touched[rows] = True
+        carried = np.zeros(n, dtype=bool)
+        carried[self.frames.carried] = True
+        # A rigid part moves as a whole: its origin is not warped apart from what it carries.
+        carried[self.frames.rows[self.frames.owner[self.frames.moves > 0.0]]] = True
+        # A node that is free along some axes counts as free; what it does along the others is reset.
+        known = self.fixed | carried
+        _, part = connected_components(laplacian, directed=False)
+        anchored = np.isin(part, part[known & touched])
+        if not self._bonds and not anchored[touched].all():
+            raise ValueError("the mesh has a part that is not connected to a fixed node")
+        # A part that only bonds hold keeps its linear step.
+        free = self._warped_nodes = np.flatnonzero(touched & anchored & ~known)
+        self._known_nodes = np.flatnonzero(carried & touched)
+        self._poisson_coupling = laplacian[free][:, self._known_nodes] if len(self._known_nodes) else None
+        lower = tril(laplacian[free][:, free], format="csc")
         lower.sort_indices()
         solver = make_solver(self._solver_name, lower.indptr, lower.indices)
         if not solver.factorise(lower.data):
-            raise ValueError("the mesh has a part that is not connected to a fixed node")
+            raise ValueError("the Laplacian of the mesh cannot be factorised")
         return solver
 
     def refresh_loads(self) -> None:

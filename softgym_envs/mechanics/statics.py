@@ -5,6 +5,7 @@ the few constraint columns, and ``W`` is there. Step lengths follow the affine-i
 of Deuflhard (Newton Methods for Nonlinear Problems, 2004, algorithm NLEQ-ERR): a step is accepted when the
 simplified Newton correction that follows it is smaller, which needs no scaling between forces and displacements.
 Displacement-driven cables are unilateral: each correction solves a small linear complementarity problem.
+Bonds are driven rows that are always held at zero.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ class Equilibrium:
 
     Attributes:
         x: node positions [m], shape (n, 3).
-        condensed: the condensed model at the state.
-        delta: constraint values of all rows, shape (size,).
-        effort: efforts of all rows, shape (size,).
+        condensed: the condensed model at the state; bonds are eliminated from it.
+        delta: constraint values of all rows, bonds last, shape (size,).
+        effort: efforts of all rows, bonds last, shape (size,).
         slack: per actuator row, True where a unilateral actuator hangs slack.
         stable: the tangent is positive definite: the state is stable whatever drives the actuators. Where it is not, a
             displacement-driven state may still be.
@@ -51,6 +52,25 @@ class Equilibrium:
 
 class _NotFound(Exception):
     """Newton's method failed on one increment."""
+
+
+def _complementary_step(W: np.ndarray, gap: np.ndarray, effort: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
+    """Steps of driven efforts that close ``gap`` where a row is bilateral, and in which no unilateral row pushes."""
+    if not unilateral.any():
+        return np.linalg.solve(W, -gap)
+    loose, firm = np.flatnonzero(unilateral), np.flatnonzero(~unilateral)
+    offset = gap - W @ effort
+    # Bilateral rows are eliminated: only the few others are a question of taut or slack.
+    reduced = np.linalg.solve(W[np.ix_(firm, firm)], np.column_stack([W[np.ix_(firm, loose)], offset[firm]]))
+    across = W[np.ix_(loose, firm)] @ reduced
+    new = np.empty_like(effort)
+    new[loose] = solve_complementarity(
+        (W[np.ix_(loose, loose)] - across[:, :-1])[None],
+        (offset[loose] - across[:, -1])[None],
+        np.ones(len(loose), dtype=bool),
+    )[0]
+    new[firm] = -(reduced[:, :-1] @ new[loose] + reduced[:, -1])
+    return new - effort
 
 
 class Statics:
@@ -81,7 +101,11 @@ class Statics:
         self.max_iterations = max_iterations
         self.max_halvings = max_halvings
         model.prepare()
-        self._actuators = sum(c.size for c in model.constraints["a"])
+        sizes = dict(model.roles)
+        self._actuators = sizes.get("a", 0)
+        self._effectors = self._actuators + np.arange(sizes.get("e", 0))
+        self._contacts = self._actuators + sizes.get("e", 0) + np.arange(sizes.get("c", 0))
+        self._bonds = model.size - sizes.get("b", 0) + np.arange(sizes.get("b", 0))
         self.unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
         self._fallback: SuperLUSolver | None = None
         self._version = model.version
@@ -138,23 +162,27 @@ class Statics:
         """Solve the linearised KKT system; returns the step of the free dofs and of the efforts."""
         step_effort = np.zeros_like(effort)
         # Effort-driven rows: the residual already holds their current effort; move it to the commanded value.
-        rows = np.arange(len(effort))
-        forced = np.setdiff1d(rows, driven)
+        forced = np.setdiff1d(np.arange(len(effort)), driven)
         step_effort[forced] = target[forced] - effort[forced]
         if len(driven):
             H = self._H[:, driven]
             gap = delta[driven] - target[driven] - H.T @ Ar + self._W[np.ix_(driven, forced)] @ step_effort[forced]
             W = self._W[np.ix_(driven, driven)]
-            unilateral = self.unilateral[driven]
+            loose = np.zeros(len(effort), dtype=bool)
+            loose[: self._actuators] = self.unilateral
             try:
-                if unilateral.any():
-                    new = solve_complementarity(W[None], (gap - W @ effort[driven])[None], unilateral)[0]
-                    step_effort[driven] = new - effort[driven]
-                else:
-                    step_effort[driven] = np.linalg.solve(W, -gap)
+                step_effort[driven] = _complementary_step(W, gap, effort[driven], loose[driven])
             except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (actuators that do the same)
                 raise _NotFound from None
-        return self._AH @ step_effort - Ar, step_effort
+        step_q = self._AH @ step_effort - Ar
+        if len(self._bonds):
+            # The tangent holds `bond_stiffness` H_b H_b^T, which already carries its share of the force.
+            step_effort[self._bonds] += self.model.bond_stiffness * (delta[self._bonds] - target[self._bonds])
+        return step_q, step_effort
+
+    def _norm(self, step: np.ndarray) -> float:
+        """Largest displacement [m] of a step of the equations."""
+        return float(np.abs(step * self.model.dof_scale).max(initial=0.0))
 
     # -- Newton -----------------------------------------------------------------------------------------------------
 
@@ -165,7 +193,7 @@ class Statics:
         step_q, step_effort = self._correction(self._Ar, self._delta, self.effort, target, driven)
         length = 1.0
         for iteration in range(1, self.max_iterations + 1):
-            norm = float(np.abs(step_q).max(initial=0.0))
+            norm = self._norm(step_q)
             if not np.isfinite(norm):
                 raise _NotFound
             while True:
@@ -175,7 +203,7 @@ class Statics:
                 if assembled is not None:
                     Ar = self._active.solve(assembled[0][:, None])[:, 0]
                     next_q, next_effort = self._correction(Ar, assembled[3], effort, target, driven)
-                    remaining = float(np.abs(next_q).max(initial=0.0))
+                    remaining = self._norm(next_q)
                     # At the last digits round-off decides, not Newton.
                     if remaining <= (1.0 - 0.25 * length) * norm or remaining <= self.tolerance:
                         break
@@ -196,17 +224,29 @@ class Statics:
             if not self._factorise(assembled):
                 raise _NotFound
             step_q, step_effort = self._correction(self._Ar, self._delta, effort, target, driven)
-            if length == 1.0 and float(np.abs(step_q).max(initial=0.0)) <= self.tolerance:
+            if length == 1.0 and self._norm(step_q) <= self.tolerance:
                 return iteration
             length = min(1.0, 2.0 * length)
         raise _NotFound
 
-    def solve(self, target: Sequence[float] | np.ndarray, mode: str | Sequence[str] = "displacement") -> Equilibrium:
+    def solve(
+        self,
+        target: Sequence[float] | np.ndarray,
+        mode: str | Sequence[str] = "displacement",
+        *,
+        effector_force: Sequence[float] | np.ndarray | None = None,
+        contact: Sequence[float] | np.ndarray | None = None,
+        contact_mode: str = "effort",
+    ) -> Equilibrium:
         """Find the equilibrium under commanded actuators.
 
         Args:
-            target: one value per actuator row: displacement [m, ...] or effort [N, ...].
+            target: one value per actuator row: displacement [m, m3, ...] or effort [N, Pa, ...].
             mode: ``"displacement"`` or ``"effort"`` for all actuators, or one of them per row.
+            effector_force: loads on the effector rows [N], shape (n_e,); default none.
+            contact: of the contact rows, shape (n_c,): forces [N], or positions [m] that they are driven to; default
+                no force.
+            contact_mode: ``"effort"`` (forces) or ``"displacement"`` (driven positions).
 
         Returns:
             The equilibrium. Unilateral actuators driven in displacement may end slack: their reached displacement
@@ -218,19 +258,28 @@ class Statics:
                 cannot push.
         """
         count = self._actuators
-        target = np.asarray(target, dtype=float)
-        if target.shape != (count,):
-            raise ValueError(f"target must have shape ({count},), got {target.shape}")
-        if not np.isfinite(target).all():
-            raise ValueError(f"target must be finite, got {target.tolist()}")
+        target = _checked("target", target, count)
         modes = [mode] * count if isinstance(mode, str) else list(mode)
         if len(modes) != count or any(m not in ("displacement", "effort") for m in modes):
             raise ValueError(f"mode must be 'displacement' or 'effort' (one, or {count} of them), got {mode!r}")
-        driven = np.array([i for i, m in enumerate(modes) if m == "displacement"], dtype=int)
+        if contact_mode not in ("displacement", "effort"):
+            raise ValueError(f"contact_mode must be 'displacement' or 'effort', got {contact_mode!r}")
+        if contact_mode == "displacement" and contact is None:
+            raise ValueError("contact_mode = 'displacement' needs the positions in 'contact'")
+        held = [np.array([i for i, m in enumerate(modes) if m == "displacement"], dtype=int)]
+        if contact_mode == "displacement":
+            held.append(self._contacts)
+        driven = np.concatenate([*held, self._bonds])
         forced = np.array([i for i, m in enumerate(modes) if m == "effort"], dtype=int)
         for row in forced[self.unilateral[forced]] if len(forced) else forced:
             if target[row] < 0.0:
                 raise ValueError(f"effort {target[row]:g} on actuator row {row} must not be negative: it cannot push")
+        goal = np.zeros(self.model.size)
+        goal[:count] = target
+        if effector_force is not None:
+            goal[self._effectors] = _checked("effector_force", effector_force, len(self._effectors))
+        if contact is not None:
+            goal[self._contacts] = _checked("contact", contact, len(self._contacts))
         if self._version != self.model.version or self.model.factor_owner is not self:
             self._version = self.model.version
             self._fresh = False
@@ -238,11 +287,9 @@ class Statics:
         if not self._fresh and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
-        # The path goes from the present values; rows that carry no load command keep their effort at zero.
-        start = np.zeros(self.model.size)
-        start[driven], start[forced] = self._delta[driven], self.effort[forced]
-        goal = np.zeros(self.model.size)
-        goal[:count] = target
+        # The path goes from the present values.
+        start = self.effort.copy()
+        start[driven] = self._delta[driven]
         done, size, iterations, increments = 0.0, 1.0, 0, 0
         loads, start_loads = self.model.loads, self._carried
         ramped = bool((loads != start_loads).any())
@@ -279,14 +326,21 @@ class Statics:
     def _state(self, target: np.ndarray, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
         effort = self.effort.copy()
         slack = np.zeros(self._actuators, dtype=bool)
-        rows = driven[self.unilateral[driven]] if len(driven) else driven
+        rows = driven[driven < self._actuators]
+        rows = rows[self.unilateral[rows]] if len(rows) else rows
         # At rest round-off would decide by the effort alone.
         slack[rows] = (effort[rows] <= 0.0) & (self._delta[rows] > target[rows] + 1e-9)
+        W = self._W.copy()
+        count = self.model.size - len(self._bonds)
+        if len(self._bonds):
+            across = W[:count, count:]
+            W = W[:count, :count] - across @ np.linalg.solve(W[count:, count:], across.T)
+            W = 0.5 * (W + W.T)
         condensed = CondensedModel(
-            compliance=self._W.copy(),
-            free=self._delta - self._W @ effort,
-            effort=effort,
-            roles=self.model.roles,
+            compliance=W,
+            free=self._delta[:count] - W @ effort[:count],
+            effort=effort[:count],
+            roles=tuple(role for role in self.model.roles if role[0] != "b"),
         )
         return Equilibrium(
             x=self.x.copy(),
@@ -298,3 +352,12 @@ class Statics:
             iterations=iterations,
             increments=increments,
         )
+
+
+def _checked(name: str, values: Sequence[float] | np.ndarray, count: int) -> np.ndarray:
+    array = np.asarray(values, dtype=float)
+    if array.shape != (count,):
+        raise ValueError(f"{name} must have shape ({count},), got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {array.tolist()}")
+    return array

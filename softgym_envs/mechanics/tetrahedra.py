@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from softgym_envs.mechanics.materials import MATERIALS, Material, lame_parameters
+from softgym_envs.mechanics.block import ElementBlock, lower_pairs
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
 
-__all__ = ["Tetrahedra"]
+__all__ = ["SolidBlock", "Tetrahedra", "orient_corners"]
 
 
 @njit(cache=True, error_model="numpy")
@@ -64,18 +66,19 @@ def _add_tangent(gradients, volumes, tangent, scatter, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _add_warped(x, step, connectivity, gradients, volumes, out):
+def _add_warped(x, step, connectivity, points, gradients, volumes, out):
     """Add ``V (F' - F) g_a``, with F' the gradient F turned and strained by a step, to ``out``, shape (n, 3)."""
     f = np.empty((3, 3))
     d = np.empty((3, 3))
     h = np.empty((3, 3))
     turn = np.empty((3, 3))
     strained = np.empty((3, 3))
-    for e in range(connectivity.shape[0]):
+    for e in range(gradients.shape[0]):
+        element = e // points
         f[:, :] = 0.0
         d[:, :] = 0.0
-        for a in range(4):
-            node = connectivity[e, a]
+        for a in range(connectivity.shape[1]):
+            node = connectivity[element, a]
             for i in range(3):
                 for j in range(3):
                     f[i, j] += x[node, i] * gradients[e, a, j]
@@ -130,16 +133,125 @@ def _add_warped(x, step, connectivity, gradients, volumes, out):
                 for k in range(3):
                     value += turn[i, k] * strained[k, j]
                 d[i, j] = v * value
-        for a in range(4):
-            node = connectivity[e, a]
+        for a in range(connectivity.shape[1]):
+            node = connectivity[element, a]
             for i in range(3):
                 out[node, i] += (
                     d[i, 0] * gradients[e, a, 0] + d[i, 1] * gradients[e, a, 1] + d[i, 2] * gradients[e, a, 2]
                 )
 
 
-class Tetrahedra:
-    """A block of linear tetrahedra of one material.
+def orient_corners(nodes: np.ndarray, connectivity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Check tetrahedra and turn those that are negatively oriented.
+
+    Args:
+        nodes: rest positions [m], shape (n, 3).
+        connectivity: corner indices, shape (m, 4).
+
+    Returns:
+        Corner indices (m, 4), volumes [m3] (m,), and which were turned (m,).
+
+    Raises:
+        ValueError: for a wrong shape, an index out of range or a degenerate element.
+    """
+    connectivity = np.array(connectivity, dtype=np.int64)
+    if connectivity.ndim != 2 or connectivity.shape[1] != 4 or len(connectivity) == 0:
+        raise ValueError(f"tetrahedra must have shape (m, 4) with m > 0, got {connectivity.shape}")
+    if connectivity.min() < 0 or connectivity.max() >= len(nodes):
+        raise ValueError(
+            f"tetrahedra refer to nodes {connectivity.min()}..{connectivity.max()}, the mesh has {len(nodes)}"
+        )
+    corners = nodes[connectivity]
+    edges = corners[:, 1:] - corners[:, :1]
+    volumes = np.linalg.det(edges) / 6.0
+    turned = volumes < 0
+    connectivity[turned] = connectivity[turned][:, [0, 2, 1, 3]]
+    flat = np.flatnonzero(np.abs(volumes) < 1e-9 * np.abs(edges).max(axis=(1, 2)) ** 3)
+    if len(flat):
+        raise ValueError(f"{len(flat)} degenerate tetrahedra, the first is number {flat[0]}")
+    return connectivity, np.abs(volumes), turned
+
+
+class SolidBlock(ElementBlock):
+    """What blocks of solid elements share: material, quadrature and the warping of steps.
+
+    Args:
+        connectivity: node indices, shape (m, k).
+        gradients: shape-function gradients [1/m] at the quadrature points, shape (m q, k, 3), element by element.
+        weights: volumes [m3] of the quadrature points, shape (m q,).
+        material: a `Material` or its name.
+        young_modulus: [Pa], scalar or shape (m,).
+        poisson_ratio: scalar or shape (m,), inside (-1, 0.5).
+        density: [kg/m3].
+    """
+
+    def __init__(
+        self,
+        connectivity: np.ndarray,
+        gradients: np.ndarray,
+        weights: np.ndarray,
+        *,
+        material: str | Material,
+        young_modulus: float | np.ndarray,
+        poisson_ratio: float | np.ndarray,
+        density: float,
+    ) -> None:
+        self.material = resolve_material(material)
+        self.density = float(density)
+        self.connectivity = connectivity
+        self.gradients = np.ascontiguousarray(gradients)
+        self.weights = weights
+        self.points = len(weights) // len(connectivity)
+        self.volumes = weights.reshape(len(connectivity), -1).sum(axis=1)
+        self.nodes_used = np.unique(connectivity)
+        self.volume = float(weights.sum())
+        self.mass = self.density * self.volume
+        self.set_elasticity(young_modulus, poisson_ratio)
+        count = len(weights)
+        self.stiffness = float(np.mean(self.mu)) * float(np.cbrt(self.volumes).mean())
+        self._F = np.empty((count, 9))
+        self._energy = np.empty(count)
+        self._stress = np.empty((count, 9))
+        self._tangent = np.empty((count, 9, 9))
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Corner nodes of the elements, shape (m, 4)."""
+        return self.connectivity[:, :4]
+
+    def set_elasticity(self, young_modulus: float | np.ndarray, poisson_ratio: float | np.ndarray) -> None:
+        """Set Young's modulus [Pa] and Poisson's ratio, scalars or shape (m,)."""
+        m = len(self.connectivity)
+        young = np.broadcast_to(np.asarray(young_modulus, dtype=float), (m,))
+        poisson = np.broadcast_to(np.asarray(poisson_ratio, dtype=float), (m,))
+        pairs, which = np.unique(np.column_stack([young, poisson]), axis=0, return_inverse=True)
+        parameters = np.repeat(
+            np.array([lame_parameters(e, nu) for e, nu in pairs])[which.ravel()], self.points, axis=0
+        )
+        self.mu, self.lame = np.ascontiguousarray(parameters[:, 0]), np.ascontiguousarray(parameters[:, 1])
+
+    def embed(self, points: np.ndarray, nodes: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
+        """Embed points [m] (p, 3) of the rest shape ``nodes`` [m] (n, 3) in the elements."""
+        return EmbeddedPoints(points, nodes, self.connectivity, hint)
+
+    def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        k = self.connectivity.shape[1]
+        return [lower_pairs((3 * self.connectivity[:, :, None] + np.arange(3)).reshape(-1, 3 * k))]
+
+    def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
+        _add_warped(x, step, self.connectivity, self.points, self.gradients, self.weights, out)
+
+    def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        m, k = self.connectivity.shape
+        values = np.einsum("q,qaj,qbj->qab", self.weights, self.gradients, self.gradients)
+        values = values.reshape(m, self.points, k, k).sum(axis=1)
+        rows = np.repeat(self.connectivity, k, axis=1)
+        columns = np.tile(self.connectivity, (1, k))
+        return rows.ravel(), columns.ravel(), values.ravel()
+
+
+class Tetrahedra(SolidBlock):
+    """A block of linear (four-node) tetrahedra of one material.
 
     Args:
         nodes: rest positions [m], shape (n, 3).
@@ -159,76 +271,38 @@ class Tetrahedra:
         connectivity: np.ndarray,
         *,
         material: str | Material = "corotational",
-        young_modulus: float = 3.0e6,
-        poisson_ratio: float = 0.3,
+        young_modulus: float | np.ndarray = 3.0e6,
+        poisson_ratio: float | np.ndarray = 0.3,
         density: float = 1100.0,
     ) -> None:
-        if isinstance(material, str):
-            if material not in MATERIALS:
-                raise ValueError(f"unknown material '{material}'; allowed: {', '.join(MATERIALS)}")
-            material = MATERIALS[material]
-        self.material = material
-        self.density = float(density)
-        connectivity = np.array(connectivity, dtype=np.int64)
-        if connectivity.ndim != 2 or connectivity.shape[1] != 4 or len(connectivity) == 0:
-            raise ValueError(f"tetrahedra must have shape (m, 4) with m > 0, got {connectivity.shape}")
-        if connectivity.min() < 0 or connectivity.max() >= len(nodes):
-            raise ValueError(
-                f"tetrahedra refer to nodes {connectivity.min()}..{connectivity.max()}, the mesh has {len(nodes)}"
-            )
+        material = resolve_material(material)
+        connectivity, volumes, _ = orient_corners(nodes, connectivity)
         corners = nodes[connectivity]
-        volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
-        connectivity[volumes < 0] = connectivity[volumes < 0][:, [0, 2, 1, 3]]
-        corners = nodes[connectivity]
-        edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-        self.volumes = np.abs(volumes)
-        size = np.abs(edges).max(axis=(1, 2))
-        flat = np.flatnonzero(self.volumes < 1e-9 * size**3)
-        if len(flat):
-            raise ValueError(f"{len(flat)} degenerate tetrahedra, the first is number {flat[0]}")
-        self.connectivity = connectivity
-        inverse = np.linalg.inv(edges)
-        self.gradients = np.ascontiguousarray(np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1))
-        m = len(connectivity)
-        self.set_elasticity(young_modulus, poisson_ratio)
-        self._F = np.empty((m, 9))
-        self._energy = np.empty(m)
-        self._stress = np.empty((m, 9))
-        self._tangent = np.empty((m, 9, 9))
+        inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
+        gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+        super().__init__(
+            connectivity,
+            gradients,
+            volumes,
+            material=material,
+            young_modulus=young_modulus,
+            poisson_ratio=poisson_ratio,
+            density=density,
+        )
 
-    def set_elasticity(self, young_modulus: float | np.ndarray, poisson_ratio: float | np.ndarray) -> None:
-        """Set Young's modulus [Pa] and Poisson's ratio, scalars or shape (m,)."""
-        m = len(self.connectivity)
-        young = np.broadcast_to(np.asarray(young_modulus, dtype=float), (m,))
-        poisson = np.broadcast_to(np.asarray(poisson_ratio, dtype=float), (m,))
-        pairs, which = np.unique(np.column_stack([young, poisson]), axis=0, return_inverse=True)
-        parameters = np.array([lame_parameters(e, nu) for e, nu in pairs])[which.ravel()]
-        self.mu, self.lame = np.ascontiguousarray(parameters[:, 0]), np.ascontiguousarray(parameters[:, 1])
+    def nodal_masses(self, count: int) -> np.ndarray:
+        share = np.repeat(0.25 * self.density * self.volumes, 4)
+        return np.bincount(self.connectivity.ravel(), weights=share, minlength=count)
 
     def add(
-        self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: np.ndarray | None
+        self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
-        """Add gradient (n, 3) and, if ``values`` is given, the lower-triangle tangent at positions ``x`` (n, 3).
-
-        Returns:
-            The elastic energy [J] and the number of inverted elements; with any, the outputs are not to be used.
-        """
         _deformation_gradients(x, self.connectivity, self.gradients, self._F)
         inverted = self.material.evaluate(self._F, self.mu, self.lame, self._energy, self._stress, self._tangent)
         if inverted:
             return np.inf, inverted
         _add_forces(self.connectivity, self.gradients, self.volumes, self._stress, gradient)
         if values is not None:
-            _add_tangent(self.gradients, self.volumes, self._tangent, scatter, values)
+            assert scatter is not None
+            _add_tangent(self.gradients, self.volumes, self._tangent, scatter[0], values)
         return float(self._energy @ self.volumes), 0
-
-    def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
-        """Add the right-hand side of rotation-strain warping of a ``step`` (n, 3) from ``x`` (n, 3) to ``out``."""
-        _add_warped(x, step, self.connectivity, self.gradients, self.volumes, out)
-
-    def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows, columns and values of the element matrices of the Laplacian, each of shape (16 m,)."""
-        values = np.einsum("m,maj,mbj->mab", self.volumes, self.gradients, self.gradients)
-        rows = np.repeat(self.connectivity, 4, axis=1)
-        columns = np.tile(self.connectivity, (1, 4))
-        return rows.ravel(), columns.ravel(), values.ravel()

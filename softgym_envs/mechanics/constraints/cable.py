@@ -18,7 +18,7 @@ def _cable_length(x, ids, weights, pull, slot, length_gradient, length_hessian, 
     points = np.zeros((count + 1, 3))
     points[0] = pull
     for p in range(count):
-        for a in range(4):
+        for a in range(ids.shape[1]):
             for d in range(3):
                 points[p + 1, d] += weights[p, a] * x[ids[p, a], d]
     length = 0.0
@@ -36,7 +36,7 @@ def _cable_length(x, ids, weights, pull, slot, length_gradient, length_hessian, 
         length += segment
         for d in range(3):
             t[d] /= segment
-        for a in range(4):
+        for a in range(ids.shape[1]):
             for d in range(3):
                 length_gradient[slot[p, a] * 3 + d] += weights[p, a] * t[d]
                 if p > 0:
@@ -53,10 +53,10 @@ def _cable_length(x, ids, weights, pull, slot, length_gradient, length_hessian, 
                     if p == 0 and side_j == 1:
                         continue
                     sign = 1.0 if side_i == side_j else -1.0
-                    for a in range(4):
+                    for a in range(ids.shape[1]):
                         row = slot[p - side_i, a] * 3
                         wi = weights[p - side_i, a] * sign
-                        for b in range(4):
+                        for b in range(ids.shape[1]):
                             column = slot[p - side_j, b] * 3
                             w = wi * weights[p - side_j, b]
                             for d in range(3):

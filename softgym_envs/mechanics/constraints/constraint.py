@@ -36,6 +36,17 @@ class Constraint(ABC):
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Return d delta / d x over ``dofs``, shape (size, k)."""
 
+    def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns (degrees of freedom) of the entries of `hessian`; all pairs of ``dofs`` by default.
+
+        Both halves are listed; entries of the same place add up.
+        """
+        k = len(self.dofs)
+        return np.repeat(self.dofs, k), np.tile(self.dofs, k)
+
     def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray | None:
-        """Return ``sum_i effort_i d2 delta_i / dx2`` over ``dofs``, shape (k, k), or None if delta is linear."""
+        """Return the entries of ``sum_i effort_i d2 delta_i / dx2`` in the order of `hessian_pattern`.
+
+        The shape is free, (k, k) for the default pattern; None if delta is linear.
+        """
         return None

@@ -1,4 +1,4 @@
-"""Material points embedded in tetrahedra by barycentric coordinates."""
+"""Material points as linear combinations of rows: in tetrahedra by barycentric coordinates, or in a frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class EmbeddedPoints:
     Attributes:
         points: reference positions [m], shape (p, 3).
         elements: element of each point, shape (p,).
-        weights: barycentric coordinates, shape (p, 4).
+        weights: barycentric coordinates, shape (p, 4); other kinds of points have other numbers of columns.
         node_ids: corner nodes, shape (p, 4).
     """
 
@@ -49,6 +49,23 @@ class EmbeddedPoints:
             self.elements[i] = best
             self.weights[i] = barycentric[best]
         self.node_ids = np.asarray(tetrahedra)[self.elements]
+
+    @classmethod
+    def from_weights(cls, node_ids: np.ndarray, weights: np.ndarray, nodes: np.ndarray) -> EmbeddedPoints:
+        """Points that are given linear combinations of rows: ids (p, k) and weights (p, k)."""
+        points = cls.__new__(cls)
+        points.node_ids = np.atleast_2d(np.asarray(node_ids, dtype=np.int64))
+        points.weights = np.atleast_2d(np.asarray(weights, dtype=float))
+        points.elements = np.full(len(points.node_ids), -1, dtype=np.int64)
+        points.points = points.positions(nodes)
+        return points
+
+    @classmethod
+    def in_frame(cls, row: int, local: np.ndarray, nodes: np.ndarray) -> EmbeddedPoints:
+        """Points of a rigid part at coordinates [m] (p, 3) along the directors of the frame at a row."""
+        local = np.atleast_2d(np.asarray(local, dtype=float))
+        ids = np.tile(row + np.arange(4), (len(local), 1))
+        return cls.from_weights(ids, np.column_stack([np.ones(len(local)), local]), nodes)
 
     def positions(self, x: np.ndarray) -> np.ndarray:
         """Return the points [m], shape (p, 3), at node positions ``x``, shape (n, 3)."""

@@ -1,0 +1,69 @@
+"""The interface of a block of elements."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+__all__ = ["ElementBlock", "lower_pairs"]
+
+
+def lower_pairs(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of the lower triangles, each (m, k (k + 1) / 2), of elements with degrees of freedom ``dofs`` (m, k)."""
+    r, s = np.tril_indices(dofs.shape[1])
+    return dofs[:, r], dofs[:, s]
+
+
+class ElementBlock(ABC):
+    """Elements of one kind: an energy of the rows of ``x`` with its gradient and exact tangent.
+
+    Degrees of freedom are numbered ``3 * row + axis`` over all rows of ``x``, whether they are free, fixed or carried
+    by a frame: which they are is the model's business.
+
+    Attributes:
+        nodes_used: rows of ``x`` that the elements touch, shape (u,).
+        volume: rest volume [m3].
+        mass: mass [kg].
+        stiffness: a typical stiffness against displacements [N/m], for scaling.
+    """
+
+    nodes_used: np.ndarray
+    volume: float
+    mass: float
+    stiffness: float
+
+    @abstractmethod
+    def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Pairs of degrees of freedom of the tangent's entries: (rows, columns), index arrays of one shape.
+
+        Each pair stands for one entry of the symmetric element matrix and its mirror image.
+        """
+
+    @abstractmethod
+    def add(
+        self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
+    ) -> tuple[float, int]:
+        """Add gradient (n, 3) and, if ``values`` is given, the tangent at positions ``x`` (n, 3).
+
+        Args:
+            x: positions [m], shape (n, 3).
+            gradient: output, added to.
+            values: output, added to at the places that ``scatter`` gives for every stencil (-1: nowhere).
+            scatter: one array for each of `stencils`, of its shape.
+
+        Returns:
+            The elastic energy [J] and the number of inverted elements; with any, the outputs are not to be used.
+        """
+
+    @abstractmethod
+    def nodal_masses(self, count: int) -> np.ndarray:
+        """Share of the mass [kg] that gravity pulls at each of ``count`` rows, shape (count,)."""
+
+    @abstractmethod
+    def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
+        """Add the right-hand side of rotation-strain warping of a ``step`` (n, 3) from ``x`` (n, 3) to ``out``."""
+
+    @abstractmethod
+    def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows, columns and values of the Laplacian that warping solves, each of shape (k,)."""

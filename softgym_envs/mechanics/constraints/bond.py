@@ -1,0 +1,51 @@
+"""A bond: two points that stay together."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softgym_envs.mechanics.constraints.constraint import Constraint
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+
+__all__ = ["Bond"]
+
+
+class Bond(Constraint):
+    """Point ``first`` minus point ``second`` [m], held at ``gap`` by a force [N] on the first and its reaction.
+
+    Bilateral, without friction or rotation: a ball joint. Under the role ``"b"`` of a model it is always held, and is
+    eliminated from the condensed model.
+
+    Args:
+        name: identifier.
+        first: one embedded point.
+        second: one embedded point, or a fixed position [m], shape (3,).
+        gap: offset in space that is held [m], shape (3,); zero ties the points together.
+    """
+
+    size = 3
+
+    def __init__(
+        self, name: str, first: EmbeddedPoints, second: EmbeddedPoints | np.ndarray, gap: np.ndarray | None = None
+    ) -> None:
+        self.name = name
+        self.first = first
+        ids, weights = [first.node_ids[0]], [first.weights[0]]
+        self._anchor = np.zeros(3) if gap is None else np.asarray(gap, dtype=float)
+        if isinstance(second, EmbeddedPoints):
+            ids.append(second.node_ids[0])
+            weights.append(-second.weights[0])
+        else:
+            self._anchor = self._anchor + np.asarray(second, dtype=float)
+        if any(len(points.node_ids) != 1 for points in (first, second) if isinstance(points, EmbeddedPoints)):
+            raise ValueError(f"bond '{name}' ties one point to one point")
+        self._ids, self._weights = np.concatenate(ids), np.concatenate(weights)
+        nodes, slot = np.unique(self._ids, return_inverse=True)
+        self.dofs = (3 * nodes[:, None] + np.arange(3)).ravel()
+        self._jacobian = np.kron(np.bincount(slot, weights=self._weights), np.eye(3))
+
+    def value(self, x: np.ndarray) -> np.ndarray:
+        return self._weights @ x[self._ids] - self._anchor
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        return self._jacobian

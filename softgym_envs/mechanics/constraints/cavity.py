@@ -1,0 +1,111 @@
+"""The volume of a closed cavity."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from softgym_envs.mechanics.constraints.constraint import Constraint
+
+__all__ = ["Cavity", "enclosed_volume"]
+
+
+def enclosed_volume(x: np.ndarray, triangles: np.ndarray) -> float:
+    """Volume [m3] inside a closed surface of triangles (k, 3), positive if they are seen counter-clockwise outside."""
+    a, b, c = (x[triangles[:, i]] for i in range(3))
+    centre = x[triangles[0, 0]]  # any; near the surface it keeps round-off small
+    return float(np.einsum("ij,ij->", a - centre, np.cross(b - centre, c - centre)) / 6.0)
+
+
+@njit(cache=True)
+def _volume_gradient(x, triangles, slot, out):
+    out[:] = 0.0
+    for t in range(triangles.shape[0]):
+        for corner in range(3):
+            a = x[triangles[t, (corner + 1) % 3]]
+            b = x[triangles[t, (corner + 2) % 3]]
+            k = 3 * slot[t, corner]
+            out[k] += (a[1] * b[2] - a[2] * b[1]) / 6.0
+            out[k + 1] += (a[2] * b[0] - a[0] * b[2]) / 6.0
+            out[k + 2] += (a[0] * b[1] - a[1] * b[0]) / 6.0
+
+
+@njit(cache=True)
+def _volume_hessian(x, triangles, scale, out):
+    """Off-diagonal entries of each triangle: d2 V / dx_a dx_b = -[x_c]x / 6 for (a, b, c) in cyclic order."""
+    k = 0
+    for t in range(triangles.shape[0]):
+        for corner in range(3):
+            c = x[triangles[t, (corner + 2) % 3]]
+            out[k], out[k + 1] = scale * c[2], -scale * c[1]
+            out[k + 2], out[k + 3] = -scale * c[2], scale * c[0]
+            out[k + 4], out[k + 5] = scale * c[1], -scale * c[0]
+            k += 6
+
+
+# Places of the entries of _volume_hessian in its 3 x 3 block.
+_ROWS = np.array([0, 0, 1, 1, 2, 2])
+_COLUMNS = np.array([1, 2, 0, 2, 0, 1])
+
+
+class Cavity(Constraint):
+    """Growth of the volume inside a closed surface; delta [m3] = volume - rest volume, effort [Pa] = pressure.
+
+    The pressure follows the surface as it deforms; its exact second derivative is part of the tangent.
+
+    Args:
+        name: identifier.
+        triangles: node indices of a closed surface, shape (k, 3), consistently oriented either way.
+        nodes: rest positions [m], shape (n, 3).
+
+    Raises:
+        ValueError: if the surface is not closed and consistently oriented, or encloses nothing.
+    """
+
+    size = 1
+    unit = ("m3", "Pa")
+
+    def __init__(self, name: str, triangles: np.ndarray, nodes: np.ndarray) -> None:
+        self.name = name
+        triangles = np.array(triangles, dtype=np.int64)
+        if triangles.ndim != 2 or triangles.shape[1] != 3 or len(triangles) < 4:
+            raise ValueError(f"cavity '{name}' needs triangles of shape (k, 3) with k >= 4, got {triangles.shape}")
+        edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+        keys = edges[:, 0] * len(nodes) + edges[:, 1]
+        mirrored = edges[:, 1] * len(nodes) + edges[:, 0]
+        if len(np.unique(keys)) != len(keys) or not np.array_equal(np.sort(keys), np.sort(mirrored)):
+            raise ValueError(f"the surface of cavity '{name}' is not closed, or its triangles are oriented differently")
+        volume = enclosed_volume(nodes, triangles)
+        if volume < 0.0:
+            triangles, volume = triangles[:, ::-1].copy(), -volume
+        if not volume > 0.0:
+            raise ValueError(f"cavity '{name}' encloses no volume")
+        self.triangles = triangles
+        self.rest_volume = volume
+        used, slot = np.unique(triangles, return_inverse=True)
+        self._slot = slot.reshape(triangles.shape)
+        self.dofs = (3 * used[:, None] + np.arange(3)).ravel()
+        self._gradient = np.empty(len(self.dofs))
+        self._entries = np.empty(18 * len(triangles))
+
+    def volume(self, x: np.ndarray) -> float:
+        """Enclosed volume [m3] at node positions ``x`` (n, 3)."""
+        return enclosed_volume(x, self.triangles)
+
+    def value(self, x: np.ndarray) -> np.ndarray:
+        return np.array([self.volume(x) - self.rest_volume])
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        _volume_gradient(x, self.triangles, self._slot, self._gradient)
+        return self._gradient[None, :]
+
+    def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        a = self.triangles[:, :, None]
+        b = np.roll(self.triangles, -1, axis=1)[:, :, None]
+        rows, columns = (3 * a + _ROWS).ravel(), (3 * b + _COLUMNS).ravel()
+        # Every entry and its mirror image.
+        return np.concatenate([rows, columns]), np.concatenate([columns, rows])
+
+    def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray:
+        _volume_hessian(x, self.triangles, effort[0] / 6.0, self._entries)
+        return np.concatenate([self._entries, self._entries])

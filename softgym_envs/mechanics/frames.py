@@ -1,0 +1,241 @@
+"""Frames: rigid parts and beam nodes, and all that they carry.
+
+A frame takes four rows of the position array ``x``: its origin and its three directors (the columns of its rotation
+matrix). Every other thing about it is linear in these rows: a point of a rigid part is ``origin + sum X_k d_k``, a
+beam's strains are products of rows. So elements and constraints treat all rows alike, and one kinematic map says how
+rows move: directors, and mesh nodes that a frame carries, follow the frame's six degrees of freedom,
+
+    x = c p + r,  r = sum_k X_k d_k,    dx = c dp + w x r,    d2x = w x (w x r)
+
+with ``w`` the spin of the frame (rotations are updated by the exponential of the spin, so the second derivative is
+the symmetric one) and ``c`` 1 for points, 0 for directors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numba import njit
+from scipy.sparse import csr_matrix
+
+__all__ = ["Frames", "KinematicMap", "frame_rows", "rotation_of", "rotation_vector_matrix"]
+
+
+def frame_rows(position: np.ndarray, rotation: np.ndarray | None = None) -> np.ndarray:
+    """Rows of a frame at a position [m] (3,) with a rotation matrix (3, 3), shape (4, 3)."""
+    rotation = np.eye(3) if rotation is None else np.asarray(rotation, dtype=float)
+    if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9):
+        raise ValueError(f"rotation must be an orthonormal matrix (3, 3), got {rotation.tolist()}")
+    if np.linalg.det(rotation) < 0.0:
+        raise ValueError(f"rotation must be right-handed, got a reflection: {rotation.tolist()}")
+    return np.vstack([np.asarray(position, dtype=float), rotation.T])
+
+
+def rotation_of(x: np.ndarray, row: int) -> np.ndarray:
+    """Rotation matrix (3, 3) of the frame whose origin is in a row of ``x``."""
+    return x[row + 1 : row + 4].T
+
+
+def rotation_vector_matrix(vectors: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    cross = np.zeros((*vectors.shape[:-1], 3, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -z, y, -x
+    cross[..., 1, 0], cross[..., 2, 0], cross[..., 2, 1] = z, -y, x
+    half = np.sinc(angle / (2.0 * np.pi))  # sin(a / 2) / (a / 2)
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * half * half * (cross @ cross)
+
+
+@njit(cache=True)
+def _expand(values, count, low, high, start, column, coefficient, target):
+    """Add entries of the tangent that touch carried rows to the entries of the degrees of freedom behind them."""
+    k = 0
+    for m in range(low.shape[0]):
+        v = values[count + m]
+        i, j = low[m], high[m]
+        for p in range(start[i], start[i + 1]):
+            for q in range(start[j], start[j + 1]):
+                if i == j and column[q] > column[p]:
+                    continue
+                w = v * coefficient[p] * coefficient[q]
+                if i != j and column[p] == column[q]:
+                    w *= 2.0  # the entry and its mirror image meet on the diagonal
+                values[target[k]] += w
+                k += 1
+
+
+@njit(cache=True)
+def _expansion_pairs(low, high, start, column):
+    """Low and high degree of freedom of every term of `_expand`, in its order."""
+    count = 0
+    for m in range(low.shape[0]):
+        i, j = low[m], high[m]
+        for p in range(start[i], start[i + 1]):
+            for q in range(start[j], start[j + 1]):
+                if i == j and column[q] > column[p]:
+                    continue
+                count += 1
+    pairs = np.empty((count, 2), dtype=np.int64)
+    k = 0
+    for m in range(low.shape[0]):
+        i, j = low[m], high[m]
+        for p in range(start[i], start[i + 1]):
+            for q in range(start[j], start[j + 1]):
+                if i == j and column[q] > column[p]:
+                    continue
+                pairs[k, 0] = min(column[p], column[q])
+                pairs[k, 1] = max(column[p], column[q])
+                k += 1
+    return pairs
+
+
+class Frames:
+    """All frames of a model and the rows they carry.
+
+    Args:
+        nodes: rest rows [m], shape (n, 3).
+        rows: first row (the origin) of each frame, shape (f,).
+        carried: mesh nodes that move with a frame: index of the frame -> rows.
+
+    Attributes:
+        rows: as given.
+        carried: all carried rows, directors first, shape (c,).
+        owner: frame of each carried row, shape (c,).
+        arm: coordinates of each carried row in its frame's directors, shape (c, 3).
+        moves: 1 where a carried row also follows the origin, 0 for directors, shape (c,).
+
+    Raises:
+        ValueError: if frames overlap, a row is carried twice, or directors are not orthonormal.
+    """
+
+    def __init__(self, nodes: np.ndarray, rows: np.ndarray, carried: Mapping[int, np.ndarray] | None = None) -> None:
+        self.rows = np.asarray(rows, dtype=np.int64).reshape(-1)
+        count = len(self.rows)
+        parts = {int(f): np.unique(np.asarray(ids, dtype=np.int64)) for f, ids in (carried or {}).items()}
+        if any(not 0 <= f < count for f in parts):
+            raise ValueError(f"rows are carried by frames {sorted(parts)}, the model has {count}")
+        directors = (self.rows[:, None] + np.arange(1, 4)).ravel()
+        self.carried = np.concatenate([directors, *parts.values()])
+        self.owner = np.concatenate(
+            [np.repeat(np.arange(count), 3), *(np.full(len(ids), f) for f, ids in parts.items())]
+        ).astype(np.int64)
+        taken = np.concatenate([self.rows, self.carried])
+        if len(np.unique(taken)) != len(taken) or (len(taken) and taken.max() >= len(nodes)):
+            raise ValueError("frames overlap, or a row is carried by two frames")
+        bases = np.array([nodes[row + 1 : row + 4] for row in self.rows]).reshape(count, 3, 3)
+        if not np.allclose(bases @ np.swapaxes(bases, 1, 2), np.eye(3), atol=1e-9):
+            raise ValueError("the directors of a frame are not orthonormal")
+        self.moves = (np.arange(len(self.carried)) >= 3 * count).astype(float)
+        offset = nodes[self.carried] - self.moves[:, None] * nodes[self.rows[self.owner]]
+        self.arm = np.einsum("ckd,cd->ck", bases[self.owner], offset)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def arms(self, x: np.ndarray) -> np.ndarray:
+        """Vectors ``r`` of the carried rows in space [m], shape (c, 3)."""
+        return x[self.carried] - self.moves[:, None] * x[self.rows[self.owner]]
+
+    def displace(self, x: np.ndarray, translation: np.ndarray, spin: np.ndarray, out: np.ndarray) -> None:
+        """Write the displacement of all rows of frames and what they carry under a finite motion to ``out`` (n, 3).
+
+        Args:
+            x: positions [m], shape (n, 3).
+            translation: of the origins [m], shape (f, 3).
+            spin: rotation vectors [rad], shape (f, 3).
+            out: displacements [m], shape (n, 3).
+        """
+        bases = x[self.rows[:, None] + np.arange(1, 4)]  # rows are directors
+        turned = bases @ np.swapaxes(rotation_vector_matrix(spin), 1, 2)
+        # Round-off must not add up over a long motion.
+        turned = 1.5 * turned - 0.5 * turned @ np.swapaxes(turned, 1, 2) @ turned
+        origins = x[self.rows] + translation
+        out[self.rows] = translation
+        new = self.moves[:, None] * origins[self.owner] + np.einsum("ck,ckd->cd", self.arm, turned[self.owner])
+        out[self.carried] = new - x[self.carried]
+
+
+class KinematicMap:
+    """How the independent degrees of freedom move carried rows, with fixed index structure.
+
+    Args:
+        frames: the frames.
+        origin: equation of each component of each frame's origin, -1 if fixed, shape (f, 3).
+        spin: equation of each component of each frame's spin, -1 if fixed, shape (f, 3).
+        size: number of equations.
+
+    Attributes:
+        matrix: sparse map of the equations to the components of carried rows, shape (3 c, size).
+    """
+
+    def __init__(self, frames: Frames, origin: np.ndarray, spin: np.ndarray, size: int) -> None:
+        self.frames = frames
+        self.size = size
+        columns: list[int] = []
+        kinds, counts = [], []
+        for c, frame in enumerate(frames.owner):
+            for axis in range(3):
+                b, d = (axis + 1) % 3, (axis + 2) % 3
+                # (w x r)_axis = w_b r_d - w_d r_b
+                entries = [(origin[frame, axis], 0, 0)] if frames.moves[c] else []
+                entries += [(spin[frame, b], 1, 3 * c + d), (spin[frame, d], -1, 3 * c + b)]
+                entries = sorted(e for e in entries if e[0] >= 0)
+                columns += [int(e[0]) for e in entries]
+                kinds += [(e[1], e[2]) for e in entries]
+                counts.append(len(entries))
+        kind = np.array(kinds, dtype=np.int64).reshape(-1, 2)
+        self._sign, self._source = kind[:, 0].astype(float), kind[:, 1]
+        pointers = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        self.matrix = csr_matrix(
+            (np.ones(len(columns)), np.array(columns, dtype=np.int64), pointers), shape=(3 * len(frames.owner), size)
+        )
+        # The same with the identity of the free equations before it.
+        self.start = np.concatenate([np.arange(size), size + pointers])
+        self.column = np.concatenate([np.arange(size), np.array(columns, dtype=np.int64)])
+        self._coefficient = np.ones(len(self.column))
+        # Spin block of each frame that gets the second derivative of its carried rows.
+        pairs = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
+        self._spin = spin
+        self.spin_pairs = np.array(
+            [(min(s[a], s[b]), max(s[a], s[b])) if min(s[a], s[b]) >= 0 else (-1, -1) for s in spin for a, b in pairs],
+            dtype=np.int64,
+        ).reshape(-1, 2)
+        self._axes = np.array(pairs)
+
+    def linearise(self, x: np.ndarray) -> np.ndarray:
+        """Bring the map to positions ``x`` (n, 3); returns the vectors r of the carried rows, shape (c, 3)."""
+        arms = self.frames.arms(x)
+        data = np.where(self._sign == 0.0, 1.0, self._sign * arms.ravel()[self._source])
+        self.matrix.data[:] = data
+        self._coefficient[self.size :] = data
+        return arms
+
+    def plan(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Pairs of equations (t, 2) that tangent entries between rows ``low`` and ``high`` lead to.
+
+        Rows are numbered as equations, then components of carried rows.
+        """
+        self._low, self._high = low, high
+        return _expansion_pairs(low, high, self.start, self.column)
+
+    def set_targets(self, target: np.ndarray, spin_target: np.ndarray) -> None:
+        """Give the place in the tangent's values of each pair of `plan` and of `spin_pairs` (-1: nowhere)."""
+        self._target = target
+        self._spin_target = spin_target
+
+    def expand(self, values: np.ndarray, count: int) -> None:
+        """Bring entries ``values[count:]`` of carried rows to the entries ``values[:count]`` of the equations."""
+        _expand(values, count, self._low, self._high, self.start, self.column, self._coefficient, self._target)
+
+    def add_curvature(self, values: np.ndarray, arms: np.ndarray, gradient: np.ndarray) -> None:
+        """Add the second derivative of the map under the gradient (c, 3) of the carried rows to the tangent."""
+        owner, count = self.frames.owner, len(self.frames)
+        products = np.zeros((count, 3, 3))
+        np.add.at(products, owner, gradient[:, :, None] * arms[:, None, :])
+        block = 0.5 * (products + np.swapaxes(products, 1, 2))
+        block -= np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        entries = block[:, self._axes[:, 0], self._axes[:, 1]].ravel()
+        keep = self._spin_target >= 0
+        values[self._spin_target[keep]] += entries[keep]
