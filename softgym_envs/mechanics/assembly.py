@@ -108,6 +108,8 @@ class Assembly:
 
     def carry(self, frame: int, rows: np.ndarray) -> None:
         """Let mesh nodes move with the frame at a row."""
+        if frame not in self._frames:
+            raise ValueError(f"no frame begins at row {frame}; frames begin at {self._frames}")
         index = self._frames.index(frame)
         self._carried[index] = np.concatenate([self._carried.get(index, np.empty(0, dtype=np.int64)), rows])
 

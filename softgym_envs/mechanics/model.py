@@ -17,6 +17,7 @@ from softgym_envs.mechanics.constraints import Cable, Constraint, EmbeddedPoints
 from softgym_envs.mechanics.frames import Frames, KinematicMap
 from softgym_envs.mechanics.linear_solver import LinearSolver, make_solver
 from softgym_envs.mechanics.materials import Material
+from softgym_envs.mechanics.skins import Skin
 from softgym_envs.mechanics.tetrahedra import SolidBlock, Tetrahedra
 
 __all__ = ["MechanicalModel", "read_mesh"]
@@ -101,6 +102,7 @@ class MechanicalModel:
         constraints: constraint objects by role letter: ``"a"`` actuators, ``"e"`` effectors, ``"c"`` contacts,
             ``"s"`` sensors (measured, never loaded), ``"b"`` bonds (held at zero, not part of the condensed model).
         applied_loads: dead loads that `assemble` applies [N], shape (n, 3); a solver may bring them on in steps.
+        skins: surfaces of beams and rigid parts, for pictures only.
         equations: number of independent degrees of freedom.
         free_dofs: rows' degrees of freedom (3 * row + axis) that are equations of their own; spins come after them.
         dof_scale: length [m] that a unit of each equation moves: 1 for nodes, an arm for spins, shape (equations,).
@@ -162,6 +164,7 @@ class MechanicalModel:
         self.dof_scale[len(self.free_dofs) :] = 0.1 * extent
         self._fixed_components = mask & ~is_carried[:, None]
         self.constraints: dict[str, list[Constraint]] = {"a": [], "e": [], "c": [], "s": [], "b": []}
+        self.skins: list[Skin] = []
         self._solver_name = solver
         self._solver: LinearSolver | None = None
         self._poisson: LinearSolver | None = None
@@ -246,9 +249,10 @@ class MechanicalModel:
         *,
         unilateral: bool = True,
         hint: np.ndarray | None = None,
+        block: int = 0,
     ) -> Cable:
-        """Add a cable actuator through ``points`` [m] (p, 3), ordered from the pull point to the anchor."""
-        cable = Cable(name, self.embed(points, hint), pull_point, unilateral=unilateral)
+        """Add a cable actuator through ``points`` [m] (p, 3) of a solid, ordered from the pull point to the anchor."""
+        cable = Cable(name, self.embed(points, hint, block=block), pull_point, unilateral=unilateral)
         self.add("a", cable)
         return cable
 

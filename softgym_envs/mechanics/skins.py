@@ -1,0 +1,58 @@
+"""Surfaces of beams and rigid parts, for pictures and export; they have no part in the mechanics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from softgym_envs.mechanics.beams import Beam
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+
+__all__ = ["Skin", "box_skin", "tube_skin"]
+
+
+@dataclass(frozen=True)
+class Skin:
+    """A closed triangle surface that moves with frames.
+
+    Attributes:
+        points: the vertices, as points of frames (v of them).
+        triangles: vertex indices, seen counter-clockwise from outside, shape (t, 3).
+    """
+
+    points: EmbeddedPoints
+    triangles: np.ndarray
+
+
+def tube_skin(beam: Beam, nodes: np.ndarray, outline: np.ndarray) -> Skin:
+    """Sweep a convex outline along a beam.
+
+    Args:
+        beam: the beam.
+        nodes: rest rows [m], shape (n, 3).
+        outline: corners [m] along d_2 and d_3, counter-clockwise, shape (k, 2) or, one for each frame, (c, k, 2).
+    """
+    count = len(beam.chain)
+    corners = np.broadcast_to(np.asarray(outline, dtype=float), (count, *np.shape(outline)[-2:]))
+    k = corners.shape[1]
+    local = np.concatenate([np.zeros((count, k, 1)), corners], axis=2).reshape(-1, 3)
+    ids = np.repeat(beam.chain, k)[:, None] + np.arange(4)
+    points = EmbeddedPoints.from_weights(ids, np.column_stack([np.ones(len(local)), local]), nodes)
+    a = (k * np.arange(count - 1)[:, None] + np.arange(k)).ravel()
+    b = (k * np.arange(count - 1)[:, None] + (np.arange(k) + 1) % k).ravel()
+    sides = np.concatenate([np.column_stack([a, b, b + k]), np.column_stack([a, b + k, a + k])])
+    fan = np.column_stack([np.zeros(k - 2, dtype=np.int64), np.arange(1, k - 1), np.arange(2, k)])
+    end = k * (count - 1)
+    # d_1 points along the beam: the outline is seen counter-clockwise from its far end.
+    return Skin(points, np.concatenate([sides, fan[:, ::-1], fan + end]))
+
+
+def box_skin(row: int, half_extents: Sequence[float], nodes: np.ndarray) -> Skin:
+    """A box about the origin of the frame at a row, with half extents [m] along its directors."""
+    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    points = EmbeddedPoints.in_frame(row, signs * np.asarray(half_extents), nodes)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    return Skin(points, triangles)

@@ -1,0 +1,289 @@
+"""Grippers made from copies of the Soft Finger: each is the finger turned and moved (thesis 4.3.1 and 4.3.2).
+
+All bodies of a gripper and the object in its hold are one finite-element model. Contact is that of the thesis: the
+fingers' contact points stay on the object, without friction moments (ball joints), in pull as in push.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+
+import numpy as np
+
+from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.mechanics.assembly import Assembly
+from softgym_envs.mechanics.constraints import Bond, EmbeddedPoints, Point
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.skins import box_skin
+from softgym_envs.robots.robot import Actuator, Robot
+from softgym_envs.robots.soft_finger import SoftFinger
+
+__all__ = ["FingerRobot", "PressFinger", "ThreeFingerGripper", "TwoFingerGripper"]
+
+STRAIGHT = np.eye(3)
+TURNED = np.diag([-1.0, -1.0, 1.0])
+"""Half a turn about z: the finger then bends towards -y."""
+
+
+class FingerRobot(Robot):
+    """One or more two-cable fingers, and what they hold.
+
+    Args:
+        mesh_size: target edge length of a finger [m].
+        meshing: ``"morph"`` or ``"remesh"``, as for the finger.
+        material: name of a material.
+        unilateral: cables cannot push (default).
+        gravity: acceleration [m/s2].
+    """
+
+    size = 0.12
+    #: Rotation and shift [m] of each finger.
+    placements: tuple[tuple[np.ndarray, tuple[float, float, float]], ...]
+    #: Range of the cables and their largest change in a control step [m].
+    cable_range = (0.0, 0.020)
+    cable_rate = 0.001
+
+    def __init__(
+        self,
+        *,
+        mesh_size: float = 8.0e-3,
+        meshing: str = "morph",
+        material: str = "corotational",
+        unilateral: bool = True,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        super().__init__(gravity=gravity)
+        self.finger = SoftFinger(
+            cables=2, mesh_size=mesh_size, meshing=meshing, material=material, unilateral=unilateral
+        )
+        self.unilateral = unilateral
+        self.design_space = DesignSpace(*self.finger.design_space.variables.values(), *self.more_variables())
+        self.actuators = tuple(
+            Actuator(f"finger_{k + 1}_{cable.name}", *self.cable_range, self.cable_rate, unilateral=unilateral)
+            for k in range(len(self.placements))
+            for cable in self.finger.actuators
+        )
+        self.effort_scale = np.full(len(self.actuators), 20.0)
+        self.effector_rest = self.object_rest(self.design_space.baseline)
+
+    @property
+    def variant(self) -> str:
+        """Name of the gripper."""
+        return self.name
+
+    @property
+    def signature(self) -> dict[str, object]:
+        """Options that change the condensed model."""
+        return {"finger": self.finger.signature, "gravity": list(self.gravity)}
+
+    def more_variables(self) -> tuple[DesignVariable, ...]:
+        """Design variables beyond those of the finger."""
+        return ()
+
+    @abstractmethod
+    def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
+        """Where the effector is at rest [m], shape (3,)."""
+
+    @abstractmethod
+    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+        """Add what ties the fingers to each other or to the object, whose frame is given, and the effector."""
+
+    def object_frame(self, design: Mapping[str, float]) -> np.ndarray | None:
+        """Position of the rigid object [m], shape (3,), or None without one."""
+        return None
+
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        """Place the fingers, route their cables, and let them hold the object."""
+        names = self.finger.design_space.names
+        self._shape = {name: design[name] for name in names}
+        mesh = self.finger.body(self._shape)
+        fixed = self.finger.clamped(mesh)
+        assembly = Assembly(gravity=self.gravity)
+        for turn, shift in self.placements:
+            assembly.add_solid(
+                mesh.nodes @ turn.T + shift,
+                mesh.tetrahedra,
+                fixed=fixed,
+                material=self.finger.material,
+                young_modulus=design["young_modulus"],
+                poisson_ratio=design["poisson_ratio"],
+            )
+        position = self.object_frame(design)
+        frame = None if position is None else assembly.add_frame(position)
+        model = assembly.build()
+        names_left = iter(self.actuators)
+        for k, (turn, shift) in enumerate(self.placements):
+            for pull_point, points in self.finger.routes(self._shape):
+                model.add_cable(
+                    next(names_left).name,
+                    points @ turn.T + shift,
+                    turn @ pull_point + shift,
+                    unilateral=self.unilateral,
+                    block=k,
+                )
+        self._mesh = mesh
+        self.hold(model, design, frame)
+        return model
+
+    def material_point(
+        self, model: MechanicalModel, finger: int, point: np.ndarray, reference: np.ndarray
+    ) -> EmbeddedPoints:
+        """Embed a point of the finger [m] (3,), given where it is in the finger's own axes, in one of its copies.
+
+        Args:
+            model: the gripper.
+            finger: number of the copy.
+            point: the point [m], shape (3,).
+            reference: the same point of the reference body, which settles the element of points outside the mesh.
+        """
+        turn, shift = self.placements[finger]
+        hint = self.finger.reference_element(self._mesh, reference)
+        return model.embed(turn @ point + shift, hint, block=finger)
+
+    def tie_contacts(self, model: MechanicalModel, frame: int) -> None:
+        """Tie the three contact points of each finger to the points of the object that they touch at rest."""
+        reference = self.finger.contact_points(self.finger.reference_design)
+        centre = model.nodes[frame]
+        for k in range(len(self.placements)):
+            for i, point in enumerate(self.finger.contact_points(self._shape)):
+                embedding = self.material_point(model, k, point, reference[i])
+                held = EmbeddedPoints.in_frame(frame, embedding.points[0] - centre, model.nodes)
+                model.add("b", Bond(f"contact_{k + 1}_{i + 1}", embedding, held))
+
+
+class PressFinger(FingerRobot):
+    """A finger that presses a cube-shaped button, which resists with a constant force along -y.
+
+    Args:
+        button_force: force of the button [N]. The published "10 N" pushes this finger back by 66 mm with its cables held
+            at zero and leaves it no stable way forward; 2 N is a fifth of it, and well inside its strength.
+        **options: as for `FingerRobot`.
+    """
+
+    name = "press_finger"
+    effectors = ("button",)
+    placements = ((STRAIGHT, (0.0, 0.0, 0.0)),)
+    half_extents = (13.75e-3, 13.75e-3, 13.75e-3)
+
+    def __init__(self, *, button_force: float = 2.0, **options) -> None:
+        if not (np.isfinite(button_force) and button_force >= 0.0):
+            raise ValueError(f"button_force = {button_force} N must be finite and not negative")
+        self.button_force = float(button_force)
+        super().__init__(**options)
+
+    @property
+    def signature(self) -> dict[str, object]:
+        """Options that change the condensed model."""
+        return {**super().signature, "button_force": self.button_force}
+
+    def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
+        """Centre of the button, whose face lies on the front of the last segment."""
+        return np.array([0.0, design["height"] + self.half_extents[1], -2.5 * design["length"]])
+
+    object_frame = object_rest
+
+    def reference_path(self, count: int = 9) -> np.ndarray:
+        """Goals along y, from where the button's force has pushed the finger, shape (count, 3); x and z are free."""
+        path = np.tile(self.effector_rest, (count, 1))
+        path[:, 1] = np.linspace(0.020, 0.044, count)
+        return path
+
+    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+        """Tie the contact points to the button and load it; the effector is its centre."""
+        assert frame is not None
+        self.tie_contacts(model, frame)
+        model.nodal_loads[frame, 1] = -self.button_force
+        model.refresh_loads()
+        model.add("e", Point("button", EmbeddedPoints.in_frame(frame, np.zeros(3), model.nodes)))
+        model.skins.append(box_skin(frame, self.half_extents, model.nodes))
+
+
+class TwoFingerGripper(FingerRobot):
+    """Two fingers that face each other and hold a bar between their tips (thesis eq. 4.6).
+
+    The bar ties the tips at a constant offset along y; it is shorter than their distance at rest, so the fingers bend
+    towards each other. The effector is the middle of the bar.
+
+    Args: as for `FingerRobot`.
+    """
+
+    name = "two_finger_gripper"
+    effectors = ("bar",)
+    placements = ((STRAIGHT, (0.0, 0.0, 0.0)), (TURNED, (0.0, 0.080, 0.0)))
+
+    def __init__(self, **options) -> None:
+        super().__init__(**options)
+        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
+
+    def more_variables(self) -> tuple[DesignVariable, ...]:
+        """The length of the bar."""
+        return (DesignVariable("bar_length", 0.030, 0.055, 0.040, "m", "offset of the two tips along y"),)
+
+    def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
+        """Middle of the bar, before the tips come together."""
+        return np.array([0.0, 0.040, self.finger.tip(design)[2]])
+
+    def reference_path(self, count: int = 61) -> np.ndarray:
+        """Goals along x: from 0 to 30 mm, to -30 mm and back to 0, shape (count, 3); z is free."""
+        path = np.tile(self.effector_rest, (count, 1))
+        path[:, 0] = np.interp(np.linspace(0.0, 4.0, count), [0.0, 1.0, 3.0, 4.0], [0.0, 0.030, -0.030, 0.0])
+        return path
+
+    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+        """Tie the tips at the bar's length; the effector lies half way between them."""
+        tip, reference = self.finger.tip(design), self.finger.tip(self.finger.reference_design)
+        first, second = (self.material_point(model, k, tip, reference) for k in (0, 1))
+        model.add("b", Bond("bar", first, second, np.array([0.0, -design["bar_length"], 0.0])))
+        middle = EmbeddedPoints.from_weights(
+            np.concatenate([first.node_ids, second.node_ids], axis=1),
+            0.5 * np.concatenate([first.weights, second.weights], axis=1),
+            model.nodes,
+        )
+        model.add("e", Point("bar", middle))
+
+
+class ThreeFingerGripper(FingerRobot):
+    """Three fingers that hold a cube (thesis 4.3.2): one pushes along +y, two along -y.
+
+    Args: as for `FingerRobot`.
+    """
+
+    name = "three_finger_gripper"
+    effectors = ("cube",)
+    placements = (
+        (STRAIGHT, (0.0, 0.0, 0.0)),
+        (TURNED, (-0.030, 0.070, 0.0)),
+        (TURNED, (0.030, 0.070, 0.0)),
+    )
+    half_extents = (35.0e-3, 13.75e-3, 13.75e-3)
+    cable_range = (-0.002, 0.020)
+
+    def __init__(self, **options) -> None:
+        super().__init__(**options)
+        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
+
+    def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
+        """Centre of the cube, between the fingers."""
+        return np.array([0.0, 0.035, -2.5 * design["length"] + 0.005])
+
+    object_frame = object_rest
+
+    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+        """Tie nine contact points to the cube; the effector is its centre."""
+        assert frame is not None
+        self.tie_contacts(model, frame)
+        model.add("e", Point("cube", EmbeddedPoints.in_frame(frame, np.zeros(3), model.nodes)))
+        model.skins.append(box_skin(frame, self.half_extents, model.nodes))
+
+    def reference_path(self, count: int = 20) -> np.ndarray:
+        """Horizontal circle of the cube's centre, shape (count, 3).
+
+        With cables that may push it is the published one: radius 1.5 mm about the rest position. Cables that cannot push
+        only lift the cube: then its radius is 1 mm, about a centre 4 mm higher.
+        """
+        angle = 2.0 * np.pi * np.arange(count) / count
+        circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
+        if not self.unilateral:
+            return self.effector_rest + 1.5e-3 * circle
+        return self.effector_rest + np.array([0.0, -0.7e-3, 4.0e-3]) + 1.0e-3 * circle
