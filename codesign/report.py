@@ -235,17 +235,15 @@ def _photographs(study: StudyFolder, bodies: Mapping[str, dict[str, float]]) -> 
 
 def _shapes(study: StudyFolder, bodies: Mapping[str, dict[str, float]]) -> list[tuple[str, dict[str, Any]]]:
     """What `plots.overlay` draws: at rest and with all actuators at 50 %."""
-    from softgym_envs.viewer.surface import ShapeFinder, boundary_triangles
+    from softgym_envs.viewer.surface import BodySurface, ShapeFinder
 
     finder = ShapeFinder(study.config.robot)
     shapes: list[tuple[str, dict[str, Any]]] = [(caption, {}) for caption, _ in _poses(study)[:2]]
     for role, body in bodies.items():
         model = finder.load(body)
-        solids = [block.connectivity for block in model.blocks if block.connectivity.shape[1] == 4]
-        triangles = boundary_triangles(np.concatenate(solids))
+        surface = BodySurface(model)
         for (_, command), (_, drawn) in zip(_poses(study), shapes, strict=False):
-            nodes = finder.at(body, command)
-            drawn[role] = (nodes, triangles, finder.state.effector)
+            drawn[role] = (surface.shape(finder.at(body, command)), surface.faces, finder.state.effector)
     return shapes
 
 

@@ -1,5 +1,20 @@
 """Controllers: they take a condensed model and a goal, and never ask where the model came from."""
 
+from softgym_envs.control.coupling import Coupled, RigidBody, couple, rotate, tie_points
+from softgym_envs.control.embedded import EmbeddedLoop, PICorrection, follow
 from softgym_envs.control.inverse_qp import InverseQP
+from softgym_envs.control.manipulation import Manipulation, Plan
 
-__all__ = ["InverseQP"]
+__all__ = [
+    "Coupled",
+    "EmbeddedLoop",
+    "InverseQP",
+    "Manipulation",
+    "PICorrection",
+    "Plan",
+    "RigidBody",
+    "couple",
+    "follow",
+    "rotate",
+    "tie_points",
+]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,12 @@ from softgym_envs.mechanics.condensation import CondensedModel
 
 __all__ = ["InverseQP"]
 
+#: Stands for "no bound", in units of a problem scaled to order one.
+FAR = 1e6
+
 
 class InverseQP:
-    """Actuator displacements that bring the effectors to a goal, one linearisation at a time.
+    """Actuator displacements or efforts that bring the effectors to a goal, one linearisation at a time.
 
     With ``d`` the change of the actuator displacements (so efforts change by ``W_aa^-1 d`` and effectors by
     ``W_ea W_aa^-1 d``), each call minimises
@@ -22,26 +26,47 @@ class InverseQP:
 
     where ``change`` is the step of the efforts and ``eps = |W_ea^T W_ea|_F / |W_aa|_F``, subject to
 
-        effort >= 0 for unilateral actuators,  lower <= delta_a <= upper,  |delta_a - command| <= rate.
+        effort >= 0 for unilateral actuators,  min_effort <= effort <= max_effort,  |change| <= effort_rate,
+        lower <= delta_a <= upper,  |delta_a - command| <= rate.
 
     Regularisation: three definitions of eps circulate in the group's codes; this one makes the weights pure numbers.
     The defaults are far below the 0.01 that some use: with that the finger stops 0.58 mm short of a goal 54 mm away,
     with 1e-5 it stops 0.6 um short.
     ``effort_weight`` decides between redundant actuators and moves the result towards rest by about that fraction of
     the way from it; ``step_weight`` only slows the last part of the approach and has no steady error.
+    ``goal_weights`` multiply the squared error of each effector coordinate: zero leaves a coordinate to itself,
+    and among coordinates that cannot all be met the larger weight wins.
 
     The problem is scaled to order one (displacements by the rate, efforts by the compliance) before ProxQP's dense
-    backend solves it with box constraints and a warm start.
+    backend solves it with box constraints and a warm start. The two norms in ``eps`` are taken in units of the rates,
+    so metres and cubic metres, newtons and pascals, or a mixture of them, give the same answer.
 
     Args:
-        lower: smallest displacements [m, ...], shape (n_a,).
+        lower: smallest displacements [m, m3, ...], shape (n_a,).
         upper: largest displacements, shape (n_a,).
-        rates: largest change of the command per call, shape (n_a,).
+        rates: largest change of the displacements per call, shape (n_a,); inf for actuators that are commanded in
+            effort and have an effort rate.
         unilateral: actuators that cannot push, shape (n_a,).
         effort_weight: see above.
         step_weight: see above.
+        goal_weights: see above, shape (n_e,); default one each.
+        min_effort: smallest efforts [N, Pa, ...], shape (n_a,), or None.
         max_effort: largest efforts, shape (n_a,), or None.
+        effort_rates: largest change of the efforts per call, shape (n_a,), or None.
+        mode: ``"displacement"`` or ``"effort"`` for all actuators, or one of them per actuator: what `solve` takes as
+            the present command and returns as the next. Rates limit the step from the command in the actuator's mode,
+            and from the state of the model in the other quantity.
+
+    Attributes:
+        displacement: actuator displacements that the model predicts for the last answer, shape (n_a,).
+        effort: efforts that it predicts for it, shape (n_a,).
+
+    Raises:
+        ValueError: for malformed bounds, rates, weights or modes.
     """
+
+    displacement: np.ndarray
+    effort: np.ndarray
 
     def __init__(
         self,
@@ -52,19 +77,46 @@ class InverseQP:
         *,
         effort_weight: float = 1e-5,
         step_weight: float = 1e-3,
+        goal_weights: np.ndarray | None = None,
+        min_effort: np.ndarray | None = None,
         max_effort: np.ndarray | None = None,
+        effort_rates: np.ndarray | None = None,
+        mode: str | Sequence[str] = "displacement",
     ) -> None:
         from proxsuite import proxqp
 
         self.lower, self.upper, self.rates = (np.asarray(v, dtype=float) for v in (lower, upper, rates))
         if not (self.rates > 0).all():
             raise ValueError(f"rates must be positive, got {self.rates.tolist()}")
+        count = len(self.rates)
         self.unilateral = np.asarray(unilateral, dtype=bool)
         self.effort_weight = effort_weight
         self.step_weight = step_weight
-        self.max_effort = (
-            np.full(len(self.rates), np.inf) if max_effort is None else np.asarray(max_effort, dtype=float)
-        )
+        self.goal_weights = None if goal_weights is None else np.asarray(goal_weights, dtype=float)
+        if self.goal_weights is not None and not (np.isfinite(self.goal_weights) & (self.goal_weights >= 0.0)).all():
+            raise ValueError(f"goal_weights must be finite and not negative, got {self.goal_weights.tolist()}")
+
+        def bound(values: np.ndarray | None, missing: float) -> np.ndarray:
+            return np.full(count, missing) if values is None else np.asarray(values, dtype=float)
+
+        floor = bound(min_effort, -np.inf)
+        self.min_effort = np.where(self.unilateral, np.maximum(floor, 0.0), floor)
+        self.max_effort = bound(max_effort, np.inf)
+        self.effort_rates = bound(effort_rates, np.inf)
+        if not (self.effort_rates > 0).all():
+            raise ValueError(f"effort_rates must be positive, got {self.effort_rates.tolist()}")
+        modes = [mode] * count if isinstance(mode, str) else list(mode)
+        if len(modes) != count or any(m not in ("displacement", "effort") for m in modes):
+            raise ValueError(f"mode must be 'displacement' or 'effort' (one, or {count} of them), got {mode!r}")
+        self.by_effort = np.array([m == "effort" for m in modes], dtype=bool)
+        if not np.isfinite(np.where(self.by_effort, np.minimum(self.rates, self.effort_rates), self.rates)).all():
+            raise ValueError("every actuator needs a finite rate: of its displacement or, in mode 'effort', its effort")
+        for low, high, word in (
+            (self.lower, self.upper, "displacement"),
+            (self.min_effort, self.max_effort, "effort"),
+        ):
+            if low.shape != (count,) or high.shape != (count,) or not (low <= high).all():
+                raise ValueError(f"bounds of {word} must be {count} pairs, low <= high, got {low} and {high}")
         self._proxqp = proxqp
         self._qp: Any = None
 
@@ -75,14 +127,14 @@ class InverseQP:
         qp = self._proxqp.dense.QP(n, 0, n, True)
         qp.settings.eps_abs = 1e-9
         qp.settings.eps_rel = 0.0
-        qp.settings.max_iter = 200
+        qp.settings.max_iter = 1000
         qp.settings.initial_guess = self._proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
         return qp
 
     def solve(
         self, condensed: CondensedModel, goal: np.ndarray, command: np.ndarray, slack: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the next actuator displacements to command, shape (n_a,).
+        """Return the next command, shape (n_a,): displacements or efforts, by the actuators' modes.
 
         Args:
             condensed: model at the present state.
@@ -91,37 +143,66 @@ class InverseQP:
             slack: actuators that hang slack, shape (n_a,); default none.
 
         Raises:
-            ValueError: if the goal has a wrong shape or is not finite.
-            ConvergenceError: if ProxQP does not reach its tolerance.
+            ValueError: if goal, command or model have a wrong shape or are not finite.
+            ConvergenceError: if ProxQP does not reach its tolerance, for example because no step within the rates
+                brings an effort back below ``max_effort``.
         """
         goal = np.asarray(goal, dtype=float).ravel()
+        command = np.asarray(command, dtype=float)
         delta, effort = condensed.delta, condensed.lambda_.a
         if goal.shape != delta.e.shape or not np.isfinite(goal).all():
             raise ValueError(f"goal must be {delta.e.size} finite coordinates, got {goal.tolist()}")
+        if command.shape != self.rates.shape or effort.shape != self.rates.shape or not np.isfinite(command).all():
+            raise ValueError(
+                f"command must be {len(self.rates)} finite numbers, got {command.tolist()} for {len(effort)} actuators"
+            )
         if not (np.isfinite(condensed.compliance).all() and np.isfinite(delta.array).all()):
             raise ValueError("the condensed model holds values that are not finite")
+        if self.goal_weights is not None and self.goal_weights.shape != goal.shape:
+            raise ValueError(f"goal_weights must be {goal.size} numbers, got {self.goal_weights.tolist()}")
         slack = np.zeros(len(command), dtype=bool) if slack is None else slack
-        Waa, Wea = condensed.W.aa, condensed.W.ea
-        stiffness = np.linalg.inv(Waa)
-        scale = self.rates
+        root = np.ones(goal.size) if self.goal_weights is None else np.sqrt(self.goal_weights)
+        Waa, Wea = condensed.W.aa, root[:, None] * condensed.W.ea
+        try:
+            stiffness = np.linalg.inv(Waa)
+        except np.linalg.LinAlgError:
+            raise ValueError("W_aa is singular: two actuators do the same") from None
+
+        limited = np.isfinite(self.effort_rates)
+        by_effort = np.abs(np.diag(Waa)) * np.where(limited, self.effort_rates, 0.0)
+        scale = np.where(limited, np.minimum(self.rates, by_effort), self.rates)
+        unit = scale.max() / scale
+        epsilon = np.linalg.norm((Wea * unit).T @ (Wea * unit)) / np.linalg.norm(unit[:, None] * Waa * unit)
         jacobian = Wea @ stiffness * scale  # effector motion per scaled displacement
         to_effort = stiffness * scale
-        length = float(scale.mean())
-        epsilon = np.linalg.norm(Wea.T @ Wea) / np.linalg.norm(Waa)
         quadratic = to_effort.T @ Waa @ to_effort * epsilon
+        pull = to_effort.T @ (Waa @ effort)
+        energies, modes = np.linalg.eigh(0.5 * (quadratic + quadratic.T))
+        if energies[0] < 0.0:
+            # A state that is stable only while its actuators are held: the energy of efforts is no norm; make it one.
+            quadratic = (modes * np.abs(energies)) @ modes.T
+            pull = quadratic @ np.linalg.solve(to_effort, effort) / epsilon
         hessian = jacobian.T @ jacobian + (self.effort_weight + self.step_weight) * quadratic
-        gradient = jacobian.T @ (delta.e - goal) + self.effort_weight * epsilon * (to_effort.T @ (Waa @ effort))
+        gradient = jacobian.T @ (root * (delta.e - goal)) + self.effort_weight * epsilon * pull
         # Order one: displacements are in units of the rate, the objective in units of its own curvature.
-        norm = float(np.trace(hessian)) or length**2
-        low = np.maximum(self.lower, command - self.rates)
-        high = np.minimum(self.upper, command + self.rates)
+        norm = float(np.trace(hessian)) or float(scale.mean()) ** 2
+
+        start = np.where(self.by_effort, delta.a, command)
+        low, high = np.maximum(self.lower, start - self.rates), np.minimum(self.upper, start + self.rates)
         # Standing still is allowed (unless it exceeds max_effort), so the problem is feasible, round-off or not.
-        box_low = np.minimum(low - delta.a, 0.0) / scale
+        box_low = np.maximum(np.minimum(low - delta.a, 0.0) / scale, -FAR)
         # A slack cable's reached displacement is not held by its command.
-        box_high = np.where(slack, 1e3, np.maximum(high - delta.a, 0.0) / scale)
+        box_high = np.where(slack, 1e3, np.minimum(np.maximum(high - delta.a, 0.0) / scale, FAR))
         effort_scale = np.abs(to_effort).sum(axis=1)
-        effort_low = np.where(self.unilateral, -np.maximum(effort, 0.0), -1e6 * effort_scale) / effort_scale
-        effort_high = np.clip((self.max_effort - effort) / effort_scale, effort_low, 1e6)
+        effort_low = np.maximum(-np.maximum(effort - self.min_effort, 0.0), -self.effort_rates)
+        effort_high = np.minimum(self.max_effort - effort, self.effort_rates)
+        # A commanded effort moves from its last command, which need not be the effort of the model.
+        least = np.clip(command - self.effort_rates, self.min_effort, self.max_effort)
+        most = np.clip(command + self.effort_rates, self.min_effort, self.max_effort)
+        effort_low = np.where(self.by_effort, least - effort, effort_low)
+        effort_high = np.where(self.by_effort, most - effort, effort_high)
+        effort_low = np.maximum(effort_low / effort_scale, -FAR)
+        effort_high = np.clip(effort_high / effort_scale, effort_low, FAR)
         arguments = (
             hessian / norm,
             gradient / norm,
@@ -133,14 +214,20 @@ class InverseQP:
             box_low,
             box_high,
         )
-        if self._qp is None:
-            self._qp = self._make_qp()
-            self._qp.init(*arguments)
+        # A warm start from a distant solution may not converge where a cold one does.
+        for warm in (True, False):
+            if self._qp is None or not warm:
+                self._qp = self._make_qp()
+                self._qp.init(*arguments)
+            else:
+                self._qp.update(*arguments)
+            self._qp.solve()
+            results = self._qp.results
+            if results.info.status == self._proxqp.QPSolverOutput.PROXQP_SOLVED:
+                break
         else:
-            self._qp.update(*arguments)
-        self._qp.solve()
-        results = self._qp.results
-        if results.info.status != self._proxqp.QPSolverOutput.PROXQP_SOLVED:
             self._qp = None
             raise ConvergenceError(f"ProxQP stopped with {results.info.status} for goal {goal.tolist()} m")
-        return np.clip(delta.a + results.x * scale, low, high)
+        self.displacement = delta.a + results.x * scale
+        self.effort = effort + to_effort @ results.x
+        return np.where(self.by_effort, np.clip(self.effort, least, most), np.clip(self.displacement, low, high))

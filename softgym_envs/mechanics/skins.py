@@ -20,10 +20,12 @@ class Skin:
     Attributes:
         points: the vertices, as points of frames (v of them).
         triangles: vertex indices, seen counter-clockwise from outside, shape (t, 3).
+        rigid: it is an object, not a part of the soft body.
     """
 
     points: EmbeddedPoints
     triangles: np.ndarray
+    rigid: bool = False
 
 
 def tube_skin(beam: Beam, nodes: np.ndarray, outline: np.ndarray) -> Skin:
@@ -55,4 +57,4 @@ def box_skin(row: int, half_extents: Sequence[float], nodes: np.ndarray) -> Skin
     points = EmbeddedPoints.in_frame(row, signs * np.asarray(half_extents), nodes)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Skin(points, triangles)
+    return Skin(points, triangles, rigid=True)

@@ -156,7 +156,7 @@ class PressFinger(FingerRobot):
     """A finger that presses a cube-shaped button, which resists with a constant force along -y.
 
     Args:
-        button_force: force of the button [N]. The published "10 N" pushes this finger back by 66 mm with its cables held
+        button_force: force of the button [N]. The published "10 N" pushes this finger back by 66 mm with cables held
             at zero and leaves it no stable way forward; 2 N is a fifth of it, and well inside its strength.
         **options: as for `FingerRobot`.
     """
@@ -279,8 +279,8 @@ class ThreeFingerGripper(FingerRobot):
     def reference_path(self, count: int = 20) -> np.ndarray:
         """Horizontal circle of the cube's centre, shape (count, 3).
 
-        With cables that may push it is the published one: radius 1.5 mm about the rest position. Cables that cannot push
-        only lift the cube: then its radius is 1 mm, about a centre 4 mm higher.
+        With cables that may push it is the published one: radius 1.5 mm about the rest position. Cables that cannot
+        push only lift the cube: then its radius is 1 mm, about a centre 4 mm higher.
         """
         angle = 2.0 * np.pi * np.arange(count) / count
         circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])

@@ -14,17 +14,20 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
+from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
-__all__ = ["BodyMesh", "mesh_geometry"]
+__all__ = ["BodyMesh", "mesh_geometry", "run_gmsh"]
 
 _FORMAT = 2
 _BROKEN = 3  # exit status of the meshing process when gmsh itself is missing or does not load
@@ -48,6 +51,39 @@ class BodyMesh:
     triangles: np.ndarray
     surfaces: np.ndarray
     origin: str = "meshed"
+
+    def surface(self) -> np.ndarray:
+        """Return the boundary triangles (k, 3), seen counter-clockwise from outside the material."""
+        corners = self.tetrahedra
+        edges = self.nodes[corners[:, 1:]] - self.nodes[corners[:, :1]]
+        corners = np.where((np.linalg.det(edges) < 0.0)[:, None], corners[:, [0, 2, 1, 3]], corners)
+        faces = corners[:, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3)
+        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        return faces[np.sort(first[count == 1])]
+
+    def cavities(
+        self, along: Sequence[float] = (0.0, 0.0, -1.0), across: Sequence[float] = (1.0, 0.0, 0.0)
+    ) -> list[np.ndarray]:
+        """Find the closed cavities: the connected pieces of the boundary but the outer hull.
+
+        Args:
+            along: cavities are ordered by the position of their middle in this direction, shape (3,),
+            across: and, where these agree within a hundredth of the body's size, in this one, shape (3,).
+
+        Returns:
+            Triangles (k, 3) of each cavity, seen counter-clockwise from inside it.
+        """
+        triangles = self.surface()
+        pairs = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
+        graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(self.nodes),) * 2)
+        _, piece = connected_components(graph, directed=False)
+        pieces = [triangles[piece[triangles[:, 0]] == number] for number in np.unique(piece[triangles[:, 0]])]
+        # Material lies inside the hull and outside the cavities: the volume within a cavity counts negative.
+        hollow = [part for part in pieces if enclosed_volume(self.nodes, part) < 0.0]
+        middle = np.array([self.nodes[np.unique(part)].mean(axis=0) for part in hollow]).reshape(-1, 3)
+        grid = 1e-2 * np.ptp(self.nodes, axis=0).max()
+        order = np.lexsort([middle @ np.asarray(across), np.round(middle @ np.asarray(along) / grid)])
+        return [hollow[k] for k in order]
 
     def save(self, path: Path) -> None:
         """Write to an npz file, atomically."""
@@ -115,19 +151,7 @@ def mesh_geometry(
                 path.unlink(missing_ok=True)  # a damaged cache entry is made again
     with tempfile.TemporaryDirectory() as scratch:
         output = Path(scratch) / "mesh.npz"
-        command = [sys.executable, "-m", "softgym_envs.robots.meshing", json.dumps({**request, "output": str(output)})]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-        try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, timeout=time_limit, env=environment, check=False
-            )
-        except subprocess.TimeoutExpired:
-            raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s for {parameters}") from None
-        if done.returncode == _BROKEN:
-            raise MeshingError(f"gmsh cannot be used: {done.stderr.strip().splitlines()[-1]}")
-        if done.returncode != 0:
-            reason = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
-            raise InfeasibleDesign(f"the geometry cannot be meshed for {parameters}: {reason}")
+        run_gmsh({**request, "output": str(output)}, time_limit=time_limit)
         mesh = BodyMesh.load(output)
     try:
         mesh.save(path)
@@ -136,8 +160,34 @@ def mesh_geometry(
     return mesh
 
 
-def _mesh_here(request: dict) -> BodyMesh:
-    """Draw and mesh in this process."""
+def run_gmsh(request: dict, *, time_limit: float) -> None:
+    """Draw a geometry in a process of its own and write it to a file.
+
+    Args:
+        request: ``build`` (``module:function``), its ``parameters``, ``mesh_size`` [m] and ``output``: a path that
+            ends with .npz (a `BodyMesh`), .step (the exact shape, in mm) or .stl (its surface, in mm).
+        time_limit: wall-clock limit of the process [s].
+
+    Raises:
+        InfeasibleDesign: if the geometry cannot be drawn or meshed, or takes too long.
+        MeshingError: if gmsh cannot be imported.
+    """
+    command = [sys.executable, "-m", "softgym_envs.robots.meshing", json.dumps(request)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    parameters = request["parameters"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=time_limit, env=environment, check=False)
+    except subprocess.TimeoutExpired:
+        raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s for {parameters}") from None
+    if done.returncode == _BROKEN:
+        raise MeshingError(f"gmsh cannot be used: {done.stderr.strip().splitlines()[-1]}")
+    if done.returncode != 0:
+        reason = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
+        raise InfeasibleDesign(f"the geometry cannot be meshed for {parameters}: {reason}")
+
+
+def _draw_here(request: dict) -> None:
+    """Draw in this process, mesh where the output asks for it, and write the output."""
     import gmsh
 
     module, _, function = request["build"].partition(":")
@@ -161,6 +211,16 @@ def _mesh_here(request: dict) -> BodyMesh:
         volumes = gmsh.model.getEntities(3)
         if len(volumes) != 1:
             raise ValueError(f"the geometry has {len(volumes)} volumes, expected one")
+        output = Path(request["output"])
+        if output.suffix != ".npz":
+            if output.suffix == ".stl":
+                gmsh.option.setNumber("Mesh.MeshSizeMin", 0.0)
+                gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", 24)  # edges per turn: round parts look round
+                gmsh.option.setNumber("Mesh.Binary", 1)
+                gmsh.model.mesh.generate(2)
+                gmsh.model.mesh.setOutwardOrientation(volumes[0][1])
+            gmsh.write(str(output))
+            return
         gmsh.model.mesh.generate(3)
         tags, coordinates, _ = gmsh.model.mesh.getNodes()
         number = np.zeros(int(tags.max()) + 1, dtype=np.int64)
@@ -177,12 +237,12 @@ def _mesh_here(request: dict) -> BodyMesh:
         used, renumbered = np.unique(tetrahedra, return_inverse=True)
         back = np.full(len(nodes), -1)
         back[used] = np.arange(len(used))
-        return BodyMesh(
+        BodyMesh(
             nodes=nodes[used],
             tetrahedra=renumbered.reshape(tetrahedra.shape),
             triangles=back[np.concatenate(triangles)],
             surfaces=np.concatenate(surfaces),
-        )
+        ).save(output)
     finally:
         gmsh.finalize()
 
@@ -190,7 +250,7 @@ def _mesh_here(request: dict) -> BodyMesh:
 if __name__ == "__main__":
     arguments = json.loads(sys.argv[1])
     try:
-        _mesh_here(arguments).save(Path(arguments["output"]))
+        _draw_here(arguments)
     except (ImportError, OSError) as problem:  # OSError: a system library that gmsh needs is missing
         print(problem, file=sys.stderr)
         sys.exit(_BROKEN)

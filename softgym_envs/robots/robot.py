@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.meshing import BodyMesh
 from softgym_envs.robots.morphing import Feature, Morpher
 
-__all__ = ["Actuator", "Robot"]
+__all__ = ["Actuator", "MeshedRobot", "Robot"]
 
 
 @dataclass(frozen=True)
@@ -64,30 +64,10 @@ class Robot(ABC):
     effort_scale: np.ndarray
     stiffness_variable: str | None = None
 
-    #: Smallest element quality, relative to the reference mesh, that a moved mesh may have before it is remeshed.
-    quality_bound = 0.3
-
-    def __init__(
-        self,
-        *,
-        mesh_size: float,
-        meshing: str = "morph",
-        material: str = "corotational",
-        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> None:
-        if meshing not in ("morph", "remesh"):
-            raise ValueError(f"meshing = {meshing!r} is unknown; allowed: 'morph', 'remesh'")
-        if not (isinstance(mesh_size, int | float) and 0.0 < mesh_size < np.inf):
-            raise ValueError(f"robot '{self.name}': mesh_size = {mesh_size!r} m must be positive: a finite number")
-        if material not in MATERIALS:
-            raise ValueError(f"unknown material '{material}'; allowed: {', '.join(MATERIALS)}")
+    def __init__(self, *, gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         if len(gravity) != 3 or not np.isfinite(gravity).all():
             raise ValueError(f"gravity must be three finite numbers [m/s2], got {gravity!r}")
-        self.material = material
         self.gravity = gravity
-        self.mesh_size = float(mesh_size)
-        self.meshing = meshing
-        self._morpher: Morpher | None = None
 
     # -- what a robot defines ---------------------------------------------------------------------------------------
 
@@ -102,58 +82,18 @@ class Robot(ABC):
         """The options that change its mechanics, JSON-serialisable; weights are valid for one signature."""
 
     @abstractmethod
-    def mesh(self, design: Mapping[str, float]) -> BodyMesh:
-        """Mesh the body of a complete design anew (or from the cache)."""
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        """Make the model of a complete design: bodies, boundary conditions, actuators, effectors, contacts."""
 
-    @abstractmethod
-    def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
-        """Geometric features that carry the boundary of the body, by name."""
-
-    @abstractmethod
-    def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
-        """Make the model of a meshed body: material, boundary conditions, actuators, effectors, contacts."""
-
-    @property
-    def reference_design(self) -> dict[str, float]:
-        """The design whose mesh is moved to all others: the baseline, or one nearer the middle of the box."""
-        return self.design_space.baseline
-
-    def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
-        """Rough displacement [m] (n, 3) of the reference nodes to a design; it only starts the mesh motion."""
-        return np.zeros_like(nodes)
-
-    # -- what follows from it ---------------------------------------------------------------------------------------
-
-    def body(self, design: Mapping[str, float] | None = None) -> BodyMesh:
-        """Return the mesh of a design: the reference mesh moved, or a new one when its quality falls too low.
+    def reference_path(self, count: int = 30) -> np.ndarray:
+        """Published trajectory of the first effector [m], shape (count, 3), where tracking is compared.
 
         Raises:
-            DesignError: for a malformed design.
-            InfeasibleDesign: if the geometry cannot exist.
+            ValueError: if the robot has none.
         """
-        complete = self.design_space.complete(design)
-        if self.meshing == "remesh":
-            return self.mesh(complete)
-        if self._morpher is None:
-            reference = self.reference_design
-            self._morpher = Morpher(self.mesh(reference), self.features(reference))
-        base = self._morpher.mesh
-        nodes = self._morpher.move(self.features(complete), self.guess(base.nodes, complete))
-        if self._morpher.quality(nodes) >= self.quality_bound:
-            return BodyMesh(nodes, base.tetrahedra, base.triangles, base.surfaces, "morphed")
-        fresh = self.mesh(complete)
-        return BodyMesh(fresh.nodes, fresh.tetrahedra, fresh.triangles, fresh.surfaces, "remeshed")
+        raise ValueError(f"robot '{self.name}' has no reference path: give a path of your own")
 
-    def reference_element(self, mesh: BodyMesh, point: np.ndarray) -> np.ndarray | None:
-        """Element nearest to a point [m] (3,) of the reference body, as a hint for points outside a moved mesh.
-
-        Returns:
-            Its index, shape (1,), or None if ``mesh`` is not the reference mesh moved.
-        """
-        if mesh.origin != "morphed" or self._morpher is None:
-            return None
-        base = self._morpher.mesh
-        return EmbeddedPoints(point, base.nodes, base.tetrahedra).elements
+    # -- what follows from it ---------------------------------------------------------------------------------------
 
     def build(self, design: Mapping[str, float] | None = None) -> MechanicalModel:
         """Return the mechanical model of a design; missing variables take their baseline.
@@ -163,9 +103,8 @@ class Robot(ABC):
             InfeasibleDesign: if the geometry cannot exist.
         """
         complete = self.design_space.complete(design)
-        mesh = self.body(complete)
         try:
-            return self.equip(mesh, complete)
+            return self.assemble(complete)
         except ValueError as error:
             shown = {name: round(value, 9) for name, value in complete.items()}
             raise InfeasibleDesign(f"robot '{self.name}' cannot be built for {shown}: {error}") from error
@@ -184,3 +123,108 @@ class Robot(ABC):
     def rates(self) -> np.ndarray:
         """Largest change of the command per control step, shape (n_a,)."""
         return np.array([actuator.rate for actuator in self.actuators])
+
+
+class MeshedRobot(Robot):
+    """A robot whose body is one solid from gmsh; its mesh is moved over the design space.
+
+    Args:
+        mesh_size: target edge length [m].
+        meshing: ``"morph"`` moves the reference mesh, ``"remesh"`` meshes every design anew.
+        material: name of a material of `softgym_envs.mechanics.materials`.
+        gravity: acceleration [m/s2], shape (3,).
+    """
+
+    #: Smallest element quality, relative to the reference mesh, that a moved mesh may have before it is remeshed.
+    quality_bound = 0.3
+
+    def __init__(
+        self,
+        *,
+        mesh_size: float,
+        meshing: str = "morph",
+        material: str = "corotational",
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        if meshing not in ("morph", "remesh"):
+            raise ValueError(f"meshing = {meshing!r} is unknown; allowed: 'morph', 'remesh'")
+        if not (isinstance(mesh_size, int | float) and 0.0 < mesh_size < np.inf):
+            raise ValueError(f"robot '{self.name}': mesh_size = {mesh_size!r} m must be positive: a finite number")
+        if material not in MATERIALS:
+            raise ValueError(f"unknown material '{material}'; allowed: {', '.join(MATERIALS)}")
+        super().__init__(gravity=gravity)
+        self.material = material
+        self.mesh_size = float(mesh_size)
+        self.meshing = meshing
+        self._morpher: Morpher | None = None
+
+    # -- what a robot defines ---------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def mesh(self, design: Mapping[str, float]) -> BodyMesh:
+        """Mesh the body of a complete design, or the part of it that `unfold` completes, anew (or from the cache)."""
+
+    @abstractmethod
+    def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
+        """Geometric features that carry the boundary of what `mesh` returns, by name."""
+
+    def unfold(self, part: BodyMesh) -> BodyMesh:
+        """Return the whole body; a symmetric robot meshes a part of it and mirrors that."""
+        return part
+
+    @abstractmethod
+    def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
+        """Make the model of a meshed body: material, boundary conditions, actuators, effectors, contacts."""
+
+    @property
+    def reference_design(self) -> dict[str, float]:
+        """The design whose mesh is moved to all others: the baseline, or one nearer the middle of the box."""
+        return self.design_space.baseline
+
+    def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
+        """Rough displacement [m] (n, 3) of the reference nodes to a design; it only starts the mesh motion."""
+        return np.zeros_like(nodes)
+
+    # -- what follows from it ---------------------------------------------------------------------------------------
+
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        return self.equip(self.body(design), design)
+
+    def body(self, design: Mapping[str, float] | None = None) -> BodyMesh:
+        """Return the mesh of a design: the reference mesh moved, or a new one when its quality falls too low.
+
+        Raises:
+            DesignError: for a malformed design.
+            InfeasibleDesign: if the geometry cannot exist.
+        """
+        complete = self.design_space.complete(design)
+        if self.meshing == "remesh":
+            return self.unfold(self.mesh(complete))
+        if self._morpher is None:
+            reference = self.reference_design
+            self._morpher = Morpher(self.mesh(reference), self.features(reference))
+        base = self._morpher.mesh
+        nodes = self._morpher.move(self.features(complete), self.guess(base.nodes, complete))
+        if self._morpher.quality(nodes) >= self.quality_bound:
+            return self.unfold(replace(base, nodes=nodes, origin="morphed"))
+        return self.unfold(replace(self.mesh(complete), origin="remeshed"))
+
+    def reference_nodes(self, mesh: BodyMesh) -> np.ndarray:
+        """Positions [m] (n, 3) that the nodes have in the reference body, or in ``mesh`` if it is no moved one.
+
+        What is chosen by them stays the same as the mesh moves.
+        """
+        if mesh.origin != "morphed" or self._morpher is None:
+            return mesh.nodes
+        return self.unfold(self._morpher.mesh).nodes
+
+    def reference_element(self, mesh: BodyMesh, point: np.ndarray) -> np.ndarray | None:
+        """Element nearest to a point [m] (3,) of the reference body, as a hint for points outside a moved mesh.
+
+        Returns:
+            Its index, shape (1,), or None if ``mesh`` is not the reference mesh moved.
+        """
+        if mesh.origin != "morphed" or self._morpher is None:
+            return None
+        base = self.unfold(self._morpher.mesh)
+        return EmbeddedPoints(point, base.nodes, base.tetrahedra).elements

@@ -12,10 +12,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.mechanics.constraints import Point
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.morphing import Cone, Cylinder, Feature, Plane
-from softgym_envs.robots.robot import Actuator, Robot
+from softgym_envs.robots.robot import Actuator, MeshedRobot
 
 __all__ = ["SoftFinger"]
 
@@ -28,6 +29,8 @@ BELLOW_HEIGHT = 8.0
 PLATEAU_HEIGHT = 3.0
 WALL_THICKNESS = 3.0
 CORK_THICKNESS = 3.0
+# Not part of the shape: no upper-case constant of the drawing, by which meshes are known.
+_contact_radius = 2.0
 
 
 def draw_finger(length: float, height: float, joint_height: float, slope: float) -> None:
@@ -75,7 +78,7 @@ def draw_finger(length: float, height: float, joint_height: float, slope: float)
     occ.cut(body, hollows)
 
 
-class SoftFinger(Robot):
+class SoftFinger(MeshedRobot):
     """Cable-driven soft finger.
 
     Args:
@@ -87,6 +90,7 @@ class SoftFinger(Robot):
         material: name of a material of `softgym_envs.mechanics.materials`.
         unilateral: cables cannot push (default). False reproduces scenes whose cables can.
         gravity: acceleration [m/s2]; the condensed-model work of the thesis has none.
+        contacts: add three contact points (role ``c``) on the front of the last segment (thesis 4.3.2).
     """
 
     name = "finger"
@@ -102,6 +106,7 @@ class SoftFinger(Robot):
         material: str = "corotational",
         unilateral: bool = True,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        contacts: bool = False,
     ) -> None:
         if cables not in (1, 2):
             raise ValueError(f"cables = {cables!r} is unknown; allowed: 1, 2")
@@ -110,6 +115,7 @@ class SoftFinger(Robot):
         super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity)
         self.cables = cables
         self.unilateral = unilateral
+        self.contacts = contacts
         self.slope = math.radians(45.0 if cables == 2 else 30.0)
         self.cable_height = 15.33e-3 if cables == 2 else 17.75e-3
         self.cable_offsets = (-5.0e-3, 5.0e-3) if cables == 2 else (0.0,)
@@ -128,7 +134,7 @@ class SoftFinger(Robot):
             DesignVariable("poisson_ratio", 0.30, 0.499, 0.30 if cables == 2 else 0.47, "1", "0.5 is incompressible"),
         )
         self.stiffness_variable = None if any(gravity) else "young_modulus"
-        self.effector_rest = self._tip(self.design_space.baseline)
+        self.effector_rest = self.tip(self.design_space.baseline)
         self.effort_scale = np.full(cables, 20.0)
         self.actuators = tuple(
             Actuator(f"cable_{i + 1}", 0.0, 0.020, 0.001, unilateral=unilateral) for i in range(cables)
@@ -148,6 +154,8 @@ class SoftFinger(Robot):
             "meshing": self.meshing,
             "material": self.material,
             "gravity": list(self.gravity),
+            # Weights from before there were contacts hold no such key.
+            **({"contacts": True} if self.contacts else {}),
         }
 
     def mesh(self, design: Mapping[str, float]) -> BodyMesh:
@@ -191,8 +199,31 @@ class SoftFinger(Robot):
         return features
 
     @staticmethod
-    def _tip(design: Mapping[str, float]) -> np.ndarray:
+    def clamped(mesh: BodyMesh) -> np.ndarray:
+        """Nodes of the flange, shape (n,)."""
+        return mesh.nodes[:, 2] >= -(FLANGE + 1e-3) * 1e-3
+
+    @staticmethod
+    def tip(design: Mapping[str, float]) -> np.ndarray:
+        """Return the middle of the tip at rest [m], shape (3,)."""
         return np.array([0.0, design["height"] / 2, -3.0 * design["length"]])
+
+    def routes(self, design: Mapping[str, float]) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Pull point (3,) and guides (6, 3) [m] of each cable: past the two notches, at both of their edges."""
+        length = design["length"]
+        offset = (self.cable_height - design["joint_height"]) * math.tan(self.slope)
+        stations = [s for k in range(3) for s in (-k * length - offset, -(k + 1) * length + offset)]
+        return [
+            (np.array([x, self.cable_height, 0.0]), np.array([[x, self.cable_height, z] for z in stations]))
+            for x in self.cable_offsets
+        ]
+
+    @staticmethod
+    def contact_points(design: Mapping[str, float]) -> np.ndarray:
+        """Three points on a circle in the middle of the last segment's front [m], shape (3, 3)."""
+        angles = math.pi / 2 + 2.0 * math.pi / 3 * np.arange(3)
+        circle = _contact_radius * 1e-3 * np.column_stack([np.cos(angles), np.zeros(3), np.sin(angles)])
+        return np.array([0.0, design["height"], -2.5 * design["length"]]) + circle
 
     def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
         """Stretch along z with the segment length."""
@@ -205,21 +236,39 @@ class SoftFinger(Robot):
         model = MechanicalModel.from_mesh(
             mesh.nodes,
             mesh.tetrahedra,
-            fixed=mesh.nodes[:, 2] >= -(FLANGE + 1e-3) * 1e-3,
+            fixed=self.clamped(mesh),
             material=self.material,
             young_modulus=design["young_modulus"],
             poisson_ratio=design["poisson_ratio"],
             density=1100.0,
             gravity=self.gravity,
         )
-        length = design["length"]
-        offset = (self.cable_height - design["joint_height"]) * math.tan(self.slope)
-        stations = [s for k in range(3) for s in (-k * length - offset, -(k + 1) * length + offset)]
-        for actuator, x in zip(self.actuators, self.cable_offsets, strict=True):
-            points = np.array([[x, self.cable_height, z] for z in stations])
-            pull_point = np.array([x, self.cable_height, 0.0])
+        for actuator, (pull_point, points) in zip(self.actuators, self.routes(design), strict=True):
             model.add_cable(actuator.name, points, pull_point, unilateral=self.unilateral)
         # The effector floats in front of the slanted tip, outside the body.
-        hint = self.reference_element(mesh, self._tip(self.reference_design))
-        model.add_effector("tip", self._tip(design), hint=hint)
+        hint = self.reference_element(mesh, self.tip(self.reference_design))
+        model.add_effector("tip", self.tip(design), hint=hint)
+        if self.contacts:
+            reference = self.contact_points(self.reference_design)
+            for i, point in enumerate(self.contact_points(design)):
+                embedding = model.embed(point, self.reference_element(mesh, reference[i]))
+                model.add("c", Point(f"contact_{i + 1}", embedding))
         return model
+
+    def reference_path(self, count: int = 25) -> np.ndarray:
+        """Closing motion of the thesis (Fig. 4.3): the tip bends about the base by up to 60 degrees, shape (count, 3).
+
+        The radius shrinks as that of the bending finger does, ``1 - 0.7 (theta / 90 deg)^2`` of the rest length (within
+        2 mm of the baseline's workspace up to 45 degrees); the end of the path is outside the workspace, as in the
+        thesis.
+        """
+        theta = np.linspace(0.0, np.pi / 3, count)
+        radius = self.size * (1.0 - 0.7 * (theta / (0.5 * np.pi)) ** 2)
+        offset = self.effector_rest[1]
+        return np.column_stack(
+            [
+                np.zeros(count),
+                offset * np.cos(theta) + radius * np.sin(theta),
+                -radius * np.cos(theta) + offset * np.sin(theta),
+            ]
+        )

@@ -9,7 +9,7 @@ import numpy as np
 from softgym_envs.backends.backend import State
 from softgym_envs.robots.robot import Robot
 from softgym_envs.viewer.scene import STUB, Scene
-from softgym_envs.viewer.surface import ShapeFinder, cable_lines
+from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
 __all__ = ["ImageRenderer", "render_bodies", "render_body"]
 
@@ -104,7 +104,7 @@ class ImageRenderer:
             for command in (None, *np.where(np.eye(len(upper), dtype=bool), upper, lower), upper):
                 x = self._shapes.at(baseline, command)
                 lines = cable_lines(model, x, self._shapes.state, stub=STUB * self.robot.size)
-                seen += [x, *lines.values()]
+                seen += [BodySurface(model).points(x), *lines.values()]
             self._scene = Scene(self.robot, self.size, np.concatenate(seen))
         return self._scene
 

@@ -165,6 +165,7 @@ class RolloutRecorder:
         if new:
             colors = np.tile(np.array(COLORS["body"], dtype=np.uint8), (len(points), 1))
             colors[self._surface.triangles[self._surface.clamped]] = COLORS["clamp"]
+            colors[self._surface.triangles[self._surface.rigid]] = COLORS["object"]
             mesh = rerun.Mesh3D(
                 vertex_positions=points,
                 vertex_normals=normals,

@@ -9,7 +9,7 @@ import numpy as np
 from softgym_envs.backends.backend import State
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.robot import Robot
-from softgym_envs.viewer.surface import BodySurface, cable_lines
+from softgym_envs.viewer.surface import BodySurface, cable_lines, surface_kinds
 
 if TYPE_CHECKING:
     import pyvista
@@ -24,6 +24,7 @@ COLORS: dict[str, Color] = {
     "shadow": (225, 229, 237),
     "body": (246, 216, 190),
     "clamp": (92, 99, 112),
+    "object": (150, 172, 205),
     "edge": (120, 84, 60),
     "ghost": (120, 140, 180),
     "cable low": (245, 166, 35),
@@ -255,13 +256,14 @@ class Scene:
             self._model = model
             self._surface = BodySurface(model)
             self._skin = _surface_mesh(self._surface)
-            colors = np.array([COLORS["body"], COLORS["clamp"]], dtype=np.uint8)[self._surface.clamped.astype(int)]
+            kinds = [COLORS["body"], COLORS["clamp"], COLORS["object"]]
+            colors = np.array(kinds, dtype=np.uint8)[surface_kinds(self._surface)]
             self._skin.cell_data["rgb"] = colors
             self._body.show(self._skin)
             self._body.mapper.set_scalars(colors, "rgb", rgb=True, preference="cell")
             self._flat = _surface_mesh(self._surface)
             self._shadow.show(self._flat)
-            self._seams = _line_mesh(np.zeros((len(model.nodes), 3)), self._surface.edges)
+            self._seams = _line_mesh(np.zeros_like(self._surface.shape(x)), self._surface.edges)
             self._edges.show(self._seams)
         points = self._surface.points(x)
         _move(self._skin, points, self._surface.normals(points))
@@ -271,7 +273,7 @@ class Scene:
         flat[:, 0] = self._wall - 2e-3 * self._length
         _move(self._flat, flat)
         # Just before the skin, towards the camera.
-        _move(self._seams, x + 2e-3 * self._length * _unit(_CAMERA))
+        _move(self._seams, self._surface.shape(x) + 2e-3 * self._length * _unit(_CAMERA))
 
     def set_ghost(self, model: MechanicalModel | None, x: np.ndarray | None = None) -> None:
         """Draw another body at node positions [m] (n, 3) as a pale shape behind everything, or none for None."""

@@ -26,6 +26,7 @@ __all__ = [
     "cable_lines",
     "commanded_displacement",
     "slacken",
+    "surface_kinds",
 ]
 
 
@@ -43,29 +44,45 @@ def boundary_triangles(tetrahedra: np.ndarray) -> np.ndarray:
 class BodySurface:
     """Boundary of a body, cut along its sharp edges so that everything else can be shaded smoothly.
 
+    Drawn are the solids and the skins of beams and rigid parts. Points of the surface are numbered as in `shape`.
+
     Args:
-        model: the body; element blocks other than tetrahedra are not drawn.
+        model: the body.
         feature_angle: an edge is sharp if its two faces differ by more at rest [rad].
 
     Attributes:
-        nodes: node of each surface vertex, shape (v,); a node on a sharp edge has several vertices.
+        faces: points of the triangles, shape (t, 3).
+        nodes: point of each surface vertex, shape (v,); a point on a sharp edge has several vertices.
         triangles: corner vertices, shape (t, 3).
-        edges: node pairs of the sharp edges, shape (s, 2).
-        clamped: triangles whose nodes are all held, shape (t,).
+        edges: point pairs of the sharp edges, shape (s, 2).
+        clamped: triangles whose points are all held, shape (t,).
+        rigid: triangles of rigid objects, shape (t,).
     """
 
     def __init__(self, model: MechanicalModel, feature_angle: float = np.pi / 6) -> None:
-        solids = [block.connectivity for block in model.blocks if block.connectivity.shape[1] == 4]
-        corners = boundary_triangles(np.concatenate(solids)) if solids else np.empty((0, 3), dtype=np.int64)
-        self.clamped = model.fixed[corners].all(axis=1)
+        self._skins = [skin.points for skin in model.skins]
+        rest = self.shape(model.nodes)
+        parts, held = [np.empty((0, 3), dtype=np.int64)], [model.fixed]
+        if model.solids:
+            parts.append(boundary_triangles(np.concatenate([block.corners for block in model.solids])))
+        start = len(model.nodes)
+        for skin in model.skins:
+            parts.append(skin.triangles + start)
+            held.append(model.fixed[skin.points.node_ids[:, 0]])
+            start += len(skin.points.node_ids)
+        corners = self.faces = np.concatenate(parts)
+        self.clamped = np.concatenate(held)[corners].all(axis=1)
+        solid = len(corners) - sum(len(skin.triangles) for skin in model.skins)
+        flags = [np.full(len(skin.triangles), skin.rigid) for skin in model.skins]
+        self.rigid = np.concatenate([np.zeros(solid, dtype=bool), *flags])
 
         # Half edges (t, 3) sorted by their node pair: the two faces of an edge are neighbours in that order.
         tails, heads = corners, np.roll(corners, -1, axis=1)
-        key = (np.minimum(tails, heads) * len(model.nodes) + np.maximum(tails, heads)).ravel()
+        key = (np.minimum(tails, heads) * len(rest) + np.maximum(tails, heads)).ravel()
         order = np.argsort(key, kind="stable")
         pairs = np.flatnonzero(key[order][1:] == key[order][:-1])
         one, other = order[pairs], order[pairs + 1]
-        normals = _face_normals(model.nodes, corners)
+        normals = _face_normals(rest, corners)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         smooth = np.einsum("ij,ij->i", normals[one // 3], normals[other // 3]) > np.cos(feature_angle)
         self.edges = np.column_stack([tails.ravel(), heads.ravel()])[one[~smooth]]
@@ -81,9 +98,13 @@ class BodySurface:
         self.nodes = np.empty(vertex.max(initial=-1) + 1, dtype=np.int64)
         self.nodes[vertex] = corners.ravel()
 
+    def shape(self, x: np.ndarray) -> np.ndarray:
+        """Return all points [m] (p, 3) at rows ``x`` [m] (n, 3): the rows, then the points of the skins."""
+        return np.vstack([x, *(points.positions(x) for points in self._skins)])
+
     def points(self, x: np.ndarray) -> np.ndarray:
-        """Return the vertices [m] (v, 3) at node positions ``x`` [m] (n, 3)."""
-        return x[self.nodes]
+        """Return the vertices [m] (v, 3) at rows ``x`` [m] (n, 3)."""
+        return self.shape(x)[self.nodes]
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """Return unit normals (v, 3) at vertices [m] (v, 3): area-weighted means of the faces around them."""
@@ -91,6 +112,11 @@ class BodySurface:
         corners = self.triangles.ravel()
         total = np.column_stack([np.bincount(corners, faces[:, d], minlength=len(points)) for d in range(3)])
         return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+
+
+def surface_kinds(surface: BodySurface) -> np.ndarray:
+    """Return what each triangle belongs to, shape (t,): 0 the body, 1 its clamp, 2 an object."""
+    return np.where(surface.rigid, 2, surface.clamped.astype(int))
 
 
 def _face_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

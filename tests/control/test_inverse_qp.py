@@ -164,6 +164,181 @@ def test_the_answer_does_not_depend_on_units(linear):
     np.testing.assert_allclose(controller.solve(kilo, 1e3 * goal, 1e3 * linear.command), 1e3 * metres, atol=1e-6)
 
 
+# -- efforts, weights and other units -------------------------------------------------------------------------------
+
+
+def test_commands_in_effort_follow_the_normal_equations(linear):
+    """The same answer as in displacement, given as efforts."""
+    linear.go(np.array([0.010, 0.006, 0.005]))
+    goal = linear.effector + np.array([2e-4, -1e-4, 1e-4])
+    displacement = linear.controller(effort_weight=1e-2).solve(linear.model, goal, linear.command)
+    controller = linear.controller(effort_weight=1e-2, mode="effort")
+    effort = controller.solve(linear.model, goal, linear.model.lambda_.a)
+    Waa = linear.W[:3, :3]
+    np.testing.assert_allclose(Waa @ effort, displacement, rtol=1e-9)
+    np.testing.assert_allclose(controller.effort, effort, rtol=1e-12)
+    np.testing.assert_allclose(controller.displacement, Waa @ effort, rtol=1e-9)
+
+
+def test_efforts_respect_bounds_and_rates_in_both_modes(linear):
+    goal = linear.rest + 40.0 * linear.W[3:, 0]
+    low, high, rates = np.array([0.2, 0.1, 0.0]), np.array([3.0, 2.0, 2.0]), np.array([0.25, 0.5, 0.1])
+    options = {"min_effort": low, "max_effort": high, "effort_rates": rates}
+    by_effort = InverseQP(linear.lower, linear.upper, linear.rates, linear.unilateral, mode="effort", **options)
+    by_displacement = linear.controller(**options)
+    for controller in (by_effort, by_displacement):
+        linear.go(linear.W[:3, :3] @ low)
+        for _ in range(40):
+            before = linear.model.lambda_.a
+            command = before if controller is by_effort else linear.command
+            answer = controller.solve(linear.model, goal, command)
+            linear.go(linear.W[:3, :3] @ answer if controller is by_effort else answer)
+            after = linear.model.lambda_.a
+            assert (np.abs(after - before) <= rates + 1e-5).all()
+            assert ((after >= low - 1e-5) & (after <= high + 1e-5)).all()
+        assert after[0] == pytest.approx(3.0, abs=1e-3)
+
+
+def test_a_command_outside_its_bounds_is_brought_back(linear):
+    controller = InverseQP(
+        linear.lower,
+        linear.upper,
+        np.full(3, np.inf),
+        linear.unilateral,
+        max_effort=[2.0] * 3,
+        effort_rates=[0.5] * 3,
+        mode="effort",
+    )
+    linear.go(linear.W[:3, :3] @ [4.0, 1.0, 1.0])
+    assert controller.solve(linear.model, linear.effector, linear.model.lambda_.a)[0] == pytest.approx(2.0)
+
+
+def test_modes_may_differ_between_actuators(linear):
+    """The first cable in displacement, the others in effort."""
+    linear.go(np.array([0.010, 0.006, 0.005]))
+    goal = linear.effector + np.array([2e-4, -1e-4, 1e-4])
+    controller = InverseQP(
+        linear.lower,
+        linear.upper,
+        linear.rates,
+        linear.unilateral,
+        effort_rates=[5.0] * 3,
+        mode=["displacement", "effort", "effort"],
+    )
+    effort = linear.model.lambda_.a
+    answer = controller.solve(linear.model, goal, np.array([linear.command[0], effort[1], effort[2]]))
+    np.testing.assert_allclose(answer, [controller.displacement[0], *controller.effort[1:]], rtol=1e-9)
+    np.testing.assert_allclose(linear.W[:3, :3] @ controller.effort, controller.displacement, atol=1e-10)
+
+
+def test_goal_weights_choose_the_coordinates(linear):
+    """With only y weighed the other goals do not matter; with two that conflict the heavier wins."""
+    controllers = [linear.controller(goal_weights=[0.0, 1.0, 0.0]) for _ in range(2)]
+    goal = linear.rest + [0.0, 0.003, 0.0]
+    answers = [
+        controller.solve(linear.model, goal + far, linear.command)
+        for controller, far in zip(controllers, (np.zeros(3), np.array([5.0, 0.0, -7.0])), strict=True)
+    ]
+    np.testing.assert_array_equal(*answers)
+    linear.follow(controllers[0], goal)
+    assert linear.effector[1] == pytest.approx(goal[1], abs=1e-6)
+    # A point that no command reaches: the error moves to the light coordinates.
+    goal = linear.rest + np.array([0.05, 0.01, 0.02])
+    errors = []
+    for weights in (None, [1.0, 1.0, 100.0]):
+        linear.go(np.zeros(3))
+        linear.follow(linear.controller(goal_weights=weights), goal)
+        errors.append(abs(linear.effector[2] - goal[2]))
+    assert errors[1] < 0.2 * errors[0]
+
+
+def rescaled(model, length, actuator):
+    """The model with effectors in ``length`` units and each actuator's displacement in its own; energy is kept."""
+    unit = np.concatenate([actuator, np.full(model.free.size - len(actuator), length)])
+    return CondensedModel(unit[:, None] * model.compliance * unit, unit * model.free, model.effort / unit, model.roles)
+
+
+@pytest.mark.parametrize(
+    "units",
+    [[1.0, 1.0, 1.0], [1e3, 1e3, 1e3], [3e-6, 3e-6, 3e-6], [1.0, 3e-6, 1e9], [3e-6, 1.0, 1e3]],
+    ids=["SI", "mm", "chambers in m3 and Pa", "cable, chamber and mm3", "chamber, cable and mm"],
+)
+@pytest.mark.parametrize("mode", ["displacement", "effort"])
+@pytest.mark.parametrize("length", [1.0, 1e3])
+def test_mixed_units_give_the_same_answer(linear, units, mode, length):
+    """delta from 1e-8 m3 with efforts of 1e5 Pa to mm: every bound and rate active somewhere on the way."""
+    units = np.array(units)
+    linear.go(np.array([0.010, 0.006, 0.005]))
+    present = linear.command if mode == "displacement" else linear.model.lambda_.a
+    to_command = np.ones(3) if mode == "displacement" else None
+    rates = np.array([0.002, 0.001, 0.003])
+    for step in ([2e-4, -1e-4, 1e-4], [0.004, 0.002, 0.003], [-0.02, 0.01, 0.0]):
+        answers = []
+        for k, e in ((np.ones(3), 1.0), (units, length)):
+            controller = InverseQP(
+                k * linear.lower,
+                k * linear.upper,
+                k * rates,
+                linear.unilateral,
+                max_effort=np.array([9.0, 7.0, 8.0]) / k,
+                effort_rates=np.array([2.0, 2.5, 3.0]) / k,
+                mode=mode,
+            )
+            scale = k if to_command is not None else 1.0 / k
+            model = rescaled(linear.model, e, k)
+            answers.append(controller.solve(model, e * (linear.effector + step), scale * present) / scale)
+        np.testing.assert_allclose(answers[1], answers[0], rtol=1e-6)
+
+
+def test_a_state_that_is_stable_only_while_held_is_no_trap(linear):
+    """W_aa indefinite: the regularisation stays convex and the goal is reached."""
+    Waa = np.array([[1e-3, 0.0, 0.0], [0.0, -2e-3, 0.0], [0.0, 0.0, 1e-3]])
+    Wea = np.array([[2e-3, 1e-3, 0.0], [0.0, 2e-3, 1e-3], [1e-3, 0.0, 2e-3]])
+    W = np.block([[Waa, Wea.T], [Wea, 1e-2 * np.eye(3)]])
+    model = CondensedModel(W, np.zeros(6), np.append(np.ones(3), np.zeros(3)), linear.model.roles)
+    bound = np.full(3, 0.1)
+    controller = InverseQP(-bound, bound, 0.02 * bound, np.zeros(3, dtype=bool), effort_weight=0.0, step_weight=1e-6)
+    step = Waa @ [0.3, -0.2, 0.4]
+    goal = model.delta.e + Wea @ [0.3, -0.2, 0.4]
+    np.testing.assert_allclose(controller.solve(model, goal, model.delta.a), model.delta.a + step, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"mode": "pressure"}, "mode must be"),
+        ({"mode": ["effort"]}, "mode must be"),
+        ({"effort_rates": [1.0, 0.0, 1.0]}, "effort_rates must be positive"),
+        ({"goal_weights": [1.0, -1.0, 0.0]}, "goal_weights must be finite and not negative"),
+        ({"max_effort": [-1.0, 1.0, 1.0]}, "bounds of effort must be 3 pairs"),
+        ({"max_effort": [1.0, 1.0]}, "bounds of effort must be 3 pairs"),
+        ({"min_effort": [np.nan, 1.0, 1.0]}, "bounds of effort must be 3 pairs"),
+    ],
+    ids=str,
+)
+def test_malformed_options_are_refused(linear, options, expected):
+    with pytest.raises(ValueError, match=expected):
+        linear.controller(**options)
+
+
+def test_other_malformed_input_is_refused(linear):
+    unlimited = np.full(3, np.inf)
+    for mode in ("displacement", "effort"):
+        with pytest.raises(ValueError, match="needs a finite rate"):
+            InverseQP(linear.lower, linear.upper, unlimited, linear.unilateral, mode=mode)
+    with pytest.raises(ValueError, match="goal_weights must be 3 numbers"):
+        linear.controller(goal_weights=[1.0]).solve(linear.model, linear.rest, linear.command)
+    for command in ([0.0, np.nan, 0.0], [0.0]):
+        with pytest.raises(ValueError, match="command must be 3 finite numbers"):
+            linear.controller().solve(linear.model, linear.rest, np.array(command))
+    W = linear.W.copy()
+    W[:2] = W[0]
+    W[:, :2] = W[:, :1]
+    same = CondensedModel(W, linear.model.free, linear.model.effort, linear.model.roles)
+    with pytest.raises(ValueError, match="two actuators do the same"):
+        linear.controller().solve(same, linear.rest, linear.command)
+
+
 @pytest.mark.parametrize(
     "goal",
     [[np.nan, 0.0, 0.0], [0.0, 0.0, np.inf], [0.0, 0.0], [[0.0] * 3] * 2, 0.0],

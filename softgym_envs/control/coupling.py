@@ -1,0 +1,348 @@
+"""Condensed models of robots that are turned, tied to each other, or hold a rigid object (thesis eq. 4.6-4.10).
+
+The parts keep their own models; only ties are added. With ``W`` the block-diagonal compliance of the parts, ``C`` the
+tied rows, ``u`` the motion of the object, ``J`` the Jacobian of its tied points and ``f`` the load on it:
+
+    delta = W (effort + C^T m) + free          every part, under actuator efforts and tie forces m
+    C delta - J u = gap                        tied rows follow each other, or the object
+    J^T m + K u = f                            the object is in equilibrium
+
+``K`` is how the present tie forces change their torque as the object turns; with it the coupled ``W`` is the exact
+derivative of the coupled equilibrium. Without ``m`` and ``u`` a model of actuators and object is left, symmetric again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from softgym_envs.mechanics.condensation import CondensedModel
+
+__all__ = ["Coupled", "RigidBody", "couple", "rotate", "rotation_matrix", "tie_points"]
+
+
+def rotation_matrix(vector: np.ndarray) -> np.ndarray:
+    """Return the rotation, shape (3, 3), about the axis and by the angle [rad] of a rotation vector (3,)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(np.asarray(vector, dtype=float)).as_matrix()
+
+
+def cross_matrix(vectors: np.ndarray) -> np.ndarray:
+    """Return ``[v]x`` with ``[v]x w = v x w``, shape (k, 3, 3), for vectors (k, 3)."""
+    x, y, z = np.moveaxis(np.asarray(vectors, dtype=float), -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
+
+
+def rotate(
+    condensed: CondensedModel,
+    rotation: np.ndarray,
+    shift: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+    *,
+    points: str = "ec",
+) -> CondensedModel:
+    """Return the model of a copy of a robot that is turned about the origin, then moved (thesis 4.3.1).
+
+    Args:
+        condensed: model of the robot itself; leading batch shapes are kept.
+        rotation: rotation matrix, shape (3, 3).
+        shift: motion after the turn [m], shape (3,).
+        points: roles whose rows are coordinates of points; all other rows are scalars and stay.
+
+    Raises:
+        ValueError: if ``rotation`` is none, ``shift`` is malformed, or a role of ``points`` is not made of threes.
+    """
+    R, shift = np.asarray(rotation, dtype=float), np.asarray(shift, dtype=float)
+    # A mirror image of a robot is another robot, but its condensed model follows the same rule.
+    if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), rtol=0.0, atol=1e-9):
+        raise ValueError(f"rotation must be an orthogonal 3 x 3 matrix, got {R.tolist()}")
+    if shift.shape != (3,) or not np.isfinite(shift).all():
+        raise ValueError(f"shift must be three finite numbers, got {shift.tolist()}")
+    turn = np.eye(condensed.compliance.shape[-1])
+    move = np.zeros(len(turn))
+    for role, size in condensed.roles:
+        if role in points:
+            if size % 3:
+                raise ValueError(f"role '{role}' has {size} rows, which are no points in space")
+            rows = condensed.slices[role]
+            turn[rows, rows] = np.kron(np.eye(size // 3), R)
+            move[rows] = np.tile(shift, size // 3)
+    compliance = turn @ condensed.compliance @ turn.T
+    return CondensedModel(
+        0.5 * (compliance + np.swapaxes(compliance, -1, -2)),
+        condensed.free @ turn.T + move,
+        condensed.effort @ turn.T,
+        condensed.roles,
+    )
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """A rigid object held at points.
+
+    Attributes:
+        position: its centre [m], shape (3,).
+        points: where it is held, from its centre and in its own axes [m], shape (k, 3).
+        rotation: its orientation, shape (3, 3).
+        load: force [N] and torque about its centre [N m] from outside (its weight, a button's spring), shape (6,).
+        free: which of x, y, z and the rotations about them can move, six flags; the others are guided.
+    """
+
+    position: np.ndarray
+    points: np.ndarray
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    load: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    free: tuple[bool, bool, bool, bool, bool, bool] = (True,) * 6
+
+    def __post_init__(self) -> None:
+        for name, shape in (("position", (3,)), ("points", (-1, 3)), ("rotation", (3, 3)), ("load", (6,))):
+            value = np.asarray(getattr(self, name), dtype=float)
+            if value.size == 0 or value.ndim != len(shape) or value.shape[-1] != shape[-1]:
+                raise ValueError(f"{name} of a rigid body must have shape {shape}, got {value.shape}")
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name} of a rigid body must be finite, got {value.tolist()}")
+            object.__setattr__(self, name, value)
+        if len(self.free) != 6 or not any(self.free):
+            raise ValueError(f"free must be six flags, not all False, got {self.free}")
+
+    @classmethod
+    def around(cls, position: np.ndarray, contacts: np.ndarray, **options) -> RigidBody:
+        """Return a body at ``position`` [m] (3,), in the world's axes, held at world points ``contacts`` [m] (k, 3)."""
+        position = np.asarray(position, dtype=float)
+        return cls(position, np.asarray(contacts, dtype=float).reshape(-1, 3) - position, **options)
+
+    @property
+    def arms(self) -> np.ndarray:
+        """Where it is held, from its centre, in the world's axes [m], shape (k, 3)."""
+        return self.points @ self.rotation.T
+
+    @property
+    def contacts(self) -> np.ndarray:
+        """Where it is held [m], shape (k, 3)."""
+        return self.position + self.arms
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """``J_c``, shape (3 k, 6): motion of the points by translation and rotation vector of the body (eq. 4.9)."""
+        k = len(self.points)
+        return np.concatenate([np.tile(np.eye(3), (k, 1, 1)), -cross_matrix(self.arms)], axis=2).reshape(3 * k, 6)
+
+    def moved(self, motion: np.ndarray) -> RigidBody:
+        """Return the body after a translation and a turn about its centre, shape (6,) [m, rad]."""
+        motion = np.asarray(motion, dtype=float)
+        return replace(self, position=self.position + motion[:3], rotation=rotation_matrix(motion[3:]) @ self.rotation)
+
+    def stiffness(self, forces: np.ndarray) -> np.ndarray:
+        """``K = d (J^T m) / d u`` at fixed tie forces ``m`` [N] (3 k,), shape (6, 6).
+
+        A turned body turns the lever arms of its forces. It is symmetric when they have no torque about the centre;
+        a rest that is not (while an iteration is under way, or under a torque load) is left out.
+        """
+        result = np.zeros((6, 6))
+        turn = (cross_matrix(np.reshape(forces, (-1, 3))) @ cross_matrix(self.arms)).sum(axis=0)
+        result[3:, 3:] = 0.5 * (turn + turn.T)
+        return result
+
+
+def tie_points(
+    models: Sequence[CondensedModel], first: tuple[int, str, int], second: tuple[int, str, int]
+) -> np.ndarray:
+    """Return the rows ``C``, shape (3, n), that tie two points: ``delta of second - delta of first = gap``.
+
+    Args:
+        models: the parts; ``n`` is the number of all their rows.
+        first: part, role (``"e"`` or ``"c"``) and index of the first point within its role.
+        second: the same of the second point.
+    """
+    starts = np.cumsum([0, *(len(model.free) for model in models)])
+    C = np.zeros((3, starts[-1]))
+    for sign, (part, role, index) in ((-1.0, first), (1.0, second)):
+        rows = models[part].slices[role]
+        if not 0 <= 3 * index <= rows.stop - rows.start - 3:
+            raise ValueError(f"part {part} has no point {index} of role '{role}'")
+        start = starts[part] + rows.start + 3 * index
+        C[:, start : start + 3] += sign * np.eye(3)
+    return C
+
+
+@dataclass(frozen=True)
+class Coupled:
+    """A coupled model, and the way back to its parts.
+
+    Attributes:
+        condensed: roles ``a`` (the actuators of all parts, in order) and ``e``: with an object, its centre [m] and, if
+            wanted, its rotation vector from the present orientation [rad]; then the effectors of the chosen parts.
+        condition: condition number of the scaled system of ties that was solved.
+        dropped: redundant directions of the ties, which carry no force.
+    """
+
+    condensed: CondensedModel
+    condition: float
+    dropped: int
+    _sizes: tuple[int, ...]
+    _forces: np.ndarray
+    _motion: np.ndarray
+
+    def efforts(self, effort: np.ndarray) -> list[np.ndarray]:
+        """Return the efforts of all rows of every part under actuator efforts (n_a,): tie forces included."""
+        every = self._forces @ np.append(1.0, effort)
+        return np.split(every, np.cumsum(self._sizes)[:-1])
+
+    def motion(self, effort: np.ndarray) -> np.ndarray:
+        """Return the motion of the object from its present pose [m, rad], shape (6,), under actuator efforts (n_a,)."""
+        return self._motion @ np.append(1.0, effort)
+
+
+def _side_by_side(
+    models: Sequence[CondensedModel],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
+    """Block-diagonal W, delta_free and present efforts of the parts, and the rows of each part's roles in them."""
+    if not models or any(model.free.ndim != 1 for model in models):
+        raise ValueError("couple needs one or more models without batch")
+    starts = np.cumsum([0, *(len(model.free) for model in models)])
+    W, free, present = np.zeros((starts[-1], starts[-1])), np.zeros(starts[-1]), np.zeros(starts[-1])
+    rows = []
+    for start, model in zip(starts, models, strict=False):
+        here = slice(start, start + len(model.free))
+        W[here, here], free[here], present[here] = model.compliance, model.free, model.effort
+        rows.append({role: start + np.arange(at.start, at.stop) for role, at in model.slices.items()})
+    if not (np.isfinite(W).all() and np.isfinite(free).all() and np.isfinite(present).all()):
+        raise ValueError("a condensed model holds values that are not finite")
+    return W, free, present, rows
+
+
+@dataclass(frozen=True)
+class _Saddle:
+    """Inverse of ``[[G, -J], [-J^T, -K]]`` without its redundant ties, and those ties, shape (m, dropped)."""
+
+    inverse: np.ndarray
+    redundant: np.ndarray
+    condition: float
+
+
+def _solve_saddle(G: np.ndarray, J: np.ndarray, K: np.ndarray, tolerance: float) -> _Saddle:
+    m = len(G)
+    # Rows and columns of G are brought to a largest entry of one (Ruiz 2001) and columns of J to length one, which
+    # cancels units. G may be indefinite: a part that would not be stable alone can be so when it is tied.
+    ties = np.ones(m)
+    for _ in range(10):
+        largest = np.abs(ties[:, None] * G * ties).max(axis=1)
+        if (largest == 0.0).any():
+            raise ValueError("a tied row has no compliance: no force can hold it")
+        ties /= np.sqrt(largest)
+    lengths = np.linalg.norm(ties[:, None] * J, axis=0)
+    scale = np.concatenate([ties, 1.0 / np.where(lengths > 0.0, lengths, 1.0)])
+    system = scale[:, None] * np.block([[G, -J], [-J.T, -K]]) * scale
+    if J.shape[1]:
+        hold = np.linalg.svd(system[:m, m:], compute_uv=False)
+        if len(hold) < J.shape[1] or not hold[-1] > 1e-6 * hold[0]:
+            raise ValueError("the points do not hold the object: it can move freely; guide it by its flags 'free'")
+    values, vectors = np.linalg.eigh(system)
+    size = np.abs(values)
+    regular = size > tolerance * size.max()
+    vectors = scale[:, None] * vectors
+    inverse = (vectors[:, regular] / values[regular]) @ vectors[:, regular].T
+    return _Saddle(inverse, vectors[:m, ~regular], float(size.max() / size[regular].min()))
+
+
+def couple(
+    models: Sequence[CondensedModel],
+    ties: np.ndarray | None = None,
+    gap: np.ndarray | None = None,
+    *,
+    body: RigidBody | None = None,
+    orientation: bool = False,
+    effectors: Sequence[int] | None = None,
+    tolerance: float = 1e-10,
+) -> Coupled:
+    """Tie robots to each other, or to a rigid object that their contact points hold.
+
+    Rows that are neither actuators nor tied keep the effort of their model, as a dead load. Ties pull as well as push,
+    and hold sideways, as the contacts of the thesis do.
+
+    The result is as exact as the parts are, but no more than that: held parts are far stiffer than free ones, so the
+    compliance of a gripper is a small difference of theirs. Random relative errors in W of three fingers grow about a
+    thousandfold in W_ea of the cube they hold (1e-5 becomes 1.5 %).
+
+    Args:
+        models: models of the parts at their present states (roles ``a`` and ``e``, ``c``, ...), unbatched.
+        ties: rows ``C``, shape (m, n), over all rows of the parts, see `tie_points`.
+        gap: ``C delta`` to hold, shape (m,); for two points, their distance as a vector [m].
+        body: object whose points are held by all rows of role ``c``, part by part.
+        orientation: give the rotation of the object too.
+        effectors: parts whose effector rows are kept; default the first, or none with an object.
+        tolerance: a direction of the ties in which the parts are this much stiffer than in others, relative, counts
+            as rigid and, unless the object needs it, redundant: it carries no force.
+
+    Raises:
+        ValueError: for malformed or non-finite input, an object that its points do not hold, or redundant ties that
+            contradict each other.
+    """
+    W, free, present, rows = _side_by_side(models)
+    actuators = np.concatenate([part["a"] for part in rows])
+    C = np.zeros((0, len(free))) if ties is None else np.atleast_2d(np.asarray(ties, dtype=float))
+    d = np.zeros(len(C)) if gap is None else np.asarray(gap, dtype=float).ravel()
+    if C.shape != (len(d), len(free)) or not (np.isfinite(C).all() and np.isfinite(d).all()):
+        raise ValueError(f"ties and gap must be finite, of shapes (m, {len(free)}) and (m,), got {C.shape}, {d.shape}")
+    J, K, load, pose = np.zeros((len(C), 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    moving = np.zeros(0, dtype=int)
+    if body is not None:
+        held = np.concatenate([part.get("c", actuators[:0]) for part in rows])
+        if len(held) != body.points.size:
+            raise ValueError(f"the object has {len(body.points)} points, but the parts have {len(held)} contact rows")
+        C, d = np.concatenate([C, np.eye(len(free))[held]]), np.concatenate([d, body.contacts.ravel()])
+        J, K, load = np.concatenate([J, body.jacobian]), body.stiffness(present[held]), body.load
+        pose[:3] = body.position
+        moving = np.flatnonzero(body.free)
+    if len(C) == 0:
+        raise ValueError("there is nothing to couple: pass ties or a body")
+    tied = np.any(C != 0.0, axis=0)
+    if tied[actuators].any():
+        raise ValueError("actuator rows cannot be tied: tie effector or contact rows")
+    CW = C @ W
+    saddle = _solve_saddle(CW @ C.T, J[:, moving], K[np.ix_(moving, moving)], tolerance)
+
+    # Everything is affine in the efforts on the kept rows (actuators first), then on the object.
+    # Column 0 is the constant.
+    chosen = ([0] if body is None else []) if effectors is None else effectors
+    kept = np.concatenate([actuators, *(rows[part].get("e", actuators[:0]) for part in chosen)])
+    count = 0 if body is None else 6 if orientation else 3
+    forces = np.zeros((len(free), 1 + len(kept) + count))
+    forces[:, 0] = np.where(tied, 0.0, present)
+    forces[actuators, 0] = 0.0
+    forces[kept, np.arange(1, 1 + len(kept))] = 1.0
+    loads = np.zeros((6, forces.shape[1]))
+    loads[:, 0] = load
+    loads[np.arange(count), 1 + len(kept) + np.arange(count)] = 1.0
+    right = np.concatenate([-CW @ forces, -loads[moving]])
+    right[: len(C), 0] += d - C @ free
+    unmet = saddle.redundant.T @ right[: len(C), 0]
+    # In units of force and energy: compared with what moving the ties by a millionth of the parts' size would do.
+    if (np.abs(unmet) > 1e-6 * np.abs(C @ free).max() * np.abs(saddle.redundant).sum(axis=0)).any():
+        raise ValueError("redundant ties contradict each other: no force closes their gap")
+    solved = saddle.inverse @ right
+    forces += C.T @ solved[: len(C)]
+    motion = np.zeros((6, forces.shape[1]))
+    motion[moving] = solved[len(C) :]
+    motion_of_rows = W[kept] @ forces
+    motion_of_rows[:, 0] += free[kept]
+    place = motion.copy()
+    place[:, 0] += pose
+    answer = np.concatenate([motion_of_rows, place[:count]])
+
+    # The object comes first among the effectors.
+    n_a, size = len(actuators), len(answer)
+    order = np.concatenate([np.arange(n_a), np.arange(len(kept), size), np.arange(n_a, len(kept))])
+    compliance = answer[:, 1:][np.ix_(order, order)]
+    effort = np.append(present[actuators], np.zeros(size - n_a))
+    return Coupled(
+        CondensedModel(0.5 * (compliance + compliance.T), answer[order, 0], effort, (("a", n_a), ("e", size - n_a))),
+        condition=saddle.condition,
+        dropped=saddle.redundant.shape[1],
+        _sizes=tuple(len(model.free) for model in models),
+        _forces=forces[:, : 1 + n_a],
+        _motion=motion[:, : 1 + n_a],
+    )
