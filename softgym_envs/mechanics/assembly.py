@@ -12,6 +12,7 @@ from softgym_envs.mechanics.block import ElementBlock
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.quadratic import QuadraticTetrahedra, add_midside_nodes
+from softgym_envs.mechanics.rigid import RigidBody
 from softgym_envs.mechanics.tetrahedra import SolidBlock, Tetrahedra
 
 __all__ = ["SOLIDS", "Assembly"]
@@ -29,11 +30,15 @@ class Assembly:
 
     Args:
         gravity: acceleration [m/s2], shape (3,).
+        floating: allow bodies that nothing holds.
         solver: name of the linear solver.
     """
 
-    def __init__(self, *, gravity: Sequence[float] = (0.0, 0.0, 0.0), solver: str = "auto") -> None:
+    def __init__(
+        self, *, gravity: Sequence[float] = (0.0, 0.0, 0.0), floating: bool = False, solver: str = "auto"
+    ) -> None:
         self._gravity = gravity
+        self._floating = floating
         self._solver = solver
         self._rows: list[np.ndarray] = []
         self._fixed: list[np.ndarray] = []
@@ -117,6 +122,10 @@ class Assembly:
         """Add beam elements along frames that were added before; options as for `Beam`."""
         self._parts.append((Beam, np.asarray(frames, dtype=np.int64), {"section": section, **options}))
 
+    def add_mass(self, frame: int, mass: float, inertia: np.ndarray) -> None:
+        """Give the rigid part at a frame its mass [kg] and its inertia along the directors [kg m2], shape (3, 3)."""
+        self._parts.append((RigidBody, np.array(frame), {"mass": mass, "inertia": inertia}))
+
     def build(self) -> MechanicalModel:
         """Return the model. Blocks come in the order in which they were added."""
         nodes = np.vstack(self._rows)
@@ -128,6 +137,7 @@ class Assembly:
             frames=self._frames,
             carried=self._carried,
             fixed_spin=np.array(self._spins) if self._spins else None,
+            floating=self._floating,
             gravity=self._gravity,
             solver=self._solver,
         )

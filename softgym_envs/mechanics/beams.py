@@ -21,6 +21,7 @@ from numba import njit
 from softgym_envs.mechanics.block import ElementBlock, lower_pairs
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.frames import rotation_vector_matrix
+from softgym_envs.mechanics.tetrahedra import element_masses
 
 __all__ = ["Beam", "Section"]
 
@@ -321,6 +322,22 @@ class Beam(ElementBlock):
         areas = np.array([s.area for s in self.sections])
         masses = (self.density * areas * self.lengths)[:, None] * shares
         return np.bincount(self.rows.ravel(), weights=masses.ravel(), minlength=count)
+
+    def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        # A cross-section has the kinetic energy rho / 2 (A |p'|^2 + I_3 |d_2'|^2 + I_2 |d_3'|^2) per length.
+        points, gauss = np.polynomial.legendre.leggauss(self.order + 1)
+        shape, _ = _lagrange(self.order, points)
+        shares = 0.5 * np.einsum("q,qa,qb->ab", gauss, shape, shape)
+        parts = []
+        for row, values in (
+            (0, [s.area for s in self.sections]),
+            (2, [s.inertia[1] for s in self.sections]),
+            (3, [s.inertia[0] for s in self.sections]),
+        ):
+            masses = self.density * np.array(values) * self.lengths
+            parts.append(element_masses(self.rows + row, masses, shares, lumped))
+        rows, columns, entries = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return rows, columns, entries
 
     def point(self, index: int, offset: np.ndarray, nodes: np.ndarray) -> EmbeddedPoints:
         """A point fixed to the cross-section of a frame of the chain, at an offset [m] (3,) along its directors."""

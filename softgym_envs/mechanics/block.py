@@ -61,6 +61,13 @@ class ElementBlock(ABC):
         """Share of the mass [kg] that gravity pulls at each of ``count`` rows, shape (count,)."""
 
     @abstractmethod
+    def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mass matrix between rows [kg]: row, column (row >= column in the element) and value, each of shape (k,).
+
+        The kinetic energy is ``sum value v_row . v_column / 2`` over these entries and their mirror images.
+        """
+
+    @abstractmethod
     def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
         """Add the right-hand side of rotation-strain warping of a ``step`` (n, 3) from ``x`` (n, 3) to ``out``."""
 

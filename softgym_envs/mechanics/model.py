@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba import njit
-from scipy.sparse import csc_matrix, tril
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, tril
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from softgym_envs.errors import DataError
 from softgym_envs.mechanics.block import ElementBlock
@@ -20,7 +23,7 @@ from softgym_envs.mechanics.materials import Material
 from softgym_envs.mechanics.skins import Skin
 from softgym_envs.mechanics.tetrahedra import SolidBlock, Tetrahedra
 
-__all__ = ["MechanicalModel", "read_mesh"]
+__all__ = ["Inertia", "MechanicalModel", "read_mesh"]
 
 
 def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -80,6 +83,49 @@ def _subtract_entries(values, places, entries):
             values[places[k]] -= entries[k]
 
 
+@njit(cache=True)
+def _symmetric_product(low, high, values, vector):
+    out = np.zeros_like(vector)
+    for k in range(low.shape[0]):
+        out[low[k]] += values[k] * vector[high[k]]
+        if low[k] != high[k]:
+            out[high[k]] += values[k] * vector[low[k]]
+    return out
+
+
+@dataclass(frozen=True)
+class _Poisson:
+    """The Poisson problem of warping along some axes: free rows, known rows, and what couples them."""
+
+    axes: np.ndarray
+    free: np.ndarray
+    known: np.ndarray
+    coupling: csc_matrix | None
+    solver: LinearSolver
+
+
+class Inertia(ABC):
+    """What one implicit time step adds to the equilibrium: inertia and Rayleigh damping at its end.
+
+    Attributes:
+        acceleration_factor: derivative of accelerations with respect to displacements [1/s2].
+        velocity_factor: derivative of velocities with respect to displacements [1/s].
+        mass_damping: Rayleigh's alpha [1/s].
+        stiffness_damping: Rayleigh's beta [s].
+        stiffness: values of the elements' tangent that beta acts on, in the layout of `element_tangent`.
+    """
+
+    acceleration_factor: float
+    velocity_factor: float
+    mass_damping: float = 0.0
+    stiffness_damping: float = 0.0
+    stiffness: np.ndarray | None = None
+
+    @abstractmethod
+    def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return velocities [m/s] and accelerations [m/s2] of the rows (n, 3) if the step ends at rows ``x`` (n, 3)."""
+
+
 class MechanicalModel:
     """Soft bodies, beams and rigid parts with actuators, effectors, contact points, sensors and bonds.
 
@@ -95,6 +141,7 @@ class MechanicalModel:
         carried: mesh nodes that move with a frame: index of the frame -> rows.
         fixed_spin: boolean mask of spin components (about the axes of space) that frames do not have, shape (f,) or
             (f, 3); default none.
+        floating: allow bodies that nothing holds: in dynamics inertia does, in statics bonds must.
         gravity: acceleration [m/s2], shape (3,).
         solver: name of the linear solver, see `make_solver`.
 
@@ -106,6 +153,7 @@ class MechanicalModel:
         equations: number of independent degrees of freedom.
         free_dofs: rows' degrees of freedom (3 * row + axis) that are equations of their own; spins come after them.
         dof_scale: length [m] that a unit of each equation moves: 1 for nodes, an arm for spins, shape (equations,).
+        inertia: what a time step adds to the energy, see `Inertia`; None in statics.
         version: grows with every change of loads or constraints.
         factor_owner: who factorised ``solver`` last; several solvers may share a model.
     """
@@ -119,6 +167,7 @@ class MechanicalModel:
         frames: Sequence[int] | np.ndarray = (),
         carried: Mapping[int, np.ndarray] | None = None,
         fixed_spin: np.ndarray | None = None,
+        floating: bool = False,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         solver: str = "auto",
     ) -> None:
@@ -133,7 +182,8 @@ class MechanicalModel:
         if fixed_spin is not None:
             flags = np.asarray(fixed_spin, dtype=bool)
             spin_mask[:] = flags[:, None] if flags.ndim == 1 else flags
-        if not mask.any():
+        self.floating = floating
+        if not mask.any() and not floating:
             raise ValueError("no node is fixed: the body could float away; pass the clamped nodes as 'fixed'")
         used = np.zeros(n, dtype=bool)
         for block in self.blocks:
@@ -159,7 +209,9 @@ class MechanicalModel:
         if len(self.frames):
             origin = self._equation[3 * self.frames.rows[:, None] + np.arange(3)]
             self._map = KinematicMap(self.frames, origin, self._spin_equation, self.equations)
-        extent = float(np.linalg.norm(np.ptp(self.nodes[~is_carried], axis=0)))
+        points = np.ones(n, dtype=bool)
+        points[self.frames.carried[self.frames.moves == 0.0]] = False
+        extent = float(np.linalg.norm(np.ptp(self.nodes[points], axis=0))) or 1.0
         self.dof_scale = np.ones(self.equations)
         self.dof_scale[len(self.free_dofs) :] = 0.1 * extent
         self._fixed_components = mask & ~is_carried[:, None]
@@ -167,8 +219,9 @@ class MechanicalModel:
         self.skins: list[Skin] = []
         self._solver_name = solver
         self._solver: LinearSolver | None = None
-        self._poisson: LinearSolver | None = None
+        self._poisson: list[_Poisson] | None = None
         self._bond_stiffness: float | None = None
+        self.inertia: Inertia | None = None
         self.version = 0
         self.factor_owner: object | None = None
         self.nodal_loads = np.zeros_like(self.nodes)
@@ -372,6 +425,8 @@ class MechanicalModel:
         self._hessian_maps = [next(following) if c in curved else None for c, _ in self._rows]
         self._bond_maps = [next(following) for _ in self._bonds]
         indptr = np.searchsorted(direct, np.arange(n + 1, dtype=np.int64) * total)
+        self._keys = np.concatenate([direct, extra])
+        self._masses: tuple[bool, csr_matrix, np.ndarray] | None = None
         self._values = np.empty(self._entries + len(extra))
         self._gradient = np.empty_like(self.nodes)
         self._targets = []
@@ -424,6 +479,8 @@ class MechanicalModel:
         for block, scatter in zip(self.blocks, self._block_maps, strict=True):
             if block.add(x, gradient, values, scatter)[1]:
                 return None
+        if self.inertia is not None:
+            self._add_inertia(x, gradient, values)
         n = self.equations
         H = np.zeros((n + 3 * len(self.frames.carried), self.size), order="F")
         delta = np.empty(self.size)
@@ -456,6 +513,125 @@ class MechanicalModel:
             residual -= H @ effort
         return residual, values[: self._entries], H, delta
 
+    # -- dynamics ---------------------------------------------------------------------------------------------------
+
+    def mass_matrix(self, lumped: bool = False) -> csr_matrix:
+        """Mass matrix between rows [kg], shape (n, n), the same for every axis."""
+        return self._mass_terms(lumped)[0]
+
+    def _mass_terms(self, lumped: bool) -> tuple[csr_matrix, np.ndarray]:
+        """The mass matrix, and its entries in the layout of the tangent's values."""
+        self.prepare()
+        if self._masses is None or self._masses[0] != lumped:
+            parts = [block.mass_entries(lumped) for block in self.blocks]
+            rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+            off = rows != columns
+            n = len(self.nodes)
+            matrix = coo_matrix(
+                (
+                    np.concatenate([values, values[off]]),
+                    (np.concatenate([rows, columns[off]]), np.concatenate([columns, rows[off]])),
+                ),
+                shape=(n, n),
+            ).tocsr()
+            total = self.equations + 3 * len(self.frames.carried)
+            entries = np.zeros(len(self._values))
+            for axis in range(3):
+                first, second = self._equation[3 * rows + axis], self._equation[3 * columns + axis]
+                keep = (first >= 0) & (second >= 0)
+                low, high = np.minimum(first, second)[keep], np.maximum(first, second)[keep]
+                key, direct = low * total + high, self._keys[: self._entries]
+                place = np.where(
+                    high < self.equations,
+                    np.searchsorted(direct, key),
+                    self._entries + np.searchsorted(self._keys[self._entries :], key),
+                )
+                entries += np.bincount(place, weights=values[keep], minlength=len(entries))
+            self._masses = (lumped, matrix, entries)
+        return self._masses[1], self._masses[2]
+
+    def element_tangent(self, x: np.ndarray) -> np.ndarray:
+        """Values of the elements' tangent at rows ``x`` (n, 3), before what frames carry is brought to equations."""
+        self.prepare()
+        values = np.zeros_like(self._values)
+        unused = np.zeros_like(self.nodes)
+        for block, scatter in zip(self.blocks, self._block_maps, strict=True):
+            block.add(x, unused, values, scatter)
+        return values
+
+    def _add_inertia(self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray) -> None:
+        terms = self.inertia
+        assert terms is not None and self._masses is not None, "a time step needs the mass matrix"
+        _, matrix, entries = self._masses
+        velocity, acceleration = terms.motion(x)
+        gradient += matrix @ (acceleration + terms.mass_damping * velocity)
+        values += (terms.acceleration_factor + terms.mass_damping * terms.velocity_factor) * entries
+        if terms.stiffness_damping:
+            values += (terms.stiffness_damping * terms.velocity_factor) * terms.stiffness
+            gradient += self.damping_force(terms, velocity)
+
+    def damping_force(self, terms: Inertia, velocity: np.ndarray) -> np.ndarray:
+        """Force [N] (n, 3) of the stiffness-proportional damping of a step at velocities of the rows (n, 3)."""
+        assert terms.stiffness is not None
+        total = self.equations + 3 * len(self.frames.carried)
+        known = self._equation >= 0
+        moved = np.zeros(total)
+        moved[self._equation[known]] = velocity.ravel()[known]
+        force = _symmetric_product(
+            self._keys // total, self._keys % total, terms.stiffness_damping * terms.stiffness, moved
+        )
+        out = np.zeros_like(self.nodes)
+        out.ravel()[known] = force[self._equation[known]]
+        return out
+
+    def row_velocity(self, x: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Velocity of all rows (n, 3) that velocities of the equations (N,) give at rows ``x`` (n, 3)."""
+        out = np.zeros_like(self.nodes)
+        out.ravel()[self.free_dofs] = velocity[: len(self.free_dofs)]
+        if self._map is not None:
+            self._map.linearise(x)
+            out[self.frames.carried] = (self._map.matrix @ velocity).reshape(-1, 3)
+        return out
+
+    def row_acceleration(self, x: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+        """Acceleration of all rows (n, 3) under velocities and accelerations of the equations (N,) at ``x`` (n, 3)."""
+        out = self.row_velocity(x, acceleration)
+        if self._map is not None:
+            spin = self._spins(velocity)[self.frames.owner]
+            # w x (w x r)
+            out[self.frames.carried] += np.cross(spin, np.cross(spin, self.frames.arms(x)))
+        return out
+
+    def equation_velocity(self, x: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Velocities of the equations (N,) behind velocities of the rows (n, 3) at ``x`` (n, 3)."""
+        out = np.zeros(self.equations)
+        out[: len(self.free_dofs)] = velocity.ravel()[self.free_dofs]
+        if self._map is not None:
+            directors = self.frames.rows[:, None] + np.arange(1, 4)
+            spin = 0.5 * np.cross(x[directors], velocity[directors]).sum(axis=1)
+            free = self._spin_equation >= 0
+            out[self._spin_equation[free]] = spin[free]
+        return out
+
+    def increment(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Displacements and rotation vectors of the equations (N,) that lead from rows ``start`` to ``end``, (n, 3)."""
+        out = np.zeros(self.equations)
+        out[: len(self.free_dofs)] = (end - start).ravel()[self.free_dofs]
+        if self._map is not None:
+            directors = self.frames.rows[:, None] + np.arange(1, 4)
+            turn = np.einsum("fki,fkj->fij", end[directors], start[directors])
+            spin = Rotation.from_matrix(turn).as_rotvec()
+            free = self._spin_equation >= 0
+            out[self._spin_equation[free]] = spin[free]
+        return out
+
+    def _spins(self, step: np.ndarray) -> np.ndarray:
+        """Spin part of a vector of the equations (N,), shape (f, 3)."""
+        spins = np.zeros_like(self._spin_equation, dtype=float)
+        free = self._spin_equation >= 0
+        spins[free] = step[self._spin_equation[free]]
+        return spins
+
     @property
     def bond_stiffness(self) -> float:
         """Stiffness [N/m] of the term that bonds add to the tangent; any positive one gives the same equilibrium.
@@ -463,7 +639,7 @@ class MechanicalModel:
         It is high beside that of elements, so that the tangent is positive definite where the bonded body is stable.
         """
         if self._bond_stiffness is None:
-            stiffness = [block.stiffness for block in self.blocks]
+            stiffness = [block.stiffness for block in self.blocks if block.stiffness > 0.0]
             self._bond_stiffness = 100.0 * float(np.mean(stiffness)) if stiffness else 1.0
         return self._bond_stiffness
 
@@ -486,9 +662,7 @@ class MechanicalModel:
         full.ravel()[self.free_dofs] = step[: len(self.free_dofs)]
         linear = full
         if self._map is not None:
-            spins = np.zeros_like(self._spin_equation, dtype=float)
-            free = self._spin_equation >= 0
-            spins[free] = step[self._spin_equation[free]]
+            spins = self._spins(step)
             linear = full.copy()
             self._map.linearise(x)
             linear[self.frames.carried] = (self._map.matrix @ step).reshape(-1, 3)
@@ -498,15 +672,14 @@ class MechanicalModel:
             block.add_warped(x, linear, rhs)
         if self._poisson is None:
             self._poisson = self._make_poisson()
-        free = self._warped_nodes
-        right = rhs[free]
-        if self._poisson_coupling is not None:
-            right = right - self._poisson_coupling @ full[self._known_nodes]
-        full[free] = self._poisson.solve(right)
-        full[self._fixed_components] = 0.0
+        for problem in self._poisson:
+            right = rhs[problem.free, problem.axes]
+            if problem.coupling is not None:
+                right = right - problem.coupling @ full[problem.known, problem.axes]
+            full[problem.free, problem.axes] = problem.solver.solve(right)
         return full
 
-    def _make_poisson(self) -> LinearSolver:
+    def _make_poisson(self) -> list[_Poisson]:
         entries = [block.laplacian_entries() for block in self.blocks]
         rows, columns, values = (np.concatenate(parts) for parts in zip(*entries, strict=True))
         n = len(self.nodes)
@@ -517,22 +690,28 @@ class MechanicalModel:
         carried[self.frames.carried] = True
         # A rigid part moves as a whole: its origin is not warped apart from what it carries.
         carried[self.frames.rows[self.frames.owner[self.frames.moves > 0.0]]] = True
-        # A node that is free along some axes counts as free; what it does along the others is reset.
-        known = self.fixed | carried
         _, part = connected_components(laplacian, directed=False)
-        anchored = np.isin(part, part[known & touched])
-        if not self._bonds and not anchored[touched].all():
-            raise ValueError("the mesh has a part that is not connected to a fixed node")
-        # A part that only bonds hold keeps its linear step.
-        free = self._warped_nodes = np.flatnonzero(touched & anchored & ~known)
-        self._known_nodes = np.flatnonzero(carried & touched)
-        self._poisson_coupling = laplacian[free][:, self._known_nodes] if len(self._known_nodes) else None
-        lower = tril(laplacian[free][:, free], format="csc")
-        lower.sort_indices()
-        solver = make_solver(self._solver_name, lower.indptr, lower.indices)
-        if not solver.factorise(lower.data):
-            raise ValueError("the Laplacian of the mesh cannot be factorised")
-        return solver
+        problems = []
+        # Nodes may be held along some axes only; axes along which the same nodes are held share a factorisation.
+        patterns, group = np.unique(self._fixed_components | carried[:, None], axis=1, return_inverse=True)
+        for number, held in enumerate(patterns.T):
+            anchored = np.isin(part, part[held & touched])
+            if not (self._bonds or self.floating) and not anchored[touched].all():
+                raise ValueError("the mesh has a part that is not connected to a fixed node")
+            # A part that only bonds hold keeps its linear step.
+            free = np.flatnonzero(touched & anchored & ~held)
+            if not len(free):
+                continue
+            known = np.flatnonzero(carried & touched)
+            lower = tril(laplacian[free][:, free], format="csc")
+            lower.sort_indices()
+            solver = make_solver(self._solver_name, lower.indptr, lower.indices)
+            if not solver.factorise(lower.data):
+                raise ValueError("the Laplacian of the mesh cannot be factorised")
+            coupling = laplacian[free][:, known] if len(known) else None
+            axes = np.flatnonzero(group.ravel() == number)
+            problems.append(_Poisson(axes, free[:, None], known[:, None], coupling, solver))
+        return problems
 
     def refresh_loads(self) -> None:
         """Take over changed ``nodal_loads``."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.materials import Material
-from softgym_envs.mechanics.tetrahedra import SolidBlock, orient_corners
+from softgym_envs.mechanics.tetrahedra import SolidBlock, element_masses, orient_corners
 
 __all__ = ["QuadraticTetrahedra", "add_midside_nodes", "split_triangles"]
 
@@ -51,6 +53,26 @@ def _shape_slopes(barycentric: np.ndarray) -> np.ndarray:
         slopes[4 + k, a], slopes[4 + k, b] = 4.0 * barycentric[b], 4.0 * barycentric[a]
     return slopes
 
+
+def _unit_mass() -> np.ndarray:
+    """Mass matrix (10, 10) of a straight-edged element of unit mass, by exact integration of polynomials."""
+    # Shape functions as polynomials of the barycentric coordinates: {exponents: factor}.
+    unit = np.eye(4, dtype=int)
+    functions = [{tuple(2 * unit[k]): 2.0, tuple(unit[k]): -1.0} for k in range(4)]
+    functions += [{tuple(unit[a] + unit[b]): 4.0} for a, b in _EDGES]
+    matrix = np.zeros((10, 10))
+    for i, first in enumerate(functions):
+        for j, second in enumerate(functions):
+            for p, u in first.items():
+                for q, v in second.items():
+                    powers = np.add(p, q)
+                    matrix[i, j] += (
+                        u * v * 6.0 * math.prod(map(math.factorial, powers)) / math.factorial(powers.sum() + 3)
+                    )
+    return matrix
+
+
+_UNIT_MASS = _unit_mass()
 
 # Four Gauss points, exact to degree two.
 _A, _B = (5.0 + 3.0 * 5.0**0.5) / 20.0, (5.0 - 5.0**0.5) / 20.0
@@ -186,6 +208,9 @@ class QuadraticTetrahedra(SolidBlock):
         shares = _shape(_GAUSS)
         masses = self.density * self.weights.reshape(-1, 4) @ shares
         return np.bincount(self.connectivity.ravel(), weights=masses.ravel(), minlength=count)
+
+    def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return element_masses(self.connectivity, self.density * self.volumes, _UNIT_MASS, lumped)
 
     def add(
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None

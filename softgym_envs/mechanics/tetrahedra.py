@@ -9,7 +9,7 @@ from softgym_envs.mechanics.block import ElementBlock, lower_pairs
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
 
-__all__ = ["SolidBlock", "Tetrahedra", "orient_corners"]
+__all__ = ["SolidBlock", "Tetrahedra", "element_masses", "orient_corners"]
 
 
 @njit(cache=True, error_model="numpy")
@@ -172,6 +172,21 @@ def orient_corners(nodes: np.ndarray, connectivity: np.ndarray) -> tuple[np.ndar
     return connectivity, np.abs(volumes), turned
 
 
+def element_masses(
+    connectivity: np.ndarray, masses: np.ndarray, shares: np.ndarray, lumped: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mass entries of elements (m, k) with masses [kg] (m,) and a mass matrix ``shares`` (k, k) of unit mass.
+
+    Lumping keeps the diagonal, scaled to the mass (Hinton, Rock and Zienkiewicz 1976).
+    """
+    if lumped:
+        diagonal = np.diag(shares) / np.trace(shares)
+        nodes = connectivity.ravel()
+        return nodes, nodes, (masses[:, None] * diagonal).ravel()
+    i, j = np.tril_indices(connectivity.shape[1])
+    return connectivity[:, i].ravel(), connectivity[:, j].ravel(), (masses[:, None] * shares[i, j]).ravel()
+
+
 class SolidBlock(ElementBlock):
     """What blocks of solid elements share: material, quadrature and the warping of steps.
 
@@ -293,6 +308,11 @@ class Tetrahedra(SolidBlock):
     def nodal_masses(self, count: int) -> np.ndarray:
         share = np.repeat(0.25 * self.density * self.volumes, 4)
         return np.bincount(self.connectivity.ravel(), weights=share, minlength=count)
+
+    def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return element_masses(
+            self.connectivity, self.density * self.volumes, (np.ones((4, 4)) + np.eye(4)) / 20, lumped
+        )
 
     def add(
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
