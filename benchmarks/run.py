@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks import accuracy, speed
+from benchmarks import accuracy, sensor_finger, speed
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError
 from softgym_envs.storage import write_json
@@ -27,6 +27,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "trajectories": accuracy.trajectories,
     "slack": accuracy.slack_states,
     "mesh_motion": accuracy.mesh_motion,
+    "sensor_finger": sensor_finger.published,
 }
 """Registry of benchmarks."""
 

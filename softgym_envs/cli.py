@@ -6,12 +6,15 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
 from softgym_envs.errors import ConfigError, SoftGymError
 from softgym_envs.version import __version__
+
+if TYPE_CHECKING:
+    from softgym_envs.robots.robot import Robot
 
 __all__ = ["main"]
 
@@ -85,6 +88,20 @@ def list_() -> None:
         click.echo(f"{title}: {', '.join(table)}")
 
 
+def _robot(name: str, options: tuple[str, ...]) -> Robot:
+    """Make a robot from ``name=value`` options."""
+    from softgym_envs.config import read_value
+    from softgym_envs.robots import make_robot
+
+    parsed = {}
+    for option in options:
+        key, separator, text = option.partition("=")
+        if not separator:
+            raise ConfigError(f"--option '{option}' must look like name=value")
+        parsed[key] = read_value(text)
+    return make_robot(name, **parsed)
+
+
 @cli.command()
 @click.argument("robot")
 @click.option("--option", "options", multiple=True, help="Robot option, name=value (repeat).")
@@ -92,16 +109,9 @@ def list_() -> None:
 @click.option("--picture", type=click.Path(path_type=Path), help="Write a PNG of the body.")
 def show(robot: str, options: tuple[str, ...], design: tuple[str, ...], picture: Path | None) -> None:
     """Show a robot: its design space, actuators and mesh."""
-    from softgym_envs.config import read_value
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.robot import MeshedRobot
 
-    parsed = {}
-    for option in options:
-        name, separator, text = option.partition("=")
-        if not separator:
-            raise ConfigError(f"--option '{option}' must look like name=value")
-        parsed[name] = read_value(text)
-    body = make_robot(robot, **parsed)
+    body = _robot(robot, options)
     click.echo(f"{robot} ({body.variant})\n\ndesign variables:")
     for variable in body.design_space.variables.values():
         unit = "" if variable.unit == "1" else f" {variable.unit}"
@@ -114,12 +124,13 @@ def show(robot: str, options: tuple[str, ...], design: tuple[str, ...], picture:
             f"at most {actuator.rate:g} {actuator.unit} a step"
         )
     chosen = _assignments(design, "design")
-    mesh = body.body(chosen)
     model = body.build(chosen)
-    click.echo(
-        f"\nmesh: {len(mesh.nodes)} nodes, {len(mesh.tetrahedra)} tetrahedra ({mesh.origin}), "
-        f"volume {1e9 * model.volume:.0f} mm3, mass {1e3 * model.mass:.1f} g"
-    )
+    if isinstance(body, MeshedRobot):
+        mesh = body.body(chosen)
+        text = f"mesh: {len(mesh.nodes)} nodes, {len(mesh.tetrahedra)} tetrahedra ({mesh.origin})"
+    else:
+        text = f"model: {model.equations} equations"
+    click.echo(f"\n{text}, volume {1e9 * model.volume:.0f} mm3, mass {1e3 * model.mass:.1f} g")
     if picture is not None:
         from PIL import Image
 
@@ -127,6 +138,30 @@ def show(robot: str, options: tuple[str, ...], design: tuple[str, ...], picture:
 
         Image.fromarray(render_body(body, chosen, size=(960, 960))).save(picture)
         click.echo(f"wrote {picture}")
+
+
+@cli.command()
+@click.argument("robot")
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--option", "options", multiple=True, help="Robot option, name=value (repeat).")
+@click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
+@click.option("--moulds", type=click.Path(path_type=Path), help="Write the parts of a finger's mould to this folder.")
+def export(
+    robot: str, files: tuple[Path, ...], options: tuple[str, ...], design: tuple[str, ...], moulds: Path | None
+) -> None:
+    """Write a body to FILES ending with .step or .stl (in millimetres), or the moulds it is cast in."""
+    from softgym_envs.robots.export import export_body
+    from softgym_envs.robots.moulds import export_moulds
+
+    if not files and moulds is None:
+        raise ConfigError("nothing to write: name a file ending with .step or .stl, or a folder with --moulds")
+    body = _robot(robot, options)
+    chosen = _assignments(design, "design")
+    written = [export_body(body, file, chosen) for file in files]
+    if moulds is not None:
+        written += export_moulds(body, moulds, chosen)
+    for path in written:
+        click.echo(f"wrote {path} (millimetres)")
 
 
 @cli.command()

@@ -10,17 +10,32 @@ __all__ = ["ENVIRONMENTS", "EnvironmentRow", "register_environments"]
 
 @dataclass(frozen=True)
 class EnvironmentRow:
-    """One environment ID: a robot, a task and a time limit."""
+    """One environment ID: a robot, a task, a time limit, and what they are made with unless told otherwise.
+
+    Attributes:
+        robot: registry name of the robot.
+        task: registry name of the task.
+        max_episode_steps: time limit.
+        backend: ``"surrogate"`` where weights ship for the robot, else ``"fem"``.
+        robot_options: options of the robot.
+        task_options: options of the task.
+    """
 
     robot: str
     task: str
     max_episode_steps: int
+    backend: str = "surrogate"
     robot_options: dict[str, Any] = field(default_factory=dict)
+    task_options: dict[str, Any] = field(default_factory=dict)
 
 
 ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/FingerReach-v0": EnvironmentRow("finger", "reach", 50),
     "SoftGym/FingerTrack-v0": EnvironmentRow("finger", "track", 100),
+    "SoftGym/DiamondReach-v0": EnvironmentRow("diamond", "reach", 50, backend="fem"),
+    "SoftGym/DiamondTrack-v0": EnvironmentRow("diamond", "track", 100, backend="fem"),
+    "SoftGym/CableTrunkReach-v0": EnvironmentRow("cable_trunk", "reach", 50, backend="fem"),
+    "SoftGym/CableTrunkTrack-v0": EnvironmentRow("cable_trunk", "track", 100, backend="fem"),
 }
 """All environment IDs."""
 
@@ -34,7 +49,16 @@ def register_environments() -> None:
             gymnasium.register(
                 id=identifier,
                 entry_point="softgym_envs.envs.soft_robot_env:SoftRobotEnv",
-                vector_entry_point="softgym_envs.envs.vector_env:SoftRobotVectorEnv",
+                # Only the surrogate is batched; without an entry point make_vec steps single environments in turn.
+                vector_entry_point=(
+                    "softgym_envs.envs.vector_env:SoftRobotVectorEnv" if row.backend == "surrogate" else None
+                ),
                 max_episode_steps=row.max_episode_steps,
-                kwargs={"robot": row.robot, "task": row.task, "robot_options": dict(row.robot_options)},
+                kwargs={
+                    "robot": row.robot,
+                    "task": row.task,
+                    "backend": row.backend,
+                    "robot_options": dict(row.robot_options),
+                    "task_options": dict(row.task_options),
+                },
             )

@@ -45,6 +45,7 @@ class Assembly:
         self._frames: list[int] = []
         self._spins: list[np.ndarray] = []
         self._carried: dict[int, np.ndarray] = {}
+        self._mounted: dict[int, list[int]] = {}
         self._parts: list[tuple[type[ElementBlock], np.ndarray, dict[str, object]]] = []
         self.size = 0
 
@@ -92,6 +93,7 @@ class Assembly:
         *,
         fixed: bool | Sequence[bool] = False,
         fixed_spin: bool | Sequence[bool] = False,
+        on: int | None = None,
     ) -> int:
         """Add a frame: a rigid part, or a node of a beam.
 
@@ -100,6 +102,7 @@ class Assembly:
             rotation: matrix (3, 3), default identity.
             fixed: origin held, all of it or by axis of space.
             fixed_spin: spin held, all of it or by axis of space.
+            on: first row of another frame that this one is fixed to.
 
         Returns:
             Its first row.
@@ -107,6 +110,9 @@ class Assembly:
         mask = np.zeros((4, 3), dtype=bool)
         mask[0] = fixed
         start = self._append(frame_rows(position, rotation), mask)
+        if on is not None:
+            self._mounted.setdefault(self._frames.index(on), []).append(start)
+            return start
         self._frames.append(start)
         self._spins.append(np.broadcast_to(np.asarray(fixed_spin, dtype=bool), (3,)))
         return start
@@ -136,6 +142,7 @@ class Assembly:
             fixed=np.vstack(self._fixed),
             frames=self._frames,
             carried=self._carried,
+            mounted={frame: np.array(rows) for frame, rows in self._mounted.items()},
             fixed_spin=np.array(self._spins) if self._spins else None,
             floating=self._floating,
             gravity=self._gravity,

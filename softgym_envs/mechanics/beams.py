@@ -201,8 +201,8 @@ class Beam(ElementBlock):
         poisson_ratio: scalar or one for each element.
         density: [kg/m3].
         order: 1 or 2, degree of the interpolation.
-
-    Any curved rest shape is free of strain.
+        stress_free: rows of the frames of the chain in the shape that is free of stress [m], shape (c, 4, 3); default
+            as in ``nodes``, however curved.
 
     Raises:
         ValueError: for a chain of a wrong length, or two frames in one place.
@@ -218,6 +218,7 @@ class Beam(ElementBlock):
         poisson_ratio: float | np.ndarray = 0.3,
         density: float = 1100.0,
         order: int = 2,
+        stress_free: np.ndarray | None = None,
     ) -> None:
         if order not in (1, 2):
             raise ValueError(f"order = {order!r} of the beam is unknown; allowed: 1, 2")
@@ -233,7 +234,12 @@ class Beam(ElementBlock):
         sections = [section] * m if isinstance(section, Section) else list(section)
         if len(sections) != m:
             raise ValueError(f"the beam has {m} elements, got {len(sections)} sections")
-        tangents = np.einsum("qa,mad->mqd", local, nodes[self.rows])
+        shape = nodes[chain[:, None] + np.arange(4)] if stress_free is None else np.asarray(stress_free, dtype=float)
+        if shape.shape != (len(chain), 4, 3):
+            raise ValueError(f"stress_free must have shape ({len(chain)}, 4, 3), got {shape.shape}")
+        rest = np.zeros_like(nodes)
+        rest[chain[:, None] + np.arange(4)] = shape
+        tangents = np.einsum("qa,mad->mqd", local, rest[self.rows])
         speed = np.linalg.norm(tangents, axis=2)
         if not (speed > 1e-12).all():
             raise ValueError("two frames of a beam lie in one place")
@@ -260,7 +266,7 @@ class Beam(ElementBlock):
         self._matrix = np.empty((m, 12 * (order + 1), 12 * (order + 1)))
         self._none = np.empty((0, 12 * (order + 1), 12 * (order + 1)))
         self._rest = np.zeros((m, order, 6))
-        self._rest = self.strains(nodes)
+        self._rest = self.strains(rest)
 
     def strains(self, x: np.ndarray) -> np.ndarray:
         """Strains (Gamma, K) beyond those at rest at the Gauss points, shape (m, q, 6) [1, 1/m]."""

@@ -98,6 +98,7 @@ class Frames:
         nodes: rest rows [m], shape (n, 3).
         rows: first row (the origin) of each frame, shape (f,).
         carried: mesh nodes that move with a frame: index of the frame -> rows.
+        mounted: frames that are fixed to another one, and are none of ``rows``: index of the frame -> first rows.
 
     Attributes:
         rows: as given.
@@ -110,24 +111,34 @@ class Frames:
         ValueError: if frames overlap, a row is carried twice, or directors are not orthonormal.
     """
 
-    def __init__(self, nodes: np.ndarray, rows: np.ndarray, carried: Mapping[int, np.ndarray] | None = None) -> None:
+    def __init__(
+        self,
+        nodes: np.ndarray,
+        rows: np.ndarray,
+        carried: Mapping[int, np.ndarray] | None = None,
+        mounted: Mapping[int, np.ndarray] | None = None,
+    ) -> None:
         self.rows = np.asarray(rows, dtype=np.int64).reshape(-1)
         count = len(self.rows)
-        parts = {int(f): np.unique(np.asarray(ids, dtype=np.int64)) for f, ids in (carried or {}).items()}
-        if any(not 0 <= f < count for f in parts):
-            raise ValueError(f"rows are carried by frames {sorted(parts)}, the model has {count}")
-        directors = (self.rows[:, None] + np.arange(1, 4)).ravel()
-        self.carried = np.concatenate([directors, *parts.values()])
-        self.owner = np.concatenate(
-            [np.repeat(np.arange(count), 3), *(np.full(len(ids), f) for f, ids in parts.items())]
-        ).astype(np.int64)
+        parts = [(np.arange(count).repeat(3), (self.rows[:, None] + np.arange(1, 4)).ravel(), 0.0)]
+        for table, mount in ((carried or {}, False), (mounted or {}, True)):
+            for frame, ids in table.items():
+                if not 0 <= frame < count:
+                    raise ValueError(f"rows are carried by frame {frame}, the model has {count}")
+                first = np.unique(np.asarray(ids, dtype=np.int64))
+                parts.append((np.full(len(first), frame), first, 1.0))
+                if mount:
+                    directors = (first[:, None] + np.arange(1, 4)).ravel()
+                    parts.append((np.full(len(directors), frame), directors, 0.0))
+        self.owner = np.concatenate([owner for owner, _, _ in parts]).astype(np.int64)
+        self.carried = np.concatenate([rows for _, rows, _ in parts]).astype(np.int64)
         taken = np.concatenate([self.rows, self.carried])
         if len(np.unique(taken)) != len(taken) or (len(taken) and taken.max() >= len(nodes)):
             raise ValueError("frames overlap, or a row is carried by two frames")
         bases = np.array([nodes[row + 1 : row + 4] for row in self.rows]).reshape(count, 3, 3)
         if not np.allclose(bases @ np.swapaxes(bases, 1, 2), np.eye(3), atol=1e-9):
             raise ValueError("the directors of a frame are not orthonormal")
-        self.moves = (np.arange(len(self.carried)) >= 3 * count).astype(float)
+        self.moves = np.concatenate([np.full(len(rows), moves) for _, rows, moves in parts])
         offset = nodes[self.carried] - self.moves[:, None] * nodes[self.rows[self.owner]]
         self.arm = np.einsum("ckd,cd->ck", bases[self.owner], offset)
 

@@ -139,6 +139,7 @@ class MechanicalModel:
         fixed: indices or boolean mask (n,) of the clamped nodes, or a mask (n, 3) by axis; for a frame, its origin.
         frames: first row of each frame, shape (f,).
         carried: mesh nodes that move with a frame: index of the frame -> rows.
+        mounted: frames fixed to another one, and not among ``frames``: index of the frame -> their first rows.
         fixed_spin: boolean mask of spin components (about the axes of space) that frames do not have, shape (f,) or
             (f, 3); default none.
         floating: allow bodies that nothing holds: in dynamics inertia does, in statics bonds must.
@@ -166,6 +167,7 @@ class MechanicalModel:
         fixed: np.ndarray,
         frames: Sequence[int] | np.ndarray = (),
         carried: Mapping[int, np.ndarray] | None = None,
+        mounted: Mapping[int, np.ndarray] | None = None,
         fixed_spin: np.ndarray | None = None,
         floating: bool = False,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
@@ -174,7 +176,7 @@ class MechanicalModel:
         self.nodes = _check_nodes(nodes)
         self.blocks = list(blocks)
         n = len(self.nodes)
-        self.frames = Frames(self.nodes, np.asarray(frames), carried)
+        self.frames = Frames(self.nodes, np.asarray(frames), carried, mounted)
         mask = np.zeros((n, 3), dtype=bool)
         chosen = np.asarray(fixed)
         mask[chosen if chosen.size else chosen.astype(int)] = True

@@ -11,7 +11,7 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.materials import Material
 from softgym_envs.mechanics.tetrahedra import SolidBlock, element_masses, orient_corners
 
-__all__ = ["QuadraticTetrahedra", "add_midside_nodes", "split_triangles"]
+__all__ = ["QuadraticTetrahedra", "add_midside_nodes", "quadratic_triangles", "split_triangles"]
 
 # Midside nodes 4..9 lie on these edges.
 _EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
@@ -25,18 +25,25 @@ def add_midside_nodes(nodes: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.nda
     return np.vstack([nodes, middle]), np.column_stack([tetrahedra, len(nodes) + which.reshape(-1, 6)])
 
 
-def split_triangles(triangles: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Split boundary triangles (k, 3) of corners into four at the midside nodes of tetrahedra (m, 10): (4 k, 3)."""
+def quadratic_triangles(triangles: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Add the midside nodes of tetrahedra (m, 10) to triangles (k, 3) of their corners: (k, 6), edges 01, 12, 20."""
     middle: dict[tuple[int, int], int] = {}
     for slot, (a, b) in enumerate(_EDGES):
         low = np.minimum(tetrahedra[:, a], tetrahedra[:, b])
         high = np.maximum(tetrahedra[:, a], tetrahedra[:, b])
         middle.update(zip(zip(low.tolist(), high.tolist(), strict=True), tetrahedra[:, 4 + slot].tolist(), strict=True))
-    parts = []
-    for a, b, c in triangles.tolist():
-        ab, bc, ca = (middle[min(p, q), max(p, q)] for p, q in ((a, b), (b, c), (c, a)))
-        parts += [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    return np.array(parts, dtype=np.int64)
+    middles = [[middle[min(p, q), max(p, q)] for p, q in ((a, b), (b, c), (c, a))] for a, b, c in triangles.tolist()]
+    return np.hstack([triangles, np.array(middles, dtype=np.int64).reshape(-1, 3)])
+
+
+def split_triangles(triangles: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Split boundary triangles (k, 3) of corners into four at the midside nodes of tetrahedra (m, 10): (4 k, 3).
+
+    For pictures. A cavity is better given `quadratic_triangles`: pressure on split ones is not spread as the elements'
+    shape functions ask for, which spoils their accuracy.
+    """
+    parts = quadratic_triangles(triangles, tetrahedra)[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]]
+    return parts.reshape(-1, 3)
 
 
 def _shape(barycentric: np.ndarray) -> np.ndarray:

@@ -13,6 +13,13 @@ __all__ = ["ROBOTS", "make_robot"]
 
 ROBOTS: dict[str, str] = {
     "finger": "softgym_envs.robots.soft_finger:SoftFinger",
+    "diamond": "softgym_envs.robots.diamond:Diamond",
+    "cable_trunk": "softgym_envs.robots.cable_trunk:CableTrunk",
+    "sensorized_finger": "softgym_envs.robots.sensorized_finger:SensorizedFinger",
+    "trunk": "softgym_envs.robots.stiff_flop:StiffFlop",
+    "press_finger": "softgym_envs.robots.grippers:PressFinger",
+    "two_finger_gripper": "softgym_envs.robots.grippers:TwoFingerGripper",
+    "three_finger_gripper": "softgym_envs.robots.grippers:ThreeFingerGripper",
 }
 """Registry: name to ``module:class``, imported when used."""
 

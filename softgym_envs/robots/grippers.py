@@ -43,6 +43,8 @@ class FingerRobot(Robot):
     #: Range of the cables and their largest change in a control step [m].
     cable_range = (0.0, 0.020)
     cable_rate = 0.001
+    #: Without gravity, all efforts scale with Young's modulus.
+    scales = True
 
     def __init__(
         self,
@@ -66,6 +68,7 @@ class FingerRobot(Robot):
         )
         self.effort_scale = np.full(len(self.actuators), 20.0)
         self.effector_rest = self.object_rest(self.design_space.baseline)
+        self.stiffness_variable = "young_modulus" if self.scales and not any(gravity) else None
 
     @property
     def variant(self) -> str:
@@ -158,19 +161,31 @@ class PressFinger(FingerRobot):
     Args:
         button_force: force of the button [N]. The published "10 N" pushes this finger back by 66 mm with cables held
             at zero and leaves it no stable way forward; 2 N is a fifth of it, and well inside its strength.
-        **options: as for `FingerRobot`.
+        mesh_size, meshing, material, unilateral, gravity: as for `FingerRobot`.
     """
 
     name = "press_finger"
     effectors = ("button",)
     placements = ((STRAIGHT, (0.0, 0.0, 0.0)),)
     half_extents = (13.75e-3, 13.75e-3, 13.75e-3)
+    scales = False  # the button's force stays what it is
 
-    def __init__(self, *, button_force: float = 2.0, **options) -> None:
+    def __init__(
+        self,
+        *,
+        button_force: float = 2.0,
+        mesh_size: float = 8.0e-3,
+        meshing: str = "morph",
+        material: str = "corotational",
+        unilateral: bool = True,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
         if not (np.isfinite(button_force) and button_force >= 0.0):
             raise ValueError(f"button_force = {button_force} N must be finite and not negative")
         self.button_force = float(button_force)
-        super().__init__(**options)
+        super().__init__(
+            mesh_size=mesh_size, meshing=meshing, material=material, unilateral=unilateral, gravity=gravity
+        )
 
     @property
     def signature(self) -> dict[str, object]:
@@ -211,10 +226,6 @@ class TwoFingerGripper(FingerRobot):
     name = "two_finger_gripper"
     effectors = ("bar",)
     placements = ((STRAIGHT, (0.0, 0.0, 0.0)), (TURNED, (0.0, 0.080, 0.0)))
-
-    def __init__(self, **options) -> None:
-        super().__init__(**options)
-        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
 
     def more_variables(self) -> tuple[DesignVariable, ...]:
         """The length of the bar."""
@@ -258,10 +269,6 @@ class ThreeFingerGripper(FingerRobot):
     )
     half_extents = (35.0e-3, 13.75e-3, 13.75e-3)
     cable_range = (-0.002, 0.020)
-
-    def __init__(self, **options) -> None:
-        super().__init__(**options)
-        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
 
     def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
         """Centre of the cube, between the fingers."""

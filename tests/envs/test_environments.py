@@ -11,10 +11,34 @@ from gymnasium.utils.env_checker import check_env
 
 import softgym_envs
 from softgym_envs.backends import BACKENDS
+from softgym_envs.envs.task import make_task
 from softgym_envs.errors import ConvergenceError, DesignError
+from softgym_envs.robots import make_robot
 from softgym_envs.robots.robot import Robot
 
-CASES = [(identifier, backend) for identifier in softgym_envs.ENVIRONMENTS for backend in BACKENDS]
+# Weights ship for the robots whose environments run on the surrogate unless told otherwise.
+CASES = [
+    (identifier, backend)
+    for identifier, row in softgym_envs.ENVIRONMENTS.items()
+    for backend in (BACKENDS if row.backend == "surrogate" else ["fem"])
+]
+# Light bodies for the robots that have a choice.
+LIGHT = {"cable_trunk": {"layers": 10, "rings": 1}}
+
+
+def make(identifier, **options):
+    """Make an environment with a light body."""
+    robot = softgym_envs.ENVIRONMENTS[identifier].robot
+    light = LIGHT.get(robot, {}) | options.pop("robot_options", {})
+    return gymnasium.make(identifier, robot_options=light, **options)
+
+
+def some_design(identifier):
+    """A body that is not the baseline."""
+    row = softgym_envs.ENVIRONMENTS[identifier]
+    variable = make_robot(row.robot, **row.robot_options).design_space
+    name = variable.names[0]
+    return {name: float(variable[name].from_unit(0.5))}
 
 
 def rollout(env, steps, seed):
@@ -36,7 +60,7 @@ def rollout(env, steps, seed):
 def test_gymnasium_checker(identifier, backend):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gymnasium.make(identifier, backend=backend)
+        env = make(identifier, backend=backend)
         check_env(env.unwrapped, skip_render_check=True)
 
 
@@ -46,13 +70,14 @@ def test_stable_baselines_checker(identifier, backend):
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        sb3_check(gymnasium.make(identifier, backend=backend), warn=True)
+        sb3_check(make(identifier, backend=backend), warn=True)
 
 
 @pytest.mark.parametrize(("identifier", "backend"), CASES)
 def test_same_seed_same_rollout_bit_for_bit(identifier, backend):
-    first = gymnasium.make(identifier, backend=backend, sample_design=("length", "joint_height"))
-    second = gymnasium.make(identifier, backend=backend, sample_design=("length", "joint_height"))
+    names = make_robot(softgym_envs.ENVIRONMENTS[identifier].robot).design_space.names[:3:2]
+    first = make(identifier, backend=backend, sample_design=names)
+    second = make(identifier, backend=backend, sample_design=names)
     a, b, again = rollout(first, 6, 7), rollout(second, 6, 7), rollout(first, 6, 7)
     assert (a[0] == b[0]).all() and (a[1] == b[1]).all()
     assert (a[0] == again[0]).all() and (a[1] == again[1]).all()
@@ -62,7 +87,7 @@ def test_same_seed_same_rollout_bit_for_bit(identifier, backend):
 
 @pytest.mark.parametrize(("identifier", "backend"), CASES)
 def test_pickle_deepcopy_and_spec(identifier, backend):
-    env = gymnasium.make(identifier, backend=backend, design={"length": 0.041}, design_in_observation=True)
+    env = make(identifier, backend=backend, design=some_design(identifier), design_in_observation=True)
     expected = rollout(env, 3, 1)
     for twin in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env)):
         assert twin.unwrapped.design == env.unwrapped.design
@@ -72,20 +97,27 @@ def test_pickle_deepcopy_and_spec(identifier, backend):
     assert (rollout(revived, 3, 1)[0] == expected[0]).all()
 
 
-@pytest.mark.parametrize("identifier", softgym_envs.ENVIRONMENTS)
+def kinds(identifier):
+    """Options of the robot that the contracts are checked with, and episodes: few where they are finite elements."""
+    row = softgym_envs.ENVIRONMENTS[identifier]
+    return [({"cables": 1}, 5), ({"cables": 2}, 5)] if row.robot == "finger" else [({}, 1)]
+
+
+@pytest.mark.parametrize(
+    ("identifier", "options", "episodes"), [(i, *kind) for i in softgym_envs.ENVIRONMENTS for kind in kinds(i)]
+)
 @pytest.mark.parametrize("action_mode", ["increment", "absolute"])
-@pytest.mark.parametrize("cables", [1, 2])
-def test_bounds_time_limit_and_info(identifier, action_mode, cables):
-    env = gymnasium.make(
+def test_bounds_time_limit_and_info(identifier, options, episodes, action_mode):
+    env = make(
         identifier,
         action_mode=action_mode,
-        robot_options={"cables": cables},
+        robot_options=options,
         design_in_observation=True,
         sample_design=True,
     )
     limit = softgym_envs.ENVIRONMENTS[identifier].max_episode_steps
     env.action_space.seed(3)
-    for episode in range(5):
+    for episode in range(episodes):
         observation, info = env.reset(seed=episode)
         assert (env.unwrapped._unit_design == env.unwrapped.design_space.to_unit(env.unwrapped.design)).all()
         truncated = False
@@ -104,6 +136,46 @@ def test_bounds_time_limit_and_info(identifier, action_mode, cables):
     assert info["is_success"] == (info["distance"] < env.unwrapped.task.success_distance)
     assert reward == pytest.approx(np.prod(list(info["reward_terms"].values())))
     assert (info["effort"] >= 0.0).all()
+
+
+def test_rows_choose_the_backend_and_make_vec_follows():
+    for identifier, row in softgym_envs.ENVIRONMENTS.items():
+        spec = gymnasium.spec(identifier)
+        assert spec.kwargs["backend"] == row.backend
+        assert (spec.vector_entry_point is not None) == (row.backend == "surrogate")
+    env = gymnasium.make_vec("SoftGym/CableTrunkReach-v0", num_envs=2, robot_options=LIGHT["cable_trunk"])
+    assert isinstance(env, gymnasium.vector.SyncVectorEnv)
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (2, 33)
+    observation, _, _, _, info = env.step(np.ones((2, 8), dtype=np.float32))
+    assert env.observation_space.contains(observation)
+    assert info["distance"].shape == (2,)
+    env.close()
+
+
+@pytest.mark.parametrize("identifier", ["SoftGym/DiamondReach-v0", "SoftGym/CableTrunkTrack-v0"])
+def test_a_surrogate_without_weights_says_what_ships(identifier):
+    from softgym_envs.errors import WeightsError
+
+    variant = make_robot(softgym_envs.ENVIRONMENTS[identifier].robot).variant
+    with pytest.raises(WeightsError, match=f"'{variant}'.*finger_1cable, finger_2cables"):
+        gymnasium.make(identifier, backend="surrogate")
+
+
+@pytest.mark.parametrize("identifier", [i for i, row in softgym_envs.ENVIRONMENTS.items() if row.task == "track"])
+def test_track_follows_the_reference_path_of_its_robot(identifier):
+    env = make(identifier).unwrapped
+    env.reset(seed=0)
+    assert (env.path == env.robot.reference_path()).all()
+    assert (np.abs(env.path) < 1.25 * env.robot.size).all()  # goals are seen whole
+
+
+def test_a_robot_without_a_reference_path_asks_for_one(monkeypatch):
+    robot = make_robot("finger")
+    monkeypatch.setattr(type(robot), "reference_path", Robot.reference_path)
+    with pytest.raises(ValueError, match="robot 'finger' has no reference path"):
+        make_task("track", robot)
+    assert make_task("track", robot, path=np.zeros((2, 3))).path.shape == (2, 3)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

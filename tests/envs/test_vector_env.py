@@ -9,7 +9,7 @@ from agents.vec_env import SB3VecEnv
 from softgym_envs.errors import DesignError
 
 
-@pytest.mark.parametrize("identifier", softgym_envs.ENVIRONMENTS)
+@pytest.mark.parametrize("identifier", [i for i, row in softgym_envs.ENVIRONMENTS.items() if row.robot == "finger"])
 @pytest.mark.parametrize("cables", [1, 2])
 def test_batch_equals_single(identifier, cables):
     design = {"length": 0.0411, "joint_height": 0.0068, "young_modulus": 2.0e6, "poisson_ratio": 0.41}

@@ -114,6 +114,47 @@ def test_small_strains_are_linear_elastic(material, rng, mu, lame):
     np.testing.assert_allclose(evaluate(material, identity + H, mu, lame)[1], linear, atol=5e-6 * np.abs(linear).max())
 
 
+def dilation(material, F):
+    """Dilation (m,), its gradient (m, 9) and hessian (m, 9, 9)."""
+    F = np.ascontiguousarray(np.reshape(F, (-1, 9)), dtype=float)
+    theta, gradient, hessian = np.empty(len(F)), np.empty((len(F), 9)), np.empty((len(F), 9, 9))
+    material.dilation(F, theta, gradient, hessian)
+    return theta, gradient, hessian
+
+
+def test_dilation_has_exact_derivatives(material, gradients):
+    _, slope, curvature = dilation(material, gradients)
+    np.testing.assert_allclose(curvature, np.swapaxes(curvature, 1, 2), rtol=0, atol=1e-12 * np.abs(curvature).max())
+    h = 1e-5
+    for k in range(9):
+        step = np.zeros(9)
+        step[k] = h
+        plus, minus = (dilation(material, gradients + s * step.reshape(3, 3)) for s in (1, -1))
+        np.testing.assert_allclose(slope[:, k], (plus[0] - minus[0]) / (2 * h), rtol=1e-6, atol=1e-6)
+        error = np.abs(curvature[:, :, k] - (plus[1] - minus[1]) / (2 * h)).max(axis=1)
+        assert (error <= 2e-6 * np.maximum(1.0, np.abs(curvature).max(axis=(1, 2)))).all()
+
+
+@pytest.mark.parametrize(("mu", "lame"), ELASTICITIES)
+def test_lames_first_parameter_acts_on_the_dilation_alone(material, gradients, mu, lame):
+    """psi(mu, lambda) = psi(mu, 0) + lambda / 2 theta^2, with its derivatives: what averaged elements rest on."""
+    theta, slope, curvature = dilation(material, gradients)
+    whole, shear = evaluate(material, gradients, mu, lame), evaluate(material, gradients, mu, 0.0)
+    size = max(1.0, abs(lame))
+    np.testing.assert_allclose(whole[0], shear[0] + 0.5 * lame * theta**2, rtol=1e-11, atol=1e-12 * size)
+    stress = shear[1].reshape(-1, 9) + lame * theta[:, None] * slope
+    np.testing.assert_allclose(whole[1].reshape(-1, 9), stress, rtol=0, atol=1e-11 * np.abs(stress).max())
+    tangent = shear[2] + lame * (theta[:, None, None] * curvature + slope[:, :, None] * slope[:, None, :])
+    np.testing.assert_allclose(whole[2], tangent, rtol=0, atol=1e-11 * np.abs(tangent).max())
+
+
+def test_dilation_is_zero_for_rotations_and_small_for_small_strain(material, rng):
+    turned = Rotation.random(20, random_state=3).as_matrix()
+    np.testing.assert_allclose(dilation(material, turned)[0], 0.0, atol=1e-14)
+    H = 1e-6 * rng.standard_normal((20, 3, 3))
+    np.testing.assert_allclose(dilation(material, np.eye(3) + H)[0], np.trace(H, axis1=1, axis2=2), atol=2e-11)
+
+
 def test_energy_grows_away_from_rest(material, rng):
     H = 0.05 * rng.standard_normal((200, 3, 3))
     energy = evaluate(material, np.eye(3) + H)[0]

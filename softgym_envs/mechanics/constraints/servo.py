@@ -1,0 +1,55 @@
+"""A servo: the angle by which a frame has turned about a fixed axis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softgym_envs.mechanics.constraints.constraint import Constraint
+
+__all__ = ["Servo"]
+
+
+class Servo(Constraint):
+    """Angle of a frame about an axis fixed in space; delta [rad] counts from rest, effort [N m] is the torque.
+
+    The angle is that of one director's projection on the plane across the axis, between -pi and pi. The frame's other
+    motions are held elsewhere (a fixed origin and spin); a frame that tilts out of the plane is still measured.
+
+    Args:
+        name: identifier.
+        row: first row of the frame.
+        axis: direction of the axis, shape (3,).
+        nodes: rest rows [m], shape (n, 3).
+    """
+
+    size = 1
+    unit = ("rad", "N m")
+
+    def __init__(self, name: str, row: int, axis: np.ndarray, nodes: np.ndarray) -> None:
+        self.name = name
+        axis = np.asarray(axis, dtype=float)
+        length = float(np.linalg.norm(axis))
+        if not length > 0.0:
+            raise ValueError(f"servo '{name}': axis {axis.tolist()} has no direction")
+        self.axis = axis / length
+        directors = nodes[row + 1 : row + 4]
+        across = directors - np.outer(directors @ self.axis, self.axis)
+        chosen = int(np.argmax(np.linalg.norm(across, axis=1)))
+        self.row = row + 1 + chosen
+        self._first = across[chosen] / np.linalg.norm(across[chosen])
+        self._second = np.cross(self.axis, self._first)
+        self.dofs = 3 * self.row + np.arange(3)
+
+    def value(self, x: np.ndarray) -> np.ndarray:
+        return np.array([np.arctan2(x[self.row] @ self._second, x[self.row] @ self._first)])
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        p, q = x[self.row] @ self._first, x[self.row] @ self._second
+        return ((p * self._second - q * self._first) / (p * p + q * q))[None, :]
+
+    def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray:
+        p, q = x[self.row] @ self._first, x[self.row] @ self._second
+        a, b = self._first, self._second
+        mixed = np.outer(a, b) + np.outer(b, a)
+        same = np.outer(a, a) - np.outer(b, b)
+        return effort[0] * (2.0 * p * q * same + (q * q - p * p) * mixed) / (p * p + q * q) ** 2

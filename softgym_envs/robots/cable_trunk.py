@@ -1,0 +1,190 @@
+"""The cable trunk: a slender tapered silicone arm that eight cables bend in two independent halves.
+
+Dimensions are those of the public model of an elephant's trunk; its folds are left out. The trunk stands on its
+clamped base along +z. Four cables run to the tip and four to the middle, each pair in one of the planes xz and yz.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.mechanics.materials import MATERIALS
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.robot import Actuator, Robot
+
+__all__ = ["CableTrunk"]
+
+MASS = 0.042  # of the published body [kg]
+TIP_FRACTION = 0.4  # radius of the long cables at the tip over the half-width there
+LONG_GUIDES, SHORT_GUIDES = 20, 10
+
+
+def octagonal_bar(layers: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mesh a bar of octagonal section, half-width 1 and length 1, that stands on z = 0, in prisms cut in three.
+
+    Sections are cut into triangles by rings about the axis. All cuts follow the numbers of the nodes, which go from
+    the axis outwards and on each ring from the middles of the sides to the corners: so the mesh is as symmetric as
+    the octagon.
+
+    Args:
+        layers: number of prisms along the bar.
+        rings: number of rings of triangles in a section.
+
+    Returns:
+        Nodes, shape (n, 3), section after section, and tetrahedra, shape (m, 4).
+    """
+    eighth = np.pi / 4
+    angles = np.concatenate([np.arange(0, 8, 2) * eighth, np.arange(1, 8, 2) * eighth, (np.arange(8) + 0.5) * eighth])
+    radii = np.repeat([1.0, 1.0, 1.0 / np.cos(eighth / 2)], [4, 4, 8])
+    ring = np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
+    section = np.concatenate([np.zeros((1, 2)), *((k + 1) / rings * ring for k in range(rings))])
+    order = np.argsort(angles)
+    sides = np.column_stack([order, np.roll(order, -1)]) + 1  # pairs of neighbours on the first ring
+    triangles = [np.insert(sides, 0, 0, axis=1)]
+    for k in range(rings - 1):
+        inner = np.sort(sides, axis=1) + 16 * k
+        outer = inner + 16
+        triangles += [np.column_stack([inner, outer[:, 1]]), np.column_stack([inner[:, 0], outer])]
+    a, b, c = np.sort(np.concatenate(triangles), axis=1).T
+    count = len(section)
+    prism = np.concatenate(
+        [
+            np.column_stack([a, b, c, a + count]),
+            np.column_stack([b, c, a + count, b + count]),
+            np.column_stack([c, a + count, b + count, c + count]),
+        ]
+    )
+    height = np.repeat(np.linspace(0.0, 1.0, layers + 1), count)
+    nodes = np.column_stack([np.tile(section, (layers + 1, 1)), height])
+    tetrahedra = (prism + count * np.arange(layers)[:, None, None]).reshape(-1, 4)
+    edges = nodes[tetrahedra[:, 1:]] - nodes[tetrahedra[:, :1]]
+    inside_out = np.linalg.det(edges) < 0.0
+    tetrahedra[inside_out] = tetrahedra[inside_out][:, [0, 2, 1, 3]]
+    return nodes, tetrahedra
+
+
+class CableTrunk(Robot):
+    """Tapered arm with four cables along its whole length and four to its middle.
+
+    The mesh is regular, so it follows the design exactly and is as symmetric as the body.
+
+    Args:
+        layers: number of elements along the trunk; the defaults give 825 nodes and 3456 tetrahedra.
+        rings: number of rings of elements about the axis.
+        material: name of a material of `softgym_envs.mechanics.materials`.
+        strokes: largest displacement of the long and of the short cables [m]. The default is half of what the public
+            model allows, (0.070, 0.040): from 37 mm on, opposite long cables crush the thin tip and no equilibrium is
+            found; a long cable alone gets to 57 mm.
+        unilateral: cables cannot push (default). False reproduces scenes whose cables can.
+        gravity: acceleration [m/s2]; the baseline body weighs 42 g.
+    """
+
+    name = "cable_trunk"
+    effectors = ("tip",)
+    size = 0.195
+
+    def __init__(
+        self,
+        *,
+        layers: int = 24,
+        rings: int = 2,
+        material: str = "corotational",
+        strokes: tuple[float, float] = (0.035, 0.020),
+        unilateral: bool = True,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        if not (isinstance(layers, int) and layers >= 1 and isinstance(rings, int) and rings >= 1):
+            raise ValueError(f"layers = {layers!r} and rings = {rings!r} must be positive integers")
+        if material not in MATERIALS:
+            raise ValueError(f"unknown material '{material}'; allowed: {', '.join(MATERIALS)}")
+        if len(strokes) != 2 or not all(0.0 < stroke < np.inf for stroke in strokes):
+            raise ValueError(f"strokes must be two positive lengths [m], got {strokes!r}")
+        super().__init__(gravity=gravity)
+        self.layers = layers
+        self.rings = rings
+        self.material = material
+        self.strokes = (float(strokes[0]), float(strokes[1]))
+        self.unilateral = unilateral
+        self.design_space = DesignSpace(
+            DesignVariable("length", 0.160, 0.230, 0.195, "m", "length of the trunk"),
+            DesignVariable("base_half_width", 0.011, 0.016, 0.013, "m", "half the width of the section at the base"),
+            DesignVariable("tip_half_width", 0.004, 0.007, 0.005, "m", "half the width of the section at the tip"),
+            DesignVariable(
+                "cable_fraction", 0.60, 0.90, 10.0 / 13.0, "1", "radius of the cables at the base over the half-width"
+            ),
+            DesignVariable("short_fraction", 0.35, 0.65, 0.5, "1", "length of the short cables over that of the trunk"),
+            DesignVariable("young_modulus", 1.0e5, 2.0e6, 4.5e5, "Pa", "stiffness of the silicone", log=True),
+            DesignVariable("poisson_ratio", 0.40, 0.499, 0.45, "1", "0.5 is incompressible"),
+        )
+        self.stiffness_variable = None if any(gravity) else "young_modulus"
+        baseline = self.design_space.baseline
+        self.effector_rest = np.array([0.0, 0.0, baseline["length"]])
+        self.effort_scale = np.full(8, 10.0)
+        self.density = MASS / self.volume(baseline)
+        self.actuators = tuple(
+            # A twentieth of the stroke per control step.
+            Actuator(f"{length}_{side}", 0.0, stroke, stroke / 20.0, unilateral=unilateral)
+            for length, stroke in zip(("long", "short"), self.strokes, strict=True)
+            for side in ("north", "west", "south", "east")
+        )
+
+    @property
+    def variant(self) -> str:
+        """``cable_trunk``."""
+        return "cable_trunk"
+
+    @property
+    def signature(self) -> dict[str, object]:
+        """Options that change the condensed model (a cable that may push has the same one)."""
+        return {
+            "layers": self.layers,
+            "rings": self.rings,
+            "strokes": list(self.strokes),
+            "material": self.material,
+            "gravity": list(self.gravity),
+        }
+
+    @staticmethod
+    def volume(design: Mapping[str, float]) -> float:
+        """Volume of the body [m3], exactly: a frustum of an octagon."""
+        base, tip = design["base_half_width"], design["tip_half_width"]
+        return 8.0 * np.tan(np.pi / 8) * design["length"] * (base * base + base * tip + tip * tip) / 3.0
+
+    def mesh(self, design: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes [m] (n, 3) and tetrahedra (m, 4) of a complete design: the bar, stretched and tapered."""
+        nodes, tetrahedra = octagonal_bar(self.layers, self.rings)
+        half_width = np.interp(nodes[:, 2], [0.0, 1.0], [design["base_half_width"], design["tip_half_width"]])
+        return nodes * np.column_stack([half_width, half_width, np.full(len(nodes), design["length"])]), tetrahedra
+
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        """Clamp the base, thread the cables through their guides, put the effector at the middle of the tip."""
+        nodes, tetrahedra = self.mesh(design)
+        model = MechanicalModel.from_mesh(
+            nodes,
+            tetrahedra,
+            fixed=nodes[:, 2] == 0.0,
+            material=self.material,
+            young_modulus=design["young_modulus"],
+            poisson_ratio=design["poisson_ratio"],
+            density=self.density,
+            gravity=self.gravity,
+        )
+        base = design["cable_fraction"] * design["base_half_width"]
+        tip = TIP_FRACTION * design["tip_half_width"]
+        actuators = iter(self.actuators)
+        for reach, count in ((1.0, LONG_GUIDES), (design["short_fraction"], SHORT_GUIDES)):
+            share = np.linspace(0.0, reach, count + 1)
+            radius, height = base + share * (tip - base), share * design["length"]
+            for x, y in ((0, 1), (-1, 0), (0, -1), (1, 0)):
+                points = np.column_stack([x * radius, y * radius, height])
+                model.add_cable(next(actuators).name, points[1:], points[0], unilateral=self.unilateral)
+        model.add_effector("tip", np.array([0.0, 0.0, design["length"]]))
+        return model
+
+    def reference_path(self, count: int = 30) -> np.ndarray:
+        """Circle of radius 60 mm about the axis, 30 mm below the tip of the baseline body and inside its workspace."""
+        angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+        return np.column_stack([0.060 * np.cos(angle), 0.060 * np.sin(angle), np.full(count, 0.165)])

@@ -1,0 +1,250 @@
+"""The Diamond: a soft parallel robot, four legs with an elbow each between a clamped base and a free top.
+
+Dimensions are those of the thesis (section 4.3.1) and its public model. The legs lie in the planes xz and yz; a
+cable pulls each elbow inwards, which lifts the top and tilts it away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
+from softgym_envs.robots.morphing import Feature, Plane
+from softgym_envs.robots.robot import Actuator, MeshedRobot
+from softgym_envs.robots.symmetry import mirrored
+
+__all__ = ["Diamond"]
+
+# Contours of one leg (r, z) from the base to the top [mm], inset by a few tenths towards the published volume.
+OUTER = (
+    *((0, -37), (35, -37), (50, -29.6), (62, -23.6), (70, -17.6), (76, -11.6), (81.6, 0), (86.6, 12), (94.7, 36)),
+    *((97, 45), (93.7, 54), (87, 59.6), (73, 71.6), (43, 95.6), (29, 107.6), (14, 119.6), (0, 126)),
+)
+INNER = (
+    *((0, -9.5), (33, -9.2), (40, -6.2), (48, -0.2), (86, 37.8), (89, 45), (87, 51)),
+    *((84, 54.2), (71, 60.2), (56, 66.2), (44, 72.2), (38, 78.2), (32, 90.2), (25, 102.2), (18, 108.2), (0, 114)),
+)
+# Half-width of a leg at two radii, linear in between and beyond [mm].
+WIDE, WIDE_RADIUS = 13.2, 40.0
+NARROW, NARROW_RADIUS = 9.4, 95.0
+# Two bevels fill the corner between two legs: from this radius on their sides to this x = y between them [mm].
+FILLET_RADIUS, FILLET_DIAGONAL = 27.0, 18.7
+# Up to this radius, and up to this height, the body is the same for all designs [mm].
+HUB_RADIUS, BASE_HEIGHT = 33.0, -9.0
+VOLUME = 394.557e-6  # of the baseline body; the published one has 392e-6 [m3]
+MASS = 0.5  # of the baseline body, as published [kg]
+
+
+def draw_eighth(**corners: float) -> None:
+    """Draw the eighth of the body in 0 <= y <= x with gmsh, in mm: half a leg, and its share of base and top.
+
+    Args:
+        **corners: closed side view of the leg, ``r0, z0, r1, z1, ...``, and closed plan view of the eighth,
+            ``x0, y0, x1, y1, ...``.
+    """
+    import gmsh
+
+    occ = gmsh.model.occ
+
+    def prism(points: list[tuple[float, float, float]], *direction: float) -> list[tuple[int, int]]:
+        tags = [occ.addPoint(*point) for point in points]
+        lines = [occ.addLine(a, b) for a, b in zip(tags, tags[1:] + tags[:1], strict=True)]
+        face = occ.addPlaneSurface([occ.addCurveLoop(lines)])
+        return [e for e in occ.extrude([(2, face)], *direction) if e[0] == 3]
+
+    side, plan = (
+        [(corners[f"{a}{k}"], corners[f"{b}{k}"]) for k in range(len(corners)) if f"{a}{k}" in corners]
+        for a, b in (("r", "z"), ("x", "y"))
+    )
+    low, high = min(z for _, z in side) - 1.0, max(z for _, z in side) + 1.0
+    wide = max(y for _, y in plan) + 1.0
+    leg = prism([(r, -1.0, z) for r, z in side], 0.0, wide + 1.0, 0.0)
+    eighth = prism([(x, y, low) for x, y in plan], 0.0, 0.0, high - low)
+    occ.intersect(leg, eighth)
+
+
+class Diamond(MeshedRobot):
+    """Four-legged parallel robot, pulled by four cables at its elbows.
+
+    The body is meshed in one eighth and mirrored, so its response has the symmetry of its shape.
+
+    Args:
+        mesh_size: target edge length [m]; the default gives 1529 nodes and 5272 tetrahedra. Edges of the outline are
+            shorter than that, so elements are smaller.
+        meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` meshes every design anew.
+        material: name of a material of `softgym_envs.mechanics.materials`.
+        unilateral: cables cannot push (default). False reproduces scenes whose cables can.
+        gravity: acceleration [m/s2]; the condensed-model work of the thesis has none. Its reinforcement-learning scene
+            is ``gravity=(0, 0, -9.81)`` with the design ``{"young_modulus": 1.8e5}``; the baseline body weighs 0.5 kg.
+    """
+
+    name = "diamond"
+    effectors = ("top",)
+    size = 0.16
+    #: Depth of the effector below the top, which is one millimetre in the published model [m].
+    effector_depth = 1.0e-3
+
+    def __init__(
+        self,
+        *,
+        mesh_size: float = 17.0e-3,
+        meshing: str = "morph",
+        material: str = "corotational",
+        unilateral: bool = True,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity)
+        self.unilateral = unilateral
+        self.design_space = DesignSpace(
+            DesignVariable("leg_width", 0.8, 1.2, 1.0, "1", "width of the legs over that of the published body"),
+            DesignVariable("top_height", 0.115, 0.140, 0.126, "m", "height of the top above the origin"),
+            DesignVariable("elbow_height", 0.036, 0.054, 0.045, "m", "height of the elbows above the origin"),
+            DesignVariable("elbow_radius", 0.087, 0.107, 0.097, "m", "distance of the elbows from the axis"),
+            DesignVariable("young_modulus", 1.0e5, 1.0e7, 3.0e6, "Pa", "stiffness of the silicone", log=True),
+            DesignVariable("poisson_ratio", 0.40, 0.499, 0.45, "1", "0.5 is incompressible"),
+        )
+        self.stiffness_variable = None if any(gravity) else "young_modulus"
+        self.effector_rest = self._top(self.design_space.baseline)
+        self.effort_scale = np.full(4, 40.0)
+        self.actuators = tuple(
+            # Published are 0 to 30 mm. Paying out lets the antagonists go, without which the published circle is out of
+            # reach: the top stays 6 mm above it.
+            Actuator(name, -0.010, 0.030, 0.0015, unilateral=unilateral)
+            for name in ("north", "west", "south", "east")
+        )
+
+    @property
+    def variant(self) -> str:
+        """``diamond``."""
+        return "diamond"
+
+    @property
+    def signature(self) -> dict[str, object]:
+        """Options that change the condensed model (a cable that may push has the same one)."""
+        return {
+            "mesh_size": self.mesh_size,
+            "meshing": self.meshing,
+            "material": self.material,
+            "gravity": list(self.gravity),
+        }
+
+    @staticmethod
+    def _top(design: Mapping[str, float]) -> np.ndarray:
+        return np.array([0.0, 0.0, design["top_height"] - Diamond.effector_depth])
+
+    # -- shape ------------------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def side_view(design: Mapping[str, float]) -> np.ndarray:
+        """Closed contour (r, z) of a leg [m], shape (k, 2): the published one, stretched piece by piece.
+
+        Between the hub and the elbow radii stretch; heights do between base and elbow, and between elbow and top.
+        It reaches a little beyond the axis, where the legs cut each other.
+        """
+        contour = []
+        for points in (OUTER, INNER[::-1]):
+            r, z = np.array(points, dtype=float).T
+            r = np.interp(r, [0.0, HUB_RADIUS, 97.0], [0.0, HUB_RADIUS, design["elbow_radius"] * 1e3])
+            heights = [-37.0, BASE_HEIGHT, design["elbow_height"] * 1e3, design["top_height"] * 1e3]
+            z = np.interp(z, [-37.0, BASE_HEIGHT, 45.0, 126.0], heights)
+            for end, inner in ((0, 1), (-1, -2)):  # both ends lie on the axis
+                slope = (z[end] - z[inner]) / (r[end] - r[inner])
+                r[end], z[end] = -10.0, z[end] - 10.0 * slope
+            contour.append(np.column_stack([r, z]) * 1e-3)
+        return np.concatenate(contour)
+
+    @staticmethod
+    def plan_view(design: Mapping[str, float]) -> np.ndarray:
+        """Closed contour (x, y) of the eighth [m], shape (5, 2): axis, leg (beyond its end), side, bevel, diagonal."""
+        end = design["elbow_radius"] * 1e3 + 1.0
+        taper = design["leg_width"] * (WIDE - NARROW) / (NARROW_RADIUS - WIDE_RADIUS)
+        axis_width = design["leg_width"] * WIDE + taper * WIDE_RADIUS
+        return 1e-3 * np.array(
+            [
+                (0.0, 0.0),
+                (end, 0.0),
+                (end, axis_width - taper * end),
+                (FILLET_RADIUS, axis_width - taper * FILLET_RADIUS),
+                (FILLET_DIAGONAL, FILLET_DIAGONAL),
+            ]
+        )
+
+    def mesh(self, design: Mapping[str, float]) -> BodyMesh:
+        """Mesh one eighth of a complete design."""
+        corners: dict[str, float] = {}
+        for names, contour in (("rz", self.side_view(design)), ("xy", self.plan_view(design))):
+            for k, point in enumerate(contour):
+                corners |= {f"{name}{k}": round(1e3 * float(v), 9) for name, v in zip(names, point, strict=True)}
+        return mesh_geometry(draw_eighth, corners, mesh_size=self.mesh_size)
+
+    def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
+        """One plane for each edge of the side view and of the plan view."""
+        features: dict[str, Feature] = {}
+        contour = self.side_view(design)
+        for k, ((r, z), (dr, dz)) in enumerate(zip(contour, np.diff(contour, axis=0), strict=False)):
+            features[f"edge {k}"] = Plane((r, 0, z), (dz, 0, -dr))
+        plan = self.plan_view(design)
+        for k, name in ((0, "middle of the leg"), (2, "side"), (3, "bevel"), (4, "diagonal")):
+            (x, y), (dx, dy) = plan[k], plan[(k + 1) % len(plan)] - plan[k]
+            features[name] = Plane((x, y, 0), (dy, -dx, 0))
+        return features
+
+    def unfold(self, part: BodyMesh) -> BodyMesh:
+        """Mirror the eighth to a quarter, a half and the whole."""
+        for normal in ((1, -1, 0), (0, 1, 0), (1, 0, 0)):
+            part = mirrored(part, normal)
+        return part
+
+    def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
+        """Stretch the legs with the elbow, and the upper half with the top."""
+        base, mm = self.reference_design, 1e-3
+        x, y, z = nodes.T
+        moved = np.column_stack(
+            [
+                np.interp(x, [0, HUB_RADIUS * mm, base["elbow_radius"]], [0, HUB_RADIUS * mm, design["elbow_radius"]]),
+                y,
+                np.interp(
+                    z,
+                    [-37 * mm, BASE_HEIGHT * mm, base["elbow_height"], base["top_height"]],
+                    [-37 * mm, BASE_HEIGHT * mm, design["elbow_height"], design["top_height"]],
+                ),
+            ]
+        )
+        return moved - nodes
+
+    # -- mechanics --------------------------------------------------------------------------------------------------
+
+    def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
+        """Clamp the middle of the base, tie a cable to each elbow, put the effector just below the top."""
+        # Chosen on the reference mesh, so that no node joins or leaves the clamp as the mesh moves.
+        nodes = self.reference_nodes(mesh)
+        model = MechanicalModel.from_mesh(
+            mesh.nodes,
+            mesh.tetrahedra,
+            fixed=(np.abs(nodes[:, :2]) <= 15.0e-3).all(axis=1) & (nodes[:, 2] <= 10.0e-3),
+            material=self.material,
+            young_modulus=design["young_modulus"],
+            poisson_ratio=design["poisson_ratio"],
+            density=MASS / VOLUME,
+            gravity=self.gravity,
+        )
+        elbow, height = design["elbow_radius"], design["elbow_height"]
+        for actuator, (x, y) in zip(self.actuators, ((0, 1), (-1, 0), (0, -1), (1, 0)), strict=True):
+            # The elbow's outermost point is a node of every mesh.
+            anchor = np.array([[x * elbow, y * elbow, height]])
+            pull_point = np.array([x * 10.0e-3, y * 10.0e-3, 30.0e-3])
+            model.add_cable(actuator.name, anchor, pull_point, unilateral=self.unilateral)
+        model.add_effector("top", self._top(design))
+        return model
+
+    def reference_path(self, count: int = 30) -> np.ndarray:
+        """Circle of radius 20 mm in the plane z = 133 mm, as published; the same for every body.
+
+        Cables that cannot push bring the top of the baseline body within 1.2 mm of it, others exactly onto it.
+        """
+        angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+        return np.column_stack([0.020 * np.cos(angle), 0.020 * np.sin(angle), np.full(count, 0.133)])
