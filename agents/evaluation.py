@@ -106,7 +106,16 @@ def make_agent(agent: str | Path, seed: int = 0) -> Agent:
             if env not in controllers or not state.command.any():  # a fresh one for each episode
                 body = env.robot
                 unilateral = np.array([actuator.unilateral for actuator in body.actuators])
-                controllers[env] = InverseQP(body.lower, body.upper, body.rates, unilateral)
+                weights = np.resize(env.task.axes, 3 * len(body.effectors))
+                # Only the first effector has a goal.
+                weights[3:] = 0.0
+                controllers[env] = InverseQP(
+                    body.lower,
+                    body.upper,
+                    body.rates,
+                    unilateral,
+                    goal_weights=None if weights.all() else weights,
+                )
             try:
                 command = controllers[env].solve(state.condensed, env.goal, state.command, state.slack)
             except ConvergenceError:  # a QP that fails holds still

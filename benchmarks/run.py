@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks import accuracy, sensor_finger, speed
+from benchmarks import accuracy, robots, sensor_finger, speed, validation
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError
 from softgym_envs.storage import write_json
@@ -19,6 +19,7 @@ __all__ = ["BENCHMARKS", "run"]
 BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "fem_step": speed.fem_step,
     "fem_profile": speed.fem_profile,
+    "fem_speed": speed.fem_speed,
     "notched_beam": speed.notched_beam,
     "surrogate_step": speed.surrogate_step,
     "inference": speed.inference,
@@ -27,7 +28,10 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "trajectories": accuracy.trajectories,
     "slack": accuracy.slack_states,
     "mesh_motion": accuracy.mesh_motion,
+    "tracking": robots.tracking,
+    "stiff_flop": robots.stiff_flop,
     "sensor_finger": sensor_finger.published,
+    "validation": validation.validation,
 }
 """Registry of benchmarks."""
 

@@ -63,41 +63,144 @@ def fem_step() -> dict[str, object]:
     return result
 
 
+class _Shares:
+    """Adds up the seconds spent in the parts of finite-element steps while it is entered as a context.
+
+    What one part calls of another counts for the outer one.
+    """
+
+    def __init__(self) -> None:
+        from softgym_envs.mechanics.linear_solver import CholmodSolver, SuperLUSolver
+        from softgym_envs.mechanics.model import MechanicalModel
+
+        solvers = (CholmodSolver, SuperLUSolver)
+        self.parts: list[tuple[Any, str, str]] = [
+            (MechanicalModel, "assemble", "assembly"),
+            (MechanicalModel, "warp", "warping"),
+            *((solver, "factorise", "factorisation") for solver in solvers),
+            *((solver, verb, "solves") for solver in solvers for verb in ("solve", "condense", "expand")),
+        ]
+        self.seconds = dict.fromkeys(("assembly", "factorisation", "solves", "warping"), 0.0)
+        self.counting = True
+        self._inside = False
+
+    def _timed(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            if self._inside or not self.counting:
+                return function(*arguments)
+            self._inside = True
+            start = time.perf_counter()
+            try:
+                return function(*arguments)
+            finally:
+                self.seconds[part] += time.perf_counter() - start
+                self._inside = False
+
+        return call
+
+    def __enter__(self) -> _Shares:
+        self._kept = [(owner, name, getattr(owner, name)) for owner, name, _ in self.parts]
+        for (owner, name, part), (_, _, function) in zip(self.parts, self._kept, strict=True):
+            setattr(owner, name, self._timed(function, part))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for owner, name, function in self._kept:
+            setattr(owner, name, function)
+
+
 def fem_profile() -> dict[str, object]:
     """Where the time of a FEM step goes (milliseconds per step, default finger, increments up to 1 mm)."""
     from softgym_envs.mechanics.statics import Statics
     from softgym_envs.robots import make_robot
 
     robot = make_robot("finger")
-    model = robot.build()
-    statics = Statics(model)
+    statics = Statics(robot.build())
     rng = np.random.default_rng(0)
     commands = np.cumsum(rng.uniform(-1e-3, 1e-3, (200, 2)), axis=0) + 5e-3
     commands = np.clip(commands, 0.0, 0.02)
     statics.solve(commands[0])
-    spent = dict.fromkeys(("assembly", "factorisation", "solves", "warping"), 0.0)
-
-    def timed(name, function):
-        def call(*arguments):
-            start = time.perf_counter()
-            try:
-                return function(*arguments)
-            finally:
-                spent[name] += time.perf_counter() - start
-
-        return call
-
-    model.assemble = timed("assembly", model.assemble)  # type: ignore[method-assign]
-    model.warp = timed("warping", model.warp)  # type: ignore[method-assign]
-    model.solver.factorise = timed("factorisation", model.solver.factorise)  # type: ignore[method-assign]
-    model.solver.solve = timed("solves", model.solver.solve)  # type: ignore[method-assign]
-    start = time.perf_counter()
-    iterations = sum(statics.solve(command).iterations for command in commands)
-    total = time.perf_counter() - start
+    with _Shares() as shares:
+        start = time.perf_counter()
+        iterations = sum(statics.solve(command).iterations for command in commands)
+        total = time.perf_counter() - start
+    spent = shares.seconds
     result: dict[str, object] = {f"{name} [ms]": 1e3 * value / len(commands) for name, value in spent.items()}
     result["rest: Python and small algebra [ms]"] = 1e3 * (total - sum(spent.values())) / len(commands)
     result["total [ms]"] = 1e3 * total / len(commands)
     result["Newton iterations per step"] = iterations / len(commands)
+    return result
+
+
+def _finer(robot: Any) -> dict[str, object]:
+    """Options that give a robot a mesh of about ten times as many elements, empty if it has no such option."""
+    if hasattr(robot, "mesh_size"):
+        return {"mesh_size": robot.mesh_size / 10.0 ** (1.0 / 3.0)}
+    if hasattr(robot, "elements"):
+        return {"elements": 10 * robot.elements}
+    return {}
+
+
+def _environment_speed(identifier: str, options: dict[str, object], steps: int, repeats: int) -> dict[str, object]:
+    """Steps per second, milliseconds per reset, size and shares of an environment on FEM, under random actions."""
+    import gymnasium
+
+    env = gymnasium.make(identifier, backend="fem", robot_options=options, disable_env_checker=True)
+    env.action_space.seed(0)
+    per_step, resets = [], []
+
+    def reset(seed: int | None = None) -> None:
+        start = time.perf_counter()
+        env.reset(seed=seed)
+        resets.append(time.perf_counter() - start)
+        for _ in range(8):  # away from rest, where half of the actuators would be slack
+            env.step(np.full(env.action_space.shape or 1, 0.3, dtype=np.float32))
+
+    reset(0)  # compiles what is not yet
+    resets.clear()
+    with _Shares() as shares:
+        for repeat in range(repeats):
+            shares.counting = False
+            reset(repeat)
+            seconds = 0.0
+            for _ in range(steps):
+                action = env.action_space.sample()
+                shares.counting = True
+                start = time.perf_counter()
+                _, _, terminated, truncated, _ = env.step(action)
+                seconds += time.perf_counter() - start
+                shares.counting = False
+                if terminated or truncated:
+                    reset()
+            per_step.append(seconds / steps)
+    unwrapped: Any = env.unwrapped
+    model = unwrapped.backend.model
+    env.close()
+    elements = sum(len(getattr(block, "connectivity", getattr(block, "rows", ()))) for block in model.blocks)
+    total = steps * sum(per_step)
+    spent = {**shares.seconds, "Python and small algebra": total - sum(shares.seconds.values())}
+    return {
+        "steps per second": 1.0 / statistics.median(per_step),
+        "reset [ms]": 1e3 * statistics.median(resets),
+        # A frame has four rows.
+        "nodes, elements, equations": f"{len(model.nodes) - 3 * len(model.frames)}, {elements}, {model.equations}",
+        "shares": ", ".join(f"{name} {100.0 * value / total:.0f} %" for name, value in spent.items()),
+    }
+
+
+def fem_speed() -> dict[str, object]:
+    """Every environment on FEM, on its own mesh and on one about ten times as fine: random actions, W included."""
+    import softgym_envs  # noqa: F401 - registers the IDs
+    from softgym_envs.envs.registration import ENVIRONMENTS
+    from softgym_envs.robots import make_robot
+
+    result: dict[str, object] = {}
+    for identifier, row in ENVIRONMENTS.items():
+        finer = _finer(make_robot(row.robot, **row.robot_options))
+        cases = [("", {}, 20, 5), *([(", fine", finer, 5, 3)] if finer else [])]
+        for label, more, steps, repeats in cases:
+            found = _environment_speed(identifier, {**row.robot_options, **more}, steps, repeats)
+            result |= {f"{identifier.removeprefix('SoftGym/')}{label}: {key}": value for key, value in found.items()}
     return result
 
 

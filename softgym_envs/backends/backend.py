@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.dynamics import Motion
 from softgym_envs.robots.robot import Robot
 
 __all__ = ["Backend", "State"]
@@ -26,6 +27,8 @@ class State:
         slack: actuators that hang slack, shape (n_a,).
         condensed: condensed model at the state.
         bonds: forces in the bonds of the body, in the order of its model [N], empty where it has none.
+        velocity: of the effectors [m/s], shape (k, 3); zero without dynamics.
+        motion: time, velocities and energies of the body, where the backend knows dynamics.
         stable: the state is stable whatever drives the actuators (always True on the surrogate, which knows no other).
         nodes: deformed nodes [m], shape (n, 3), where the backend has them.
     """
@@ -37,6 +40,8 @@ class State:
     slack: np.ndarray
     condensed: CondensedModel
     nodes: np.ndarray | None = None
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    motion: Motion | None = None
     bonds: np.ndarray = field(default_factory=lambda: np.zeros(0))
     stable: bool = True
 
@@ -48,8 +53,10 @@ class Backend(ABC):
         robot: the family of bodies.
         design: the present complete design.
         state: the present state.
+        moving: states have velocities that matter.
     """
 
+    moving: bool = False
     robot: Robot
     design: dict[str, float]
     state: State
@@ -64,12 +71,13 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def step(self, command: np.ndarray, mode: str = "displacement") -> State:
+    def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
         """Go to the equilibrium under a command, shape (n_a,), from the present one.
 
         Args:
             command: actuator displacements, or efforts.
             mode: ``"displacement"`` or ``"effort"``; an effort on an actuator that cannot push is not negative.
+            force: on the first effector [N], shape (3,), or None.
 
         Raises:
             ConvergenceError: if no equilibrium is found; the present state is kept.

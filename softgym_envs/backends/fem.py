@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.statics import Equilibrium, Statics
 from softgym_envs.robots.robot import Robot
@@ -15,18 +17,63 @@ from softgym_envs.robots.robot import Robot
 __all__ = ["FEMBackend"]
 
 
+def _let_fall(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
+    """Find an equilibrium that Newton's method does not, by the motion towards it: slow, and heavily damped."""
+    fall = Dynamics(model, step=0.02, stiffness_damping=0.02, tolerance=1e-8)
+    for _ in range(200):
+        motion = fall.advance(command, mode)
+        if np.abs(motion.velocity).max() * model.dof_scale.max() < 1e-3:
+            break
+    statics.restore(fall.x, fall.effort)
+    return statics.solve(command, mode)
+
+
 class FEMBackend(Backend):
-    """Static equilibria of the finite-element model; exact ``W`` at every state.
+    """The finite-element model: static equilibria with exact ``W``, or its motion.
+
+    An actuator whose effort would exceed its ``max_effort`` is driven by that effort instead, until the command lies on
+    the other side.
 
     Args:
         robot: the family of bodies.
         design: first design; missing variables take their baseline.
+        dynamics: step in time. The body still starts at its static equilibrium.
+        control_step: time of one `step` [s].
+        time_step: largest physical time step [s]; commands are ramped over those of a control step.
+        scheme: time integration, see `Dynamics`.
+        mass_damping: Rayleigh's alpha [1/s].
+        stiffness_damping: Rayleigh's beta [s].
     """
 
     model: MechanicalModel
 
-    def __init__(self, robot: Robot, design: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        design: Mapping[str, float] | None = None,
+        *,
+        dynamics: bool = False,
+        control_step: float = 0.05,
+        time_step: float = 0.01,
+        scheme: str = "euler",
+        mass_damping: float = 0.0,
+        stiffness_damping: float = 0.01,
+    ) -> None:
+        for name, value in (("control_step", control_step), ("time_step", time_step)):
+            if not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} = {value} s must be positive and finite")
         self.robot = robot
+        self.moving = dynamics
+        self.control_step = control_step
+        self._substeps = max(1, int(np.ceil(control_step / time_step - 1e-9)))
+        self._options: dict[str, Any] = {
+            "step": control_step / self._substeps,
+            "scheme": scheme,
+            "mass_damping": mass_damping,
+            "stiffness_damping": stiffness_damping,
+        }
+        self._max_effort = np.array([actuator.max_effort for actuator in robot.actuators])
+        self._limited = bool(np.isfinite(self._max_effort).any())
         self.design = {}
         self.reset(robot.design_space.complete(design))
 
@@ -36,36 +83,111 @@ class FEMBackend(Backend):
             model = self.robot.build(complete)
             statics = Statics(model)
             zero = np.zeros(len(self.robot.actuators))
-            self._rest = self._state(statics.solve(zero, "effort"), zero)
+            try:
+                rest = statics.solve(zero, self.robot.rest_mode)
+            except ConvergenceError:
+                rest = _let_fall(model, statics, zero, self.robot.rest_mode)
+            if self.robot.rest_mode == "effort" and model.loads.any():
+                # Loads would drag the actuators along; they are held.
+                rest = statics.solve(zero)
+            self._dynamics = Dynamics(model, **self._options) if self.moving else None
+            self._rest = self._state(rest, zero, still=True)
             self.model, self._statics, self.design = model, statics, dict(complete)
         self.restore(self._rest)
         return self.state
 
-    def step(self, command: np.ndarray, mode: str = "displacement") -> State:
+    def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
         command = np.asarray(command, dtype=float)
+        load = None
+        if force is not None:
+            load = np.zeros(self.state.condensed.delta.e.size)
+            load[:3] = force
         try:
-            equilibrium = self._statics.solve(command, mode)
+            if self._dynamics is None:
+                found = self._drive(self._statics, command, mode, load)
+                self.state = self._state(found, command)
+            else:
+                self.state = self._advance(command, mode, load)
         except ConvergenceError:
             self.restore(self.state)
             raise
-        self.state = self._state(equilibrium, command)
         return self.state
+
+    def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
+        """Return the static equilibrium under a command without going there."""
+        kept = self.state
+        try:
+            return self._state(self._statics.solve(np.asarray(command, dtype=float), mode), command, still=True)
+        finally:
+            self.restore(kept)
 
     def restore(self, state: State) -> None:
         assert state.nodes is not None
-        self._statics.restore(state.nodes, np.concatenate([state.condensed.effort, state.bonds]))
+        effort = np.concatenate([state.condensed.effort, state.bonds])
+        self._statics.restore(state.nodes, effort)
+        if self._dynamics is not None:
+            self._dynamics.restore(state.nodes, effort, None if state.motion is None else state.motion.velocity)
+        self._saturated = np.abs(state.effort) >= self._max_effort * (1.0 - 1e-9)
         self.state = state
 
-    def _state(self, equilibrium: Equilibrium, command: np.ndarray) -> State:
+    def _advance(self, command: np.ndarray, mode: str, load: np.ndarray | None) -> State:
+        assert self._dynamics is not None
+        start = self.state.command if mode == "displacement" else self.state.effort
+        for k in range(self._substeps):
+            part = command if k == self._substeps - 1 else start + (k + 1) / self._substeps * (command - start)
+            motion = self._drive(self._dynamics, part, mode, load)
+        return self._state(motion.equilibrium, command, motion)
+
+    def _drive(self, solver: Any, command: np.ndarray, mode: str, load: np.ndarray | None) -> Any:
+        """One solve, in which actuators give way at their largest effort."""
+        go = solver.advance if isinstance(solver, Dynamics) else solver.solve
+        if not self._limited or mode == "effort":
+            if command.shape == self._max_effort.shape:
+                command = np.clip(command, -self._max_effort, self._max_effort)
+            return go(command, mode, effector_force=load)
+        saturated = self._saturated.copy()
+        sign = np.sign(solver.effort[: len(command)])
+        for _ in range(len(command) + 1):
+            # One that gives way is released when its command asks for less than it has.
+            target = np.where(saturated, sign * self._max_effort, command)
+            modes = ["effort" if s else "displacement" for s in saturated]
+            kept = (solver.x, solver.effort, getattr(solver, "snapshot", None))
+            found = go(target, modes, effector_force=load)
+            equilibrium = found.equilibrium if isinstance(found, Motion) else found
+            effort, reached = equilibrium.effort[: len(command)], equilibrium.delta[: len(command)]
+            over = ~saturated & (np.abs(effort) > self._max_effort)
+            back = saturated & (sign * (command - reached) < 0.0)
+            if not (over.any() or back.any()):
+                break
+            sign = np.where(over, np.sign(effort), sign)
+            saturated = (saturated | over) & ~back
+            if isinstance(solver, Dynamics):
+                assert kept[2] is not None
+                solver.snapshot = kept[2]
+            else:
+                solver.restore(kept[0], kept[1])
+        self._saturated = saturated
+        return found
+
+    def _state(
+        self, equilibrium: Equilibrium, command: np.ndarray, motion: Motion | None = None, *, still: bool = False
+    ) -> State:
         condensed, slices = equilibrium.condensed, equilibrium.condensed.slices
+        effector = equilibrium.delta[slices["e"]].reshape(-1, 3)
+        velocity = np.zeros_like(effector)
+        if motion is not None and not still:
+            assert self._dynamics is not None
+            velocity = self._dynamics.effector_velocity().reshape(-1, 3)
         return State(
-            command=command.copy(),
+            command=np.array(command, dtype=float),
             displacement=equilibrium.delta[slices["a"]],
             effort=equilibrium.effort[slices["a"]],
-            effector=equilibrium.delta[slices["e"]].reshape(-1, 3),
+            effector=effector,
             slack=equilibrium.slack,
             condensed=condensed,
             nodes=equilibrium.x,
+            velocity=velocity,
+            motion=motion,
             bonds=equilibrium.effort[len(condensed.effort) :],
             stable=equilibrium.stable,
         )

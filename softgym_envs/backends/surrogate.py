@@ -137,7 +137,9 @@ class SurrogateBackend(Backend):
         self.state = self._rest
         return self.state
 
-    def step(self, command: np.ndarray, mode: str = "displacement") -> State:
+    def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
+        if force is not None and np.any(force):
+            raise ValueError("the surrogate knows no forces on effectors; use backend='fem'")
         command = np.asarray(command, dtype=float)
         if command.shape != (self.model.count,) or not np.isfinite(command).all():
             raise ValueError(f"command must be {self.model.count} finite numbers, got {command.tolist()}")

@@ -18,21 +18,33 @@ class Interface:
         action_mode: ``"increment"``: an action of 1 moves a command by its largest rate; ``"absolute"``: -1 and 1 are
             the ends of the actuator's range, approached at no more than the rate.
         design_names: design variables shown in the observation, none for an empty tuple.
+        axes: which coordinates of the effector count in the error, shape (3,); default all.
+        moving: show velocities, as an agent needs in dynamics.
     """
 
-    def __init__(self, robot: Robot, *, action_mode: str, design_names: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        action_mode: str,
+        design_names: tuple[str, ...],
+        axes: np.ndarray | None = None,
+        moving: bool = False,
+    ) -> None:
         if action_mode not in ("increment", "absolute"):
             raise ValueError(f"action_mode = {action_mode!r} is unknown; allowed: 'increment', 'absolute'")
         self.robot = robot
         self.action_mode = action_mode
         self.design_names = design_names
+        self.axes = np.ones(3) if axes is None else axes
+        self.moving = moving
         self.lower, self.upper, self.rates = robot.lower, robot.upper, robot.rates
         self._middle = 0.5 * (self.lower + self.upper)
         self._half = 0.5 * (self.upper - self.lower)
         self._reach = 1.25 * robot.size
         n = len(robot.actuators)
         self.action_space = spaces.Box(-1.0, 1.0, (n,), np.float32)
-        self.observation_space = spaces.Box(-1.0, 1.0, (3 * n + 9 + len(design_names),), np.float32)
+        self.observation_space = spaces.Box(-1.0, 1.0, (3 * n + 9 + 3 * moving + len(design_names),), np.float32)
 
     def check_action(self, action: np.ndarray) -> np.ndarray:
         """Return the action as float64, clipped to [-1, 1].
@@ -73,13 +85,15 @@ class Interface:
         effector: np.ndarray,
         goal: np.ndarray,
         unit_design: np.ndarray,
+        velocity: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Scaled observation (..., d): command, displacement, effort, effector, goal, error, design.
+        """Scaled observation (..., d): command, displacement, effort, effector, goal, error, velocity, design.
 
         Efforts and errors have no bound of their own and are squashed by x / (1 + |x|), which loses nothing.
         """
         relative = effort / self.robot.effort_scale
-        error = (goal - effector) * (10.0 / self.robot.size)
+        error = self.axes * (goal - effector) * (2.5 / self.robot.motion)
+        speed = velocity / self.robot.size if self.moving and velocity is not None else None
         parts = (
             (command - self._middle) / self._half,
             (displacement - self._middle) / self._half,
@@ -87,6 +101,7 @@ class Interface:
             effector / self._reach,
             goal / self._reach,
             error / (1.0 + np.abs(error)),
+            *(() if speed is None else (speed / (1.0 + np.abs(speed)),)),
             unit_design,
         )
         observation = np.concatenate(parts, axis=-1)

@@ -24,7 +24,6 @@ class Reach(Task):
     """
 
     name = "reach"
-    success_distance = 0.002
     horizon = 1
 
     def __init__(

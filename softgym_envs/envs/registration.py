@@ -17,6 +17,7 @@ class EnvironmentRow:
         task: registry name of the task.
         max_episode_steps: time limit.
         backend: ``"surrogate"`` where weights ship for the robot, else ``"fem"``.
+        backend_options: options of that backend.
         robot_options: options of the robot.
         task_options: options of the task.
     """
@@ -27,15 +28,29 @@ class EnvironmentRow:
     backend: str = "surrogate"
     robot_options: dict[str, Any] = field(default_factory=dict)
     task_options: dict[str, Any] = field(default_factory=dict)
+    backend_options: dict[str, Any] = field(default_factory=dict)
 
+
+MOVING = {"dynamics": True}
 
 ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/FingerReach-v0": EnvironmentRow("finger", "reach", 50),
     "SoftGym/FingerTrack-v0": EnvironmentRow("finger", "track", 100),
     "SoftGym/DiamondReach-v0": EnvironmentRow("diamond", "reach", 50, backend="fem"),
-    "SoftGym/DiamondTrack-v0": EnvironmentRow("diamond", "track", 100, backend="fem"),
+    # The published circle asks for cables that push back on their way out.
+    "SoftGym/DiamondTrack-v0": EnvironmentRow(
+        "diamond", "track", 100, backend="fem", robot_options={"unilateral": False}
+    ),
     "SoftGym/CableTrunkReach-v0": EnvironmentRow("cable_trunk", "reach", 50, backend="fem"),
     "SoftGym/CableTrunkTrack-v0": EnvironmentRow("cable_trunk", "track", 100, backend="fem"),
+    "SoftGym/TrunkReach-v0": EnvironmentRow("trunk", "reach", 50, backend="fem"),
+    "SoftGym/TrunkTrack-v0": EnvironmentRow("trunk", "track", 100, backend="fem"),
+    "SoftGym/FingerPress-v0": EnvironmentRow("press_finger", "track", 100, backend="fem"),
+    "SoftGym/GripperPinch-v0": EnvironmentRow("two_finger_gripper", "track", 100, backend="fem"),
+    "SoftGym/GripperManipulate-v0": EnvironmentRow("three_finger_gripper", "track", 100, backend="fem"),
+    "SoftGym/TetrapodReach-v0": EnvironmentRow("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
+    "SoftGym/TetrapodTrack-v0": EnvironmentRow("tetrapod", "track", 100, backend="fem", backend_options=MOVING),
+    "SoftGym/TetrapodCarry-v0": EnvironmentRow("tetrapod", "carry", 100, backend="fem", backend_options=MOVING),
 }
 """All environment IDs."""
 
@@ -60,5 +75,6 @@ def register_environments() -> None:
                     "backend": row.backend,
                     "robot_options": dict(row.robot_options),
                     "task_options": dict(row.task_options),
+                    "backend_options": dict(row.backend_options),
                 },
             )

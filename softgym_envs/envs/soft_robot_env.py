@@ -92,12 +92,18 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self._sampled = design_names(self.design_space, sample_design)
         shown = design_names(self.design_space, design_in_observation)
         self.task = make_task(task, self.robot, **dict(task_options or {}))
-        self.interface = Interface(self.robot, action_mode=action_mode, design_names=shown)
-        self.action_space = self.interface.action_space
-        self.observation_space = self.interface.observation_space
         self.backend: Backend = make_backend(
             backend, self.robot, design=self._fixed_design, **dict(backend_options or {})
         )
+        self.interface = Interface(
+            self.robot,
+            action_mode=action_mode,
+            design_names=shown,
+            axes=self.task.axes,
+            moving=self.backend.moving,
+        )
+        self.action_space = self.interface.action_space
+        self.observation_space = self.interface.observation_space
         self._renderer: Any = None
         self._path = np.zeros((1, 3))
         self._step = 0
@@ -156,6 +162,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             self._path = self.task.sample(self.np_random, 1, self._kinematics)[0]
         else:
             self._path = check_goals(goal, "goal")
+        self.task.begin(self.np_random)
         self._step = 0
         return self._observe()
 
@@ -173,7 +180,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         command = self.interface.command(action, self.backend.state.command)
         converged = True
         try:
-            self.backend.step(command)
+            self.backend.step(command, force=self.task.push(self._step))
         except ConvergenceError:
             converged = False
         self._step += 1
@@ -189,8 +196,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
     def _observe(self) -> tuple[np.ndarray, dict[str, Any]]:
         state, goal = self.backend.state, self.goal
         effector = state.effector[0]
-        offset = effector - goal
-        distance = float(np.sqrt(offset @ offset))
+        distance = float(self.task.distance(effector, goal))
         share = np.abs(state.effort / self.robot.effort_scale).mean()
         info = {
             "effector": effector.copy(),
@@ -203,8 +209,9 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             "stable": state.stable,
             "converged": True,
         }
+        velocity = state.velocity[0] if self.interface.moving else None
         observation = self.interface.observe(
-            state.command, state.displacement, state.effort, effector, goal, self._unit_design
+            state.command, state.displacement, state.effort, effector, goal, self._unit_design, velocity
         )
         return observation, info
 

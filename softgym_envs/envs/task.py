@@ -15,6 +15,7 @@ __all__ = ["TASKS", "Task", "check_goals", "make_task", "tolerance"]
 TASKS: dict[str, str] = {
     "reach": "softgym_envs.envs.reach:Reach",
     "track": "softgym_envs.envs.track:Track",
+    "carry": "softgym_envs.envs.carry:Carry",
 }
 """Registry: name to ``module:class``, imported when used."""
 
@@ -54,16 +55,18 @@ class Task(ABC):
 
     Attributes:
         name: registry name.
+        axes: which coordinates of the effector count, 1 or 0, shape (3,).
         success_distance: distance below which a goal counts as reached [m].
         horizon: control steps a goal path describes; paths hold their last goal beyond it.
     """
 
     name: str
-    success_distance: float
     horizon: int
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
+        self.axes = np.asarray(robot.goal_axes, dtype=float)
+        self.success_distance = robot.precision
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, count: int, kinematics: Kinematics) -> np.ndarray:
@@ -82,6 +85,17 @@ class Task(ABC):
         index = np.minimum(steps * counts // self.horizon, counts - 1)
         return paths[np.arange(len(paths)), index]
 
+    def begin(self, rng: np.random.Generator) -> None:  # noqa: B027 - a hook, not a duty
+        """Draw what else is random in an episode of a single environment; nothing by default."""
+
+    def push(self, step: int) -> np.ndarray | None:
+        """Force on the first effector during a control step [N], shape (3,), or None."""
+        return None
+
+    def distance(self, effector: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Distance [m] (...) of effectors to goals, each (..., 3), along the axes that count."""
+        return np.linalg.norm(self.axes * (effector - goal), axis=-1)
+
     def reward_terms(self, distance: np.ndarray, effort_share: np.ndarray) -> dict[str, np.ndarray]:
         """Return the factors of the reward, each in [0, 1].
 
@@ -90,7 +104,7 @@ class Task(ABC):
             effort_share: mean actuator effort over its scale, shape (...).
         """
         close = 0.5 * tolerance(distance, 0.0, self.success_distance) + 0.5 * tolerance(
-            distance, 0.0, 0.25 * self.robot.size
+            distance, 0.0, self.robot.motion
         )
         return {"distance": close, "effort": 1.0 - 0.05 * np.clip(effort_share, 0.0, 1.0)}
 

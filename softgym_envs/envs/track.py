@@ -20,7 +20,6 @@ class Track(Task):
     """
 
     name = "track"
-    success_distance = 0.002
     horizon = 100
 
     def __init__(self, robot: Robot, *, path: np.ndarray | None = None, jitter: float = 0.0) -> None:

@@ -242,7 +242,7 @@ class SoftRobotVectorEnv(VectorEnv):
 
     def _info(self) -> tuple[dict[str, Any], np.ndarray]:
         goals = self._goals()
-        distance = np.linalg.norm(self._effector - goals, axis=1)
+        distance = self.task.distance(self._effector, goals)
         share = np.abs(self._effort / self.robot.effort_scale).mean(axis=1)
         terms = self.task.reward_terms(distance, share)
         reward = np.ones(self.num_envs)

@@ -88,7 +88,7 @@ class Assembly:
 
     def add_frame(
         self,
-        position: np.ndarray,
+        position: np.ndarray | Sequence[float],
         rotation: np.ndarray | None = None,
         *,
         fixed: bool | Sequence[bool] = False,

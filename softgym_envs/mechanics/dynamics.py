@@ -198,6 +198,29 @@ class Dynamics(Statics):
         self.velocity = self.model.row_velocity(self.x, velocity)
         self._history = None
 
+    @property
+    def snapshot(self) -> tuple:
+        """All that a step starts from; assign it to take steps back."""
+        return (
+            self.x,
+            self.effort,
+            self.velocity,
+            self.time,
+            self._history,
+            self._work,
+            self._dissipated,
+        )
+
+    @snapshot.setter
+    def snapshot(self, kept: tuple) -> None:
+        self.x, self.effort, self.velocity, self.time, self._history, self._work, self._dissipated = kept
+        self._fresh = False
+
+    def effector_velocity(self) -> np.ndarray:
+        """Velocity of the effector rows [m/s], shape (n_e,)."""
+        parts = [c.jacobian(self.x) @ self.velocity.ravel()[c.dofs] for c in self.model.constraints["e"]]
+        return np.concatenate([np.zeros(0), *parts])
+
     def energies(self) -> tuple[float, float]:
         """Kinetic and potential energy [J] of the present state."""
         return 0.5 * float(np.vdot(self.velocity, self._mass @ self.velocity)), self.model.energy(self.x)
@@ -221,7 +244,7 @@ class Dynamics(Statics):
         """
         target = np.asarray(target, dtype=float)
         options = {"effector_force": effector_force, "contact": contact, "contact_mode": contact_mode}
-        start = (self.x, self.effort, self.velocity, self.time, self._history, self._work, self._dissipated)
+        start = self.snapshot
         first = self._present_command(mode)
         for cut in range(self.max_cuts + 1):
             count = 2**cut
@@ -232,8 +255,7 @@ class Dynamics(Statics):
                     found = self._advance(part, mode, self.step / count, options)
                 break
             except ConvergenceError:
-                self.x, self.effort, self.velocity, self.time, self._history, self._work, self._dissipated = start
-                self._fresh = False
+                self.snapshot = start
                 if cut == self.max_cuts:
                     raise ConvergenceError(
                         f"no motion over {self.step:g} s to actuators {target.tolist()}, even in {count} steps",

@@ -13,7 +13,7 @@ the symmetric one) and ``c`` 1 for points, 0 for directors.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numba import njit
@@ -22,7 +22,7 @@ from scipy.sparse import csr_matrix
 __all__ = ["Frames", "KinematicMap", "frame_rows", "rotation_of", "rotation_vector_matrix"]
 
 
-def frame_rows(position: np.ndarray, rotation: np.ndarray | None = None) -> np.ndarray:
+def frame_rows(position: np.ndarray | Sequence[float], rotation: np.ndarray | None = None) -> np.ndarray:
     """Rows of a frame at a position [m] (3,) with a rotation matrix (3, 3), shape (4, 3)."""
     rotation = np.eye(3) if rotation is None else np.asarray(rotation, dtype=float)
     if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9):
@@ -37,15 +37,30 @@ def rotation_of(x: np.ndarray, row: int) -> np.ndarray:
     return x[row + 1 : row + 4].T
 
 
+@njit(cache=True, error_model="numpy")
+def _rodrigues(vectors, out):
+    for k in range(vectors.shape[0]):
+        x, y, z = vectors[k]
+        squared = x * x + y * y + z * z
+        angle = np.sqrt(squared)
+        if angle < 1e-4:
+            a = 1.0 - squared / 6.0
+            b = 0.5 - squared / 24.0
+        else:
+            a = np.sin(angle) / angle
+            half = np.sin(0.5 * angle) / angle
+            b = 2.0 * half * half
+        out[k, 0, 0], out[k, 0, 1], out[k, 0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+        out[k, 1, 0], out[k, 1, 1], out[k, 1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
+        out[k, 2, 0], out[k, 2, 1], out[k, 2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
+
+
 def rotation_vector_matrix(vectors: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    cross = np.zeros((*vectors.shape[:-1], 3, 3))
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -z, y, -x
-    cross[..., 1, 0], cross[..., 2, 0], cross[..., 2, 1] = z, -y, x
-    half = np.sinc(angle / (2.0 * np.pi))  # sin(a / 2) / (a / 2)
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * half * half * (cross @ cross)
+    vectors = np.asarray(vectors, dtype=float)
+    out = np.empty((*vectors.shape, 3))
+    _rodrigues(np.ascontiguousarray(vectors).reshape(-1, 3), out.reshape(-1, 3, 3))
+    return out
 
 
 @njit(cache=True)

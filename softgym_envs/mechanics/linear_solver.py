@@ -43,6 +43,15 @@ class LinearSolver(ABC):
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Solve for the columns of ``rhs``, shape (n, k), with the last factorisation."""
 
+    def condense(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``H^T A^-1 H``, shape (k, k), for columns ``H`` (n, k), and what `expand` needs, shape (n, k)."""
+        solved = self.solve(columns)
+        return columns.T @ solved, solved
+
+    def expand(self, vector: np.ndarray) -> np.ndarray:
+        """Return ``A^-1 H s``, shape (n,), for ``vector = half @ s`` with the second result of `condense`."""
+        return vector
+
 
 class CholmodSolver(LinearSolver):
     """Supernodal Cholesky of CHOLMOD, from the cvxopt wheel (GPL). Positive definite matrices only."""
@@ -75,6 +84,20 @@ class CholmodSolver(LinearSolver):
         solution = self._matrix(np.asfortranarray(rhs))
         self._cholmod.solve(self._factor, solution)
         return np.asarray(solution)
+
+    def condense(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # With P A P^T = L L^T half of the work will do: H^T A^-1 H = Y^T Y, L Y = P H.
+        half = self._matrix(np.asfortranarray(columns))
+        self._cholmod.solve(self._factor, half, sys=7)  # P
+        self._cholmod.solve(self._factor, half, sys=4)  # L
+        solved = np.asarray(half)
+        return solved.T @ solved, solved
+
+    def expand(self, vector: np.ndarray) -> np.ndarray:
+        solution = self._matrix(vector)
+        self._cholmod.solve(self._factor, solution, sys=5)  # L^T
+        self._cholmod.solve(self._factor, solution, sys=8)  # P^T
+        return np.asarray(solution)[:, 0]
 
 
 class SuperLUSolver(LinearSolver):

@@ -126,6 +126,31 @@ class Inertia(ABC):
         """Return velocities [m/s] and accelerations [m/s2] of the rows (n, 3) if the step ends at rows ``x`` (n, 3)."""
 
 
+@njit(cache=True)
+def _find_entries(keys, total, indptr, indices, out):
+    """Places of keys ``column * total + row`` in a CSC pattern; other keys than those in it keep their place."""
+    for k in range(keys.shape[0]):
+        column = keys[k] // total
+        if keys[k] < 0 or column >= indptr.shape[0] - 1:
+            continue
+        row = keys[k] - column * total
+        low, high = indptr[column], indptr[column + 1]
+        while low < high:
+            middle = (low + high) // 2
+            if indices[middle] < row:
+                low = middle + 1
+            else:
+                high = middle
+        if low < indptr[column + 1] and indices[low] == row:
+            out[k] = low
+
+
+def _distinct(keys: np.ndarray) -> np.ndarray:
+    """Sorted distinct values, as `numpy.unique` returns them; for integers sorting alone is far faster."""
+    keys = np.sort(keys)
+    return keys[np.append(True, keys[1:] != keys[:-1])] if len(keys) else keys
+
+
 class MechanicalModel:
     """Soft bodies, beams and rigid parts with actuators, effectors, contact points, sensors and bonds.
 
@@ -398,7 +423,7 @@ class MechanicalModel:
             key = np.minimum(first, second) * total + np.maximum(first, second)
             key[~valid] = -1
             keys.append(key)
-        seen = np.unique(np.concatenate([key.ravel() for key in keys] + [np.arange(n) * (total + 1)]))
+        seen = _distinct(np.concatenate([key.ravel() for key in keys] + [np.arange(n) * (total + 1)]))
         seen = seen[seen >= 0]
         high = seen % total
         direct, extra = seen[high < n], seen[high >= n]
@@ -407,7 +432,7 @@ class MechanicalModel:
             expanded = self._map.plan(extra // total, extra % total)
             spins = self._map.spin_pairs
         pairs = np.concatenate([expanded, spins[spins[:, 0] >= 0]])
-        direct = np.unique(np.concatenate([direct, pairs[:, 0] * total + pairs[:, 1]]))
+        direct = _distinct(np.concatenate([direct, pairs[:, 0] * total + pairs[:, 1]]))
         self._entries = len(direct)
         if self._map is not None:
             spin_target = np.searchsorted(direct, spins[:, 0] * total + spins[:, 1])
@@ -415,18 +440,20 @@ class MechanicalModel:
                 np.searchsorted(direct, expanded[:, 0] * total + expanded[:, 1]),
                 np.where(spins[:, 0] >= 0, spin_target, -1),
             )
+        indptr = np.searchsorted(direct, np.arange(n + 1, dtype=np.int64) * total)
+        indices = direct % total
         maps: list[np.ndarray] = []
         for key in keys:
-            place = np.searchsorted(direct, key)
+            place = np.full(key.shape, -1, dtype=np.int32)
+            _find_entries(key.ravel(), total, indptr, indices, place.reshape(-1))
             if len(extra):
-                touches = key % total >= n
-                place = np.where(touches, self._entries + np.searchsorted(extra, key), place)
-            maps.append(np.where(key < 0, -1, place).astype(np.int32))
+                touches = (key >= 0) & (key % total >= n)
+                place[touches] = self._entries + np.searchsorted(extra, key[touches])
+            maps.append(place)
         following = iter(maps)
         self._block_maps = [[next(following) for _ in range(share)] for share in shares]
         self._hessian_maps = [next(following) if c in curved else None for c, _ in self._rows]
         self._bond_maps = [next(following) for _ in self._bonds]
-        indptr = np.searchsorted(direct, np.arange(n + 1, dtype=np.int64) * total)
         self._keys = np.concatenate([direct, extra])
         self._masses: tuple[bool, csr_matrix, np.ndarray] | None = None
         self._values = np.empty(self._entries + len(extra))
@@ -436,7 +463,7 @@ class MechanicalModel:
             equations = self._equation[constraint.dofs]
             keep = np.flatnonzero(equations >= 0)
             self._targets.append((keep, equations[keep]))
-        self._solver = make_solver(self._solver_name, indptr, direct % total)
+        self._solver = make_solver(self._solver_name, indptr, indices)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the factorisations, which cannot be copied and are made again when needed."""
@@ -494,8 +521,8 @@ class MechanicalModel:
                 hessian = constraint.hessian(x, part)
                 assert hessian is not None
                 _subtract_entries(values, mapping, hessian.ravel())
-            H[equations, rows] = constraint.jacobian(x)[:, keep].T
-            delta[rows] = constraint.value(x)
+            delta[rows], jacobian = constraint.linearise(x)
+            H[equations, rows] = jacobian[:, keep].T
         residual = np.zeros(n)
         residual[: len(self.free_dofs)] = gradient.ravel()[self.free_dofs]
         if self._map is not None:
@@ -569,6 +596,7 @@ class MechanicalModel:
         gradient += matrix @ (acceleration + terms.mass_damping * velocity)
         values += (terms.acceleration_factor + terms.mass_damping * terms.velocity_factor) * entries
         if terms.stiffness_damping:
+            assert terms.stiffness is not None
             values += (terms.stiffness_damping * terms.velocity_factor) * terms.stiffness
             gradient += self.damping_force(terms, velocity)
 

@@ -58,14 +58,17 @@ def _complementary_step(W: np.ndarray, gap: np.ndarray, effort: np.ndarray, unil
     """Steps of driven efforts that close ``gap`` where a row is bilateral, and in which no unilateral row pushes."""
     if not unilateral.any():
         return np.linalg.solve(W, -gap)
+    if unilateral.all():
+        return solve_complementarity(W[None], (gap - W @ effort)[None], unilateral)[0] - effort
     loose, firm = np.flatnonzero(unilateral), np.flatnonzero(~unilateral)
     offset = gap - W @ effort
     # Bilateral rows are eliminated: only the few others are a question of taut or slack.
-    reduced = np.linalg.solve(W[np.ix_(firm, firm)], np.column_stack([W[np.ix_(firm, loose)], offset[firm]]))
-    across = W[np.ix_(loose, firm)] @ reduced
+    below, right = firm[:, None], loose[:, None]
+    reduced = np.linalg.solve(W[below, firm], np.column_stack([W[below, loose], offset[firm]]))
+    across = W[right, firm] @ reduced
     new = np.empty_like(effort)
     new[loose] = solve_complementarity(
-        (W[np.ix_(loose, loose)] - across[:, :-1])[None],
+        (W[right, loose] - across[:, :-1])[None],
         (offset[loose] - across[:, -1])[None],
         np.ones(len(loose), dtype=bool),
     )[0]
@@ -147,9 +150,8 @@ class Statics:
             if not self._fallback.factorise(values):
                 return False
             self._active = self._fallback
-        columns = self._active.solve(np.column_stack([self._H, self._residual]))
-        self._AH, self._Ar = columns[:, :-1], columns[:, -1]
-        self._W = self._H.T @ self._AH
+        self._Ar = self._active.solve(self._residual[:, None])[:, 0]
+        self._W, self._half = self._active.condense(self._H)
         if not np.isfinite(self._W).all():
             return False
         self._W = 0.5 * (self._W + self._W.T)
@@ -162,19 +164,19 @@ class Statics:
         """Solve the linearised KKT system; returns the step of the free dofs and of the efforts."""
         step_effort = np.zeros_like(effort)
         # Effort-driven rows: the residual already holds their current effort; move it to the commanded value.
-        forced = np.setdiff1d(np.arange(len(effort)), driven)
+        forced = np.ones(len(effort), dtype=bool)
+        forced[driven] = False
         step_effort[forced] = target[forced] - effort[forced]
         if len(driven):
-            H = self._H[:, driven]
-            gap = delta[driven] - target[driven] - H.T @ Ar + self._W[np.ix_(driven, forced)] @ step_effort[forced]
-            W = self._W[np.ix_(driven, driven)]
+            gap = (delta - target - Ar @ self._H + self._W @ step_effort)[driven]
+            W = self._W[driven[:, None], driven]
             loose = np.zeros(len(effort), dtype=bool)
             loose[: self._actuators] = self.unilateral
             try:
                 step_effort[driven] = _complementary_step(W, gap, effort[driven], loose[driven])
             except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (actuators that do the same)
                 raise _NotFound from None
-        step_q = self._AH @ step_effort - Ar
+        step_q = self._active.expand(self._half @ step_effort) - Ar
         if len(self._bonds):
             # The tangent holds `bond_stiffness` H_b H_b^T, which already carries its share of the force.
             step_effort[self._bonds] += self.model.bond_stiffness * (delta[self._bonds] - target[self._bonds])

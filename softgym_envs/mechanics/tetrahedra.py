@@ -258,7 +258,7 @@ class SolidBlock(ElementBlock):
 
     def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         m, k = self.connectivity.shape
-        values = np.einsum("q,qaj,qbj->qab", self.weights, self.gradients, self.gradients)
+        values = (self.weights[:, None, None] * self.gradients) @ np.swapaxes(self.gradients, 1, 2)
         values = values.reshape(m, self.points, k, k).sum(axis=1)
         rows = np.repeat(self.connectivity, k, axis=1)
         columns = np.tile(self.connectivity, (1, k))
@@ -304,6 +304,9 @@ class Tetrahedra(SolidBlock):
             poisson_ratio=poisson_ratio,
             density=density,
         )
+
+    def embed(self, points: np.ndarray, nodes: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
+        return EmbeddedPoints(points, nodes, self.connectivity, hint, gradients=self.gradients[:, 1:])
 
     def nodal_masses(self, count: int) -> np.ndarray:
         share = np.repeat(0.25 * self.density * self.volumes, 4)

@@ -19,6 +19,7 @@ ROBOTS: dict[str, str] = {
     "trunk": "softgym_envs.robots.stiff_flop:StiffFlop",
     "press_finger": "softgym_envs.robots.grippers:PressFinger",
     "two_finger_gripper": "softgym_envs.robots.grippers:TwoFingerGripper",
+    "tetrapod": "softgym_envs.robots.tetrapod:Tetrapod",
     "three_finger_gripper": "softgym_envs.robots.grippers:ThreeFingerGripper",
 }
 """Registry: name to ``module:class``, imported when used."""

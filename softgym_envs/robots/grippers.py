@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -59,8 +60,9 @@ class FingerRobot(Robot):
         self.finger = SoftFinger(
             cables=2, mesh_size=mesh_size, meshing=meshing, material=material, unilateral=unilateral
         )
+        self.mesh_size = self.finger.mesh_size
         self.unilateral = unilateral
-        self.design_space = DesignSpace(*self.finger.design_space.variables.values(), *self.more_variables())
+        self.design_space = DesignSpace(*self.variables())
         self.actuators = tuple(
             Actuator(f"finger_{k + 1}_{cable.name}", *self.cable_range, self.cable_rate, unilateral=unilateral)
             for k in range(len(self.placements))
@@ -80,9 +82,9 @@ class FingerRobot(Robot):
         """Options that change the condensed model."""
         return {"finger": self.finger.signature, "gravity": list(self.gravity)}
 
-    def more_variables(self) -> tuple[DesignVariable, ...]:
-        """Design variables beyond those of the finger."""
-        return ()
+    def variables(self) -> tuple[DesignVariable, ...]:
+        """Design variables: those of the finger, and more if there are any."""
+        return tuple(self.finger.design_space.variables.values())
 
     @abstractmethod
     def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
@@ -168,6 +170,8 @@ class PressFinger(FingerRobot):
     effectors = ("button",)
     placements = ((STRAIGHT, (0.0, 0.0, 0.0)),)
     half_extents = (13.75e-3, 13.75e-3, 13.75e-3)
+    goal_axes = np.array([0.0, 1.0, 0.0])
+    precision = 5e-4
     scales = False  # the button's force stays what it is
 
     def __init__(
@@ -191,6 +195,13 @@ class PressFinger(FingerRobot):
     def signature(self) -> dict[str, object]:
         """Options that change the condensed model."""
         return {**super().signature, "button_force": self.button_force}
+
+    def variables(self) -> tuple[DesignVariable, ...]:
+        """Those of the finger, without bodies so soft that the button folds them."""
+        return tuple(
+            replace(variable, low=2.0e6) if variable.name == "young_modulus" else variable
+            for variable in super().variables()
+        )
 
     def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
         """Centre of the button, whose face lies on the front of the last segment."""
@@ -226,16 +237,19 @@ class TwoFingerGripper(FingerRobot):
     name = "two_finger_gripper"
     effectors = ("bar",)
     placements = ((STRAIGHT, (0.0, 0.0, 0.0)), (TURNED, (0.0, 0.080, 0.0)))
+    goal_axes = np.array([1.0, 1.0, 0.0])
+    precision = 5e-4
 
-    def more_variables(self) -> tuple[DesignVariable, ...]:
-        """The length of the bar."""
-        return (DesignVariable("bar_length", 0.030, 0.055, 0.040, "m", "offset of the two tips along y"),)
+    def variables(self) -> tuple[DesignVariable, ...]:
+        """Those of the finger and the length of the bar."""
+        bar = DesignVariable("bar_length", 0.030, 0.055, 0.040, "m", "offset of the two tips along y")
+        return (*super().variables(), bar)
 
     def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
         """Middle of the bar, before the tips come together."""
         return np.array([0.0, 0.040, self.finger.tip(design)[2]])
 
-    def reference_path(self, count: int = 61) -> np.ndarray:
+    def reference_path(self, count: int = 25) -> np.ndarray:
         """Goals along x: from 0 to 30 mm, to -30 mm and back to 0, shape (count, 3); z is free."""
         path = np.tile(self.effector_rest, (count, 1))
         path[:, 0] = np.interp(np.linspace(0.0, 4.0, count), [0.0, 1.0, 3.0, 4.0], [0.0, 0.030, -0.030, 0.0])
@@ -269,6 +283,8 @@ class ThreeFingerGripper(FingerRobot):
     )
     half_extents = (35.0e-3, 13.75e-3, 13.75e-3)
     cable_range = (-0.002, 0.020)
+    motion = 0.004
+    precision = 1e-4
 
     def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
         """Centre of the cube, between the fingers."""

@@ -167,9 +167,12 @@ class Morpher:
     @staticmethod
     def _project(x: np.ndarray, features: Mapping[str, Feature], chosen: tuple[str, ...]) -> np.ndarray:
         """Nearest points on the intersection of the chosen features, by Gauss-Newton with least-norm steps."""
+        flat = all(isinstance(features[name], Plane) for name in chosen)
         for _ in range(20):
             parts = [features[name].evaluate(x) for name in chosen]
             distance = np.stack([part[0] for part in parts], axis=1)
+            if flat:  # one matrix for all points, and one step
+                return x - distance @ np.linalg.pinv(np.stack([part[1][0] for part in parts]), rcond=1e-6).T
             gradient = np.stack([part[1] for part in parts], axis=1)
             step = np.einsum("kij,kj->ki", np.linalg.pinv(gradient, rcond=1e-6), distance)
             x = x - step

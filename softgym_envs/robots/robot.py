@@ -30,6 +30,7 @@ class Actuator:
         rate: largest change of the command per control step [unit].
         unit: unit of displacement.
         unilateral: cannot push.
+        max_effort: largest effort either way; beyond it a commanded displacement is not reached.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Actuator:
     rate: float
     unit: str = "m"
     unilateral: bool = True
+    max_effort: float = np.inf
 
 
 class Robot(ABC):
@@ -51,6 +53,11 @@ class Robot(ABC):
         size: a characteristic length [m], for scaling.
         effector_rest: effector of the baseline body at rest [m], shape (3,).
         effort_scale: typical effort of each actuator of the baseline body [N, ...], shape (n_a,).
+        goal_axes: which coordinates of the first effector a goal is about, 1 or 0, shape (3,).
+        precision: distance at which a goal counts as reached [m].
+        motion: distance over which the effector typically moves [m], a quarter of the size unless said otherwise; it
+            scales rewards and errors.
+        rest_mode: how actuators are held at rest: ``"effort"`` (without effort) or ``"displacement"`` (at zero).
         stiffness_variable: design variable that scales all efforts and nothing else (Young's modulus without dead
             loads), or None. Surrogates use it exactly instead of learning it.
     """
@@ -62,7 +69,16 @@ class Robot(ABC):
     size: float
     effector_rest: np.ndarray
     effort_scale: np.ndarray
+    goal_axes: np.ndarray = np.ones(3)
+    precision: float = 0.002
+    motion: float
+    rest_mode: str = "effort"
     stiffness_variable: str | None = None
+
+    def __init_subclass__(cls, **options: object) -> None:
+        super().__init_subclass__(**options)
+        if "size" in vars(cls) and "motion" not in vars(cls):
+            cls.motion = 0.25 * cls.size
 
     def __init__(self, *, gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         if len(gravity) != 3 or not np.isfinite(gravity).all():

@@ -139,7 +139,7 @@ class StiffFlop(Robot):
         model.skins.append(tube_skin(beam, model.nodes, radius * np.column_stack([np.cos(turn), np.sin(turn)])))
         return model
 
-    def reference_path(self, count: int = 600) -> np.ndarray:
+    def reference_path(self, count: int = 50) -> np.ndarray:
         """Circle of radius 40 mm about the axis (thesis 4.4.3), in a plane the baseline reaches, shape (count, 3)."""
         angle = 2.0 * np.pi * np.arange(count) / count
         return np.column_stack([np.full(count, CIRCLE_DISTANCE), 0.040 * np.cos(angle), 0.040 * np.sin(angle)])

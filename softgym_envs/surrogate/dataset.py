@@ -106,7 +106,7 @@ def generate_dataset(
     else:
         write_json(path, manifest)
     # The baseline mesh is made once, before the workers ask for it.
-    body.body()
+    body.build()
     jobs = []
     shards = []
     for number, first in enumerate(range(0, plan.groups, groups_per_shard)):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from softgym_envs.mechanics import constraints
 from softgym_envs.mechanics.beams import Beam, Section
-from softgym_envs.mechanics.constraints import Bond, Cable, Cavity, Chamber, Constraint, EmbeddedPoints, Point
+from softgym_envs.mechanics.constraints import Bond, Cable, Cavity, Chamber, Constraint, EmbeddedPoints, Point, Servo
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
@@ -76,6 +76,11 @@ def make_chamber(nodes, tetrahedra):
     return Chamber("chamber", lines, area=0.7)
 
 
+def make_servo(nodes, tetrahedra):
+    # Derivatives hold for any three rows; that they are directors matters to the value only.
+    return Servo("servo", 4, np.array([0.2, 1.0, 0.3]), nodes)
+
+
 FACTORIES = {
     "Bond": make_bond,
     "Cable": make_cable,
@@ -83,6 +88,7 @@ FACTORIES = {
     "Cavity of quadratic triangles": make_quadratic_cavity,
     "Chamber": make_chamber,
     "Point": make_point,
+    "Servo": make_servo,
 }
 
 
@@ -395,6 +401,31 @@ def test_a_chamber_without_area_is_refused(area):
     nodes, beam = straight_beam()
     with pytest.raises(ValueError, match="chamber 'c': area"):
         Chamber("c", [beam.line(range(2), (0.0, 0.0), nodes)], area=area)
+
+
+# -- servo ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 0.0, -2.0), (0.3, -0.5, 0.4)])
+def test_servo_measures_the_turn_of_its_frame(axis):
+    start = Rotation.random(random_state=6)
+    nodes = np.vstack([np.zeros((2, 3)), frame_rows([0.1, 0.2, 0.3], start.as_matrix())])
+    servo = Servo("servo", 2, np.array(axis), nodes)
+    assert servo.unit == ("rad", "N m")
+    assert servo.value(nodes)[0] == pytest.approx(0.0, abs=1e-15)
+    direction = np.array(axis) / np.linalg.norm(axis)
+    for angle in (-3.0, -0.5, 1e-6, 2.0, 3.1):
+        turned = nodes.copy()
+        turned[2:] = frame_rows([1.0, 2.0, 3.0], (Rotation.from_rotvec(angle * direction) * start).as_matrix())
+        assert servo.value(turned)[0] == pytest.approx(angle, rel=1e-12)
+        # Unit torque: the moment of the forces on the directors about the axis is one.
+        force = servo.jacobian(turned)[0]
+        assert np.cross(turned[servo.row], force) @ direction == pytest.approx(1.0, rel=1e-12)
+
+
+def test_servo_without_an_axis_is_refused(mesh):
+    with pytest.raises(ValueError, match="servo 's': axis"):
+        Servo("s", 4, np.zeros(3), mesh[0])
 
 
 # -- bond -----------------------------------------------------------------------------------------------------------

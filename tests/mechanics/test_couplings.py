@@ -317,6 +317,32 @@ def test_nodes_may_be_held_along_some_axes(box):
     assert x[np.isclose(nodes[:, 0], 0.01), 0].max() > 0.01 + 1e-11
 
 
+def test_no_node_needs_to_be_held_along_all_axes(box):
+    """Three planes of symmetry without the node they share: as with it, only that this node now finds its place."""
+    nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 4), jitter=0.2)
+    held = np.isclose(nodes, 0.0, atol=1e-12)
+    held[held.all(axis=1)] = False
+    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=held, young_modulus=1e5, poisson_ratio=0.4)
+    assert not model.fixed.any()
+    model.nodal_loads[np.isclose(nodes[:, 2], 0.04), 2] = 0.8
+    model.refresh_loads()
+    found = Statics(model, tolerance=1e-13).solve([])
+    assert found.iterations <= 6  # steps are warped: the stretch is large
+    assert found.x[-1, 2] > 0.045
+    np.testing.assert_array_equal(found.x[held], nodes[held])
+    np.testing.assert_allclose(model.assemble(found.x, np.zeros(0))[0], 0.0, atol=1e-9)
+
+
+def test_a_body_that_is_not_held_along_an_axis_is_refused(box):
+    nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 4))
+    held = np.isclose(nodes, 0.0, atol=1e-12)
+    held[:, 2] = False
+    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=held)
+    model.nodal_loads[-1, 0] = 1.0
+    with pytest.raises((ConvergenceError, ValueError)):
+        Statics(model).solve([])
+
+
 # -- cavities -------------------------------------------------------------------------------------------------------
 
 

@@ -11,23 +11,25 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 __all__ = ["Cable"]
 
 
-@njit(cache=True)
-def _cable_length(x, ids, weights, pull, slot, length_gradient, length_hessian, want_hessian):
-    """Length of the polyline pull -> p0 -> p1 ..., its gradient and hessian over the stencil."""
-    count = ids.shape[0]
-    points = np.zeros((count + 1, 3))
+@njit(cache=True, error_model="numpy")
+def _cable_points(x, ids, weights, pull, points):
+    """The polyline pull -> p0 -> p1 ..., shape (p + 1, 3)."""
     points[0] = pull
-    for p in range(count):
+    for p in range(ids.shape[0]):
+        points[p + 1] = 0.0
         for a in range(ids.shape[1]):
             for d in range(3):
                 points[p + 1, d] += weights[p, a] * x[ids[p, a], d]
+
+
+@njit(cache=True, error_model="numpy")
+def _cable_length(x, ids, weights, pull, slot, points, gradient):
+    """Length of the polyline and its gradient over the stencil."""
+    _cable_points(x, ids, weights, pull, points)
     length = 0.0
-    length_gradient[:] = 0.0
-    if want_hessian:
-        length_hessian[:, :] = 0.0
+    gradient[:] = 0.0
     t = np.empty(3)
-    local = np.empty((3, 3))
-    for p in range(count):
+    for p in range(ids.shape[0]):
         segment = 0.0
         for d in range(3):
             t[d] = points[p + 1, d] - points[p, d]
@@ -38,31 +40,40 @@ def _cable_length(x, ids, weights, pull, slot, length_gradient, length_hessian, 
             t[d] /= segment
         for a in range(ids.shape[1]):
             for d in range(3):
-                length_gradient[slot[p, a] * 3 + d] += weights[p, a] * t[d]
+                gradient[slot[p, a] * 3 + d] += weights[p, a] * t[d]
                 if p > 0:
-                    length_gradient[slot[p - 1, a] * 3 + d] -= weights[p - 1, a] * t[d]
-        if want_hessian:
-            for d in range(3):
-                for c in range(3):
-                    local[d, c] = -t[d] * t[c] / segment
-                local[d, d] += 1.0 / segment
-            for side_i in range(2):
-                if p == 0 and side_i == 1:
-                    continue  # the pull point is fixed
-                for side_j in range(2):
-                    if p == 0 and side_j == 1:
-                        continue
-                    sign = 1.0 if side_i == side_j else -1.0
-                    for a in range(ids.shape[1]):
-                        row = slot[p - side_i, a] * 3
-                        wi = weights[p - side_i, a] * sign
-                        for b in range(ids.shape[1]):
-                            column = slot[p - side_j, b] * 3
-                            w = wi * weights[p - side_j, b]
-                            for d in range(3):
-                                for c in range(3):
-                                    length_hessian[row + d, column + c] += w * local[d, c]
+                    gradient[slot[p - 1, a] * 3 + d] -= weights[p - 1, a] * t[d]
     return length
+
+
+@njit(cache=True, error_model="numpy")
+def _cable_hessian(x, ids, weights, pull, points, scale, out):
+    """Blocks of the points with themselves (p), with the next one (p - 1), and their transposes (p - 1)."""
+    _cable_points(x, ids, weights, pull, points)
+    count, k = ids.shape
+    t = np.empty(3)
+    local = np.empty((3, 3))
+    out[:count] = 0.0
+    for p in range(count):
+        segment = 0.0
+        for d in range(3):
+            t[d] = points[p + 1, d] - points[p, d]
+            segment += t[d] * t[d]
+        factor = scale / np.sqrt(segment)
+        for d in range(3):
+            for c in range(3):
+                local[d, c] = -factor * t[d] * t[c] / segment
+            local[d, d] += factor
+        for a in range(k):
+            for b in range(k):
+                for d in range(3):
+                    for c in range(3):
+                        out[p, 3 * a + d, 3 * b + c] += weights[p, a] * weights[p, b] * local[d, c]
+                        if p > 0:
+                            out[p - 1, 3 * a + d, 3 * b + c] += weights[p - 1, a] * weights[p - 1, b] * local[d, c]
+                            across = -weights[p - 1, a] * weights[p, b] * local[d, c]
+                            out[count + p - 1, 3 * a + d, 3 * b + c] = across
+                            out[2 * count + p - 2, 3 * b + c, 3 * a + d] = across
 
 
 class Cable(Constraint):
@@ -92,8 +103,10 @@ class Cable(Constraint):
         nodes, slot = np.unique(embedding.node_ids, return_inverse=True)
         self._slot = slot.reshape(embedding.node_ids.shape)
         self.dofs = (3 * nodes[:, None] + np.arange(3)).ravel()
+        count, k = embedding.node_ids.shape
         self._gradient = np.empty(len(self.dofs))
-        self._hessian = np.empty((len(self.dofs), len(self.dofs)))
+        self._points = np.empty((count + 1, 3))
+        self._blocks = np.empty((3 * count - 2, 3 * k, 3 * k))
         rest = np.vstack([self.pull_point, embedding.points])
         segments = np.linalg.norm(np.diff(rest, axis=0), axis=1)
         if not (segments > 1e-9).all():
@@ -104,25 +117,28 @@ class Cable(Constraint):
         """Return the polyline [m], shape (p + 1, 3), pull point first."""
         return np.vstack([self.pull_point, self.embedding.positions(x)])
 
-    def _length(self, x: np.ndarray, want_hessian: bool) -> float:
-        return _cable_length(
-            x,
-            self.embedding.node_ids,
-            self.embedding.weights,
-            self.pull_point,
-            self._slot,
-            self._gradient,
-            self._hessian,
-            want_hessian,
-        )
+    def _length(self, x: np.ndarray) -> float:
+        ids, weights = self.embedding.node_ids, self.embedding.weights
+        return _cable_length(x, ids, weights, self.pull_point, self._slot, self._points, self._gradient)
 
     def value(self, x: np.ndarray) -> np.ndarray:
-        return np.array([self.rest_length - self._length(x, False)])
+        return np.array([self.rest_length - self._length(x)])
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        self._length(x, False)
+        self._length(x)
         return -self._gradient[None, :]
 
+    def linearise(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([self.rest_length - self._length(x)]), -self._gradient[None, :]
+
+    def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        # Only neighbouring points depend on each other.
+        dofs = (3 * self.embedding.node_ids[:, :, None] + np.arange(3)).reshape(len(self.embedding.node_ids), -1)
+        first, second = np.concatenate([dofs, dofs[:-1], dofs[1:]]), np.concatenate([dofs, dofs[1:], dofs[:-1]])
+        k = dofs.shape[1]
+        return np.repeat(first, k, axis=1).ravel(), np.tile(second, (1, k)).ravel()
+
     def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray:
-        self._length(x, True)
-        return -effort[0] * self._hessian
+        ids, weights = self.embedding.node_ids, self.embedding.weights
+        _cable_hessian(x, ids, weights, self.pull_point, self._points, -effort[0], self._blocks)
+        return self._blocks

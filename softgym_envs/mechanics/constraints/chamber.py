@@ -11,13 +11,11 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 __all__ = ["Chamber"]
 
 
-@njit(cache=True)
-def _line_length(x, ids, weights, slot, gradient, hessian, want_hessian):
-    """Sum of the norms of ``t_q = sum_a weights[q, a] x[ids[q, a]]``, its gradient and hessian over the stencil."""
+@njit(cache=True, error_model="numpy")
+def _line_length(x, ids, weights, slot, gradient):
+    """Sum of the norms of ``t_q = sum_a weights[q, a] x[ids[q, a]]`` and its gradient over the stencil."""
     length = 0.0
     gradient[:] = 0.0
-    if want_hessian:
-        hessian[:, :] = 0.0
     t = np.empty(3)
     for q in range(ids.shape[0]):
         t[:] = 0.0
@@ -26,20 +24,37 @@ def _line_length(x, ids, weights, slot, gradient, hessian, want_hessian):
                 t[d] += weights[q, a] * x[ids[q, a], d]
         norm = np.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
         length += norm
-        for d in range(3):
-            t[d] /= norm
         for a in range(ids.shape[1]):
             for d in range(3):
-                gradient[3 * slot[q, a] + d] += weights[q, a] * t[d]
-        if want_hessian:
-            for a in range(ids.shape[1]):
-                for b in range(ids.shape[1]):
-                    w = weights[q, a] * weights[q, b] / norm
+                gradient[3 * slot[q, a] + d] += weights[q, a] * t[d] / norm
+    return length
+
+
+@njit(cache=True, error_model="numpy")
+def _line_hessian(x, ids, weights, group, scale, out):
+    """The second derivative, one block for each group of tangents between the same rows."""
+    out[:] = 0.0
+    t = np.empty(3)
+    local = np.empty((3, 3))
+    for q in range(ids.shape[0]):
+        t[:] = 0.0
+        for a in range(ids.shape[1]):
+            for d in range(3):
+                t[d] += weights[q, a] * x[ids[q, a], d]
+        squared = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
+        factor = scale / np.sqrt(squared)
+        for d in range(3):
+            for c in range(3):
+                local[d, c] = -factor * t[d] * t[c] / squared
+            local[d, d] += factor
+        block = out[group[q]]
+        for a in range(ids.shape[1]):
+            for b in range(ids.shape[1]):
+                w = weights[q, a] * weights[q, b]
+                if w != 0.0:
                     for d in range(3):
                         for c in range(3):
-                            hessian[3 * slot[q, a] + d, 3 * slot[q, b] + c] -= w * t[d] * t[c]
-                        hessian[3 * slot[q, a] + d, 3 * slot[q, b] + d] += w
-    return length
+                            block[3 * a + d, 3 * b + c] += w * local[d, c]
 
 
 class Chamber(Constraint):
@@ -69,17 +84,28 @@ class Chamber(Constraint):
         self._slot = slot.reshape(self._ids.shape)
         self.dofs = (3 * nodes[:, None] + np.arange(3)).ravel()
         self._gradient = np.empty(len(self.dofs))
-        self._hessian = np.empty((len(self.dofs), len(self.dofs)))
+        self._rows, group = np.unique(self._ids, axis=0, return_inverse=True)
+        self._group = group.ravel()
+        k = 3 * self._ids.shape[1]
+        self._blocks = np.empty((len(self._rows), k, k))
         self.rest_length = float(sum(np.linalg.norm(line.points, axis=1).sum() for line in tangents))
 
     def value(self, x: np.ndarray) -> np.ndarray:
-        vectors = np.einsum("qa,qad->qd", self._weights, x[self._ids])
-        return np.array([self.area * (float(np.linalg.norm(vectors, axis=1).sum()) - self.rest_length)])
+        return self.linearise(x)[0]
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        _line_length(x, self._ids, self._weights, self._slot, self._gradient, self._hessian, False)
-        return self.area * self._gradient[None, :]
+        return self.linearise(x)[1]
+
+    def linearise(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        length = _line_length(x, self._ids, self._weights, self._slot, self._gradient)
+        return np.array([self.area * (length - self.rest_length)]), self.area * self._gradient[None, :]
+
+    def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        # Rows depend on each other within an element only.
+        dofs = (3 * self._rows[:, :, None] + np.arange(3)).reshape(len(self._rows), -1)
+        k = dofs.shape[1]
+        return np.repeat(dofs, k, axis=1).ravel(), np.tile(dofs, (1, k)).ravel()
 
     def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray:
-        _line_length(x, self._ids, self._weights, self._slot, self._gradient, self._hessian, True)
-        return effort[0] * self.area * self._hessian
+        _line_hessian(x, self._ids, self._weights, self._group, effort[0] * self.area, self._blocks)
+        return self._blocks

@@ -36,6 +36,10 @@ class Constraint(ABC):
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Return d delta / d x over ``dofs``, shape (size, k)."""
 
+    def linearise(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return `value` and `jacobian` at once."""
+        return self.value(x), self.jacobian(x)
+
     def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns (degrees of freedom) of the entries of `hessian`; all pairs of ``dofs`` by default.
 

@@ -19,6 +19,7 @@ class EmbeddedPoints:
         tetrahedra: corner indices, shape (m, 4).
         hint: elements from which points outside the mesh are extrapolated, shape (p,). The nearest element can
             change abruptly when a mesh of the same topology is moved; a fixed one keeps the point's motion smooth.
+        gradients: of the last three barycentric coordinates [1/m], shape (m, 3, 3), where they are known already.
 
     Attributes:
         points: reference positions [m], shape (p, 3).
@@ -28,19 +29,25 @@ class EmbeddedPoints:
     """
 
     def __init__(
-        self, points: np.ndarray, nodes: np.ndarray, tetrahedra: np.ndarray, hint: np.ndarray | None = None
+        self,
+        points: np.ndarray,
+        nodes: np.ndarray,
+        tetrahedra: np.ndarray,
+        hint: np.ndarray | None = None,
+        *,
+        gradients: np.ndarray | None = None,
     ) -> None:
         points = np.atleast_2d(np.asarray(points, dtype=float))
         if not np.isfinite(points).all():
             raise ValueError(f"embedded points must be finite, got {points.tolist()}")
         self.points = points
         corners = nodes[tetrahedra]
-        edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-        inverse = np.linalg.inv(edges)
+        if gradients is None:
+            gradients = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
         self.elements = np.empty(len(points), dtype=np.int64)
         self.weights = np.empty((len(points), 4))
         for i, point in enumerate(points):
-            tail = np.einsum("mij,mj->mi", inverse, point - corners[:, 0])
+            tail = np.einsum("mij,mj->mi", gradients, point - corners[:, 0])
             barycentric = np.column_stack([1.0 - tail.sum(axis=1), tail])
             score = barycentric.min(axis=1)
             best = int(np.argmax(score))

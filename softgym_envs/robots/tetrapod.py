@@ -1,0 +1,209 @@
+"""The Tetrapod: four servos bend elastic legs that meet in a small rigid centre (thesis 5.3).
+
+The published frame has y up; here z is up, so its (x, y, z) is our (x, z, -y). The robot hangs from its servos.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.optimize import brentq
+
+from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.mechanics.assembly import Assembly
+from softgym_envs.mechanics.beams import Beam, Section
+from softgym_envs.mechanics.constraints import EmbeddedPoints, Point, Servo
+from softgym_envs.mechanics.frames import frame_rows
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.rigid import sphere_inertia
+from softgym_envs.mechanics.skins import box_skin, tube_skin
+from softgym_envs.robots.robot import Actuator, Robot
+
+__all__ = ["Tetrapod"]
+
+HORN = 22.5e-3
+"""Distance of a leg's root from its servo's axis, outwards [m]."""
+CENTRE_RADIUS = 13e-3
+"""Distance of the legs' tips from the middle of the centre part [m]; published as about 10 to 16 mm."""
+CENTRE_MASS = 0.020
+"""Mass of the centre part [kg]; not published."""
+HANGING = -0.150
+"""Published height of the centre at rest [m]; where the search for the true one starts."""
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class Tetrapod(Robot):
+    """Four servo-driven legs and a rigid centre.
+
+    A leg leaves the horn of its servo straight downwards and reaches the centre horizontally; printed straight, it is
+    bent in between. With the published lengths that gives the published rest height and workspace (see the page of
+    this robot).
+
+    Args:
+        payload: mass at the centre [kg].
+        elements: quadratic beam elements per leg.
+        gravity: acceleration [m/s2].
+    """
+
+    name = "tetrapod"
+    effectors = ("centre",)
+    size = 0.2
+    rest_mode = "displacement"
+
+    def __init__(
+        self,
+        *,
+        payload: float = 0.0,
+        elements: int = 6,
+        gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+    ) -> None:
+        super().__init__(gravity=gravity)
+        if not (np.isfinite(payload) and payload >= 0.0):
+            raise ValueError(f"payload = {payload} kg must be finite and not negative")
+        if not isinstance(elements, int) or elements < 2:
+            raise ValueError(f"elements = {elements!r} is out of bounds; allowed: integers from 2")
+        self.payload = float(payload)
+        self.elements = elements
+        bend = [
+            DesignVariable(f"curvature_{k}", -8.0, 8.0, 0.0, "1/m", f"printed curvature of the leg, {place}; inwards")
+            for k, place in ((1, "at its root"), (2, "in the middle"), (3, "at its tip"))
+        ]
+        self.design_space = DesignSpace(
+            DesignVariable("leg_length", 0.190, 0.225, 0.205, "m", "length of a leg"),
+            DesignVariable("leg_width", 0.005, 0.020, 0.010, "m", "width of its section, along the servo's axis"),
+            DesignVariable("leg_thickness", 0.003, 0.008, 0.005, "m", "thickness of its section"),
+            DesignVariable("servo_radius", 0.090, 0.110, 0.100, "m", "distance of the servos from the middle"),
+            *bend,
+            DesignVariable("young_modulus", 2.0e7, 6.0e7, 3.5e7, "Pa", "stiffness of the printed legs", log=True),
+        )
+        self.effector_rest = np.array([0.0, 0.0, HANGING])
+        self.effort_scale = np.full(4, 0.2)
+        self.actuators = tuple(
+            Actuator(
+                f"servo_{k + 1}",
+                -0.5 * math.pi,
+                0.5 * math.pi,
+                math.pi / 20,
+                unit="rad",
+                unilateral=False,
+                max_effort=1.4,
+            )
+            for k in range(4)
+        )
+
+    @property
+    def variant(self) -> str:
+        """``tetrapod``."""
+        return "tetrapod"
+
+    @property
+    def signature(self) -> dict[str, object]:
+        """Options that change the condensed model."""
+        return {"payload": self.payload, "elements": self.elements, "gravity": list(self.gravity)}
+
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        """Lay out servos, legs and centre, bent as a first guess; the equilibrium is found by the solver."""
+        radius, length = design["servo_radius"], design["leg_length"]
+        assembly = Assembly(gravity=self.gravity)
+        middle = HANGING * UP
+        centre = assembly.add_frame(middle)
+        mass = CENTRE_MASS + self.payload
+        assembly.add_mass(centre, mass, sphere_inertia(mass, CENTRE_RADIUS))
+        section = Section.rectangle(design["leg_width"], design["leg_thickness"])
+        servos = []
+        for k in range(4):
+            angle = 0.5 * math.pi * k
+            outwards = np.array([math.cos(angle), math.sin(angle), 0.0])
+            along = np.array([-math.sin(angle), math.cos(angle), 0.0])
+            servo = assembly.add_frame(radius * outwards, fixed=True, fixed_spin=np.abs(along) < 0.5)
+            servos.append((servo, -along))
+            root = (radius + HORN) * outwards
+            tip = middle + CENTRE_RADIUS * outwards
+            shape = _bent(root, -UP, tip, -outwards, length, along, 2 * self.elements + 1)
+            mounts = {0: servo, 2 * self.elements: centre}
+            frames = [assembly.add_frame(p, r, on=mounts.get(j)) for j, (p, r) in enumerate(shape)]
+            assembly.add_beam(
+                frames,
+                section=section,
+                young_modulus=design["young_modulus"],
+                poisson_ratio=0.45,
+                density=1220.0,
+                stress_free=self._printed(root, outwards, along, design),
+            )
+        model = assembly.build()
+        for actuator, (servo, axis) in zip(self.actuators, servos, strict=True):
+            model.add("a", Servo(actuator.name, servo, axis, model.nodes))
+        model.add("e", Point("centre", EmbeddedPoints.in_frame(centre, np.zeros(3), model.nodes)))
+        half = 0.5 * np.array([design["leg_width"], design["leg_thickness"]])
+        outline = half * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+        model.skins += [tube_skin(leg, model.nodes, outline) for leg in model.blocks if isinstance(leg, Beam)]
+        model.skins.append(box_skin(centre, (CENTRE_RADIUS, CENTRE_RADIUS, 0.4 * CENTRE_RADIUS), model.nodes))
+        return model
+
+    def _printed(
+        self, root: np.ndarray, outwards: np.ndarray, along: np.ndarray, design: Mapping[str, float]
+    ) -> np.ndarray:
+        """Rows of the frames of a leg as printed: from the root downwards, with a curvature quadratic in the length."""
+        count, length = 2 * self.elements + 1, design["leg_length"]
+        knots = [design[f"curvature_{k}"] for k in (1, 2, 3)]
+        curvature = np.polynomial.Polynomial.fit([0.0, 0.5 * length, length], knots, 2)
+        turn = curvature.integ(lbnd=0.0)
+        fine = np.linspace(0.0, length, 20 * (count - 1) + 1)
+        directions = -np.cos(turn(fine))[:, None] * UP - np.sin(turn(fine))[:, None] * outwards
+        steps = 0.5 * (directions[1:] + directions[:-1]) * np.diff(fine)[:, None]
+        points = root + np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+        return np.array(
+            [
+                frame_rows(p, np.column_stack([d, along, np.cross(d, along)]))
+                for p, d in zip(points[::20], directions[::20], strict=True)
+            ]
+        )
+
+    def reference_path(self, count: int = 60) -> np.ndarray:
+        """Horizontal circle of radius 40 mm about the hanging position, 10 mm higher, shape (count, 3)."""
+        angle = 2.0 * np.pi * np.arange(count) / count
+        circle = 0.040 * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
+        return self.effector_rest + np.array([0.0, 0.0, 0.010]) + circle
+
+
+def _bent(
+    start: np.ndarray,
+    first: np.ndarray,
+    end: np.ndarray,
+    last: np.ndarray,
+    length: float,
+    across: np.ndarray,
+    count: int,
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Frames, evenly spaced, along a cubic of a length [m] between two points with given directions."""
+    t = np.linspace(0.0, 1.0, 20 * count)[:, None]
+
+    def curve(reach: float) -> np.ndarray:
+        return (
+            (2 * t**3 - 3 * t**2 + 1) * start
+            + (t**3 - 2 * t**2 + t) * reach * first
+            + (3 * t**2 - 2 * t**3) * end
+            + (t**3 - t**2) * reach * last
+        )
+
+    def excess(reach: float) -> float:
+        return float(np.linalg.norm(np.diff(curve(reach), axis=0), axis=1).sum()) - length
+
+    # A leg too short for its gap starts stretched along the shortest of these curves.
+    reaches = np.linspace(0.5, 4.0, 36) * length
+    lengths = [excess(reach) for reach in reaches]
+    shortest = int(np.argmin(lengths))
+    longer = next((k for k in range(shortest, len(reaches)) if lengths[k] > 0.0), shortest)
+    reach = reaches[shortest] if lengths[shortest] >= 0.0 else brentq(excess, reaches[longer - 1], reaches[longer])
+    points = curve(reach)
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    even = np.linspace(0.0, arc[-1], count)
+    slopes = np.gradient(points, arc, axis=0)
+    frames = []
+    for s in even:
+        point, direction = (np.array([np.interp(s, arc, field[:, d]) for d in range(3)]) for field in (points, slopes))
+        direction /= np.linalg.norm(direction)
+        frames.append((point, np.column_stack([direction, across, np.cross(direction, across)])))
+    return frames

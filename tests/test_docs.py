@@ -1,0 +1,134 @@
+"""The documentation: every ID and robot has a page, the code of the tutorials runs, and the site builds."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from codesign.config import StudyConfig
+from softgym_envs.config import check_config
+from softgym_envs.envs.interface import Interface
+from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.robots import ROBOTS
+from softgym_envs.surrogate.training import FitConfig
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+generate = load("generate")
+code_blocks = load("run_page").code_blocks
+
+
+def test_names_of_pages():
+    assert generate.page_name("SoftGym/CableTrunkReach-v0") == "cable_trunk_reach"
+    assert generate.page_name("SoftGym/FingerTrack-v12") == "finger_track"
+
+
+@pytest.mark.parametrize("identifier", ENVIRONMENTS)
+def test_every_environment_has_a_page_with_a_description(identifier):
+    page = DOCS / "environments" / f"{generate.page_name(identifier)}.md"
+    assert page.is_file(), f"write {page.relative_to(ROOT)}: a title and '## Description', the rest is generated"
+    assert generate.describes(page.read_text())
+    version = int(identifier.rsplit("-v", 1)[1])
+    assert version == 0 or f"* v{version}:" in page.read_text(), "a new version is a line of the version history"
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_every_robot_has_a_page_with_a_description(name):
+    page = DOCS / "robots" / f"{name}.md"
+    assert page.is_file(), f"write {page.relative_to(ROOT)}: a title, '## Description' and '## Published beside ours'"
+    assert generate.describes(page.read_text())
+    assert dict(generate.split(page.read_text())).get("Published beside ours")
+
+
+def test_an_empty_description_is_seen():
+    assert not generate.describes(
+        "# Title\n\n## Description\n\n<!-- to be written, by somebody, in many words: " + "x " * 60 + "-->"
+    )
+    assert not generate.describes("# Title\n\n" + "word " * 60)
+    assert generate.describes("# Title\n\n## Description\n\n" + "word " * 60)
+
+
+@pytest.mark.parametrize("identifier", ENVIRONMENTS)
+def test_pages_of_environments_are_completed(identifier):
+    text = (DOCS / "environments" / f"{generate.page_name(identifier)}.md").read_text()
+    sections = generate.environment_sections(identifier)
+    page = generate.compose(text, generate.environment_top(identifier), sections)
+    found = [heading for heading, body in generate.split(page) if heading in sections and body]
+    assert found == list(sections)
+    assert generate.HERE not in page
+    robot = generate.robot_of(ENVIRONMENTS[identifier].robot)
+    for name in robot.design_space.names:
+        assert f"`{name}`" in page
+
+
+@pytest.mark.parametrize("identifier", ENVIRONMENTS)
+def test_scales_of_the_observation_are_the_real_ones(identifier):
+    robot = generate.robot_of(ENVIRONMENTS[identifier].robot)
+    scales = generate.observation_scales(robot)
+    interface = Interface(robot, action_mode="increment", design_names=(), moving=True)
+    n, none = len(robot.actuators), np.zeros(0)
+    here, there, speed = np.zeros(3), np.array([scales["error"], 0.0, 0.0]), np.array([0.0, 0.0, scales["speed"]])
+    row = interface.observe(robot.lower, robot.upper, robot.effort_scale, here, there, none, speed)
+    expected = np.concatenate([-np.ones(n), np.ones(n), np.full(n, 0.5), here, there / scales["position"]])
+    np.testing.assert_allclose(row, [*expected, 0.5, 0.0, 0.0, 0.0, 0.0, 0.5], atol=1e-6)
+
+
+def test_what_a_page_says_itself_wins():
+    template = {"One": lambda: "generated one", "Two": lambda: "generated two", "Three": lambda: ""}
+    page = "# T\n\n## Two\n\nbefore\n\n<!-- generated -->\n\n## Own\n\n```sh\n## no heading\n```\n"
+    composed = generate.compose(page, "top", template)
+    assert [heading for heading, _ in generate.split(composed)] == ["", "One", "Two", "Own"]
+    assert "before\n\ngenerated two" in composed and "generated one" in composed
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "tutorials").glob("*.md")), ids=lambda p: p.stem)
+def test_the_code_of_a_tutorial_runs(page, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(DOCS / "run_page.py"), str(page), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert code_blocks(page)
+    assert page.stem == "codesign" or list(tmp_path.glob("*.png"))
+
+
+@pytest.mark.parametrize(("page", "config"), [("tutorials/codesign", StudyConfig), ("surrogates", FitConfig)])
+def test_configurations_on_pages_are_valid(page, config):
+    for _, text, _ in code_blocks(DOCS / f"{page}.md", "yaml"):
+        check_config(config, yaml.safe_load(text), page)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs the extra 'docs'")
+def test_the_site_builds_without_a_warning(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    pages = sorted(path.relative_to(tmp_path / "site").as_posix() for path in (tmp_path / "site").rglob("*.html"))
+    wanted = [f"environments/{generate.page_name(identifier)}.html" for identifier in ENVIRONMENTS]
+    assert {*wanted, *(f"robots/{name}.html" for name in ROBOTS), "index.html"} <= set(pages)
+    assert not list((tmp_path / "site").rglob("*.py"))
+    # Nothing is loaded from elsewhere when a page is read.
+    for page in pages:
+        text = (tmp_path / "site" / page).read_text()
+        for attribute in ("src", 'rel="stylesheet" href'):
+            assert f'{attribute}="http' not in text and f'{attribute}="//' not in text, page
