@@ -71,6 +71,7 @@ class FEMBackend(Backend):
             "scheme": scheme,
             "mass_damping": mass_damping,
             "stiffness_damping": stiffness_damping,
+            "tolerance": 1e-9,
         }
         self._max_effort = np.array([actuator.max_effort for actuator in robot.actuators])
         self._limited = bool(np.isfinite(self._max_effort).any())

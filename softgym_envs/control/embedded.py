@@ -26,11 +26,12 @@ class PICorrection:
         proportional: gain on the present error.
         integral: gain on the sum of errors.
         limit: largest correction by the sum [m].
-        slip: distance below which the model counts as having reached the corrected goal [m].
+        slip: distance below which the model counts as having reached the corrected goal [m]: above what one
+            linearisation leaves of a step (a hundredth of a millimetre for the Stiff-Flop on its circle).
     """
 
     def __init__(
-        self, proportional: float = 0.01, integral: float = 0.002, *, limit: float = 0.02, slip: float = 1e-5
+        self, proportional: float = 0.01, integral: float = 0.002, *, limit: float = 0.02, slip: float = 1e-4
     ) -> None:
         gains = np.array([proportional, integral, limit, slip])
         if not (np.isfinite(gains) & (gains >= 0.0)).all():

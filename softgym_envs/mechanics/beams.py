@@ -20,7 +20,6 @@ from numba import njit
 
 from softgym_envs.mechanics.block import ElementBlock, lower_pairs
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.frames import rotation_vector_matrix
 from softgym_envs.mechanics.tetrahedra import element_masses
 
 __all__ = ["Beam", "Section"]
@@ -189,6 +188,50 @@ def _scatter(rows, forces, matrix, gradient, values, scatter):
                     values[target] += matrix[e, i, j]
 
 
+@njit(cache=True, error_model="numpy")
+def _cross(a, b, factor, out):
+    """Add ``factor a x b`` to ``out``."""
+    out[0] += factor * (a[1] * b[2] - a[2] * b[1])
+    out[1] += factor * (a[2] * b[0] - a[0] * b[2])
+    out[2] += factor * (a[0] * b[1] - a[1] * b[0])
+
+
+@njit(cache=True, error_model="numpy")
+def _add_warped(x, step, rows, shape, slope, weights, out):
+    """The tangent is turned by the exponential of the spin and strained by what is left of the step."""
+    spin = np.empty(3)
+    tangent = np.empty(3)
+    strained = np.empty(3)
+    turned = np.empty(3)
+    for e in range(rows.shape[0]):
+        for q in range(weights.shape[1]):
+            spin[:] = 0.0
+            tangent[:] = 0.0
+            strained[:] = 0.0
+            for a in range(rows.shape[1]):
+                row = rows[e, a]
+                for k in range(1, 4):
+                    _cross(x[row + k], step[row + k], 0.5 * shape[q, a], spin)
+                for d in range(3):
+                    tangent[d] += slope[e, q, a] * x[row, d]
+                    strained[d] += slope[e, q, a] * (x[row, d] + step[row, d])
+            _cross(spin, tangent, -1.0, strained)
+            # Rodrigues' formula: R v = v + sin(t) / t w x v + (1 - cos(t)) / t^2 w x (w x v).
+            squared = spin[0] ** 2 + spin[1] ** 2 + spin[2] ** 2
+            angle = np.sqrt(squared)
+            if angle < 1e-4:
+                first, second = 1.0 - squared / 6.0, 0.5 - squared / 24.0
+            else:
+                first, second = np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared
+            turned[:] = 0.0
+            _cross(spin, strained, 1.0, turned)
+            tangent[:] = strained - tangent + first * turned
+            _cross(spin, turned, second, tangent)
+            for a in range(rows.shape[1]):
+                for d in range(3):
+                    out[rows[e, a], d] += weights[e, q] * slope[e, q, a] * tangent[d]
+
+
 class Beam(ElementBlock):
     """A chain of beam elements between frames.
 
@@ -308,15 +351,7 @@ class Beam(ElementBlock):
         return float(energy), 0
 
     def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
-        # The tangent is turned by the exponential of the spin and strained by what is left of the step.
-        directors = x[self.rows[:, :, None] + np.arange(1, 4)]
-        turning = step[self.rows[:, :, None] + np.arange(1, 4)]
-        spins = np.einsum("qa,mad->mqd", self._shape, 0.5 * np.cross(directors, turning).sum(axis=2))
-        tangent = np.einsum("mqa,mad->mqd", self._slope, x[self.rows])
-        change = np.einsum("mqa,mad->mqd", self._slope, step[self.rows])
-        strained = tangent + change - np.cross(spins, tangent)
-        target = np.einsum("mqij,mqj->mqi", rotation_vector_matrix(spins), strained) - tangent
-        np.add.at(out, self.rows, np.einsum("mq,mqa,mqd->mad", self.weights, self._slope, target))
+        _add_warped(x, step, self.rows, self._shape, self._slope, self.weights, out)
 
     def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         k = self.order + 1

@@ -35,6 +35,7 @@ class _Euler(Inertia):
 
     def __init__(self, x: np.ndarray, v: np.ndarray, h: float) -> None:
         self._x, self._v, self._h = x, v, h
+        self.step = h
         self.velocity_factor, self.acceleration_factor = 1.0 / h, 1.0 / h**2
 
     def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -69,6 +70,7 @@ class _Alpha(Inertia):
         self._am, self._af = (2.0 * radius - 1.0) / (radius + 1.0), radius / (radius + 1.0)
         self._gamma = 0.5 - self._am + self._af
         self._beta = 0.25 * (self._gamma + 0.5) ** 2
+        self.step = h
         self.velocity_factor = self._gamma / (self._beta * h)
         self.acceleration_factor = (1.0 - self._am) / ((1.0 - self._af) * self._beta * h**2)
 
@@ -270,6 +272,10 @@ class Dynamics(Statics):
         modes = [mode] * self._actuators if isinstance(mode, str) else list(mode)
         return np.array([i for i, m in enumerate(modes) if m == "displacement"], dtype=int)
 
+    def _move(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        # Steps in time are short: warping them costs more than it saves.
+        return self.model.displace(x, step)
+
     def _present_command(self, mode: str | Sequence[str]) -> np.ndarray:
         command, rows = self.effort[: self._actuators].copy(), self._displacement_rows(mode)
         command[rows] = self._rows_delta()[rows]
@@ -302,14 +308,23 @@ class Dynamics(Statics):
         self._dissipated += float(np.vdot(drag, self.x - x))
         return found
 
-    def _solve_with(self, terms: Inertia, target: np.ndarray, mode: str | Sequence[str], options: dict) -> Equilibrium:
+    def _solve_with(self, terms: _Euler | _Alpha, target: np.ndarray, mode: str | Sequence[str], options: dict) -> Equilibrium:
         self._fresh = False
         # Dead loads act in full: their ramp belongs to statics.
         self._carried = self.model.loads
         self.model.mass_matrix(self._lumped)
         self.model.inertia = terms
+        # What moves is likely to move on; where that inverts an element, the step starts where it is.
+        kept = self.x
+        drift = terms.step * self.model.equation_velocity(kept, self.velocity)
+        self.x = kept + self.model.displace(kept, drift)
         try:
+            if not self._linearise():
+                self.x = kept
             return self.solve(target, mode, **options)
+        except ConvergenceError:
+            self.x = kept
+            raise
         finally:
             self.model.inertia = None
             self._fresh = False

@@ -455,7 +455,11 @@ class MechanicalModel:
         self._hessian_maps = [next(following) if c in curved else None for c, _ in self._rows]
         self._bond_maps = [next(following) for _ in self._bonds]
         self._keys = np.concatenate([direct, extra])
+        self._low, self._high = self._keys // total, self._keys % total
+        self._known_dofs = np.flatnonzero(self._equation >= 0)
         self._masses: tuple[bool, csr_matrix, np.ndarray] | None = None
+        #: Rows and the elements' tangent of the last assembly of a time step.
+        self._elements: tuple[np.ndarray, np.ndarray] | None = None
         self._values = np.empty(self._entries + len(extra))
         self._gradient = np.empty_like(self.nodes)
         self._targets = []
@@ -509,6 +513,7 @@ class MechanicalModel:
             if block.add(x, gradient, values, scatter)[1]:
                 return None
         if self.inertia is not None:
+            self._elements = x, values.copy()
             self._add_inertia(x, gradient, values)
         n = self.equations
         H = np.zeros((n + 3 * len(self.frames.carried), self.size), order="F")
@@ -582,6 +587,8 @@ class MechanicalModel:
     def element_tangent(self, x: np.ndarray) -> np.ndarray:
         """Values of the elements' tangent at rows ``x`` (n, 3), before what frames carry is brought to equations."""
         self.prepare()
+        if self._elements is not None and self._elements[0] is x:
+            return self._elements[1]
         values = np.zeros_like(self._values)
         unused = np.zeros_like(self.nodes)
         for block, scatter in zip(self.blocks, self._block_maps, strict=True):
@@ -603,15 +610,12 @@ class MechanicalModel:
     def damping_force(self, terms: Inertia, velocity: np.ndarray) -> np.ndarray:
         """Force [N] (n, 3) of the stiffness-proportional damping of a step at velocities of the rows (n, 3)."""
         assert terms.stiffness is not None
-        total = self.equations + 3 * len(self.frames.carried)
-        known = self._equation >= 0
-        moved = np.zeros(total)
-        moved[self._equation[known]] = velocity.ravel()[known]
-        force = _symmetric_product(
-            self._keys // total, self._keys % total, terms.stiffness_damping * terms.stiffness, moved
-        )
+        moved = np.zeros(self.equations + 3 * len(self.frames.carried))
+        equations = self._equation[self._known_dofs]
+        moved[equations] = velocity.ravel()[self._known_dofs]
+        force = _symmetric_product(self._low, self._high, terms.stiffness, moved)
         out = np.zeros_like(self.nodes)
-        out.ravel()[known] = force[self._equation[known]]
+        out.ravel()[self._known_dofs] = terms.stiffness_damping * force[equations]
         return out
 
     def row_velocity(self, x: np.ndarray, velocity: np.ndarray) -> np.ndarray:
@@ -688,15 +692,11 @@ class MechanicalModel:
         convergence, and takes far larger steps in bending.
         """
         self.prepare()
-        full = np.zeros_like(self.nodes)
-        full.ravel()[self.free_dofs] = step[: len(self.free_dofs)]
-        linear = full
+        full = self.displace(x, step)
+        linear = full.copy()
         if self._map is not None:
-            spins = self._spins(step)
-            linear = full.copy()
             self._map.linearise(x)
             linear[self.frames.carried] = (self._map.matrix @ step).reshape(-1, 3)
-            self.frames.displace(x, full[self.frames.rows], spins, full)
         rhs = np.zeros_like(self.nodes)
         for block in self.blocks:
             block.add_warped(x, linear, rhs)
@@ -707,6 +707,14 @@ class MechanicalModel:
             if problem.coupling is not None:
                 right = right - problem.coupling @ full[problem.known, problem.axes]
             full[problem.free, problem.axes] = problem.solver.solve(right)
+        return full
+
+    def displace(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Displacement of all rows (n, 3) by a step of the equations (N,): frames turn, all else goes straight."""
+        full = np.zeros_like(self.nodes)
+        full.ravel()[self.free_dofs] = step[: len(self.free_dofs)]
+        if self._map is not None:
+            self.frames.displace(x, full[self.frames.rows], self._spins(step), full)
         return full
 
     def _make_poisson(self) -> list[_Poisson]:

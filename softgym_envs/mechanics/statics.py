@@ -186,6 +186,10 @@ class Statics:
         """Largest displacement [m] of a step of the equations."""
         return float(np.abs(step * self.model.dof_scale).max(initial=0.0))
 
+    def _move(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Displacement of the rows (n, 3) that a step of the equations (N,) stands for."""
+        return self.model.warp(x, step)
+
     # -- Newton -----------------------------------------------------------------------------------------------------
 
     def _newton(self, target: np.ndarray, driven: np.ndarray) -> int:
@@ -199,7 +203,7 @@ class Statics:
             if not np.isfinite(norm):
                 raise _NotFound
             while True:
-                x = self.x + self.model.warp(self.x, length * step_q)
+                x = self.x + self._move(self.x, length * step_q)
                 effort = self.effort + length * step_effort
                 assembled = self.model.assemble(x, effort)
                 if assembled is not None:
@@ -215,7 +219,7 @@ class Statics:
             contraction = remaining / norm if norm > 0.0 else 0.0
             if length == 1.0 and remaining > self.tolerance and remaining * contraction <= 0.1 * self.tolerance:
                 # The simplified correction alone reaches the tolerance: take it and save a factorisation.
-                closer = x + self.model.warp(x, next_q)
+                closer = x + self._move(x, next_q)
                 finished = self.model.assemble(closer, effort + next_effort)
                 if finished is not None:
                     x, effort, assembled = closer, effort + next_effort, finished

@@ -201,6 +201,7 @@ def _bent(
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     even = np.linspace(0.0, arc[-1], count)
     slopes = np.gradient(points, arc, axis=0)
+    slopes[0], slopes[-1] = first, last  # the ends are clamped: exactly so
     frames = []
     for s in even:
         point, direction = (np.array([np.interp(s, arc, field[:, d]) for d in range(3)]) for field in (points, slopes))
