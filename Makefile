@@ -3,11 +3,13 @@
 #   make demo     a co-design study of the Soft Finger, with a report to look at
 #   make test     all tests               make lint    ruff            make types   mypy
 #   make bench    speed and accuracy      make clean   remove caches and build leftovers
+#   make docs     the site, in site/      make docs-images    its pictures, in docs/images/
 #   make setup    the set-up alone        make lock    write requirements.lock anew
 #
 # PYTHON=python3.12      another interpreter (3.11 to 3.13; requirements.lock is made for 3.11)
 # PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"    a small torch, without CUDA
-# ARGS="-k cable -x"     further arguments of pytest (make test), softgym bench (make bench) or pip (make lock)
+# ARGS="-k cable -x"     further arguments of pytest (make test), softgym bench (make bench), docs/make_images.py (make
+#                        docs-images) or pip (make lock)
 
 VENV ?= .venv
 WORKERS ?= 2
@@ -26,7 +28,7 @@ SYSTEM_CHECK := import gmsh, pyvista; plotter = pyvista.Plotter(off_screen=True,
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: setup demo test lint types bench lock clean
+.PHONY: setup demo test lint types bench docs docs-images lock clean
 
 setup: $(VENV)/.stamp-system
 
@@ -54,16 +56,24 @@ demo: setup
 	@echo "report: $(CURDIR)/$(DEMO)/report.html"
 
 # One thread in each process: the matrices are small, and the test workers fill the cores.
-test bench: export OMP_NUM_THREADS = 1
-test bench: export OPENBLAS_NUM_THREADS = 1
-test bench: export MKL_NUM_THREADS = 1
-test bench: export NUMBA_NUM_THREADS = 1
+test bench docs docs-images: export OMP_NUM_THREADS = 1
+test bench docs docs-images: export OPENBLAS_NUM_THREADS = 1
+test bench docs docs-images: export MKL_NUM_THREADS = 1
+test bench docs docs-images: export NUMBA_NUM_THREADS = 1
 
 test: setup
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
 
 bench: setup
 	$(BIN)/softgym bench $(ARGS)
+
+# A notice of the theme about its successor is no warning of this build.
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "site: $(CURDIR)/site/index.html"
+
+docs-images: setup
+	$(BIN)/python docs/make_images.py $(ARGS)
 
 lint: $(VENV)/.stamp
 	$(BIN)/ruff check .
@@ -76,12 +86,12 @@ types: $(VENV)/.stamp
 lock:
 	rm -rf build/lock
 	$(PYTHON) -m venv build/lock
-	build/lock/bin/python -m pip install $(PIP_ARGS) --upgrade setuptools $(ARGS) -e '.[test]'
+	build/lock/bin/python -m pip install $(PIP_ARGS) --upgrade setuptools $(ARGS) -e '.[test,docs]'
 	{ sed '/^[^#]/,$$d' requirements.lock && build/lock/bin/python -m pip freeze --all --exclude-editable \
 		| sed 's/+[^+]*$$//' | grep -vE '^(pip|wheel|triton|nvidia-.*|cuda-.*)=='; } > build/requirements.lock
 	mv build/requirements.lock requirements.lock
 	rm -rf build/lock
 
 clean:
-	rm -rf build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find softgym_envs agents codesign tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -133,7 +133,7 @@ def fem_profile() -> dict[str, object]:
 
 
 def _finer(robot: Any) -> dict[str, object]:
-    """Options that give a robot a mesh of about ten times as many elements, empty if it has no such option."""
+    """Options that give a robot a mesh of elements of a tenth of the volume, empty if it has none."""
     if hasattr(robot, "mesh_size"):
         return {"mesh_size": robot.mesh_size / 10.0 ** (1.0 / 3.0)}
     if hasattr(robot, "elements"):
@@ -189,7 +189,10 @@ def _environment_speed(identifier: str, options: dict[str, object], steps: int, 
 
 
 def fem_speed() -> dict[str, object]:
-    """Every environment on FEM, on its own mesh and on one about ten times as fine: random actions, W included."""
+    """Every environment on FEM under random actions, W included: on its own mesh and on a finer one.
+
+    The finer one has elements of a tenth of the volume, or ten times as many where a robot counts them.
+    """
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.envs.registration import ENVIRONMENTS
     from softgym_envs.robots import make_robot

@@ -231,7 +231,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             from softgym_envs.viewer.image import ImageRenderer
 
             self._renderer = ImageRenderer(self.robot, self.render_size)
-        return self._renderer.render(self.backend.design, self.backend.state, self._path, self.goal)
+        distance = float(self.task.distance(self.backend.state.effector[0], self.goal))
+        return self._renderer.render(self.backend.design, self.backend.state, self._path, self.goal, distance)
 
     def close(self) -> None:
         """Free the renderer."""

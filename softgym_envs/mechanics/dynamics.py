@@ -43,6 +43,17 @@ class _Euler(Inertia):
         return velocity, (velocity - self._v) / self._h
 
 
+class _Start(Inertia):
+    """The start of a motion, at rows ``x`` with velocities of the equations ``v``: a step of ``h^2`` accelerations."""
+
+    def __init__(self, model: MechanicalModel, x: np.ndarray, v: np.ndarray, h: float) -> None:
+        self._motion = model.row_velocity(x, v), model.row_acceleration(x, v, np.zeros_like(v))
+        self.velocity_factor, self.acceleration_factor = 0.0, 1.0 / h**2
+
+    def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._motion
+
+
 class _Alpha(Inertia):
     """Generalised alpha; histories are kept in the equations, in which frames have spins instead of directors.
 
@@ -308,7 +319,9 @@ class Dynamics(Statics):
         self._dissipated += float(np.vdot(drag, self.x - x))
         return found
 
-    def _solve_with(self, terms: _Euler | _Alpha, target: np.ndarray, mode: str | Sequence[str], options: dict) -> Equilibrium:
+    def _solve_with(
+        self, terms: _Euler | _Alpha, target: np.ndarray, mode: str | Sequence[str], options: dict
+    ) -> Equilibrium:
         self._fresh = False
         # Dead loads act in full: their ramp belongs to statics.
         self._carried = self.model.loads
@@ -330,27 +343,41 @@ class Dynamics(Statics):
             self._fresh = False
 
     def _starting_acceleration(self, target: np.ndarray, mode: str | Sequence[str]) -> np.ndarray:
-        """Acceleration of the equations at the start: of a step of Euler's so short that it is linear, shape (N,)."""
+        """Accelerations of the equations at the start, shape (N,): efforts as they are, driven rows move on steadily."""
         h = 1e-3 * self.step
-        driven = np.concatenate([self._displacement_rows(mode), self._bonds])
+        speed = self.model.equation_velocity(self.x, self.velocity)
+        terms = _Start(self.model, self.x, speed, h)
+        terms.mass_damping, terms.stiffness_damping = self.mass_damping, self.stiffness_damping
+        if self.stiffness_damping:
+            terms.stiffness = self.model.element_tangent(self.x)
+        delta = self._rows_delta()
+        rows = self._displacement_rows(mode)
+        # A cable that hangs slack goes on doing so.
+        slack = self.unilateral[rows] & (self.effort[rows] <= 0.0) & (delta[rows] > target[rows])
+        driven = np.concatenate([rows[~slack], self._bonds])
+        # Along a steady motion a driven value changes by h^2 times this; the acceleration makes up for it.
+        before, after = (
+            self._rows_delta(self.x + self.model.displace(self.x, s * self.step * speed)) for s in (-0.01, 0.01)
+        )
+        change = (before - 2.0 * delta + after) / (0.01 * self.step) ** 2
         goal = self.effort.copy()
-        goal[driven] = self._rows_delta()[driven]
-        goal[: self._actuators] += 1e-3 * (target - self._present_command(mode))
+        goal[driven] = -(h**2) * change[driven]
         self.model.mass_matrix(self._lumped)
         self.model.applied_loads = self.model.loads
-        self.model.inertia = _Euler(self.x, self.velocity, h)
+        self.model.inertia = terms
         try:
             if not self._linearise():
                 raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
-            step, _ = self._correction(self._Ar, self._delta, self.effort, goal, driven)
+            step, _ = self._correction(self._Ar, np.zeros_like(delta), self.effort, goal, driven)
         finally:
             self.model.inertia = None
             self._fresh = False
-        return (step / h - self.model.equation_velocity(self.x, self.velocity)) / h
+        return step / h**2
 
     @property
     def _moving(self) -> np.ndarray:
         return np.concatenate([np.arange(self._actuators), self._effectors, self._contacts])
 
-    def _rows_delta(self) -> np.ndarray:
-        return np.concatenate([np.zeros(0), *(c.value(self.x) for c, _ in self.model.rows)])
+    def _rows_delta(self, x: np.ndarray | None = None) -> np.ndarray:
+        x = self.x if x is None else x
+        return np.concatenate([np.zeros(0), *(c.value(x) for c, _ in self.model.rows)])

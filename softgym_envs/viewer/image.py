@@ -38,7 +38,14 @@ class ImageRenderer:
         self._shapes = ShapeFinder(robot)
         self._scene: Scene | None = None
 
-    def render(self, design: Mapping[str, float], state: State, path: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    def render(
+        self,
+        design: Mapping[str, float],
+        state: State,
+        path: np.ndarray,
+        goal: np.ndarray,
+        distance: float | None = None,
+    ) -> np.ndarray:
         """Return a picture, shape (height, width, 3) uint8.
 
         A state without nodes is drawn in the shape that a finite-element model takes at its displacements.
@@ -48,6 +55,7 @@ class ImageRenderer:
             state: its state.
             path: all goals of the episode [m], shape (p, 3).
             goal: the present goal [m], shape (3,).
+            distance: to the goal as the task counts it [m]; default all three coordinates.
         """
         scene = self._open()
         model = self._shapes.load(design)
@@ -56,8 +64,9 @@ class ImageRenderer:
         scene.set_ghost(None)
         scene.set_state(x, state)
         scene.set_goal(np.asarray(goal), np.asarray(path))
-        distance = 1e3 * float(np.linalg.norm(state.effector[0] - goal))
-        scene.set_text(f"distance {distance:.1f} mm")
+        if distance is None:
+            distance = float(np.linalg.norm(state.effector[0] - goal))
+        scene.set_text(f"distance {1e3 * distance:.1f} mm")
         return scene.picture()
 
     def render_body(

@@ -103,6 +103,7 @@ class RolloutRecorder:
         *,
         path: np.ndarray | None = None,
         reward: float | None = None,
+        distance: float | None = None,
     ) -> None:
         """Log one state.
 
@@ -113,6 +114,7 @@ class RolloutRecorder:
             goal: the present goal [m], shape (3,).
             path: all goals of the episode [m], shape (p, 3).
             reward: reward that led to the state, none after a reset.
+            distance: to the goal as the task counts it [m]; default all three coordinates.
         """
         import rerun
 
@@ -134,7 +136,9 @@ class RolloutRecorder:
             self._goals = np.array(path)
             self._stream.log("world/path", rerun.LineStrips3D([path], radii=0.005 * size, colors=COLORS["goal"]))
 
-        self._plot("distance", 1e3 * float(np.linalg.norm(state.effector[0] - goal)))
+        if distance is None:
+            distance = float(np.linalg.norm(state.effector[0] - goal))
+        self._plot("distance", 1e3 * distance)
         if reward is not None:
             self._plot("reward", reward)
         for row, actuator in enumerate(self.robot.actuators):
@@ -218,12 +222,20 @@ def record_rollout(
     name = Path(path).stem if env.spec is None else env.spec.id
     with RolloutRecorder(body.robot, path, name=name) as recorder:
         observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
-        recorder.log(0, body.design, body.state, body.goal, path=body.path)
+        recorder.log(0, body.design, body.state, body.goal, path=body.path, distance=float(info["distance"]))
         total, step, over = 0.0, 0, False
         while step < steps and not over:
             observation, reward, terminated, truncated, info = env.step(agent(observation, body))
             step, total, over = step + 1, total + float(reward), terminated or truncated
-            recorder.log(step, body.design, body.state, body.goal, path=body.path, reward=float(reward))
+            recorder.log(
+                step,
+                body.design,
+                body.state,
+                body.goal,
+                path=body.path,
+                reward=float(reward),
+                distance=float(info["distance"]),
+            )
     return {
         "return": total,
         "final_distance": float(info["distance"]),

@@ -1,0 +1,40 @@
+"""Run the Python blocks of a page as one script: ``python docs/run_page.py PAGE FOLDER``.
+
+The blocks share a namespace and run in the folder. A block with a title is a file: it is written there, to be imported.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path
+
+__all__ = ["code_blocks", "run_page"]
+
+
+def code_blocks(page: Path, language: str = "python") -> list[tuple[str, str, int]]:
+    """Return title (or ``""``), text and first line of each fenced block of a language."""
+    text = page.read_text()
+    pattern = rf'^```{language}(?: title="([^"]+)")?\n(.*?)^```$'
+    return [
+        (match[1] or "", match[2], text[: match.start(2)].count("\n"))
+        for match in re.finditer(pattern, text, flags=re.MULTILINE | re.DOTALL)
+    ]
+
+
+def run_page(page: Path, folder: Path) -> None:
+    """Run the blocks of a page in a folder; best in a process of its own, for a page may register things."""
+    os.chdir(folder)
+    sys.path.insert(0, str(folder))
+    namespace: dict[str, object] = {"__name__": "__page__"}
+    for title, text, line in code_blocks(page):
+        if title:
+            (folder / title).write_text(text)
+        else:
+            # Blank lines before the block give errors the line numbers of the page.
+            exec(compile("\n" * line + text, str(page), "exec"), namespace)
+
+
+if __name__ == "__main__":
+    run_page(Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve())
