@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from softgym_envs.config import Config
 from softgym_envs.envs.registration import ENVIRONMENTS
@@ -16,7 +16,7 @@ __all__ = ["EnvironmentConfig", "SACConfig", "TrainConfig"]
 
 
 class EnvironmentConfig(Config):
-    """An environment: its ID and the options of ``gymnasium.make``."""
+    """An environment: its ID and the options of ``gymnasium.make``; the backend is by default that of its row."""
 
     id: str
     backend: str = "surrogate"
@@ -27,6 +27,12 @@ class EnvironmentConfig(Config):
     robot_options: dict[str, Any] = {}
     task_options: dict[str, Any] = {}
     backend_options: dict[str, Any] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_backend(cls, data: Any) -> Any:
+        row = ENVIRONMENTS.get(str(data.get("id"))) if isinstance(data, dict) else None
+        return {"backend": row.backend, **data} if row is not None else data
 
     @field_validator("id")
     @classmethod
@@ -42,7 +48,11 @@ class EnvironmentConfig(Config):
 
     def _options(self, overrides: dict[str, Any]) -> dict[str, Any]:
         options = self.model_dump(exclude={"id"})
-        options["robot_options"] = {**ENVIRONMENTS[self.id].robot_options, **self.robot_options}
+        row = ENVIRONMENTS[self.id]
+        options["robot_options"] = {**row.robot_options, **self.robot_options}
+        options["task_options"] = {**row.task_options, **self.task_options}
+        if self.backend == row.backend:
+            options["backend_options"] = {**row.backend_options, **self.backend_options}
         return {**options, **overrides}
 
     def make(self, **overrides: Any) -> gymnasium.Env:
@@ -54,12 +64,19 @@ class EnvironmentConfig(Config):
         return gymnasium.make(self.id, **self._options(overrides))
 
     def make_vec(self, num_envs: int, **overrides: Any) -> gymnasium.vector.VectorEnv:
-        """Return the batched environment on the surrogate."""
+        """Return the batched environment on the surrogate, or one process for each environment on finite elements."""
         import gymnasium
 
         import softgym_envs  # noqa: F401 - registers the IDs
 
-        return gymnasium.make_vec(self.id, num_envs=num_envs, **self._options(overrides))
+        options: dict[str, Any] = {}
+        if self.backend != "surrogate":
+            mode = gymnasium.vector.AutoresetMode.SAME_STEP
+            options = {
+                "vectorization_mode": "async" if num_envs > 1 else "sync",
+                "vector_kwargs": {"autoreset_mode": mode},
+            }
+        return gymnasium.make_vec(self.id, num_envs=num_envs, **options, **self._options(overrides))
 
 
 class SACConfig(Config):

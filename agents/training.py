@@ -236,13 +236,15 @@ def _save_checkpoint(model: SAC, path: Path, curve: list[dict[str, float]]) -> N
     _, keys, *position = np.random.get_state()  # noqa: NPY002 - stable-baselines3 samples with the global generator
     tensors["random/numpy"] = np.asarray(keys)
     vector_env: Any = model.get_env().env  # type: ignore[union-attr]
+    generator = vector_env.np_random
     meta = {
         "step": int(model.num_timesteps),
         "updates": int(model._n_updates),
         "position": int(buffer.pos),
         "full": bool(buffer.full),
         "numpy": [int(position[0]), int(position[1]), float(position[2])],
-        "environment": vector_env.np_random.bit_generator.state,
+        # Environments in processes of their own have one generator each, out of reach.
+        "environment": None if isinstance(generator, tuple) else generator.bit_generator.state,
         "actions": model.action_space.np_random.bit_generator.state,
         "curve": curve,
     }
@@ -279,8 +281,12 @@ def _restore(model: SAC, path: Path) -> list[dict[str, float]]:
     torch.set_rng_state(torch.as_tensor(tensors["random/torch"]))
     np.random.set_state(("MT19937", tensors["random/numpy"], *meta["numpy"]))  # noqa: NPY002 - as above
     env: Any = model.get_env()
-    env.env.reset(seed=0)
-    env.env.np_random.bit_generator.state = meta["environment"]
+    if meta["environment"] is None:
+        # Environments in processes of their own keep their generators: they start anew, from a seed of this step.
+        env.env.reset(seed=model.num_timesteps)
+    else:
+        env.env.reset(seed=0)
+        env.env.np_random.bit_generator.state = meta["environment"]
     env.cancel_seed()  # else the first reset would start the random goals and bodies anew
     model.action_space.np_random.bit_generator.state = meta["actions"]
     return meta["curve"]

@@ -167,12 +167,12 @@ def export(
 @cli.command()
 @click.argument("environment")
 @click.option("--agent", default="qp", show_default=True, help="qp, random or a policy file.")
-@click.option("--backend", default="surrogate", show_default=True)
+@click.option("--backend", help="surrogate or fem; default that of the environment.")
 @click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
 @click.option("--seed", default=0, show_default=True)
 @click.option("--record", type=click.Path(path_type=Path), help="Write a rerun recording (.rrd).")
 def rollout(
-    environment: str, agent: str, backend: str, design: tuple[str, ...], seed: int, record: Path | None
+    environment: str, agent: str, backend: str | None, design: tuple[str, ...], seed: int, record: Path | None
 ) -> None:
     """Run one episode and print what happened."""
     import gymnasium
@@ -188,7 +188,9 @@ def rollout(
         # A policy sees and does what it was trained to see and do.
         trained = Policy(agent).card["config"]["environment"]
         options = {name: trained[name] for name in ("design_in_observation", "action_mode", "robot_options")}
-    env = gymnasium.make(environment, backend=backend, design=chosen or None, **options)
+    if backend is not None:
+        options["backend"] = backend
+    env = gymnasium.make(environment, design=chosen or None, **options)
     if record is not None:
         from softgym_envs.viewer.recording import record_rollout
 
@@ -201,7 +203,8 @@ def rollout(
     while not ended:
         observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
         total, step, ended = total + float(reward), step + 1, terminated or truncated
-    click.echo(f"{environment} on {backend}, agent {agent}: {step} steps, return {total:.2f}")
+    physics = env.spec.kwargs["backend"] if env.spec is not None else backend
+    click.echo(f"{environment} on {physics}, agent {agent}: {step} steps, return {total:.2f}")
     click.echo(f"final distance {1e3 * info['distance']:.3f} mm, success {info['is_success']}")
     env.close()
 
@@ -274,9 +277,7 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
     show_default=True,
     help="qp, random or a policy file (repeat).",
 )
-@click.option(
-    "--backend", "backends", multiple=True, default=("surrogate",), show_default=True, help="Repeat for several."
-)
+@click.option("--backend", "backends", multiple=True, help="Default that of the environment; repeat for several.")
 @click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
 @click.option("--goals", default=200, show_default=True, help="Number of unseen goals.")
 @click.option("--seed", default=2_000_003, show_default=True, help="Seed of the goals.")
@@ -306,7 +307,7 @@ def evaluate(
     points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
     results: list[dict[str, Any]] = []
     click.echo(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean mm':>9s} {'worst mm':>9s} {'return':>8s}")
-    for backend in backends:
+    for backend in backends or (environment.backend,):
         for agent in agents:
             outcome = run(agent, environment.on(backend), points, design=chosen, seed=seed)
             results.append({"agent": agent, "backend": backend, **outcome.to_json()})
