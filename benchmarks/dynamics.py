@@ -366,7 +366,7 @@ def pendulum_exact(count: int, spin: Sequence[float], duration: float) -> np.nda
                     continue
                 r = sign * (turns[bar] @ end)
                 matrix[c, 6 * bar : 6 * bar + 3] = sign * np.eye(3)
-                matrix[c, 6 * bar + 3 : 6 * bar + 6] = -sign * skew(r).T
+                matrix[c, 6 * bar + 3 : 6 * bar + 6] = -sign * skew(r)
                 right[c] -= sign * np.cross(w[bar], np.cross(w[bar], r))
             matrix[:, c] = matrix[c].T
         found = np.linalg.solve(matrix, right)[: 6 * count].reshape(count, 6)
