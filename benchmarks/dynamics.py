@@ -423,3 +423,111 @@ def rigid(levels: Sequence[int] = (50, 100, 200, 400)) -> list[Row]:
                 found.append(Row(f"{name}: end, {scheme}", f"{steps} steps", error, 0.0, error))
             rows += _orders(found)
     return rows
+
+
+# -- actuators ------------------------------------------------------------------------------------------------------
+
+
+def pulled_bar(**options) -> MechanicalModel:
+    """A hanging bar of 0.2 m with a cable off its axis and an effector at its tip."""
+    nodes, tetrahedra = box((2, 2, 8))
+    body = Assembly(gravity=GRAVITY)
+    nodes = nodes * [0.02, 0.02, 0.2]
+    body.add_solid(
+        nodes, tetrahedra, fixed=nodes[:, 2] > 0.199, young_modulus=5e5, poisson_ratio=0.4, density=1000.0, **options
+    )
+    model = body.build()
+    cable = np.array([[0.016, 0.009, z] for z in (0.18, 0.1, 0.02)])
+    model.add_cable("cable", cable, np.array([0.016, 0.009, 0.205]))
+    model.add_effector("tip", np.array([0.011, 0.01, 0.0]))
+    return model
+
+
+def pulled_bar_at_rest(**options) -> Dynamics:
+    """The bar hanging still under its weight, the cable without force."""
+    from softgym_envs.mechanics.statics import Statics
+
+    model = pulled_bar()
+    rest = Statics(model, tolerance=1e-13).solve([0.0], "effort")
+    solver = Dynamics(model, tolerance=1e-13, **options)
+    solver.restore(rest.x, rest.effort)
+    return solver
+
+
+def tetrapod_at_rest(design: dict[str, float] | None = None, **options) -> Dynamics:
+    """The Tetrapod hanging still, servos held at zero."""
+    from softgym_envs.mechanics.statics import Statics
+
+    model = make_robot("tetrapod").build(design)
+    rest = Statics(model, tolerance=1e-13).solve(np.zeros(4))
+    solver = Dynamics(model, tolerance=1e-12, **options)
+    solver.restore(rest.x, rest.effort)
+    return solver
+
+
+DAMPING = {"mass_damping": 0.5, "stiffness_damping": 0.01}
+
+
+def compliance(scheme: str = "euler") -> list[Row]:
+    """W of a step in the middle of a motion against central differences of the efforts; error relative to its size.
+
+    Mixed units: every row and column is measured by its own diagonal entry.
+    """
+    rows = []
+    machines: dict[str, tuple[Callable[..., Dynamics], np.ndarray, float]] = {
+        "bar with a cable": (pulled_bar_at_rest, np.array([0.01]), 1e-3),
+        "Tetrapod": (tetrapod_at_rest, np.array([0.3, -0.2, 0.1, 0.25]), 1e-4),
+    }
+    for name, (build, pull, size) in machines.items():
+        for damping in ({}, DAMPING):
+            solver = build(step=0.01, scheme=scheme, **damping)
+            n = len(pull)
+            for k in range(8):
+                motion = solver.advance((k + 1) / 8.0 * pull)
+            effort = motion.equilibrium.effort[: n + 3]
+            kept = solver.snapshot
+            condensed = solver.advance(effort[:n], "effort").equilibrium.condensed
+            W, found = condensed.compliance, np.empty((n + 3, n + 3))
+            scale = 1.0 / np.sqrt(np.diag(W))
+            for i in range(n + 3):
+                ends = []
+                for sign in (1.0, -1.0):
+                    solver.snapshot = kept
+                    push = np.zeros(n + 3)
+                    push[i] = sign * size * scale[i]
+                    ends.append(
+                        solver.advance(effort[:n] + push[:n], "effort", effector_force=push[n:]).equilibrium.delta[: n + 3]
+                    )
+                found[:, i] = (ends[0] - ends[1]) / (2.0 * size * scale[i])
+            error = float(np.abs(scale[:, None] * (found - W) * scale).max())
+            setting = f"{scheme}, {'Rayleigh damping' if damping else 'no damping'}"
+            rows.append(Row(f"{name}: W of one step", setting, error, 0.0, error))
+    return rows
+
+
+def book_keeping(levels: Sequence[int] = (50, 100, 200)) -> list[Row]:
+    """What is missing from work = change of energy + dissipated, over the work, while actuators move for 0.5 s.
+
+    Implicit Euler loses energy; the missing part is its own damping, positive and falling with the step.
+    """
+    rows = []
+    machines: dict[str, tuple[Callable[..., Dynamics], np.ndarray]] = {
+        "bar with a cable": (pulled_bar_at_rest, np.array([0.015])),
+        "Tetrapod": (tetrapod_at_rest, np.array([0.6, -0.3, 0.2, 0.5])),
+    }
+    for name, (build, pull) in machines.items():
+        for scheme in SCHEMES:
+            for damping in ({}, DAMPING):
+                found = []
+                for steps in levels:
+                    solver = build(step=0.5 / steps, scheme=scheme, **damping)
+                    start = sum(solver.energies())
+                    for k in range(steps):
+                        # Starts and ends smoothly.
+                        motion = solver.advance(0.5 * (1.0 - np.cos(np.pi * (k + 1) / steps)) * pull)
+                    missing = (motion.work - (motion.energy - start) - motion.dissipated) / motion.work
+                    kind = "Rayleigh damping" if damping else "no damping"
+                    case = f"{name}: energy missing, {scheme}, {kind}"
+                    found.append(Row(case, f"{steps} steps", missing, 0.0, missing))
+                rows += _orders(found)
+    return rows
