@@ -14,10 +14,13 @@ from agents.config import EnvironmentConfig
 from agents.policy import Policy
 from softgym_envs.errors import ConvergenceError
 
-__all__ = ["Evaluation", "evaluate", "make_agent", "sample_goals"]
+__all__ = ["AGENTS", "Evaluation", "evaluate", "make_agent", "sample_goals"]
 
 Agent = Callable[[np.ndarray, Any], np.ndarray]
 """``agent(observation, env.unwrapped) -> action``."""
+
+AGENTS = ("qp", "qp_static", "random")
+"""Names of agents that need no training."""
 
 
 @dataclass(frozen=True)
@@ -92,17 +95,31 @@ def sample_goals(
 
 
 def make_agent(agent: str | Path, seed: int = 0) -> Agent:
-    """Return ``agent(observation, env.unwrapped) -> action`` for ``"qp"``, ``"random"`` or a policy file."""
+    """Return ``agent(observation, env.unwrapped) -> action``.
+
+    Args:
+        agent: ``"random"``; ``"qp"``, the inverse QP on the condensed model of the present state, which in dynamics is
+            that of the next time step; ``"qp_static"``, the inverse QP on the static equilibrium under the present
+            command, which knows no momentum; or a policy file.
+        seed: of the random agent.
+    """
     if agent == "random":
         rng = np.random.default_rng(seed)
         return lambda observation, env: rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
-    if agent == "qp":
+    if agent in ("qp", "qp_static"):
         from softgym_envs.control import InverseQP
 
         controllers: WeakKeyDictionary[Any, InverseQP] = WeakKeyDictionary()
 
         def control(observation: np.ndarray, env: Any) -> np.ndarray:
             state = env.state
+            model, slack = state.condensed, state.slack
+            if agent == "qp_static" and env.backend.moving:
+                try:
+                    still = env.backend.probe(state.command)
+                except ConvergenceError:  # no equilibrium there: wait for the next
+                    return env.interface.action(state.command, state.command)
+                model, slack = still.condensed, still.slack
             if env not in controllers or not state.command.any():  # a fresh one for each episode
                 body = env.robot
                 unilateral = np.array([actuator.unilateral for actuator in body.actuators])
@@ -117,7 +134,7 @@ def make_agent(agent: str | Path, seed: int = 0) -> Agent:
                     goal_weights=None if weights.all() else weights,
                 )
             try:
-                command = controllers[env].solve(state.condensed, env.goal, state.command, state.slack)
+                command = controllers[env].solve(model, env.goal, state.command, slack)
             except ConvergenceError:  # a QP that fails holds still
                 command = state.command
             return env.interface.action(command, state.command)
@@ -146,7 +163,7 @@ def evaluate(
     """
     goals = np.asarray(goals, dtype=float)
     goals = goals[:, None, :] if goals.ndim == 2 else goals
-    if agent not in ("qp", "random") and environment.backend == "surrogate":
+    if agent not in AGENTS and environment.backend == "surrogate":
         return _evaluate_batch(Policy(agent), environment, goals, design, seed)
     env = environment.make(sample_design=False)
     act = make_agent(agent, seed)

@@ -444,11 +444,11 @@ def pulled_bar(**options) -> MechanicalModel:
 
 
 def pulled_bar_at_rest(**options) -> Dynamics:
-    """The bar hanging still under its weight, the cable without force."""
+    """The bar hanging still under its weight, the cable held."""
     from softgym_envs.mechanics.statics import Statics
 
     model = pulled_bar()
-    rest = Statics(model, tolerance=1e-13).solve([0.0], "effort")
+    rest = Statics(model, tolerance=1e-13).solve([0.0])
     solver = Dynamics(model, tolerance=1e-13, **options)
     solver.restore(rest.x, rest.effort)
     return solver
@@ -483,7 +483,8 @@ def compliance(scheme: str = "euler") -> list[Row]:
             solver = build(step=0.01, scheme=scheme, **damping)
             n = len(pull)
             for k in range(8):
-                motion = solver.advance((k + 1) / 8.0 * pull)
+                # Starts smoothly: the second order scheme would rattle, and steps would be cut.
+                motion = solver.advance(0.5 * (1.0 - np.cos(0.6 * np.pi * (k + 1) / 8.0)) * pull)
             effort = motion.equilibrium.effort[: n + 3]
             kept = solver.snapshot
             condensed = solver.advance(effort[:n], "effort").equilibrium.condensed
@@ -531,3 +532,47 @@ def book_keeping(levels: Sequence[int] = (50, 100, 200)) -> list[Row]:
                     found.append(Row(case, f"{steps} steps", missing, 0.0, missing))
                 rows += _orders(found)
     return rows
+
+
+# -- robots ---------------------------------------------------------------------------------------------------------
+
+ROBOTS: dict[str, tuple[dict[str, object], list[float]]] = {
+    "finger": ({}, [0.010, 0.003]),
+    "diamond": ({"mesh_size": 30e-3}, [0.010, 0.0, 0.004, 0.0]),
+    "tetrapod": ({}, [0.5, -0.3, 0.2, 0.4]),
+}
+"""Robots of the quasi-static case: options, and a command."""
+
+
+def quasi_static(names: Sequence[str] = tuple(ROBOTS), rest: int = 60) -> list[Row]:
+    """Distance [m] of the effector from its static equilibrium after a slow command and ``rest`` control steps of calm.
+
+    Rayleigh damping: 2 / s of the masses, 0.05 s of the stiffness.
+    """
+    rows = []
+    for name in names:
+        options, command = ROBOTS[name]
+        robot = make_robot(name, **options)
+        still = FEMBackend(robot).step(np.array(command)).effector[0]
+        moving = FEMBackend(robot, dynamics=True, mass_damping=2.0, stiffness_damping=0.05)
+        for k in range(20):
+            moving.step((k + 1) / 20.0 * np.array(command))
+        state = moving.state
+        error = float(np.linalg.norm(state.effector[0] - still))
+        rows.append(Row(f"{name}: distance to statics", "after the command", error, 0.0, error))
+        for _ in range(rest):
+            state = moving.step(np.array(command))
+        error = float(np.linalg.norm(state.effector[0] - still))
+        rows.append(Row(f"{name}: distance to statics", f"{rest} steps later", error, 0.0, error))
+    return rows
+
+
+def statics_of(command: np.ndarray, solver: Statics) -> np.ndarray | None:
+    """Effector [m] (3,) under servo angles (4,), reached from rest in small steps; None if there is no equilibrium."""
+    solver.restore(*REST)
+    try:
+        for k in range(4):
+            found = solver.solve((k + 1) / 4.0 * command)
+    except ConvergenceError:
+        return None
+    return found.delta[4:7]

@@ -166,7 +166,7 @@ def export(
 
 @cli.command()
 @click.argument("environment")
-@click.option("--agent", default="qp", show_default=True, help="qp, random or a policy file.")
+@click.option("--agent", default="qp", show_default=True, help="qp, qp_static, random or a policy file.")
 @click.option("--backend", help="surrogate or fem; default that of the environment.")
 @click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
 @click.option("--seed", default=0, show_default=True)
@@ -178,13 +178,13 @@ def rollout(
     import gymnasium
 
     import softgym_envs  # noqa: F401 - registers the IDs
-    from agents.evaluation import make_agent
+    from agents.evaluation import AGENTS, make_agent
     from agents.policy import Policy
 
     act = make_agent(agent, seed)
     chosen = _assignments(design, "design")
     options: dict[str, Any] = {}
-    if agent not in ("qp", "random"):
+    if agent not in AGENTS:
         # A policy sees and does what it was trained to see and do.
         trained = Policy(agent).card["config"]["environment"]
         options = {name: trained[name] for name in ("design_in_observation", "action_mode", "robot_options")}
@@ -275,7 +275,7 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
     multiple=True,
     default=("qp", "random"),
     show_default=True,
-    help="qp, random or a policy file (repeat).",
+    help="qp, qp_static, random or a policy file (repeat).",
 )
 @click.option("--backend", "backends", multiple=True, help="Default that of the environment; repeat for several.")
 @click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
