@@ -103,6 +103,7 @@ class FEMBackend(Backend):
         if force is not None:
             load = np.zeros(self.state.condensed.delta.e.size)
             load[:3] = force
+        kept = self._snapshot
         try:
             if self._dynamics is None:
                 found = self._drive(self._statics, command, mode, load)
@@ -110,17 +111,17 @@ class FEMBackend(Backend):
             else:
                 self.state = self._advance(command, mode, load)
         except ConvergenceError:
-            self.restore(self.state)
+            self._go_back(kept)
             raise
         return self.state
 
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
         """Return the static equilibrium under a command without going there."""
-        kept = self.state
+        kept = self._snapshot
         try:
             return self._state(self._statics.solve(np.asarray(command, dtype=float), mode), command, still=True)
         finally:
-            self.restore(kept)
+            self._go_back(kept)
 
     def restore(self, state: State) -> None:
         assert state.nodes is not None
@@ -130,6 +131,16 @@ class FEMBackend(Backend):
             self._dynamics.restore(state.nodes, effort, None if state.motion is None else state.motion.velocity)
         self._saturated = np.abs(state.effort) >= self._max_effort * (1.0 - 1e-9)
         self.state = state
+
+    @property
+    def _snapshot(self) -> tuple | None:
+        return None if self._dynamics is None else self._dynamics.snapshot
+
+    def _go_back(self, motion: tuple | None) -> None:
+        """Take back what happened since the present state; of a motion also what a state does not hold."""
+        self.restore(self.state)
+        if self._dynamics is not None and motion is not None:
+            self._dynamics.snapshot = motion
 
     def _advance(self, command: np.ndarray, mode: str, load: np.ndarray | None) -> State:
         assert self._dynamics is not None
@@ -148,7 +159,8 @@ class FEMBackend(Backend):
             return go(command, mode, effector_force=load)
         saturated = self._saturated.copy()
         sign = np.sign(solver.effort[: len(command)])
-        for _ in range(len(command) + 1):
+        count = len(command)
+        for attempt in range(2 * count + 2):
             # One that gives way is released when its command asks for less than it has.
             target = np.where(saturated, sign * self._max_effort, command)
             modes = ["effort" if s else "displacement" for s in saturated]
@@ -157,7 +169,8 @@ class FEMBackend(Backend):
             equilibrium = found.equilibrium if isinstance(found, Motion) else found
             effort, reached = equilibrium.effort[: len(command)], equilibrium.delta[: len(command)]
             over = ~saturated & (np.abs(effort) > self._max_effort)
-            back = saturated & (sign * (command - reached) < 0.0)
+            # In the end none is released any more, so that this ends.
+            back = saturated & (sign * (command - reached) < 0.0) & (attempt <= count)
             if not (over.any() or back.any()):
                 break
             sign = np.where(over, np.sign(effort), sign)

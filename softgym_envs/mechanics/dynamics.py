@@ -22,7 +22,7 @@ import numpy as np
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.model import Inertia, MechanicalModel
-from softgym_envs.mechanics.statics import Equilibrium, Statics
+from softgym_envs.mechanics.statics import Equilibrium, Statics, _NotFound
 
 __all__ = ["SCHEMES", "Dynamics", "Motion"]
 
@@ -343,7 +343,7 @@ class Dynamics(Statics):
             self._fresh = False
 
     def _starting_acceleration(self, target: np.ndarray, mode: str | Sequence[str]) -> np.ndarray:
-        """Accelerations of the equations at the start, shape (N,): efforts as they are, driven rows move on steadily."""
+        """Accelerations of the equations at the start, (N,): efforts as they are, driven rows move on steadily."""
         h = 1e-3 * self.step
         speed = self.model.equation_velocity(self.x, self.velocity)
         terms = _Start(self.model, self.x, speed, h)
@@ -369,6 +369,8 @@ class Dynamics(Statics):
             if not self._linearise():
                 raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
             step, _ = self._correction(self._Ar, np.zeros_like(delta), self.effort, goal, driven)
+        except _NotFound:
+            raise ConvergenceError("the starting state has no single acceleration", fraction=0.0) from None
         finally:
             self.model.inertia = None
             self._fresh = False

@@ -64,6 +64,56 @@ def rotation_vector_matrix(vectors: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
+def _displace(x, rows, carried, owner, moves, arm, translation, turn, out):
+    bases = np.empty((rows.shape[0], 3, 3))
+    gram = np.empty((3, 3))
+    for f in range(rows.shape[0]):
+        turned = np.zeros((3, 3))
+        for k in range(3):
+            for i in range(3):
+                for j in range(3):
+                    turned[k, i] += turn[f, i, j] * x[rows[f] + 1 + k, j]
+        # Round-off must not add up over a long motion.
+        for k in range(3):
+            for m in range(3):
+                gram[k, m] = turned[k, 0] * turned[m, 0] + turned[k, 1] * turned[m, 1] + turned[k, 2] * turned[m, 2]
+        for k in range(3):
+            for i in range(3):
+                bases[f, k, i] = 1.5 * turned[k, i]
+                for m in range(3):
+                    bases[f, k, i] -= 0.5 * gram[k, m] * turned[m, i]
+            out[rows[f], k] = translation[f, k]
+    for c in range(carried.shape[0]):
+        f = owner[c]
+        for i in range(3):
+            value = moves[c] * (x[rows[f], i] + translation[f, i])
+            for k in range(3):
+                value += arm[c, k] * bases[f, k, i]
+            out[carried[c], i] = value - x[carried[c], i]
+
+
+@njit(cache=True)
+def _add_curvature(values, owner, count, arms, gradient, target):
+    """Add ``(g r^T + r g^T) / 2 - (g . r) I`` of every carried row to the spin block of its frame."""
+    blocks = np.zeros((count, 6))
+    for c in range(owner.shape[0]):
+        block = blocks[owner[c]]
+        g, r = gradient[c], arms[c]
+        dot = g[0] * r[0] + g[1] * r[1] + g[2] * r[2]
+        k = 0
+        for a in range(3):
+            for b in range(a + 1):
+                block[k] += 0.5 * (g[a] * r[b] + r[a] * g[b])
+                if a == b:
+                    block[k] -= dot
+                k += 1
+    for f in range(count):
+        for k in range(6):
+            if target[6 * f + k] >= 0:
+                values[target[6 * f + k]] += blocks[f, k]
+
+
+@njit(cache=True)
 def _expand(values, count, low, high, start, column, coefficient, target):
     """Add entries of the tangent that touch carried rows to the entries of the degrees of freedom behind them."""
     k = 0
@@ -173,14 +223,8 @@ class Frames:
             spin: rotation vectors [rad], shape (f, 3).
             out: displacements [m], shape (n, 3).
         """
-        bases = x[self.rows[:, None] + np.arange(1, 4)]  # rows are directors
-        turned = bases @ np.swapaxes(rotation_vector_matrix(spin), 1, 2)
-        # Round-off must not add up over a long motion.
-        turned = 1.5 * turned - 0.5 * turned @ np.swapaxes(turned, 1, 2) @ turned
-        origins = x[self.rows] + translation
-        out[self.rows] = translation
-        new = self.moves[:, None] * origins[self.owner] + np.einsum("ck,ckd->cd", self.arm, turned[self.owner])
-        out[self.carried] = new - x[self.carried]
+        turn = rotation_vector_matrix(spin)
+        _displace(x, self.rows, self.carried, self.owner, self.moves, self.arm, translation, turn, out)
 
 
 class KinematicMap:
@@ -213,10 +257,13 @@ class KinematicMap:
                 counts.append(len(entries))
         kind = np.array(kinds, dtype=np.int64).reshape(-1, 2)
         self._sign, self._source = kind[:, 0].astype(float), kind[:, 1]
+        self._constant = (self._sign == 0.0).astype(float)
         pointers = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.matrix = csr_matrix(
             (np.ones(len(columns)), np.array(columns, dtype=np.int64), pointers), shape=(3 * len(frames.owner), size)
         )
+        #: Its transpose, on the same data.
+        self.transposed = self.matrix.T
         # The same with the identity of the free equations before it.
         self.start = np.concatenate([np.arange(size), size + pointers])
         self.column = np.concatenate([np.arange(size), np.array(columns, dtype=np.int64)])
@@ -228,12 +275,11 @@ class KinematicMap:
             [(min(s[a], s[b]), max(s[a], s[b])) if min(s[a], s[b]) >= 0 else (-1, -1) for s in spin for a, b in pairs],
             dtype=np.int64,
         ).reshape(-1, 2)
-        self._axes = np.array(pairs)
 
     def linearise(self, x: np.ndarray) -> np.ndarray:
         """Bring the map to positions ``x`` (n, 3); returns the vectors r of the carried rows, shape (c, 3)."""
         arms = self.frames.arms(x)
-        data = np.where(self._sign == 0.0, 1.0, self._sign * arms.ravel()[self._source])
+        data = self._sign * arms.ravel()[self._source] + self._constant
         self.matrix.data[:] = data
         self._coefficient[self.size :] = data
         return arms
@@ -257,11 +303,4 @@ class KinematicMap:
 
     def add_curvature(self, values: np.ndarray, arms: np.ndarray, gradient: np.ndarray) -> None:
         """Add the second derivative of the map under the gradient (c, 3) of the carried rows to the tangent."""
-        owner, count = self.frames.owner, len(self.frames)
-        products = np.zeros((count, 3, 3))
-        np.add.at(products, owner, gradient[:, :, None] * arms[:, None, :])
-        block = 0.5 * (products + np.swapaxes(products, 1, 2))
-        block -= np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        entries = block[:, self._axes[:, 0], self._axes[:, 1]].ravel()
-        keep = self._spin_target >= 0
-        values[self._spin_target[keep]] += entries[keep]
+        _add_curvature(values, self.frames.owner, len(self.frames), arms, gradient, self._spin_target)

@@ -535,7 +535,7 @@ class MechanicalModel:
             pull = gradient[self.frames.carried]
             if effort.any():
                 pull = pull - (H[n:] @ effort).reshape(-1, 3)
-            turning = self._map.matrix.T
+            turning = self._map.transposed
             residual += turning @ gradient[self.frames.carried].ravel()
             H = np.asfortranarray(H[:n] + turning @ H[n:])
             self._add_bonds(x, values)

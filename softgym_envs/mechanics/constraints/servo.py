@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from softgym_envs.mechanics.constraints.constraint import Constraint
@@ -39,17 +41,22 @@ class Servo(Constraint):
         self._first = across[chosen] / np.linalg.norm(across[chosen])
         self._second = np.cross(self.axis, self._first)
         self.dofs = 3 * self.row + np.arange(3)
+        a, b = self._first, self._second
+        self._mixed = np.outer(a, b) + np.outer(b, a)
+        self._same = np.outer(a, a) - np.outer(b, b)
 
     def value(self, x: np.ndarray) -> np.ndarray:
-        return np.array([np.arctan2(x[self.row] @ self._second, x[self.row] @ self._first)])
+        return self.linearise(x)[0]
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        p, q = x[self.row] @ self._first, x[self.row] @ self._second
-        return ((p * self._second - q * self._first) / (p * p + q * q))[None, :]
+        return self.linearise(x)[1]
+
+    def linearise(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        p, q = float(x[self.row] @ self._first), float(x[self.row] @ self._second)
+        square = p * p + q * q
+        return np.array([math.atan2(q, p)]), ((p / square) * self._second - (q / square) * self._first)[None, :]
 
     def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray:
-        p, q = x[self.row] @ self._first, x[self.row] @ self._second
-        a, b = self._first, self._second
-        mixed = np.outer(a, b) + np.outer(b, a)
-        same = np.outer(a, a) - np.outer(b, b)
-        return effort[0] * (2.0 * p * q * same + (q * q - p * p) * mixed) / (p * p + q * q) ** 2
+        p, q = float(x[self.row] @ self._first), float(x[self.row] @ self._second)
+        scale = float(effort[0]) / (p * p + q * q) ** 2
+        return (2.0 * p * q * scale) * self._same + ((q * q - p * p) * scale) * self._mixed
