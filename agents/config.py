@@ -48,11 +48,6 @@ class EnvironmentConfig(Config):
 
     def _options(self, overrides: dict[str, Any]) -> dict[str, Any]:
         options = self.model_dump(exclude={"id"})
-        row = ENVIRONMENTS[self.id]
-        options["robot_options"] = {**row.robot_options, **self.robot_options}
-        options["task_options"] = {**row.task_options, **self.task_options}
-        if self.backend == row.backend:
-            options["backend_options"] = {**row.backend_options, **self.backend_options}
         return {**options, **overrides}
 
     def make(self, **overrides: Any) -> gymnasium.Env:

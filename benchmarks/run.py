@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks import accuracy, dynamics, robots, sensor_finger, speed, validation
+from benchmarks import accuracy, carry, dynamics, robots, sensor_finger, speed, validation
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError
 from softgym_envs.storage import write_json
@@ -30,6 +30,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "mesh_motion": accuracy.mesh_motion,
     "tracking": robots.tracking,
     "stiff_flop": robots.stiff_flop,
+    "carry": carry.carry,
     "sensor_finger": sensor_finger.published,
     "validation": validation.validation,
     "dynamics": dynamics.dynamics,

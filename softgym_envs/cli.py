@@ -175,22 +175,19 @@ def rollout(
     environment: str, agent: str, backend: str | None, design: tuple[str, ...], seed: int, record: Path | None
 ) -> None:
     """Run one episode and print what happened."""
-    import gymnasium
-
     import softgym_envs  # noqa: F401 - registers the IDs
+    from agents.config import EnvironmentConfig
     from agents.evaluation import AGENTS, make_agent
     from agents.policy import Policy
 
     act = make_agent(agent, seed)
     chosen = _assignments(design, "design")
-    options: dict[str, Any] = {}
-    if agent not in AGENTS:
-        # A policy sees and does what it was trained to see and do.
-        trained = Policy(agent).card["config"]["environment"]
-        options = {name: trained[name] for name in ("design_in_observation", "action_mode", "robot_options")}
+    # A policy sees and does what it was trained to see and do.
+    trained = {} if agent in AGENTS else Policy(agent).card["config"]["environment"]
+    config = EnvironmentConfig(**{**trained, "id": environment})
     if backend is not None:
-        options["backend"] = backend
-    env = gymnasium.make(environment, design=chosen or None, **options)
+        config = config.on(backend)
+    env = config.make(**({"design": chosen} if chosen else {}))
     if record is not None:
         from softgym_envs.viewer.recording import record_rollout
 
@@ -203,8 +200,7 @@ def rollout(
     while not ended:
         observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
         total, step, ended = total + float(reward), step + 1, terminated or truncated
-    physics = env.spec.kwargs["backend"] if env.spec is not None else backend
-    click.echo(f"{environment} on {physics}, agent {agent}: {step} steps, return {total:.2f}")
+    click.echo(f"{environment} on {config.backend}, agent {agent}: {step} steps, return {total:.2f}")
     click.echo(f"final distance {1e3 * info['distance']:.3f} mm, success {info['is_success']}")
     env.close()
 

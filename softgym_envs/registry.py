@@ -21,7 +21,7 @@ def make_registered(kind: str, table: Mapping[str, str], name: str, *arguments: 
         **options: keyword arguments of the class.
 
     Raises:
-        ValueError: for an unknown name, or an option that the class does not take.
+        ValueError: for an unknown name, an option that the class does not take, or one of the wrong type.
     """
     if name not in table:
         raise ValueError(f"unknown {kind} '{name}'; allowed: {', '.join(table)}")
@@ -31,4 +31,7 @@ def make_registered(kind: str, table: Mapping[str, str], name: str, *arguments: 
         inspect.signature(cls).bind(*arguments, **options)
     except TypeError as error:
         raise ValueError(f"{kind} '{name}': {error}") from None
-    return cls(*arguments, **options)
+    try:
+        return cls(*arguments, **options)
+    except TypeError as error:  # an option of the wrong type, somewhere inside
+        raise ValueError(f"{kind} '{name}' cannot be made with {options}: {error}") from error

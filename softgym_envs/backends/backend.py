@@ -29,7 +29,8 @@ class State:
         bonds: forces in the bonds of the body, in the order of its model [N], empty where it has none.
         velocity: of the effectors [m/s], shape (k, 3); zero without dynamics.
         motion: time, velocities and energies of the body, where the backend knows dynamics.
-        stable: the state is stable whatever drives the actuators (always True on the surrogate, which knows no other).
+        stable: the state is stable whatever drives the actuators (always True on the surrogate, which knows no other);
+            in dynamics it is the tangent of the time step, with its inertia, that is positive definite.
         nodes: deformed nodes [m], shape (n, 3), where the backend has them.
     """
 
@@ -54,9 +55,11 @@ class Backend(ABC):
         design: the present complete design.
         state: the present state.
         moving: states have velocities that matter.
+        takes_force: `step` can push the effector.
     """
 
     moving: bool = False
+    takes_force: bool = False
     robot: Robot
     design: dict[str, float]
     state: State

@@ -46,6 +46,7 @@ class FEMBackend(Backend):
     """
 
     model: MechanicalModel
+    takes_force = True
 
     def __init__(
         self,
@@ -59,6 +60,8 @@ class FEMBackend(Backend):
         mass_damping: float = 0.0,
         stiffness_damping: float = 0.01,
     ) -> None:
+        if not isinstance(dynamics, bool):
+            raise ValueError(f"dynamics = {dynamics!r} is unknown; allowed: True, False")
         for name, value in (("control_step", control_step), ("time_step", time_step)):
             if not (np.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} = {value} s must be positive and finite")
@@ -98,11 +101,11 @@ class FEMBackend(Backend):
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        command = np.asarray(command, dtype=float)
+        command = self._checked("command", command, len(self._max_effort))
         load = None
         if force is not None:
             load = np.zeros(self.state.condensed.delta.e.size)
-            load[:3] = force
+            load[:3] = self._checked("force", force, 3)
         kept = self._snapshot
         try:
             if self._dynamics is None:
@@ -110,26 +113,35 @@ class FEMBackend(Backend):
                 self.state = self._state(found, command)
             else:
                 self.state = self._advance(command, mode, load)
-        except ConvergenceError:
+        except BaseException:
+            # Whatever stopped it, the present state stands.
             self._go_back(kept)
             raise
         return self.state
 
+    @staticmethod
+    def _checked(name: str, values: np.ndarray, count: int) -> np.ndarray:
+        array = np.asarray(values, dtype=float)
+        if array.shape != (count,) or not np.isfinite(array).all():
+            raise ValueError(f"{name} must be {count} finite numbers, got {array.tolist()}")
+        return array
+
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
         """Return the static equilibrium under a command without going there."""
         kept = self._snapshot
+        command = self._checked("command", command, len(self._max_effort))
         try:
-            return self._state(self._statics.solve(np.asarray(command, dtype=float), mode), command, still=True)
+            return self._state(self._statics.solve(command, mode), command, still=True)
         finally:
             self._go_back(kept)
 
     def restore(self, state: State) -> None:
+        """Go back to a state; in dynamics with its velocities, while time, work and a scheme's history start anew."""
         assert state.nodes is not None
         effort = np.concatenate([state.condensed.effort, state.bonds])
         self._statics.restore(state.nodes, effort)
         if self._dynamics is not None:
             self._dynamics.restore(state.nodes, effort, None if state.motion is None else state.motion.velocity)
-        self._saturated = np.abs(state.effort) >= self._max_effort * (1.0 - 1e-9)
         self.state = state
 
     @property
@@ -154,11 +166,11 @@ class FEMBackend(Backend):
         """One solve, in which actuators give way at their largest effort."""
         go = solver.advance if isinstance(solver, Dynamics) else solver.solve
         if not self._limited or mode == "effort":
-            if command.shape == self._max_effort.shape:
+            if mode == "effort":
                 command = np.clip(command, -self._max_effort, self._max_effort)
             return go(command, mode, effector_force=load)
-        saturated = self._saturated.copy()
-        sign = np.sign(solver.effort[: len(command)])
+        present = solver.effort[: len(command)]
+        saturated, sign = np.abs(present) >= self._max_effort * (1.0 - 1e-9), np.sign(present)
         count = len(command)
         for attempt in range(2 * count + 2):
             # One that gives way is released when its command asks for less than it has.
@@ -180,7 +192,6 @@ class FEMBackend(Backend):
                 solver.snapshot = kept[2]
             else:
                 solver.restore(kept[0], kept[1])
-        self._saturated = saturated
         return found
 
     def _state(

@@ -90,6 +90,11 @@ class InverseQP:
             raise ValueError(f"rates must be positive, got {self.rates.tolist()}")
         count = len(self.rates)
         self.unilateral = np.asarray(unilateral, dtype=bool)
+        for name, weight in (("effort_weight", effort_weight), ("step_weight", step_weight)):
+            if not (np.isfinite(weight) and weight >= 0.0):
+                raise ValueError(f"{name} = {weight} must be finite and not negative")
+        if self.unilateral.shape != (count,):
+            raise ValueError(f"unilateral must have shape ({count},), got {self.unilateral.shape}")
         self.effort_weight = effort_weight
         self.step_weight = step_weight
         self.goal_weights = None if goal_weights is None else np.asarray(goal_weights, dtype=float)

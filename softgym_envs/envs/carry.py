@@ -45,6 +45,7 @@ class Carry(Task):
         self.axes = np.array([1.0, 0.0, 0.0])
         self.goal = robot.effector_rest + np.array([distance, 0.0, 0.0])
         self.largest_push, self.push_steps, self.push_window = push, push_steps, push_window
+        self.pushes = push > 0.0
         self._force = np.zeros(3)
         self._first = 0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from softgym_envs.envs.task import Kinematics, Task, check_goals
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots.robot import Robot
 
 __all__ = ["Reach"]
@@ -48,4 +49,13 @@ class Reach(Task):
             return self.fixed_goals[rng.integers(len(self.fixed_goals), size=count)][:, None]
         low = self.robot.lower + self.command_low * (self.robot.upper - self.robot.lower)
         goals = kinematics(rng.uniform(low, self.robot.upper, (count, len(low))))
+        for _ in range(50):
+            lost = np.isnan(goals[:, 0])  # commands without an equilibrium are drawn again
+            if not lost.any():
+                break
+            goals[lost] = kinematics(rng.uniform(low, self.robot.upper, (count, len(low))))[lost]
+        else:
+            raise ConvergenceError(
+                "50 random commands in a row have no equilibrium: no goal can be drawn", fraction=0.0
+            )
         return (goals + rng.uniform(-self.spread, self.spread, goals.shape))[:, None]

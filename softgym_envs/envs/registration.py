@@ -73,8 +73,12 @@ def register_environments() -> None:
                     "robot": row.robot,
                     "task": row.task,
                     "backend": row.backend,
-                    "robot_options": dict(row.robot_options),
-                    "task_options": dict(row.task_options),
-                    "backend_options": dict(row.backend_options),
+                    # Gymnasium replaces whole mappings; these stay under what the user gives.
+                    "defaults": {
+                        "backend": row.backend,
+                        "robot_options": dict(row.robot_options),
+                        "task_options": dict(row.task_options),
+                        "backend_options": dict(row.backend_options),
+                    },
                 },
             )

@@ -17,7 +17,21 @@ from softgym_envs.envs.task import check_goals, make_task
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots import make_robot
 
-__all__ = ["SoftRobotEnv", "design_names"]
+__all__ = ["SoftRobotEnv", "design_names", "merge_defaults"]
+
+
+def merge_defaults(
+    defaults: Mapping[str, Any] | None, backend: str, *given: Mapping[str, Any] | None
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Put options of a robot, a task and a backend over the defaults of an environment's row."""
+    rows = dict(defaults or {})
+    if rows.get("backend") != backend:
+        rows["backend_options"] = {}
+    robot, task, physics = (
+        {**rows.get(name, {}), **(options or {})}
+        for name, options in zip(("robot_options", "task_options", "backend_options"), given, strict=True)
+    )
+    return robot, task, physics
 
 
 def design_names(space: DesignSpace, choice: bool | Sequence[str]) -> tuple[str, ...]:
@@ -45,6 +59,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         robot_options: options of the robot.
         task_options: options of the task.
         backend_options: options of the backend.
+        defaults: options of the environment's row, under those given here; its ``backend_options`` count on its
+            ``backend`` only.
         render_mode: None or ``"rgb_array"``.
         render_size: width and height of an image [pixels].
     """
@@ -64,6 +80,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         robot_options: Mapping[str, Any] | None = None,
         task_options: Mapping[str, Any] | None = None,
         backend_options: Mapping[str, Any] | None = None,
+        defaults: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         render_size: tuple[int, int] = (480, 480),
     ) -> None:
@@ -79,6 +96,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             robot_options=robot_options,
             task_options=task_options,
             backend_options=backend_options,
+            defaults=defaults,
             render_mode=render_mode,
             render_size=render_size,
         )
@@ -86,15 +104,18 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             raise ValueError(f"render_mode = {render_mode!r} is unknown; allowed: None, 'rgb_array'")
         self.render_mode = render_mode
         self.render_size = render_size
-        self.robot = make_robot(robot, **dict(robot_options or {}))
+        robot_options, task_options, backend_options = merge_defaults(
+            defaults, backend, robot_options, task_options, backend_options
+        )
+        self.robot = make_robot(robot, **robot_options)
         self.design_space = self.robot.design_space
         self._fixed_design = self.design_space.complete(design)
         self._sampled = design_names(self.design_space, sample_design)
         shown = design_names(self.design_space, design_in_observation)
-        self.task = make_task(task, self.robot, **dict(task_options or {}))
-        self.backend: Backend = make_backend(
-            backend, self.robot, design=self._fixed_design, **dict(backend_options or {})
-        )
+        self.task = make_task(task, self.robot, **task_options)
+        self.backend: Backend = make_backend(backend, self.robot, design=self._fixed_design, **backend_options)
+        if self.task.pushes and not self.backend.takes_force:
+            raise ValueError(f"task '{task}' pushes the effector, backend '{backend}' knows no forces; use 'fem'")
         self.interface = Interface(
             self.robot,
             action_mode=action_mode,
@@ -106,6 +127,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.observation_space = self.interface.observation_space
         self._renderer: Any = None
         self._path = np.zeros((1, 3))
+        self._unit_design = np.zeros(len(shown))
         self._step = 0
 
     @property
@@ -216,11 +238,11 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         return observation, info
 
     def _kinematics(self, commands: np.ndarray) -> np.ndarray:
-        """Effectors [m] (1, 3) that commands (1, n_a) lead to; the present one where no equilibrium is found."""
+        """Effectors [m] (1, 3) that commands (1, n_a) lead to; NaN where no equilibrium is found."""
         try:
             return self.backend.probe(commands[0]).effector[:1]
         except ConvergenceError:
-            return self.backend.state.effector[:1]
+            return np.full((1, 3), np.nan)
 
     def render(self) -> np.ndarray | None:
         """Return an image (height, width, 3) of the body, its cables, effector and goal, or None without a mode."""

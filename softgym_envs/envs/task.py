@@ -60,6 +60,9 @@ class Task(ABC):
         horizon: control steps a goal path describes; paths hold their last goal beyond it.
     """
 
+    #: It pushes the effector, so the backend must know forces.
+    pushes = False
+
     name: str
     horizon: int
 

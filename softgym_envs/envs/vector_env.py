@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 
 from softgym_envs.backends.surrogate import settle
 from softgym_envs.envs.interface import Interface
-from softgym_envs.envs.soft_robot_env import design_names
+from softgym_envs.envs.soft_robot_env import design_names, merge_defaults
 from softgym_envs.envs.task import check_goals, make_task
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.pretrained import pretrained_model
@@ -38,6 +38,7 @@ class SoftRobotVectorEnv(VectorEnv):
         robot_options: options of the robot.
         task_options: options of the task.
         backend_options: options of the backend (``weights``).
+        defaults: as for `SoftRobotEnv`.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
@@ -57,6 +58,7 @@ class SoftRobotVectorEnv(VectorEnv):
         robot_options: Mapping[str, Any] | None = None,
         task_options: Mapping[str, Any] | None = None,
         backend_options: Mapping[str, Any] | None = None,
+        defaults: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
     ) -> None:
         if backend != "surrogate":
@@ -72,10 +74,15 @@ class SoftRobotVectorEnv(VectorEnv):
             raise ValueError(f"num_envs = {num_envs} must be at least 1")
         self.num_envs = num_envs
         self.render_mode = None
-        self.robot = make_robot(robot, **dict(robot_options or {}))
+        robot_options, task_options, backend_options = merge_defaults(
+            defaults, backend, robot_options, task_options, backend_options
+        )
+        self.robot = make_robot(robot, **robot_options)
         self.design_space = self.robot.design_space
-        self.model = pretrained_model(self.robot, **dict(backend_options or {}))
-        self.task = make_task(task, self.robot, **dict(task_options or {}))
+        self.model = pretrained_model(self.robot, **backend_options)
+        self.task = make_task(task, self.robot, **task_options)
+        if self.task.pushes:
+            raise ValueError(f"task '{task}' pushes the effector, the batched environment knows no forces")
         self.max_episode_steps = max_episode_steps if max_episode_steps is not None else np.iinfo(np.int64).max
         self._fixed_design = self.design_space.complete(design)
         self._sampled = design_names(self.design_space, sample_design)

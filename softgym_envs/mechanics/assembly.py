@@ -110,6 +110,8 @@ class Assembly:
         mask = np.zeros((4, 3), dtype=bool)
         mask[0] = fixed
         start = self._append(frame_rows(position, rotation), mask)
+        if on is not None and on not in self._frames:
+            raise ValueError(f"there is no frame at row {on} to mount on; frames: {self._frames}")
         if on is not None:
             self._mounted.setdefault(self._frames.index(on), []).append(start)
             return start
@@ -126,6 +128,10 @@ class Assembly:
 
     def add_beam(self, frames: Sequence[int] | np.ndarray, *, section: Section | list[Section], **options) -> None:
         """Add beam elements along frames that were added before; options as for `Beam`."""
+        known = {*self._frames, *(row for rows in self._mounted.values() for row in rows)}
+        strange = [int(row) for row in frames if int(row) not in known]
+        if strange:
+            raise ValueError(f"there is no frame at row {strange[0]} for a beam; frames: {sorted(known)}")
         self._parts.append((Beam, np.asarray(frames, dtype=np.int64), {"section": section, **options}))
 
     def add_mass(self, frame: int, mass: float, inertia: np.ndarray) -> None:

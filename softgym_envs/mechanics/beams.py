@@ -20,7 +20,7 @@ from numba import njit
 
 from softgym_envs.mechanics.block import ElementBlock, lower_pairs
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.tetrahedra import element_masses
+from softgym_envs.mechanics.tetrahedra import check_density, element_masses
 
 __all__ = ["Beam", "Section"]
 
@@ -34,21 +34,30 @@ class Section:
         inertia: second moments of area about d_2 and d_3 [m4].
         torsion: torsion constant [m4].
         shear: shear correction factors along d_2 and d_3.
+        mass_area: area of the material [m2] where that is more than what carries load; default the same.
     """
 
     area: float
     inertia: tuple[float, float]
     torsion: float
     shear: tuple[float, float] = (1.0, 1.0)
+    mass_area: float | None = None
 
     def __post_init__(self) -> None:
-        values = (self.area, *self.inertia, self.torsion, *self.shear)
+        values = (self.area, *self.inertia, self.torsion, *self.shear, self.material_area)
         if not all(np.isfinite(v) and v > 0.0 for v in values):
             raise ValueError(f"section values must be positive and finite, got {self}")
+
+    @property
+    def material_area(self) -> float:
+        """Area of the material [m2], which has mass and volume."""
+        return self.area if self.mass_area is None else self.mass_area
 
     @classmethod
     def rectangle(cls, width: float, thickness: float) -> Section:
         """A rectangle of a width [m] along d_2 and a thickness [m] along d_3 (Timoshenko's torsion series)."""
+        if not (width > 0.0 and thickness > 0.0):
+            raise ValueError(f"a section of {width} m by {thickness} m must have positive sides")
         area = width * thickness
         long, short = max(width, thickness), min(width, thickness)
         k = np.arange(1, 40, 2)
@@ -59,6 +68,8 @@ class Section:
     @classmethod
     def circle(cls, radius: float, inner: float = 0.0) -> Section:
         """A circle or, with an ``inner`` radius, a tube [m]."""
+        if not 0.0 <= inner < radius:
+            raise ValueError(f"radii of a section must be 0 <= inner < radius, got {inner} and {radius} m")
         area = np.pi * (radius**2 - inner**2)
         inertia = 0.25 * np.pi * (radius**4 - inner**4)
         shear = 0.9 if inner == 0.0 else 0.5
@@ -298,8 +309,8 @@ class Beam(ElementBlock):
         self.element_stiffness = np.array(
             [s.stiffness(e, nu) for s, e, nu in zip(sections, young, poisson, strict=True)]
         )
-        self.density = float(density)
-        areas = np.array([s.area for s in sections])
+        self.density = check_density(density)
+        areas = np.array([s.material_area for s in sections])
         self.lengths = self.weights.sum(axis=1)
         self.nodes_used = np.unique(chain[:, None] + np.arange(4))
         self.volume = float(areas @ self.lengths)
@@ -310,6 +321,8 @@ class Beam(ElementBlock):
         self._none = np.empty((0, 12 * (order + 1), 12 * (order + 1)))
         self._rest = np.zeros((m, order, 6))
         self._rest = self.strains(rest)
+        if not (self._rest[..., 0] > 0.5).all():
+            raise ValueError("the directors d_1 of a beam's frames must point along its axis")
 
     def strains(self, x: np.ndarray) -> np.ndarray:
         """Strains (Gamma, K) beyond those at rest at the Gauss points, shape (m, q, 6) [1, 1/m]."""
@@ -360,7 +373,7 @@ class Beam(ElementBlock):
 
     def nodal_masses(self, count: int) -> np.ndarray:
         shares = np.array([0.5, 0.5]) if self.order == 1 else np.array([1.0, 4.0, 1.0]) / 6.0
-        areas = np.array([s.area for s in self.sections])
+        areas = np.array([s.material_area for s in self.sections])
         masses = (self.density * areas * self.lengths)[:, None] * shares
         return np.bincount(self.rows.ravel(), weights=masses.ravel(), minlength=count)
 
@@ -371,9 +384,9 @@ class Beam(ElementBlock):
         shares = 0.5 * np.einsum("q,qa,qb->ab", gauss, shape, shape)
         parts = []
         for row, values in (
-            (0, [s.area for s in self.sections]),
-            (2, [s.inertia[1] for s in self.sections]),
-            (3, [s.inertia[0] for s in self.sections]),
+            (0, [s.material_area for s in self.sections]),
+            (2, [s.inertia[1] * s.material_area / s.area for s in self.sections]),
+            (3, [s.inertia[0] * s.material_area / s.area for s in self.sections]),
         ):
             masses = self.density * np.array(values) * self.lengths
             parts.append(element_masses(self.rows + row, masses, shares, lumped))

@@ -274,6 +274,10 @@ class Dynamics(Statics):
                         f"no motion over {self.step:g} s to actuators {target.tolist()}, even in {count} steps",
                         fraction=0.0,
                     ) from None
+            except BaseException:
+                # Whatever stopped it, a refused command or Ctrl-C: the body has not moved.
+                self.snapshot = start
+                raise
         kinetic, potential = self.energies()
         return Motion(
             found, self.velocity.copy(), self.time, kinetic, potential, self._work, self._dissipated, substeps=count

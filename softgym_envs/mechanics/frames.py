@@ -276,6 +276,10 @@ class KinematicMap:
             dtype=np.int64,
         ).reshape(-1, 2)
 
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+        self.transposed = self.matrix.T  # a copy has to share its data, too
+
     def linearise(self, x: np.ndarray) -> np.ndarray:
         """Bring the map to positions ``x`` (n, 3); returns the vectors r of the carried rows, shape (c, 3)."""
         arms = self.frames.arms(x)

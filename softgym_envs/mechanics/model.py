@@ -249,6 +249,7 @@ class MechanicalModel:
         self._poisson: list[_Poisson] | None = None
         self._bond_stiffness: float | None = None
         self.inertia: Inertia | None = None
+        self._elements: tuple[np.ndarray, np.ndarray] | None = None
         self.version = 0
         self.factor_owner: object | None = None
         self.nodal_loads = np.zeros_like(self.nodes)
@@ -458,8 +459,7 @@ class MechanicalModel:
         self._low, self._high = self._keys // total, self._keys % total
         self._known_dofs = np.flatnonzero(self._equation >= 0)
         self._masses: tuple[bool, csr_matrix, np.ndarray] | None = None
-        #: Rows and the elements' tangent of the last assembly of a time step.
-        self._elements: tuple[np.ndarray, np.ndarray] | None = None
+        self._elements = None  # rows and the elements' tangent of the last assembly of a time step
         self._values = np.empty(self._entries + len(extra))
         self._gradient = np.empty_like(self.nodes)
         self._targets = []
@@ -752,6 +752,8 @@ class MechanicalModel:
         return problems
 
     def refresh_loads(self) -> None:
-        """Take over changed ``nodal_loads``."""
+        """Take over changed ``nodal_loads``, or a changed elasticity of a block."""
         self.applied_loads = self.loads
+        self._elements = None
+        self._bond_stiffness = None
         self.version += 1

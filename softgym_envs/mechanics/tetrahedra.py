@@ -9,7 +9,7 @@ from softgym_envs.mechanics.block import ElementBlock, lower_pairs
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
 
-__all__ = ["SolidBlock", "Tetrahedra", "element_masses", "orient_corners"]
+__all__ = ["SolidBlock", "Tetrahedra", "check_density", "element_masses", "orient_corners"]
 
 
 @njit(cache=True, error_model="numpy")
@@ -187,6 +187,17 @@ def element_masses(
     return connectivity[:, i].ravel(), connectivity[:, j].ravel(), (masses[:, None] * shares[i, j]).ravel()
 
 
+def check_density(density: float) -> float:
+    """Return a density [kg/m3].
+
+    Raises:
+        ValueError: if it is negative or not finite.
+    """
+    if not (np.isfinite(density) and density >= 0.0):
+        raise ValueError(f"density = {density} kg/m3 must be finite and not negative")
+    return float(density)
+
+
 class SolidBlock(ElementBlock):
     """What blocks of solid elements share: material, quadrature and the warping of steps.
 
@@ -212,7 +223,7 @@ class SolidBlock(ElementBlock):
         density: float,
     ) -> None:
         self.material = resolve_material(material)
-        self.density = float(density)
+        self.density = check_density(density)
         self.connectivity = connectivity
         self.gradients = np.ascontiguousarray(gradients)
         self.weights = weights
@@ -235,7 +246,10 @@ class SolidBlock(ElementBlock):
         return self.connectivity[:, :4]
 
     def set_elasticity(self, young_modulus: float | np.ndarray, poisson_ratio: float | np.ndarray) -> None:
-        """Set Young's modulus [Pa] and Poisson's ratio, scalars or shape (m,)."""
+        """Set Young's modulus [Pa] and Poisson's ratio, scalars or shape (m,).
+
+        A model in use learns of it by its `refresh_loads`.
+        """
         m = len(self.connectivity)
         young = np.broadcast_to(np.asarray(young_modulus, dtype=float), (m,))
         poisson = np.broadcast_to(np.asarray(poisson_ratio, dtype=float), (m,))

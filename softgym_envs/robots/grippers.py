@@ -28,7 +28,7 @@ TURNED = np.diag([-1.0, -1.0, 1.0])
 
 
 class FingerRobot(Robot):
-    """One or more two-cable fingers, and what they hold.
+    """One or more two-cable fingers, and what they hold. Held objects have no mass.
 
     Args:
         mesh_size: target edge length of a finger [m].

@@ -51,7 +51,7 @@ class Robot(ABC):
         actuators: in the order of the commands.
         effectors: names, in the order of the effector rows of the condensed model.
         size: a characteristic length [m], for scaling.
-        effector_rest: effector of the baseline body at rest [m], shape (3,).
+        effector_rest: nominal effector of the baseline body at rest [m], before loads, shape (3,).
         effort_scale: typical effort of each actuator of the baseline body [N, ...], shape (n_a,).
         goal_axes: which coordinates of the first effector a goal is about, 1 or 0, shape (3,).
         precision: distance at which a goal counts as reached [m].

@@ -111,7 +111,8 @@ class StiffFlop(Robot):
         frames = [assembly.add_frame([x, 0.0, 0.0], fixed=k == 0, fixed_spin=k == 0) for k, x in enumerate(stations)]
         disc = math.pi * radius**2
         inertia = INERTIA_SHARE * 0.25 * math.pi * radius**4
-        section = Section(AREA_SHARE * disc, (inertia, inertia), 2.0 * inertia, (0.5, 0.5))
+        material = disc - 6.0 * math.pi * design["chamber_radius"] ** 2
+        section = Section(AREA_SHARE * disc, (inertia, inertia), 2.0 * inertia, (0.5, 0.5), mass_area=material)
         moduli = [
             modulus
             for soft_modulus in (design["base_modulus"], design["tip_modulus"])

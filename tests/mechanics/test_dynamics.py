@@ -87,7 +87,10 @@ def test_free_fall(scheme):
     np.testing.assert_allclose(motion.equilibrium.delta[:3], expected, rtol=0, atol=1e-9)
     assert motion.time == pytest.approx(t)
     np.testing.assert_allclose(solver.effector_velocity(), [1.0, 0.0, 2.0 - 9.81 * t], atol=1e-9)
-    assert motion.kinetic == pytest.approx(0.5 * 2.0 * (1.0 + (2.0 - 9.81 * t) ** 2) + 0.5 * 0.008 * 25.0, rel=1e-3)
+    # Euler's directors turn by chords: it damps a spin, too.
+    turning = 0.5 * 0.008 * 25.0
+    kinetic = 0.5 * 2.0 * (1.0 + (2.0 - 9.81 * t) ** 2) + turning
+    assert motion.kinetic == pytest.approx(kinetic, abs=0.25 * turning if scheme == "euler" else 1e-9)
 
 
 @pytest.mark.parametrize("alpha", [0.5, 3.0])
@@ -179,11 +182,11 @@ def test_masses(lumped):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_compliance_is_the_derivative_of_a_step(scheme):
-    """Measured: 8e-6 (cable), 5e-7 (servos). The second order scheme leaves out gyroscopic terms of frames."""
+    """The second order scheme leaves out gyroscopic terms of frames (measured: 5e-5, with damping 5e-3)."""
     for row in cases.compliance(scheme):
         print(row.case, row.setting, row.error)
         frames = scheme == "generalised_alpha" and "Tetrapod" in row.case
-        assert row.error < (1e-2 if frames else 1e-5)
+        assert row.error < (1e-2 if frames else 1e-6)
 
 
 def test_energies_add_up():
@@ -222,42 +225,38 @@ def test_slow_motion_follows_statics():
 # -- steps that fail, and steps taken back --------------------------------------------------------------------------
 
 
-def lever(**options):
-    """A bar on a servo."""
-    body = Assembly()
-    servo = body.add_frame([0.0, 0.0, 0.0], fixed=True, fixed_spin=(True, False, True))
-    tip = body.add_frame([0.1, 0.0, 0.0], on=servo)
-    body.add_mass(tip, 1.0, sphere_inertia(1.0, 0.02))
-    model = body.build()
-    model.add("a", Servo("servo", servo, np.array([0.0, 1.0, 0.0]), model.nodes))
-    model.add("e", Point("tip", EmbeddedPoints.in_frame(tip, np.zeros(3), model.nodes)))
-    return Dynamics(model, **options)
+JUMP = np.array([3.0, -3.0, 1.5, 0.0])
+"""Servo angles no solver goes to at once."""
 
 
 def test_a_step_that_cannot_be_solved_is_cut():
-    """A servo told to turn by 2.5 rad in one step: not solvable at once, so its command is ramped over parts."""
-    solver = lever(step=0.1)
-    motion = solver.advance([2.5])
-    assert motion.substeps > 1
-    assert motion.time == pytest.approx(0.1, rel=1e-12)
-    assert motion.equilibrium.delta[0] == pytest.approx(2.5, abs=1e-12)
-    # Ramped: the parts all turn at one speed.
-    np.testing.assert_allclose(np.linalg.norm(solver.effector_velocity()), 0.1 * 2.5 / 0.1, rtol=0.2)
+    """Its command is ramped over the parts, of which the last takes the command itself."""
+    solver = cases.tetrapod_at_rest(step=0.01)
+    motion = solver.advance(JUMP)
+    assert motion.substeps > 4 and (motion.substeps & (motion.substeps - 1)) == 0
+    assert motion.time == pytest.approx(0.01, rel=1e-12)
+    np.testing.assert_allclose(motion.equilibrium.delta[:4], JUMP, rtol=0, atol=1e-10)
+    # The same by hand.
+    other = cases.tetrapod_at_rest(step=0.01 / motion.substeps)
+    for k in range(motion.substeps):
+        by_hand = other.advance((k + 1) / motion.substeps * JUMP)
+    np.testing.assert_allclose(by_hand.equilibrium.delta, motion.equilibrium.delta, rtol=0, atol=1e-8)
+    assert by_hand.work == pytest.approx(motion.work, rel=1e-6)
 
 
 def test_a_step_that_cannot_be_cut_further_leaves_the_state():
-    solver = lever(step=0.1, max_cuts=1)
-    solver.advance([0.2])
+    solver = cases.tetrapod_at_rest(step=0.01, max_cuts=1)
+    solver.advance(0.01 * JUMP)
     kept = solver.snapshot
     before = [np.array(part, copy=True) for part in kept if part is not None]
-    with pytest.raises(ConvergenceError, match=r"no motion over 0.1 s to actuators \[3.0\], even in 2 steps") as caught:
-        solver.advance([3.0])
+    with pytest.raises(ConvergenceError, match="no motion over 0.01 s to actuators .*, even in 2 steps") as caught:
+        solver.advance(JUMP)
     assert caught.value.fraction == 0.0
     for part, old in zip([p for p in solver.snapshot if p is not None], before, strict=True):
         np.testing.assert_array_equal(part, old)
     assert solver.model.inertia is None
-    motion = solver.advance([0.3])  # and goes on
-    assert motion.equilibrium.delta[0] == pytest.approx(0.3, abs=1e-10)
+    motion = solver.advance(0.02 * JUMP)  # and goes on
+    np.testing.assert_allclose(motion.equilibrium.delta[:4], 0.02 * JUMP, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -364,7 +363,13 @@ def test_bad_options(options, message):
 
 
 def test_bad_commands_and_launches():
-    solver = lever(step=0.01)
+    body = Assembly()
+    frame = body.add_frame([0.0, 0.0, 0.0], fixed=True, fixed_spin=(True, False, True))
+    body.add_mass(frame, 1.0, sphere_inertia(1.0, 0.02))
+    model = body.build()
+    model.add("a", Servo("servo", frame, np.array([0.0, 1.0, 0.0]), model.nodes))
+    model.add("e", Point("tip", EmbeddedPoints.in_frame(frame, np.array([0.1, 0.0, 0.0]), model.nodes)))
+    solver = Dynamics(model, step=0.01)
     start = solver.x
     for target, options, message in (
         ([0.0, 0.0], {}, r"target must have shape \(1,\), got \(2,\)"),

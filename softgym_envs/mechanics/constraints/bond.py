@@ -32,11 +32,17 @@ class Bond(Constraint):
         self.first = first
         ids, weights = [first.node_ids[0]], [first.weights[0]]
         self._anchor = np.zeros(3) if gap is None else np.asarray(gap, dtype=float)
+        if self._anchor.shape != (3,):
+            raise ValueError(f"gap of bond '{name}' must be three numbers [m], got {self._anchor.tolist()}")
         if isinstance(second, EmbeddedPoints):
             ids.append(second.node_ids[0])
             weights.append(-second.weights[0])
         else:
             self._anchor = self._anchor + np.asarray(second, dtype=float)
+        if self._anchor.shape != (3,) or not np.isfinite(self._anchor).all():
+            raise ValueError(
+                f"gap and position of bond '{name}' must be three finite numbers, got {self._anchor.tolist()}"
+            )
         if any(len(points.node_ids) != 1 for points in (first, second) if isinstance(points, EmbeddedPoints)):
             raise ValueError(f"bond '{name}' ties one point to one point")
         self._ids, self._weights = np.concatenate(ids), np.concatenate(weights)
