@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from softgym_envs.mechanics.materials import Material
-from softgym_envs.mechanics.tetrahedra import Tetrahedra, _add_forces, _add_tangent, _deformation_gradients
+from softgym_envs.mechanics.tetrahedra import Tetrahedra, _add_forces, _add_tangent, _deformation_gradients, _viscosity
 
 __all__ = ["AveragedTetrahedra"]
 
@@ -115,14 +115,8 @@ class AveragedTetrahedra(Tetrahedra):
             return np.inf, inverted
         theta, slope, curvature = self._dilation, self._dilation_gradient, self._dilation_hessian
         self.material.dilation(self._F, theta, slope, curvature)
-        shares = 0.25 * self.volumes
-        count = len(self._node_volumes)
-
-        def gather(per_element: np.ndarray) -> np.ndarray:
-            return np.bincount(self._slot.ravel(), weights=np.repeat(shares * per_element, 4), minlength=count)
-
-        mean = gather(theta) / self._node_volumes
-        lame = gather(self.lame) / self._node_volumes
+        mean = self._nodal_sum(theta) / self._node_volumes
+        lame = self._nodal_sum(self.lame) / self._node_volumes
         pressure = (lame * mean)[self._slot].mean(axis=1)
         self._stress += pressure[:, None] * slope
         _add_forces(self.connectivity, self.gradients, self.volumes, self._stress, gradient)
@@ -135,3 +129,17 @@ class AveragedTetrahedra(Tetrahedra):
                 self._pointers, self._patch_gradient, lame * self._node_volumes, scatter[1], self._starts, values
             )
         return float(self._energy @ self.volumes + 0.5 * (lame * mean**2) @ self._node_volumes), 0
+
+    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        _deformation_gradients(x, self.connectivity, self.gradients, self._F)
+        # F^-T is the gradient of the rate of dilation.
+        _viscosity(self._F, self.mu, self._zero, self._stress, self._tangent)
+        _add_tangent(self.gradients, self.volumes, self._tangent, scatter[0], values)
+        _patch_gradients(self._element_slots, self._shares, self.gradients, self._stress, self._patch_gradient)
+        lame = self._nodal_sum(self.lame)
+        _add_patches(self._pointers, self._patch_gradient, lame, scatter[1], self._starts, values)
+
+    def _nodal_sum(self, per_element: np.ndarray) -> np.ndarray:
+        """Sum of a quarter of each element's volume times its value over the elements of each node."""
+        weights = np.repeat(0.25 * self.volumes * per_element, 4)
+        return np.bincount(self._slot.ravel(), weights=weights, minlength=len(self._node_volumes))

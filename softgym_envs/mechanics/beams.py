@@ -109,8 +109,13 @@ def _strains(z, products, factors, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _evaluate(x, rows, shape, slope, weights, rest, stiffness, products, factors, row_of, is_slope, forces, matrix):
-    """Energy; forces (m, k, 4, 3) and, unless ``matrix`` is empty, element matrices (m, 12 k, 12 k)."""
+def _evaluate(
+    x, rows, shape, slope, weights, rest, stiffness, products, factors, row_of, is_slope, stressed, forces, matrix
+):
+    """Energy; forces (m, k, 4, 3) and, unless ``matrix`` is empty, element matrices (m, 12 k, 12 k).
+
+    Without ``stressed`` the matrices are those of strains alone, as if there were no stress.
+    """
     m, k = rows.shape
     quadrature = weights.shape[1]
     z = np.empty((7, 3))
@@ -160,7 +165,7 @@ def _evaluate(x, rows, shape, slope, weights, rest, stiffness, products, factors
                         ci = c * g[i]
                         for j in range(21):
                             hessian[i, j] += ci * g[j]
-            for p in range(products.shape[0]):
+            for p in range(products.shape[0] if stressed else 0):
                 s, a, b = products[p]
                 c = w * stiffness[e, s] * strain[s] * factors[p]
                 for d in range(3):
@@ -341,7 +346,20 @@ class Beam(ElementBlock):
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
         matrix = self._none if values is None else self._matrix
-        energy = _evaluate(
+        energy = self._fill(x, matrix)
+        if not np.isfinite(energy):
+            return np.inf, len(self.rows)
+        empty = np.empty(0)
+        places = np.empty((0, 0), dtype=np.int32) if scatter is None else scatter[0]
+        _scatter(self.rows, self._forces, matrix, gradient, empty if values is None else values, places)
+        return float(energy), 0
+
+    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        self._fill(x, self._matrix, stressed=False)
+        _scatter(self.rows, self._forces, self._matrix, np.zeros_like(x), values, scatter[0])
+
+    def _fill(self, x: np.ndarray, matrix: np.ndarray, *, stressed: bool = True) -> float:
+        return _evaluate(
             x,
             self.rows,
             self._shape,
@@ -353,15 +371,10 @@ class Beam(ElementBlock):
             _FACTORS,
             _ROW,
             _SLOPE,
+            stressed,
             self._forces,
             matrix,
         )
-        if not np.isfinite(energy):
-            return np.inf, len(self.rows)
-        empty = np.empty(0)
-        places = np.empty((0, 0), dtype=np.int32) if scatter is None else scatter[0]
-        _scatter(self.rows, self._forces, matrix, gradient, empty if values is None else values, places)
-        return float(energy), 0
 
     def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
         _add_warped(x, step, self.rows, self._shape, self._slope, self.weights, out)

@@ -57,6 +57,14 @@ class ElementBlock(ABC):
         """
 
     @abstractmethod
+    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        """Add the stiffness against strain rates at positions ``x`` (n, 3), the elastic one at rest: for damping.
+
+        Never negative, and rigid motions have no part in it. The tangent itself has neither property under stress: a
+        damping by it would push what is compressed.
+        """
+
+    @abstractmethod
     def nodal_masses(self, count: int) -> np.ndarray:
         """Share of the mass [kg] that gravity pulls at each of ``count`` rows, shape (count,)."""
 

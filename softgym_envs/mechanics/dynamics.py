@@ -137,7 +137,7 @@ class Dynamics(Statics):
         scheme: a name of `SCHEMES`.
         spectral_radius: of the generalised alpha scheme: 1 damps nothing, 0 all that the step does not resolve.
         mass_damping: Rayleigh's alpha [1/s].
-        stiffness_damping: Rayleigh's beta [s], on the elements' stiffness at the start of each step.
+        stiffness_damping: Rayleigh's beta [s], on the stiffness against strain rates at the start of each step.
         lumped: lump the masses.
         tolerance: largest correction of any node left at convergence [m].
         max_iterations: Newton iterations per load increment.
@@ -308,7 +308,7 @@ class Dynamics(Statics):
             terms = _Alpha(self.model, x, *self._history, h, self.spectral_radius)
         terms.mass_damping, terms.stiffness_damping = self.mass_damping, self.stiffness_damping
         if self.stiffness_damping:
-            terms.stiffness = self.model.element_tangent(x)
+            terms.stiffness = self.model.viscosity(x)
         kept = self._rows_delta()
         found = self._solve_with(terms, target, mode, options)
         self.velocity = terms.motion(self.x)[0]
@@ -353,7 +353,7 @@ class Dynamics(Statics):
         terms = _Start(self.model, self.x, speed, h)
         terms.mass_damping, terms.stiffness_damping = self.mass_damping, self.stiffness_damping
         if self.stiffness_damping:
-            terms.stiffness = self.model.element_tangent(self.x)
+            terms.stiffness = self.model.viscosity(self.x)
         delta = self._rows_delta()
         rows = self._displacement_rows(mode)
         # A cable that hangs slack goes on doing so.

@@ -112,7 +112,7 @@ class Inertia(ABC):
         velocity_factor: derivative of velocities with respect to displacements [1/s].
         mass_damping: Rayleigh's alpha [1/s].
         stiffness_damping: Rayleigh's beta [s].
-        stiffness: values of the elements' tangent that beta acts on, in the layout of `element_tangent`.
+        stiffness: values that beta acts on, see `MechanicalModel.viscosity`.
     """
 
     acceleration_factor: float
@@ -249,7 +249,6 @@ class MechanicalModel:
         self._poisson: list[_Poisson] | None = None
         self._bond_stiffness: float | None = None
         self.inertia: Inertia | None = None
-        self._elements: tuple[np.ndarray, np.ndarray] | None = None
         self.version = 0
         self.factor_owner: object | None = None
         self.nodal_loads = np.zeros_like(self.nodes)
@@ -459,7 +458,6 @@ class MechanicalModel:
         self._low, self._high = self._keys // total, self._keys % total
         self._known_dofs = np.flatnonzero(self._equation >= 0)
         self._masses: tuple[bool, csr_matrix, np.ndarray] | None = None
-        self._elements = None  # rows and the elements' tangent of the last assembly of a time step
         self._values = np.empty(self._entries + len(extra))
         self._gradient = np.empty_like(self.nodes)
         self._targets = []
@@ -513,7 +511,6 @@ class MechanicalModel:
             if block.add(x, gradient, values, scatter)[1]:
                 return None
         if self.inertia is not None:
-            self._elements = x, values.copy()
             self._add_inertia(x, gradient, values)
         n = self.equations
         H = np.zeros((n + 3 * len(self.frames.carried), self.size), order="F")
@@ -584,15 +581,15 @@ class MechanicalModel:
             self._masses = (lumped, matrix, entries)
         return self._masses[1], self._masses[2]
 
-    def element_tangent(self, x: np.ndarray) -> np.ndarray:
-        """Values of the elements' tangent at rows ``x`` (n, 3), before what frames carry is brought to equations."""
+    def viscosity(self, x: np.ndarray) -> np.ndarray:
+        """Values of the elements' stiffness against strain rates at rows ``x`` (n, 3), in the layout of assembly.
+
+        See `ElementBlock.add_viscosity`; before what frames carry is brought to equations.
+        """
         self.prepare()
-        if self._elements is not None and self._elements[0] is x:
-            return self._elements[1]
         values = np.zeros_like(self._values)
-        unused = np.zeros_like(self.nodes)
         for block, scatter in zip(self.blocks, self._block_maps, strict=True):
-            block.add(x, unused, values, scatter)
+            block.add_viscosity(x, values, scatter)
         return values
 
     def _add_inertia(self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray) -> None:
@@ -754,6 +751,5 @@ class MechanicalModel:
     def refresh_loads(self) -> None:
         """Take over changed ``nodal_loads``, or a changed elasticity of a block."""
         self.applied_loads = self.loads
-        self._elements = None
         self._bond_stiffness = None
         self.version += 1

@@ -9,7 +9,7 @@ from numba import njit
 
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.materials import Material
-from softgym_envs.mechanics.tetrahedra import SolidBlock, element_masses, orient_corners
+from softgym_envs.mechanics.tetrahedra import SolidBlock, _viscosity, element_masses, orient_corners
 
 __all__ = ["QuadraticTetrahedra", "add_midside_nodes", "quadratic_triangles", "split_triangles"]
 
@@ -233,3 +233,8 @@ class QuadraticTetrahedra(SolidBlock):
                 self.connectivity, self.points, self.gradients, self.weights, self._tangent, scatter[0], values
             )
         return float(self._energy @ self.weights), 0
+
+    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
+        _viscosity(self._F, self.mu, self.lame, self._stress, self._tangent)
+        _add_tangent(self.connectivity, self.points, self.gradients, self.weights, self._tangent, scatter[0], values)

@@ -58,6 +58,9 @@ class RigidBody(ElementBlock):
     ) -> tuple[float, int]:
         return 0.0, 0
 
+    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        """A rigid part has no strain."""
+
     def nodal_masses(self, count: int) -> np.ndarray:
         masses = np.zeros(count)
         masses[self.row] = self.mass

@@ -66,6 +66,37 @@ def _add_tangent(gradients, volumes, tangent, scatter, out):
 
 
 @njit(cache=True, error_model="numpy")
+def _viscosity(F, mu, lame, inverse, out):
+    """Second derivative (m, 9, 9) of ``mu D : D + lame / 2 (tr D)^2``, D = sym(F' F^-1), by F'; and F^-T (m, 9)."""
+    rate = np.empty((6, 9))
+    for e in range(F.shape[0]):
+        f = F[e]
+        c = inverse[e]
+        for i in range(3):
+            for j in range(3):
+                a, b, p, q = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+                c[3 * i + j] = f[3 * a + p] * f[3 * b + q] - f[3 * a + q] * f[3 * b + p]
+        c /= f[0] * c[0] + f[1] * c[1] + f[2] * c[2]
+        # Rows: D_00, D_11, D_22 and sqrt(2) times D_01, D_02, D_12.
+        rate[:] = 0.0
+        s = np.sqrt(0.5)
+        k = 3
+        for i in range(3):
+            rate[i, 3 * i : 3 * i + 3] = c[3 * i : 3 * i + 3]
+            for j in range(i + 1, 3):
+                rate[k, 3 * i : 3 * i + 3] = s * c[3 * j : 3 * j + 3]
+                rate[k, 3 * j : 3 * j + 3] = s * c[3 * i : 3 * i + 3]
+                k += 1
+        for p in range(9):
+            for q in range(p + 1):
+                value = 0.0
+                for k in range(6):
+                    value += rate[k, p] * rate[k, q]
+                out[e, p, q] = 2.0 * mu[e] * value + lame[e] * c[p] * c[q]
+                out[e, q, p] = out[e, p, q]
+
+
+@njit(cache=True, error_model="numpy")
 def _add_warped(x, step, connectivity, points, gradients, volumes, out):
     """Add ``V (F' - F) g_a``, with F' the gradient F turned and strained by a step, to ``out``, shape (n, 3)."""
     f = np.empty((3, 3))
@@ -343,3 +374,8 @@ class Tetrahedra(SolidBlock):
             assert scatter is not None
             _add_tangent(self.gradients, self.volumes, self._tangent, scatter[0], values)
         return float(self._energy @ self.volumes), 0
+
+    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        _deformation_gradients(x, self.connectivity, self.gradients, self._F)
+        _viscosity(self._F, self.mu, self.lame, self._stress, self._tangent)
+        _add_tangent(self.gradients, self.volumes, self._tangent, scatter[0], values)

@@ -40,27 +40,39 @@ def moved(model, rng, amplitude=2e-4):
     return x
 
 
+def symmetric(stencils, values, size):
+    """The whole matrix (size, size) of stencils' values, each of which stands for itself and its mirror image."""
+    rows, columns = (np.concatenate([pair[side].ravel() for pair in stencils]) for side in (0, 1))
+    twice = rows != columns
+    entries = np.concatenate([values, values[twice]])
+    places = np.concatenate([rows, columns[twice]]), np.concatenate([columns, rows[twice]])
+    return coo_matrix((entries, places), shape=(size, size)).toarray()
+
+
+def places_of(stencils):
+    """Scatter maps that give each entry of the stencils a place of its own, and the number of places."""
+    sizes = [rows.size for rows, _ in stencils]
+    places = np.split(np.arange(sum(sizes), dtype=np.int32), np.cumsum(sizes)[:-1])
+    return [place.reshape(rows.shape) for place, (rows, _) in zip(places, stencils, strict=True)], sum(sizes)
+
+
 def element_matrix(block, x):
     """The block's whole tangent (3 n, 3 n), gradient (n, 3) and energy [J] at rows ``x``, frames or not."""
     stencils = block.stencils()
-    sizes = [rows.size for rows, _ in stencils]
-    places = np.split(np.arange(sum(sizes), dtype=np.int32), np.cumsum(sizes)[:-1])
-    values, gradient = np.zeros(sum(sizes)), np.zeros_like(x)
-    energy, inverted = block.add(
-        x, gradient, values, [place.reshape(rows.shape) for place, (rows, _) in zip(places, stencils, strict=True)]
-    )
+    places, count = places_of(stencils)
+    values, gradient = np.zeros(count), np.zeros_like(x)
+    energy, inverted = block.add(x, gradient, values, places)
     assert inverted == 0
-    rows, columns = (np.concatenate([pair[side].ravel() for pair in stencils]) for side in (0, 1))
-    # One entry stands for itself and its mirror image.
-    twice = rows != columns
-    matrix = coo_matrix(
-        (
-            np.concatenate([values, values[twice]]),
-            (np.concatenate([rows, columns[twice]]), np.concatenate([columns, rows[twice]])),
-        ),
-        shape=(x.size, x.size),
-    ).toarray()
-    return energy, gradient, matrix
+    return energy, gradient, symmetric(stencils, values, x.size)
+
+
+def viscosity_matrix(block, x):
+    """The block's whole stiffness against strain rates (3 n, 3 n) at rows ``x``."""
+    stencils = block.stencils()
+    places, count = places_of(stencils)
+    values = np.zeros(count)
+    block.add_viscosity(x, values, places)
+    return symmetric(stencils, values, x.size)
 
 
 def test_every_block_is_tested():
@@ -106,6 +118,25 @@ def test_tangent_at_rest_has_no_negative_eigenvalue_and_six_rigid_motions(body):
         if not isinstance(block, Beam):  # a beam's directors could be strained in ways the frames do not allow
             soft = (eigenvalues < 1e-7 * scale).sum()
             assert soft == 6
+
+
+def test_viscosity_is_the_stiffness_without_stress(body, rng):
+    """At rest it is the tangent; elsewhere it has no negative eigenvalue, and rigid motions do not feel it."""
+    x = moved(body, rng)
+    turning, shift = np.cross([0.3, -0.5, 0.8], x), np.array([0.1, 0.2, -0.3])
+    frames = body.frames.rows[:, None] + np.arange(1, 4)
+    shifts = np.tile(shift, (len(x), 1))
+    shifts[frames.ravel()] = 0.0  # directors only turn
+    for block in body.blocks:
+        at_rest = viscosity_matrix(block, body.nodes)
+        tangent = element_matrix(block, body.nodes)[2]
+        np.testing.assert_allclose(at_rest, tangent, rtol=0, atol=1e-9 * np.abs(tangent).max())
+        matrix = viscosity_matrix(block, x)
+        scale = np.abs(matrix).max()
+        assert np.linalg.eigvalsh(matrix)[0] > -1e-10 * scale
+        np.testing.assert_allclose(matrix @ (turning + shifts).ravel(), 0.0, atol=1e-11 * scale)
+        # Under stress the tangent is something else.
+        assert np.abs(matrix - element_matrix(block, x)[2]).max() > 1e-5 * scale
 
 
 def test_a_rigid_motion_strains_nothing(body, rng):
