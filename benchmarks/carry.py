@@ -1,8 +1,8 @@
 """How far right does the Tetrapod come? Controllers, an optimised swing, and learned policies.
 
 ``softgym bench carry`` compares them. ``python -m benchmarks.carry`` searches the swing anew: servo angles through a
-few knots, found by differential evolution on the finite elements, for the farthest point that the centre passes. It knows
-what is reachable at all, and takes half an hour.
+few knots, found by differential evolution on the finite elements, for the farthest point that the centre passes. It
+knows what is reachable at all, and takes half an hour.
 """
 
 from __future__ import annotations
