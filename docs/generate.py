@@ -356,8 +356,8 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
     spec = gymnasium.spec(identifier)
     robot = robot_of(row.robot, tuple(sorted(row.robot_options.items())))
     task_class: Any = class_of(TASKS[row.task])
-    task: Task = task_class(robot, **dict(spec.kwargs.get("task_options") or {}))
-    moving = bool((spec.kwargs.get("backend_options") or {}).get("dynamics"))
+    task: Task = task_class(robot, **row.task_options)
+    moving = bool(row.backend_options.get("dynamics"))
     interface = Interface(robot, action_mode="increment", design_names=(), axes=task.axes, moving=moving)
     scales = observation_scales(robot)
     along = "" if task.axes.all() else " along " + " and ".join(np.array(list("xyz"))[task.axes > 0.0])
@@ -466,9 +466,11 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         )
 
     def arguments() -> str:
-        fixed = spec.kwargs
+        fixed = {name: value for name, value in spec.kwargs.items() if name != "defaults"}
+        fixed |= {name: getattr(row, name) for name in ("robot_options", "task_options", "backend_options")}
         given = {name: value for name, value in fixed.items() if value not in (None, {})}
-        parts = [table(["argument", "default", "meaning"], options_of(SoftRobotEnv, given))]
+        shown = [line for line in options_of(SoftRobotEnv, given) if "`defaults`" not in line[0]]
+        parts = [table(["argument", "default", "meaning"], shown)]
         for argument, kind, cls in (
             ("task_options", f"task `{row.task}`", task_class),
             ("robot_options", f"robot [`{row.robot}`](../robots/{row.robot}.md)", type(robot)),
@@ -508,7 +510,7 @@ def environment_top(identifier: str) -> str:
     row = ENVIRONMENTS[identifier]
     robot = robot_of(row.robot, tuple(sorted(row.robot_options.items())))
     n, name = len(robot.actuators), page_name(identifier)
-    moving = bool((gymnasium.spec(identifier).kwargs.get("backend_options") or {}).get("dynamics"))
+    moving = bool(row.backend_options.get("dynamics"))
     size = 3 * n + 9 + 3 * moving
     rows = [
         ["Action space", f"`Box(-1, 1, ({n},), float32)`"],

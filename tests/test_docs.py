@@ -87,6 +87,15 @@ def test_scales_of_the_observation_are_the_real_ones(identifier):
     np.testing.assert_allclose(row, [*expected, 0.5, 0.0, 0.0, 0.0, 0.0, 0.5], atol=1e-6)
 
 
+@pytest.mark.parametrize("identifier", ENVIRONMENTS)
+def test_the_printed_size_of_the_observation_is_the_real_one(identifier):
+    import gymnasium
+
+    env = gymnasium.make(identifier)
+    assert f"({env.observation_space.shape[0]} + k,)" in generate.environment_top(identifier)
+    env.close()
+
+
 def test_what_a_page_says_itself_wins():
     template = {"One": lambda: "generated one", "Two": lambda: "generated two", "Three": lambda: ""}
     page = "# T\n\n## Two\n\nbefore\n\n<!-- generated -->\n\n## Own\n\n```sh\n## no heading\n```\n"
