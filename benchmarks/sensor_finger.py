@@ -25,8 +25,9 @@ import numpy as np
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConvergenceError, DataError, InfeasibleDesign
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.finger_shape import draw_finger
 from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
-from softgym_envs.robots.sensorized_finger import SensorizedFinger, draw_bellow_finger
+from softgym_envs.robots.sensorized_finger import SensorizedFinger
 from softgym_envs.storage import atomic_write, write_json
 
 __all__ = ["DESIGNS", "SourceFinger", "compare", "published", "statistics_of"]
@@ -88,7 +89,7 @@ def draw_refined(**lengths: float) -> None:
     """Draw the finger, with elements of 2 mm around the bellows and of 10 mm elsewhere."""
     import gmsh
 
-    draw_bellow_finger(**lengths)
+    draw_finger(**lengths)
     field, boxes = gmsh.model.mesh.field, []
     for joint in (1, 2):
         box = field.add("Box")

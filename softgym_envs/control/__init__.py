@@ -1,6 +1,6 @@
 """Controllers: they take a condensed model and a goal, and never ask where the model came from."""
 
-from softgym_envs.control.coupling import Coupled, RigidBody, couple, rotate, tie_points
+from softgym_envs.control.coupling import Coupled, HeldObject, couple, rotate, tie_points
 from softgym_envs.control.embedded import EmbeddedLoop, PICorrection, follow
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.control.manipulation import Manipulation, Plan
@@ -12,7 +12,7 @@ __all__ = [
     "Manipulation",
     "PICorrection",
     "Plan",
-    "RigidBody",
+    "HeldObject",
     "couple",
     "follow",
     "rotate",

@@ -19,15 +19,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.frames import rotation_vector_matrix
 
-__all__ = ["Coupled", "RigidBody", "couple", "rotate", "rotation_matrix", "tie_points"]
-
-
-def rotation_matrix(vector: np.ndarray) -> np.ndarray:
-    """Return the rotation, shape (3, 3), about the axis and by the angle [rad] of a rotation vector (3,)."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(np.asarray(vector, dtype=float)).as_matrix()
+__all__ = ["Coupled", "HeldObject", "couple", "rotate", "tie_points"]
 
 
 def cross_matrix(vectors: np.ndarray) -> np.ndarray:
@@ -80,7 +74,7 @@ def rotate(
 
 
 @dataclass(frozen=True)
-class RigidBody:
+class HeldObject:
     """A rigid object held at points.
 
     Attributes:
@@ -109,7 +103,7 @@ class RigidBody:
             raise ValueError(f"free must be six flags, not all False, got {self.free}")
 
     @classmethod
-    def around(cls, position: np.ndarray, contacts: np.ndarray, **options) -> RigidBody:
+    def around(cls, position: np.ndarray, contacts: np.ndarray, **options) -> HeldObject:
         """Return a body at ``position`` [m] (3,), in the world's axes, held at world points ``contacts`` [m] (k, 3)."""
         position = np.asarray(position, dtype=float)
         return cls(position, np.asarray(contacts, dtype=float).reshape(-1, 3) - position, **options)
@@ -130,10 +124,12 @@ class RigidBody:
         k = len(self.points)
         return np.concatenate([np.tile(np.eye(3), (k, 1, 1)), -cross_matrix(self.arms)], axis=2).reshape(3 * k, 6)
 
-    def moved(self, motion: np.ndarray) -> RigidBody:
+    def moved(self, motion: np.ndarray) -> HeldObject:
         """Return the body after a translation and a turn about its centre, shape (6,) [m, rad]."""
         motion = np.asarray(motion, dtype=float)
-        return replace(self, position=self.position + motion[:3], rotation=rotation_matrix(motion[3:]) @ self.rotation)
+        return replace(
+            self, position=self.position + motion[:3], rotation=rotation_vector_matrix(motion[3:]) @ self.rotation
+        )
 
     def stiffness(self, forces: np.ndarray) -> np.ndarray:
         """``K = d (J^T m) / d u`` at fixed tie forces ``m`` [N] (3 k,), shape (6, 6).
@@ -253,7 +249,7 @@ def couple(
     ties: np.ndarray | None = None,
     gap: np.ndarray | None = None,
     *,
-    body: RigidBody | None = None,
+    body: HeldObject | None = None,
     orientation: bool = False,
     effectors: Sequence[int] | None = None,
     tolerance: float = 1e-10,

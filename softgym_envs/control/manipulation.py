@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softgym_envs.control.coupling import Coupled, RigidBody, couple
+from softgym_envs.control.coupling import Coupled, HeldObject, couple
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.mechanics.condensation import CondensedModel
 
@@ -29,7 +29,7 @@ class Plan:
     command: np.ndarray
     effort: np.ndarray
     contact_forces: np.ndarray
-    body: RigidBody
+    body: HeldObject
     coupled: Coupled
 
 
@@ -57,12 +57,12 @@ class Manipulation:
         contact_forces: last forces of the object on the parts [N], shape (k, 3); zero at the start.
     """
 
-    def __init__(self, controller: InverseQP, body: RigidBody, *, tolerance: float = 1e-10) -> None:
+    def __init__(self, controller: InverseQP, body: HeldObject, *, tolerance: float = 1e-10) -> None:
         self.controller = controller
         self.tolerance = tolerance
         self.reset(body)
 
-    def reset(self, body: RigidBody) -> None:
+    def reset(self, body: HeldObject) -> None:
         """Start again with an object that is not held yet."""
         self.body = body
         self.contact_forces = np.zeros_like(body.points)
@@ -75,7 +75,7 @@ class Manipulation:
         slack: np.ndarray | None = None,
         *,
         rotation: np.ndarray | None = None,
-        body: RigidBody | None = None,
+        body: HeldObject | None = None,
         load: np.ndarray | None = None,
     ) -> Plan:
         """Plan the next step.

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
-from softgym_envs.mechanics.materials import Material
-from softgym_envs.mechanics.tetrahedra import Tetrahedra, _add_forces, _add_tangent, _deformation_gradients, _viscosity
+from softgym_envs.mechanics.tetrahedra import Tetrahedra, _add_forces, _deformation_gradients, _viscosity
 
 __all__ = ["AveragedTetrahedra"]
 
@@ -56,24 +57,8 @@ class AveragedTetrahedra(Tetrahedra):
     Args: as for `Tetrahedra`.
     """
 
-    def __init__(
-        self,
-        nodes: np.ndarray,
-        connectivity: np.ndarray,
-        *,
-        material: str | Material = "corotational",
-        young_modulus: float | np.ndarray = 3.0e6,
-        poisson_ratio: float | np.ndarray = 0.3,
-        density: float = 1100.0,
-    ) -> None:
-        super().__init__(
-            nodes,
-            connectivity,
-            material=material,
-            young_modulus=young_modulus,
-            poisson_ratio=poisson_ratio,
-            density=density,
-        )
+    def __init__(self, nodes: np.ndarray, connectivity: np.ndarray, **options: Any) -> None:
+        super().__init__(nodes, connectivity, **options)
         m = len(self.connectivity)
         used, slot = np.unique(self.connectivity, return_inverse=True)
         slot = slot.reshape(m, 4)
@@ -109,7 +94,7 @@ class AveragedTetrahedra(Tetrahedra):
     def add(
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
-        _deformation_gradients(x, self.connectivity, self.gradients, self._F)
+        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
         inverted = self.material.evaluate(self._F, self.mu, self._zero, self._energy, self._stress, self._tangent)
         if inverted:
             return np.inf, inverted
@@ -119,11 +104,11 @@ class AveragedTetrahedra(Tetrahedra):
         lame = self._nodal_sum(self.lame) / self._node_volumes
         pressure = (lame * mean)[self._slot].mean(axis=1)
         self._stress += pressure[:, None] * slope
-        _add_forces(self.connectivity, self.gradients, self.volumes, self._stress, gradient)
+        _add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
         if values is not None:
             assert scatter is not None
             self._tangent += pressure[:, None, None] * curvature
-            _add_tangent(self.gradients, self.volumes, self._tangent, scatter[0], values)
+            self._add_stiffness(self._tangent, values, scatter)
             _patch_gradients(self._element_slots, self._shares, self.gradients, slope, self._patch_gradient)
             _add_patches(
                 self._pointers, self._patch_gradient, lame * self._node_volumes, scatter[1], self._starts, values
@@ -131,10 +116,10 @@ class AveragedTetrahedra(Tetrahedra):
         return float(self._energy @ self.volumes + 0.5 * (lame * mean**2) @ self._node_volumes), 0
 
     def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
-        _deformation_gradients(x, self.connectivity, self.gradients, self._F)
+        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
         # F^-T is the gradient of the rate of dilation.
         _viscosity(self._F, self.mu, self._zero, self._stress, self._tangent)
-        _add_tangent(self.gradients, self.volumes, self._tangent, scatter[0], values)
+        self._add_stiffness(self._tangent, values, scatter)
         _patch_gradients(self._element_slots, self._shares, self.gradients, self._stress, self._patch_gradient)
         lame = self._nodal_sum(self.lame)
         _add_patches(self._pointers, self._patch_gradient, lame, scatter[1], self._starts, values)

@@ -9,7 +9,7 @@ from numba import njit
 
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.materials import Material
-from softgym_envs.mechanics.tetrahedra import SolidBlock, _viscosity, element_masses, orient_corners
+from softgym_envs.mechanics.tetrahedra import SolidBlock, element_masses, orient_corners
 
 __all__ = ["QuadraticTetrahedra", "add_midside_nodes", "quadratic_triangles", "split_triangles"]
 
@@ -84,32 +84,6 @@ _UNIT_MASS = _unit_mass()
 # Four Gauss points, exact to degree two.
 _A, _B = (5.0 + 3.0 * 5.0**0.5) / 20.0, (5.0 - 5.0**0.5) / 20.0
 _GAUSS = np.full((4, 4), _B) + (_A - _B) * np.eye(4)
-
-
-@njit(cache=True, error_model="numpy")
-def _deformation_gradients(x, connectivity, points, gradients, F):
-    for q in range(gradients.shape[0]):
-        e = q // points
-        for i in range(9):
-            F[q, i] = 0.0
-        for a in range(connectivity.shape[1]):
-            node = connectivity[e, a]
-            for i in range(3):
-                for j in range(3):
-                    F[q, 3 * i + j] += x[node, i] * gradients[q, a, j]
-
-
-@njit(cache=True, error_model="numpy")
-def _add_forces(connectivity, points, gradients, weights, stress, out):
-    for q in range(gradients.shape[0]):
-        e = q // points
-        for a in range(connectivity.shape[1]):
-            node = connectivity[e, a]
-            for i in range(3):
-                value = 0.0
-                for j in range(3):
-                    value += stress[q, 3 * i + j] * gradients[q, a, j]
-                out[node, i] += weights[q] * value
 
 
 @njit(cache=True, error_model="numpy")
@@ -219,22 +193,5 @@ class QuadraticTetrahedra(SolidBlock):
     def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return element_masses(self.connectivity, self.density * self.volumes, _UNIT_MASS, lumped)
 
-    def add(
-        self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
-    ) -> tuple[float, int]:
-        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
-        inverted = self.material.evaluate(self._F, self.mu, self.lame, self._energy, self._stress, self._tangent)
-        if inverted:
-            return np.inf, inverted
-        _add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
-        if values is not None:
-            assert scatter is not None
-            _add_tangent(
-                self.connectivity, self.points, self.gradients, self.weights, self._tangent, scatter[0], values
-            )
-        return float(self._energy @ self.weights), 0
-
-    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
-        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
-        _viscosity(self._F, self.mu, self.lame, self._stress, self._tangent)
-        _add_tangent(self.connectivity, self.points, self.gradients, self.weights, self._tangent, scatter[0], values)
+    def _add_stiffness(self, tangent: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        _add_tangent(self.connectivity, self.points, self.gradients, self.weights, tangent, scatter[0], values)

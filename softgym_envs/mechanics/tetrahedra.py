@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+
 import numpy as np
 from numba import njit
 
@@ -9,33 +11,34 @@ from softgym_envs.mechanics.block import ElementBlock, lower_pairs
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
 
-__all__ = ["SolidBlock", "Tetrahedra", "check_density", "element_masses", "orient_corners"]
+__all__ = ["SolidBlock", "Tetrahedra", "boundary_triangles", "check_density", "element_masses", "orient_corners"]
 
 
 @njit(cache=True, error_model="numpy")
-def _deformation_gradients(x, connectivity, gradients, F):
-    for e in range(connectivity.shape[0]):
+def _deformation_gradients(x, connectivity, points, gradients, F):
+    for q in range(gradients.shape[0]):
+        e = q // points
         for i in range(9):
-            F[e, i] = 0.0
-        for a in range(4):
+            F[q, i] = 0.0
+        for a in range(connectivity.shape[1]):
             node = connectivity[e, a]
             for i in range(3):
                 for j in range(3):
-                    F[e, 3 * i + j] += x[node, i] * gradients[e, a, j]
+                    F[q, 3 * i + j] += x[node, i] * gradients[q, a, j]
 
 
 @njit(cache=True, error_model="numpy")
-def _add_forces(connectivity, gradients, volumes, stress, out):
+def _add_forces(connectivity, points, gradients, weights, stress, out):
     """Add the gradient of the energy to ``out``, shape (n, 3)."""
-    for e in range(connectivity.shape[0]):
-        v = volumes[e]
-        for a in range(4):
+    for q in range(gradients.shape[0]):
+        e = q // points
+        for a in range(connectivity.shape[1]):
             node = connectivity[e, a]
             for i in range(3):
                 value = 0.0
                 for j in range(3):
-                    value += stress[e, 3 * i + j] * gradients[e, a, j]
-                out[node, i] += v * value
+                    value += stress[q, 3 * i + j] * gradients[q, a, j]
+                out[node, i] += weights[q] * value
 
 
 @njit(cache=True, error_model="numpy")
@@ -218,6 +221,17 @@ def element_masses(
     return connectivity[:, i].ravel(), connectivity[:, j].ravel(), (masses[:, None] * shares[i, j]).ravel()
 
 
+def boundary_triangles(tetrahedra: np.ndarray) -> np.ndarray:
+    """Return the faces (t, 3) that belong to one tetrahedron only, seen counter-clockwise from outside.
+
+    Args:
+        tetrahedra: corner indices of positively oriented tetrahedra, shape (m, 4).
+    """
+    faces = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[np.sort(first[count == 1])]
+
+
 def check_density(density: float) -> float:
     """Return a density [kg/m3].
 
@@ -298,6 +312,28 @@ class SolidBlock(ElementBlock):
         k = self.connectivity.shape[1]
         return [lower_pairs((3 * self.connectivity[:, :, None] + np.arange(3)).reshape(-1, 3 * k))]
 
+    def add(
+        self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
+    ) -> tuple[float, int]:
+        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
+        inverted = self.material.evaluate(self._F, self.mu, self.lame, self._energy, self._stress, self._tangent)
+        if inverted:
+            return np.inf, inverted
+        _add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
+        if values is not None:
+            assert scatter is not None
+            self._add_stiffness(self._tangent, values, scatter)
+        return float(self._energy @ self.weights), 0
+
+    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
+        _viscosity(self._F, self.mu, self.lame, self._stress, self._tangent)
+        self._add_stiffness(self._tangent, values, scatter)
+
+    @abstractmethod
+    def _add_stiffness(self, tangent: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        """Add the element matrices of tangents (m q, 9, 9) at the quadrature points."""
+
     def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
         _add_warped(x, step, self.connectivity, self.points, self.gradients, self.weights, out)
 
@@ -362,20 +398,5 @@ class Tetrahedra(SolidBlock):
             self.connectivity, self.density * self.volumes, (np.ones((4, 4)) + np.eye(4)) / 20, lumped
         )
 
-    def add(
-        self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
-    ) -> tuple[float, int]:
-        _deformation_gradients(x, self.connectivity, self.gradients, self._F)
-        inverted = self.material.evaluate(self._F, self.mu, self.lame, self._energy, self._stress, self._tangent)
-        if inverted:
-            return np.inf, inverted
-        _add_forces(self.connectivity, self.gradients, self.volumes, self._stress, gradient)
-        if values is not None:
-            assert scatter is not None
-            _add_tangent(self.gradients, self.volumes, self._tangent, scatter[0], values)
-        return float(self._energy @ self.volumes), 0
-
-    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
-        _deformation_gradients(x, self.connectivity, self.gradients, self._F)
-        _viscosity(self._F, self.mu, self.lame, self._stress, self._tangent)
-        _add_tangent(self.gradients, self.volumes, self._tangent, scatter[0], values)
+    def _add_stiffness(self, tangent: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        _add_tangent(self.gradients, self.volumes, tangent, scatter[0], values)

@@ -6,42 +6,19 @@ Lengths in the files are **millimetres**; the suite itself counts in metres.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.robots import soft_finger
 from softgym_envs.robots.meshing import BodyMesh, run_gmsh
-from softgym_envs.robots.robot import MeshedRobot, Robot
+from softgym_envs.robots.robot import Drawing, MeshedRobot, Robot
 from softgym_envs.storage import atomic_write
 
-__all__ = ["FORMATS", "drawing_of", "export_body", "write_drawing", "write_stl"]
+__all__ = ["FORMATS", "export_body", "write_drawing", "write_stl"]
 
 FORMATS = (".step", ".stl")
 """Endings of the files that can be written."""
-
-Drawing = tuple[Callable[..., None], dict]
-"""A module-level function that draws one volume with gmsh in millimetres, and its parameters (JSON-serialisable)."""
-
-
-def drawing_of(robot: Robot, design: Mapping[str, float] | None = None) -> Drawing:
-    """Return what draws the body of a design exactly.
-
-    A robot that is drawn with gmsh has a method ``drawing(complete design)``.
-
-    Raises:
-        DesignError: for a malformed design.
-        InfeasibleDesign: if the geometry cannot exist.
-        ValueError: if the robot's body is not drawn with gmsh.
-    """
-    complete = robot.design_space.complete(design)
-    if hasattr(robot, "drawing"):
-        return robot.drawing(complete)
-    if isinstance(robot, soft_finger.SoftFinger):
-        lengths = {name: round(complete[name] * 1e3, 9) for name in ("length", "height", "joint_height")}
-        return soft_finger.draw_finger, {**lengths, "slope": robot.slope}
-    raise ValueError(f"robot '{robot.name}' has no exact shape to write as STEP; write its triangles: .stl")
 
 
 def export_body(
@@ -65,7 +42,7 @@ def export_body(
     """
     path = _check_path(path)
     if path.suffix == ".step":
-        write_drawing(drawing_of(robot, design), path, time_limit=time_limit)
+        write_drawing(robot.drawing(robot.design_space.complete(design)), path, time_limit=time_limit)
     elif isinstance(robot, MeshedRobot):
         mesh = robot.body(design)
         write_stl(path, mesh.nodes, mesh.surface())

@@ -25,6 +25,7 @@ from scipy.sparse.csgraph import connected_components
 
 from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
+from softgym_envs.mechanics.tetrahedra import boundary_triangles, orient_corners
 from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
 __all__ = ["BodyMesh", "mesh_geometry", "run_gmsh"]
@@ -54,12 +55,7 @@ class BodyMesh:
 
     def surface(self) -> np.ndarray:
         """Return the boundary triangles (k, 3), seen counter-clockwise from outside the material."""
-        corners = self.tetrahedra
-        edges = self.nodes[corners[:, 1:]] - self.nodes[corners[:, :1]]
-        corners = np.where((np.linalg.det(edges) < 0.0)[:, None], corners[:, [0, 2, 1, 3]], corners)
-        faces = corners[:, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3)
-        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-        return faces[np.sort(first[count == 1])]
+        return boundary_triangles(orient_corners(self.nodes, self.tetrahedra)[0])
 
     def cavities(
         self, along: Sequence[float] = (0.0, 0.0, -1.0), across: Sequence[float] = (1.0, 0.0, 0.0)

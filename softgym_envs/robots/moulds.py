@@ -18,16 +18,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from softgym_envs.robots import soft_finger
-from softgym_envs.robots.export import FORMATS, Drawing, write_drawing
-from softgym_envs.robots.robot import Robot
-from softgym_envs.robots.sensorized_finger import (
-    FLANGE,
-    THICKNESS,
-    SensorizedFinger,
-    check_finger,
-    draw_bellow_finger,
-)
+from softgym_envs.robots.export import FORMATS, write_drawing
+from softgym_envs.robots.finger_shape import FLANGE, THICKNESS, draw_finger
+from softgym_envs.robots.robot import Drawing, Robot
+from softgym_envs.robots.sensorized_finger import SensorizedFinger
+from softgym_envs.robots.soft_finger import SoftFinger
 
 __all__ = ["MOULD_PARTS", "draw_box", "draw_clamp", "draw_cork", "draw_lid", "export_moulds", "mould_parts"]
 
@@ -59,23 +54,12 @@ def mould_parts(robot: Robot, design: Mapping[str, float] | None = None) -> dict
     """
     complete = robot.design_space.complete(design)
     if isinstance(robot, SensorizedFinger):
-        lengths = {"split": 0.0, **robot.drawing(complete)[1]}
         wires = [[0.0, 1e3 * robot.cable_height(complete)]]
-    elif isinstance(robot, soft_finger.SoftFinger):
-        lengths = {name: round(complete[name] * 1e3, 9) for name in ("length", "height", "joint_height")}
-        lengths |= {
-            "slope": robot.slope,
-            "outer_radius": soft_finger.OUTER_RADIUS,
-            "bellow_height": soft_finger.BELLOW_HEIGHT,
-            "plateau_height": soft_finger.PLATEAU_HEIGHT,
-            "wall_thickness": soft_finger.WALL_THICKNESS,
-            "cork_thickness": soft_finger.CORK_THICKNESS,
-            "split": 0.0,
-        }
+    elif isinstance(robot, SoftFinger):
         wires = [[1e3 * x, 1e3 * robot.cable_height] for x in robot.cable_offsets]
     else:
         raise ValueError(f"there are no moulds for robot '{robot.name}'; allowed: finger, sensorized_finger")
-    check_finger(lengths)
+    lengths = {"split": 0.0, **robot.drawing(complete)[1]}
     return {
         "box": (draw_box, {"lengths": lengths, "wires": wires}),
         "lid": (draw_lid, {"lengths": lengths}),
@@ -137,7 +121,7 @@ def _draw_finger(lengths: Mapping[str, float], part: str) -> list:
     import gmsh
 
     before = set(gmsh.model.occ.getEntities(3))
-    draw_bellow_finger(**lengths, part=part)
+    draw_finger(**lengths, part=part)
     return sorted(set(gmsh.model.occ.getEntities(3)) - before)
 
 
@@ -164,7 +148,7 @@ def draw_box(lengths: Mapping[str, float], wires: Sequence[Sequence[float]]) -> 
     """Draw the box with gmsh.
 
     Args:
-        lengths: parameters of `draw_bellow_finger` [mm, rad].
+        lengths: parameters of `draw_finger` [mm, rad].
         wires: x and y of the cables [mm], shape (n, 2).
     """
     import gmsh
@@ -178,7 +162,7 @@ def draw_box(lengths: Mapping[str, float], wires: Sequence[Sequence[float]]) -> 
 
 
 def draw_lid(lengths: Mapping[str, float]) -> None:
-    """Draw the lid with the cores with gmsh; ``lengths`` [mm, rad] are the parameters of `draw_bellow_finger`."""
+    """Draw the lid with the cores with gmsh; ``lengths`` [mm, rad] are the parameters of `draw_finger`."""
     import gmsh
 
     occ = gmsh.model.occ
@@ -198,7 +182,7 @@ def draw_lid(lengths: Mapping[str, float]) -> None:
 
 
 def draw_cork(lengths: Mapping[str, float]) -> None:
-    """Draw the tray for the plugs with gmsh; ``lengths`` [mm, rad] are the parameters of `draw_bellow_finger`."""
+    """Draw the tray for the plugs with gmsh; ``lengths`` [mm, rad] are the parameters of `draw_finger`."""
     import gmsh
 
     occ = gmsh.model.occ

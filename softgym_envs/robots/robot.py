@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,10 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.meshing import BodyMesh
 from softgym_envs.robots.morphing import Feature, Morpher
 
-__all__ = ["Actuator", "MeshedRobot", "Robot"]
+__all__ = ["Actuator", "Drawing", "MeshedRobot", "Robot"]
+
+Drawing = tuple[Callable[..., None], dict]
+"""A module-level function that draws one volume with gmsh in millimetres, and its parameters (JSON-serialisable)."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,15 @@ class Robot(ABC):
     @abstractmethod
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Make the model of a complete design: bodies, boundary conditions, actuators, effectors, contacts."""
+
+    def drawing(self, design: Mapping[str, float]) -> Drawing:
+        """Return what draws the exact shape of a complete design.
+
+        Raises:
+            InfeasibleDesign: if the shape cannot exist.
+            ValueError: if the body is not drawn with gmsh as a whole.
+        """
+        raise ValueError(f"robot '{self.name}' has no exact shape to write as STEP; write its triangles: .stl")
 
     def reference_path(self, count: int = 30) -> np.ndarray:
         """Published trajectory of the first effector [m], shape (count, 3), where tracking is compared.

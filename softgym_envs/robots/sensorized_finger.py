@@ -18,134 +18,18 @@ from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.constraints import Cavity
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.statics import Statics
+from softgym_envs.robots.finger_shape import FLANGE, THICKNESS, check_finger, draw_finger, finger_features
 from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
-from softgym_envs.robots.morphing import Cone, Cylinder, Feature, Plane
+from softgym_envs.robots.morphing import Feature
 from softgym_envs.robots.robot import Actuator, MeshedRobot
 
-__all__ = ["SensorReadings", "SensorizedFinger", "check_finger", "draw_bellow_finger"]
+__all__ = ["SensorReadings", "SensorizedFinger"]
 
-# Fixed dimensions [mm]. Where bellows end along z they are as wide as the segments: TEETH_RADIUS = THICKNESS / 2.
+# Fixed dimensions [mm].
 LENGTH = 40.0
 HEIGHT = 20.0
-THICKNESS = 17.5
-FLANGE = 3.0
-TEETH_RADIUS = 8.75
 
 _LATERAL_POINT = (-THICKNESS / 2, HEIGHT / 2, -1.5 * LENGTH)
-
-
-def draw_bellow_finger(
-    length: float,
-    height: float,
-    joint_height: float,
-    slope: float,
-    outer_radius: float,
-    bellow_height: float,
-    plateau_height: float,
-    wall_thickness: float,
-    cork_thickness: float,
-    split: float = 0.0,
-    part: str = "body",
-) -> None:
-    """Draw a finger of three segments and two bellows with gmsh: lengths in mm, slope of the notches in rad.
-
-    Args:
-        length: of one segment, along -z.
-        height: of the segments, along y.
-        joint_height: thickness left under the notches.
-        slope: angle of the notch faces from the cross-section.
-        outer_radius: of the bellows, at their plateau.
-        bellow_height: of bellows and cavities along z, where they are widest in z.
-        plateau_height: of their cylindrical part.
-        wall_thickness: radius of the bellow minus radius of the cavity.
-        cork_thickness: height of the slab under the cavities.
-        split: half the thickness of a wall in the plane x = 0 through the cavities; 0 for none.
-        part: ``"body"``, ``"filled"`` (the body without its cavities) or ``"cavities"`` (what was left out).
-    """
-    import gmsh
-
-    occ = gmsh.model.occ
-    run = (height - joint_height) * math.tan(slope)
-
-    def half_turned(inner: float, outer: float, z: float) -> tuple[int, int]:
-        """A trapezoid profile (full height up to ``inner``, plateau at ``outer``) turned by 180 degrees about z."""
-        full, flat = bellow_height / 2, plateau_height / 2
-        profile = [(0.0, -full), (inner, -full), (outer, -flat), (outer, flat), (inner, full), (0.0, full)]
-        points = [occ.addPoint(r, 0, z + h) for r, h in profile]
-        lines = [occ.addLine(a, b) for a, b in zip(points, points[1:] + points[:1], strict=True)]
-        face = occ.addPlaneSurface([occ.addCurveLoop(lines)])
-        return next(e for e in occ.revolve([(2, face)], 0, 0, 0, 0, 0, 1, math.pi) if e[0] == 3)
-
-    hollows = []
-    if part != "filled":
-        cavities = [
-            half_turned(TEETH_RADIUS - wall_thickness, outer_radius - wall_thickness, -j * length) for j in (1, 2)
-        ]
-        solid = []
-        for joint in (1, 2):
-            low = -joint * length - bellow_height
-            solid.append(
-                (3, occ.addBox(-outer_radius, -1, low, 2 * outer_radius, 1 + cork_thickness, 2 * bellow_height))
-            )
-            if split:
-                solid.append((3, occ.addBox(-split, -1, low, 2 * split, 1 + outer_radius, 2 * bellow_height)))
-        hollows, _ = occ.cut(cavities, solid)
-    if part == "cavities":
-        return
-
-    # Side view (y, z): a bar with a notch at each joint; the base half of the first segment is filled.
-    outline = [(0.0, 0.0), (0.0, -3.0 * length), (joint_height, -3.0 * length), (height, -3.0 * length + run)]
-    for joint in (2, 1):
-        z = -joint * length
-        outline += [(height, z - run), (joint_height, z), (height, z + run)]
-    outline.append((height, 0.0))
-    points = [occ.addPoint(-THICKNESS / 2, y, z) for y, z in outline]
-    lines = [occ.addLine(a, b) for a, b in zip(points, points[1:] + points[:1], strict=True)]
-    face = occ.addPlaneSurface([occ.addCurveLoop(lines)])
-    bar = [e for e in occ.extrude([(2, face)], THICKNESS, 0, 0) if e[0] == 3]
-    flange = (3, occ.addBox(-THICKNESS / 2 - FLANGE, 0, -FLANGE, THICKNESS + 2 * FLANGE, height + FLANGE, FLANGE))
-    bellows = [half_turned(TEETH_RADIUS, outer_radius, -joint * length) for joint in (1, 2)]
-    body, _ = occ.fuse(bar, [flange, *bellows])
-    if hollows:
-        occ.cut(body, hollows)
-
-
-def check_finger(lengths: Mapping[str, float]) -> None:
-    """Check that the shape of `draw_bellow_finger` exists.
-
-    Args:
-        lengths: its parameters [mm, rad].
-
-    Raises:
-        InfeasibleDesign: naming what does not fit.
-    """
-    length, height, joint_height = lengths["length"], lengths["height"], lengths["joint_height"]
-    tangent = math.tan(lengths["slope"])
-    outer, inner = lengths["outer_radius"] - lengths["wall_thickness"], TEETH_RADIUS - lengths["wall_thickness"]
-    half, cork, split = lengths["bellow_height"] / 2, lengths["cork_thickness"], lengths.get("split", 0.0)
-    run = (height - joint_height) * tangent
-    if not run > 0.0:
-        raise InfeasibleDesign(
-            f"there is no notch: joint height {joint_height:.2f} mm, height {height:.2f} mm, tan(slope) {tangent:.3g}"
-        )
-    if 2.0 * run >= length:
-        raise InfeasibleDesign(
-            f"the notches meet: 2 x {run:.2f} mm does not fit in a segment of {length:.2f} mm; "
-            "lower the slope or raise the joints"
-        )
-    if lengths["plateau_height"] >= 2.0 * half:
-        raise InfeasibleDesign(f"a plateau of {lengths['plateau_height']:.2f} mm on a bellow of {2.0 * half:.2f} mm")
-    if math.hypot(cork, split) >= outer:
-        raise InfeasibleDesign(
-            f"the cavity vanishes: the cork ends at {cork:.2f} mm, the cavity at a radius of {outer:.2f} mm"
-        )
-    # Where the cavity is widest along z, only the segment beside it closes it.
-    closed = joint_height + half / tangent
-    if inner > cork and inner >= closed:
-        raise InfeasibleDesign(
-            f"the cavity opens into the notch: it is {inner:.2f} mm high at its ends, the segment beside it "
-            f"{closed:.2f} mm"
-        )
 
 
 @dataclass(frozen=True)
@@ -266,7 +150,7 @@ class SensorizedFinger(MeshedRobot):
     # -- shape ------------------------------------------------------------------------------------------------------
 
     def lengths(self, design: Mapping[str, float]) -> dict[str, float]:
-        """Return the parameters of `draw_bellow_finger` [mm, rad] for a complete design."""
+        """Return the parameters of `draw_finger` [mm, rad] for a complete design."""
         names = ("joint_height", "outer_radius", "bellow_height", "plateau_height", "wall_thickness", "cork_thickness")
         lengths = {name: round(design[name] * 1e3, 9) for name in names}
         lengths |= {"length": LENGTH, "height": HEIGHT, "slope": round(design["slope"], 12)}
@@ -288,7 +172,7 @@ class SensorizedFinger(MeshedRobot):
                 f"the cable does not pass through the segments and over the joints: it is {cable:.2f} mm above the "
                 f"bottom, the joints end at {lengths['joint_height']:.2f} mm and the segments at {HEIGHT:.2f} mm"
             )
-        return draw_bellow_finger, lengths
+        return draw_finger, lengths
 
     def cable_height(self, design: Mapping[str, float]) -> float:
         """Return the height of the cable over the bottom of a complete design [m]."""
@@ -308,43 +192,8 @@ class SensorizedFinger(MeshedRobot):
         return mesh
 
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
-        """Planes of the bar, the flange and the notches; cones and cylinders of bellows and cavities."""
-        mm = 1e-3
-        x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-        side, flange, height, length = THICKNESS / 2 * mm, FLANGE * mm, HEIGHT * mm, LENGTH * mm
-        joint, tangent = design["joint_height"], math.tan(design["slope"])
-        outer, wall, full = design["outer_radius"], design["wall_thickness"], design["bellow_height"] / 2
-        features: dict[str, Feature] = {
-            "left": Plane((-side, 0, 0), x),
-            "right": Plane((side, 0, 0), x),
-            "bottom": Plane((0, 0, 0), y),
-            "top": Plane((0, height, 0), y),
-            "base": Plane((0, 0, 0), z),
-            "tip": Plane((0, 0, -3 * length), z),
-            "flange left": Plane((-side - flange, 0, 0), x),
-            "flange right": Plane((side + flange, 0, 0), x),
-            "flange top": Plane((0, height + flange, 0), y),
-            "flange face": Plane((0, 0, -flange), z),
-            "bellow rim": Cylinder(outer),
-            "cavity rim": Cylinder(outer - wall),
-            "cork": Plane((0, design["cork_thickness"], 0), y),
-            "notch 3 base": Plane((0, joint, -3 * length), (0.0, -tangent, 1.0)),
-        }
-        if self.cavities == 4:
-            features["split left"] = Plane((-design["split"], 0, 0), x)
-            features["split right"] = Plane((design["split"], 0, 0), x)
-        # Radius lost per height between full height and plateau.
-        taper = (outer - TEETH_RADIUS * mm) / (full - design["plateau_height"] / 2)
-        for k in (1, 2):
-            centre = -k * length
-            for word, sign in (("base", 1.0), ("tip", -1.0)):
-                features[f"notch {k} {word}"] = Plane((0, joint, centre), (0.0, -sign * tangent, 1.0))
-                features[f"flat {k} {word}"] = Plane((0, 0, centre + sign * full), z)
-                for part, radius in (("bellow", TEETH_RADIUS * mm), ("cavity", TEETH_RADIUS * mm - wall)):
-                    features[f"{part} {k} {word}"] = Cone(radius, centre + sign * full, -sign * taper)
-        return features
-
-    # -- mechanics --------------------------------------------------------------------------------------------------
+        """Surfaces of the shape of a complete design."""
+        return finger_features(self.lengths(design))
 
     def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Clamp the flange, route the cable past the notches, put the effector at the tip, make cavities sensors."""

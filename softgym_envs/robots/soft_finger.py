@@ -14,68 +14,24 @@ import numpy as np
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.constraints import Point
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.finger_shape import FLANGE, check_finger, draw_finger, finger_features
 from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
-from softgym_envs.robots.morphing import Cone, Cylinder, Feature, Plane
-from softgym_envs.robots.robot import Actuator, MeshedRobot
+from softgym_envs.robots.morphing import Feature
+from softgym_envs.robots.robot import Actuator, Drawing, MeshedRobot
 
 __all__ = ["SoftFinger"]
 
-# Fixed dimensions [mm].
-THICKNESS = 17.5
-FLANGE = 3.0
-OUTER_RADIUS = 14.75
-TEETH_RADIUS = 8.75
-BELLOW_HEIGHT = 8.0
-PLATEAU_HEIGHT = 3.0
-WALL_THICKNESS = 3.0
-CORK_THICKNESS = 3.0
-# Not part of the shape: no upper-case constant of the drawing, by which meshes are known.
-_contact_radius = 2.0
+BELLOWS = {
+    "outer_radius": 14.75,
+    "bellow_height": 8.0,
+    "plateau_height": 3.0,
+    "wall_thickness": 3.0,
+    "cork_thickness": 3.0,
+}
+"""Fixed dimensions of the bellows and their cavities [mm], named as in `draw_finger`."""
 
-
-def draw_finger(length: float, height: float, joint_height: float, slope: float) -> None:
-    """Draw the finger with gmsh: lengths in mm, slope of the notches in rad."""
-    import gmsh
-
-    occ = gmsh.model.occ
-    run = (height - joint_height) * math.tan(slope)
-    if 2.0 * run >= length:
-        raise ValueError(f"the notches meet: 2 x {run:.2f} mm does not fit in a segment of {length:.2f} mm")
-
-    def half_turned(inner: float, outer: float, z: float) -> tuple[int, int]:
-        """A trapezoid profile (full height up to ``inner``, plateau at ``outer``) turned by 180 degrees about z."""
-        full, flat = BELLOW_HEIGHT / 2, PLATEAU_HEIGHT / 2
-        profile = [(0.0, -full), (inner, -full), (outer, -flat), (outer, flat), (inner, full), (0.0, full)]
-        points = [occ.addPoint(r, 0, z + h) for r, h in profile]
-        lines = [occ.addLine(a, b) for a, b in zip(points, points[1:] + points[:1], strict=True)]
-        face = occ.addPlaneSurface([occ.addCurveLoop(lines)])
-        return next(e for e in occ.revolve([(2, face)], 0, 0, 0, 0, 0, 1, math.pi) if e[0] == 3)
-
-    # Side view (y, z): a bar with a notch at each joint; the base half of the first segment is filled.
-    outline = [(0.0, 0.0), (0.0, -3.0 * length), (joint_height, -3.0 * length), (height, -3.0 * length + run)]
-    for joint in (2, 1):
-        z = -joint * length
-        outline += [(height, z - run), (joint_height, z), (height, z + run)]
-    outline.append((height, 0.0))
-    points = [occ.addPoint(-THICKNESS / 2, y, z) for y, z in outline]
-    lines = [occ.addLine(a, b) for a, b in zip(points, points[1:] + points[:1], strict=True)]
-    face = occ.addPlaneSurface([occ.addCurveLoop(lines)])
-    bar = [e for e in occ.extrude([(2, face)], THICKNESS, 0, 0) if e[0] == 3]
-    flange = (3, occ.addBox(-THICKNESS / 2 - FLANGE, 0, -FLANGE, THICKNESS + 2 * FLANGE, height + FLANGE, FLANGE))
-    bellows = [half_turned(TEETH_RADIUS, OUTER_RADIUS, -joint * length) for joint in (1, 2)]
-    body, _ = occ.fuse(bar, [flange, *bellows])
-    cavities = [half_turned(TEETH_RADIUS - WALL_THICKNESS, OUTER_RADIUS - WALL_THICKNESS, -j * length) for j in (1, 2)]
-    corks = [
-        (
-            3,
-            occ.addBox(
-                -OUTER_RADIUS, -1, -j * length - BELLOW_HEIGHT, 2 * OUTER_RADIUS, 1 + CORK_THICKNESS, 2 * BELLOW_HEIGHT
-            ),
-        )
-        for j in (1, 2)
-    ]
-    hollows, _ = occ.cut(cavities, corks)
-    occ.cut(body, hollows)
+CONTACT_RADIUS = 2.0e-3
+"""Radius of the circle of contact points [m]."""
 
 
 class SoftFinger(MeshedRobot):
@@ -158,45 +114,24 @@ class SoftFinger(MeshedRobot):
             **({"contacts": True} if self.contacts else {}),
         }
 
+    def lengths(self, design: Mapping[str, float]) -> dict[str, float]:
+        """Return the parameters of `draw_finger` [mm, rad] for a complete design."""
+        lengths = {name: round(design[name] * 1e3, 9) for name in ("length", "height", "joint_height")}
+        return {**lengths, "slope": self.slope, **BELLOWS}
+
+    def drawing(self, design: Mapping[str, float]) -> Drawing:
+        lengths = self.lengths(design)
+        check_finger(lengths)
+        return draw_finger, lengths
+
     def mesh(self, design: Mapping[str, float]) -> BodyMesh:
         """Mesh the body of a complete design."""
-        lengths = {name: round(design[name] * 1e3, 9) for name in ("length", "height", "joint_height")}
-        return mesh_geometry(draw_finger, {**lengths, "slope": self.slope}, mesh_size=self.mesh_size)
+        draw, lengths = self.drawing(design)
+        return mesh_geometry(draw, lengths, mesh_size=self.mesh_size)
 
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
-        """Planes of the bar, the flange and the notches; cones and cylinders of bellows and cavities."""
-        length, height, joint = design["length"], design["height"], design["joint_height"]
-        mm = 1e-3
-        x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-        side = THICKNESS / 2 * mm
-        flange = FLANGE * mm
-        features: dict[str, Feature] = {
-            "left": Plane((-side, 0, 0), x),
-            "right": Plane((side, 0, 0), x),
-            "bottom": Plane((0, 0, 0), y),
-            "top": Plane((0, height, 0), y),
-            "base": Plane((0, 0, 0), z),
-            "tip": Plane((0, 0, -3 * length), z),
-            "flange left": Plane((-side - flange, 0, 0), x),
-            "flange right": Plane((side + flange, 0, 0), x),
-            "flange top": Plane((0, height + flange, 0), y),
-            "flange face": Plane((0, 0, -flange), z),
-            "bellow rim": Cylinder(OUTER_RADIUS * mm),
-            "cavity rim": Cylinder((OUTER_RADIUS - WALL_THICKNESS) * mm),
-            "cork": Plane((0, CORK_THICKNESS * mm, 0), y),
-            "notch 3 base": Plane((0, joint, -3 * length), (0.0, -math.tan(self.slope), 1.0)),
-        }
-        # Radius lost per height between full height and plateau.
-        taper = (OUTER_RADIUS - TEETH_RADIUS) / ((BELLOW_HEIGHT - PLATEAU_HEIGHT) / 2)
-        full = BELLOW_HEIGHT / 2 * mm
-        for k in (1, 2):
-            centre = -k * length
-            for word, sign in (("base", 1.0), ("tip", -1.0)):
-                features[f"notch {k} {word}"] = Plane((0, joint, centre), (0.0, -sign * math.tan(self.slope), 1.0))
-                features[f"flat {k} {word}"] = Plane((0, 0, centre + sign * full), z)
-                for part, radius in (("bellow", TEETH_RADIUS), ("cavity", TEETH_RADIUS - WALL_THICKNESS)):
-                    features[f"{part} {k} {word}"] = Cone(radius * mm, centre + sign * full, -sign * taper)
-        return features
+        """Surfaces of the shape of a complete design."""
+        return finger_features(self.lengths(design))
 
     @staticmethod
     def clamped(mesh: BodyMesh) -> np.ndarray:
@@ -222,7 +157,7 @@ class SoftFinger(MeshedRobot):
     def contact_points(design: Mapping[str, float]) -> np.ndarray:
         """Three points on a circle in the middle of the last segment's front [m], shape (3, 3)."""
         angles = math.pi / 2 + 2.0 * math.pi / 3 * np.arange(3)
-        circle = _contact_radius * 1e-3 * np.column_stack([np.cos(angles), np.zeros(3), np.sin(angles)])
+        circle = CONTACT_RADIUS * np.column_stack([np.cos(angles), np.zeros(3), np.sin(angles)])
         return np.array([0.0, design["height"], -2.5 * design["length"]]) + circle
 
     def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:

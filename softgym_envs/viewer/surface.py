@@ -13,6 +13,7 @@ from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.tetrahedra import boundary_triangles
 from softgym_envs.robots.robot import Robot
 
 if TYPE_CHECKING:
@@ -22,23 +23,11 @@ __all__ = [
     "BodySurface",
     "ShapeFinder",
     "body_surface",
-    "boundary_triangles",
     "cable_lines",
     "commanded_displacement",
     "slacken",
     "surface_kinds",
 ]
-
-
-def boundary_triangles(tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the faces (t, 3) that belong to one tetrahedron only, seen counter-clockwise from outside.
-
-    Args:
-        tetrahedra: corner indices of positively oriented tetrahedra, shape (m, 4).
-    """
-    faces = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[np.sort(first[count == 1])]
 
 
 class BodySurface:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.control import RigidBody, couple, rotate, tie_points
+from softgym_envs.control import HeldObject, couple, rotate, tie_points
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.statics import Statics
@@ -30,7 +30,7 @@ def cube(models, rng=None, **options):
     contacts = np.concatenate([model.delta.c for model in models]).reshape(-1, 3)
     if rng is not None:
         contacts = contacts + 1e-4 * rng.standard_normal(contacts.shape)
-    return RigidBody.around(contacts.mean(axis=0) + [0.001, 0.002, -0.001], contacts, **options)
+    return HeldObject.around(contacts.mean(axis=0) + [0.001, 0.002, -0.001], contacts, **options)
 
 
 # -- dense linear examples ------------------------------------------------------------------------------------------
@@ -103,7 +103,7 @@ def test_W_is_symmetric_and_its_object_rows_answer_loads(rng):
     np.testing.assert_array_equal(W, W.T)
     effort = coupled.condensed.lambda_.a
     for i in range(6):
-        pushed = couple(models, body=RigidBody(body.position, body.points, load=np.eye(6)[i]), orientation=True)
+        pushed = couple(models, body=HeldObject(body.position, body.points, load=np.eye(6)[i]), orientation=True)
         response = pushed.condensed.delta.array - couple(models, body=body, orientation=True).condensed.delta.array
         np.testing.assert_allclose(response, W[:10, 4 + i], atol=1e-13)
     assert np.isfinite(coupled.efforts(effort)[0]).all()
@@ -142,7 +142,7 @@ def test_nearly_rigid_contact_triads_are_safe(rng, softness):
     models, bodies = [], []
     for _ in range(2):
         points = rng.standard_normal((3, 3)) * 0.002 + [0.0, 0.02, -0.1]
-        frame = RigidBody.around(points.mean(axis=0), points)
+        frame = HeldObject.around(points.mean(axis=0), points)
         rigid = random_model(rng, a=2, e=0, c=6)  # its c rows: motion of a frame that carries the points
         scale = np.diag([1, 1, 1, 50.0, 50.0, 50.0])
         H = np.zeros((11, 8))
@@ -153,7 +153,7 @@ def test_nearly_rigid_contact_triads_are_safe(rng, softness):
         free = np.concatenate([1e-3 * rng.standard_normal(2), points.ravel()])
         models.append(CondensedModel(H @ rigid.compliance @ H.T + strain, free, np.zeros(11), (("a", 2), ("c", 9))))
         bodies.append((H, rigid.compliance))
-    body = RigidBody.around(np.array([0.0, 0.035, -0.095]), np.concatenate([m.delta_free.c for m in models]))
+    body = HeldObject.around(np.array([0.0, 0.035, -0.095]), np.concatenate([m.delta_free.c for m in models]))
     coupled = couple(models, body=body, orientation=True)
     # The limit: both frames tied to the object by all six of their degrees of freedom.
     actuators, ties = np.zeros((16, 16)), np.zeros((12, 16))
@@ -181,7 +181,7 @@ def test_the_answer_does_not_depend_on_units(rng, units):
     models = [random_model(rng, c=9), random_model(rng, c=9)]
     body = cube(models)
     scaled = [CondensedModel(units * m.compliance, units * m.free, m.effort, m.roles) for m in models]
-    big = RigidBody(units * body.position, units * body.points)
+    big = HeldObject(units * body.position, units * body.points)
     one, other = couple(models, body=body), couple(scaled, body=big)
     np.testing.assert_allclose(other.condensed.compliance, units * one.condensed.compliance, rtol=1e-8)
     np.testing.assert_allclose(other.efforts(np.ones(4))[0], one.efforts(np.ones(4))[0], rtol=1e-8)
@@ -200,9 +200,9 @@ def test_malformed_couplings_are_refused(rng):
         ("must be finite, of shapes", [models, C, np.zeros(2)], {}),
         ("must be finite, of shapes", [models, C, np.full(3, np.nan)], {}),
         ("actuator rows cannot be tied", [models, np.eye(16)[:1]], {}),
-        ("1 points, but the parts have 6", [models], {"body": RigidBody.around(np.zeros(3), contacts[:1])}),
+        ("1 points, but the parts have 6", [models], {"body": HeldObject.around(np.zeros(3), contacts[:1])}),
         # Two points leave a turn about their line.
-        ("it can move freely", [models], {"body": RigidBody.around(np.zeros(3), contacts)}),
+        ("it can move freely", [models], {"body": HeldObject.around(np.zeros(3), contacts)}),
     ]:
         with pytest.raises(ValueError, match=expected):
             couple(*arguments, **options)
@@ -229,7 +229,7 @@ def test_malformed_couplings_are_refused(rng):
 )
 def test_malformed_bodies_are_refused(options, expected):
     with pytest.raises(ValueError, match=expected):
-        RigidBody(**{"position": np.zeros(3), "points": np.eye(3), **options})
+        HeldObject(**{"position": np.zeros(3), "points": np.eye(3), **options})
 
 
 # -- turned robots --------------------------------------------------------------------------------------------------
@@ -413,7 +413,7 @@ def gripper(model, **options):
     """Three fingers of the thesis (4.3.2) and its cube, at rest."""
     rest = np.array([point.value(model.nodes) for point in model.constraints["c"]])
     contacts = np.concatenate([rest @ R.T + shift for R, shift in Grip.places])
-    return RigidBody.around(np.array([0.0, 0.035, -0.095]), contacts, **options)
+    return HeldObject.around(np.array([0.0, 0.035, -0.095]), contacts, **options)
 
 
 def test_gripper_W_is_the_derivative_of_the_coupled_equilibrium(contact_finger):

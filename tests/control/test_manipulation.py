@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.control import InverseQP, Manipulation, RigidBody, rotate
+from softgym_envs.control import HeldObject, InverseQP, Manipulation, rotate
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.statics import Statics
 from softgym_envs.robots import make_robot
@@ -31,7 +31,7 @@ class Gripper:
         self.places = PLACES[:count]
         rest = np.array([point.value(model.nodes) for point in model.constraints["c"]])
         contacts = np.concatenate([rest @ R.T + shift for R, shift in self.places])
-        self.body = RigidBody.around(CENTRE, contacts, **body)
+        self.body = HeldObject.around(CENTRE, contacts, **body)
         self.fingers = [Statics(model) for _ in self.places]
 
     def models(self, command, body):
@@ -106,7 +106,7 @@ def random_part(rng, contacts):
 def held(rng):
     """Three parts with three cables each, and an object they hold."""
     contacts = 0.03 * rng.standard_normal((3, 3, 3))
-    return [random_part(rng, c) for c in contacts], RigidBody.around(np.zeros(3), contacts.reshape(-1, 3))
+    return [random_part(rng, c) for c in contacts], HeldObject.around(np.zeros(3), contacts.reshape(-1, 3))
 
 
 def settled(models, plan):

@@ -11,9 +11,9 @@ from softgym_envs import cli
 from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.robots import make_robot
-from softgym_envs.robots.export import drawing_of, export_body, write_drawing
+from softgym_envs.robots.export import export_body, write_drawing
+from softgym_envs.robots.finger_shape import draw_finger
 from softgym_envs.robots.moulds import MOULD_PARTS, WALL, WIRE_RADIUS, export_moulds, mould_parts
-from softgym_envs.robots.sensorized_finger import draw_bellow_finger
 
 FINGERS = [
     ("finger", {"cables": 1}, {}),
@@ -103,8 +103,8 @@ def test_designs_change_the_files(tmp_path):
 def test_both_fingers_are_one_drawing(occ):
     """Moulds draw the Soft Finger by the function of the sensorized one."""
     robot = make_robot("finger")
-    body = draw(occ, *drawing_of(robot))
-    again = draw(occ, draw_bellow_finger, mould_parts(robot)["lid"][1]["lengths"])
+    body = draw(occ, *robot.drawing(robot.design_space.baseline))
+    again = draw(occ, draw_finger, mould_parts(robot)["lid"][1]["lengths"])
     assert volume(occ, body) == pytest.approx(volume(occ, again), rel=1e-9)
     assert common(occ, body, again) == pytest.approx(volume(occ, body), rel=1e-6)
 
@@ -127,7 +127,8 @@ def test_refusals_leave_nothing_behind(name, file, design, error, message, tmp_p
 
 
 def test_a_drawing_that_fails_or_takes_too_long_leaves_nothing_behind(tmp_path):
-    draw_body, lengths = drawing_of(make_robot("finger"))
+    robot = make_robot("finger")
+    draw_body, lengths = robot.drawing(robot.design_space.baseline)
     with pytest.raises(InfeasibleDesign, match="the notches meet"):
         write_drawing((draw_body, lengths | {"slope": 1.4}), tmp_path / "body.step")
     with pytest.raises(InfeasibleDesign, match="took longer than"):
@@ -147,8 +148,8 @@ def test_what_is_cast_is_the_body(name, options, design, occ):
     assert tuple(parts) == MOULD_PARTS
     lengths, wires = parts["box"][1]["lengths"], parts["box"][1]["wires"]
 
-    body = draw(occ, *drawing_of(robot, design))
-    cavities = draw(occ, draw_bellow_finger, lengths | {"part": "cavities"})
+    body = draw(occ, *robot.drawing(robot.design_space.complete(design)))
+    cavities = draw(occ, draw_finger, lengths | {"part": "cavities"})
     tray, lid, box, clamp = (draw(occ, *parts[part]) for part in ("cork", "lid", "box", "clamp"))
     for part in (tray, lid, box, clamp):
         assert len(part) == 1

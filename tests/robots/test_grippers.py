@@ -10,7 +10,7 @@ import itertools
 import numpy as np
 import pytest
 
-from softgym_envs.control import RigidBody, couple, rotate, tie_points
+from softgym_envs.control import HeldObject, couple, rotate, tie_points
 from softgym_envs.errors import DesignError
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.statics import Statics
@@ -114,7 +114,7 @@ def test_coupled_fingers_hold_the_object_as_one_model_does(grippers, name, pulle
     turn, centre = rotation_of(state.x, frame), state.x[frame]
     models = part_models(robot, state, points)
     load = np.append(model.nodal_loads[frame], np.zeros(3))
-    coupled = couple(models, body=RigidBody(centre, (points - centre) @ turn, rotation=turn, load=load))
+    coupled = couple(models, body=HeldObject(centre, (points - centre) @ turn, rotation=turn, load=load))
     assert coupled.dropped == 0
     agrees(coupled.condensed, state)
     np.testing.assert_allclose(coupled.motion(state.effort[: len(robot.actuators)]), 0.0, atol=1e-9)

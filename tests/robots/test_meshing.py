@@ -9,11 +9,12 @@ import pytest
 
 from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
 from softgym_envs.robots import meshing
+from softgym_envs.robots.finger_shape import draw_finger
 from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
-from softgym_envs.robots.soft_finger import draw_finger
+from softgym_envs.robots.soft_finger import BELLOWS
 
 COARSE = 0.02
-GOOD = {"length": 40.0, "height": 20.0, "joint_height": 6.0, "slope": 0.5}
+GOOD = {"length": 40.0, "height": 20.0, "joint_height": 6.0, "slope": 0.5, **BELLOWS}
 
 
 @pytest.fixture

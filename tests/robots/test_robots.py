@@ -12,7 +12,9 @@ import pytest
 from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.statics import Statics
 from softgym_envs.robots import ROBOTS, make_robot, meshing
+from softgym_envs.robots.finger_shape import draw_finger
 from softgym_envs.robots.morphing import mean_ratio
+from softgym_envs.robots.soft_finger import BELLOWS
 
 # Every robot with a mesh from gmsh, in every variant: a new one adds its row. The others have files of their own.
 VARIANTS = [("finger", {"cables": 1}), ("finger", {"cables": 2}), ("diamond", {})]
@@ -293,11 +295,8 @@ def test_a_geometry_that_cannot_exist_is_infeasible(monkeypatch):
     robot = make_robot("finger", meshing="remesh", mesh_size=0.02)
 
     def impossible(design):
-        return meshing.mesh_geometry(
-            __import__("softgym_envs.robots.soft_finger", fromlist=["draw_finger"]).draw_finger,
-            {"length": 10.0, "height": 30.0, "joint_height": 5.0, "slope": 0.8},
-            mesh_size=0.02,
-        )
+        lengths = {"length": 10.0, "height": 30.0, "joint_height": 5.0, "slope": 0.8}
+        return meshing.mesh_geometry(draw_finger, {**lengths, **BELLOWS}, mesh_size=0.02)
 
     monkeypatch.setattr(robot, "mesh", impossible)
     with pytest.raises(InfeasibleDesign, match="notches meet"):

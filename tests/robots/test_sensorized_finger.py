@@ -11,8 +11,8 @@ from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.mechanics.statics import Statics
 from softgym_envs.robots import make_robot, meshing
+from softgym_envs.robots.finger_shape import check_finger
 from softgym_envs.robots.meshing import BodyMesh
-from softgym_envs.robots.sensorized_finger import check_finger
 
 MM = 1e-3
 
