@@ -14,20 +14,126 @@ ELASTICITIES = ((5000, 0.47, 0.91), (1000, 0.45, 0.29), (7000, 0.40, 0.90), (300
 def test_set() -> dict[str, object]:
     """Errors on the untouched test sets over the whole design box, as recorded when the weights were made."""
     from softgym_envs.robots import make_robot
-    from softgym_envs.surrogate.pretrained import pretrained_model
+    from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
 
     result: dict[str, object] = {}
-    for cables in (1, 2):
-        card = pretrained_model(make_robot("finger", cables=cables)).card
+    for variant, (name, options) in shipped_robots().items():
+        robot = make_robot(name, **options)
+        card = pretrained_model(robot).card
         test = card["test"]
+        size = sum(path.stat().st_size for path in pretrained_folder(robot).iterdir())
         result |= {
-            f"{cables} cable(s): states in the test set": test["states"],
-            f"{cables} cable(s): effector error, mean [mm]": 1e3 * test["effector_mean"],
-            f"{cables} cable(s): effector error, worst [mm]": 1e3 * test["effector_worst"],
-            f"{cables} cable(s): W relative Frobenius error, median [%]": 100 * test["compliance_median"],
-            f"{cables} cable(s): W relative Frobenius error, worst [%]": 100 * test["compliance_worst"],
-            f"{cables} cable(s): share with positive definite W": test["positive_definite"],
+            f"{variant}: states for training / in the test set": f"{card['states']['train']} / {test['states']}",
+            f"{variant}: effector error, mean [mm]": 1e3 * test["effector_mean"],
+            f"{variant}: effector error, worst [mm]": 1e3 * test["effector_worst"],
+            f"{variant}: W relative Frobenius error, median [%]": 100 * test["compliance_median"],
+            f"{variant}: W relative Frobenius error, worst [%]": 100 * test["compliance_worst"],
+            f"{variant}: largest effort error, of the largest effort [%]": 100 * test["effort_worst"],
+            f"{variant}: trusted below an uncertainty of [mm]": 1e3 * card["domain"].get("limit", np.nan),
+            f"{variant}: size of the files [kB]": size / 1e3,
         }
+    return result
+
+
+def positive_definite(count: int = 1_000_000) -> dict[str, object]:
+    """A million random states of every robot: is W symmetric positive definite, and the derivative of delta?
+
+    The derivative is that of the predicted state by central differences; the network computes in single precision.
+    """
+    from softgym_envs.robots import make_robot
+    from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
+
+    result: dict[str, object] = {}
+    for variant, (name, options) in shipped_robots().items():
+        robot = make_robot(name, **options)
+        model = pretrained_model(robot)
+        rng = np.random.default_rng(0)
+        low, high = (
+            np.array([getattr(v, end) for v in robot.design_space.variables.values()]) for end in ("low", "high")
+        )
+        good, smallest = 0, np.inf
+        for _ in range(-(-count // 10_000)):
+            designs = rng.uniform(low, high, (1000, len(low)))
+            context = model.context(designs).rows(np.repeat(np.arange(1000), 10))
+            displacement = rng.uniform(robot.lower, robot.upper, (10_000, model.count))
+            W = model.compliance(context, displacement)
+            scale = np.sqrt(np.einsum("bii->bi", W))
+            least = np.linalg.eigvalsh(W / scale[:, :, None] / scale[:, None, :])[:, 0]
+            symmetric = (W == W.swapaxes(1, 2)).all(axis=(1, 2))
+            good += int((symmetric & (least > 0.0)).sum())
+            smallest = min(smallest, float(least.min()))
+        result[f"{variant}: symmetric positive definite [%]"] = 100 * good / (-(-count // 10_000) * 10_000)
+        result[f"{variant}: smallest eigenvalue, rows scaled to a diagonal of 1"] = smallest
+        n = model.count
+        K = np.linalg.inv(W[:, :n, :n])
+        J = W[:, n:, :n] @ K
+        worst, across = 0.0, 0.0
+        for k in range(n):
+            step = np.zeros(n)
+            step[k] = 2e-3 * (robot.upper - robot.lower)[k]
+            up, down = model.state(context, displacement + step), model.state(context, displacement - step)
+            slopes = [(a - b) / (2 * step[k]) for a, b in zip(up[:2], down[:2], strict=True)]
+            worst = max(worst, float(np.abs(slopes[0] - K[:, :, k]).max() / np.abs(K[:, :, k]).max()))
+            across = max(across, float(np.abs(slopes[1] - J[:, :, k]).max() / np.abs(J[:, :, k]).max()))
+        result[f"{variant}: d effort / d delta against W, largest difference"] = worst
+        result[f"{variant}: d effector / d delta against W, largest difference"] = across
+    return result
+
+
+def design_gradients(bodies: int = 12) -> dict[str, object]:
+    """Derivative of the effector by each design variable at held actuators: surrogate against differences of FEM.
+
+    The error is the difference of the two vectors relative to the FEM one, per body and variable; FEM differences are
+    central over 2 % of a variable's range, on moved meshes.
+    """
+    import torch
+
+    from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+    from softgym_envs.mechanics.statics import Statics
+    from softgym_envs.robots import make_robot
+    from softgym_envs.surrogate.gradients import TorchModel
+    from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
+    from softgym_envs.surrogate.sampling import learned_variables
+
+    result: dict[str, object] = {}
+    for variant, (name, options) in shipped_robots().items():
+        robot = make_robot(name, **options)
+        net = TorchModel(pretrained_model(robot))
+        space = robot.design_space
+        rng = np.random.default_rng(5)
+        errors = []
+        for _ in range(bodies):
+            design = {k: v.low + rng.uniform(0.05, 0.95) * (v.high - v.low) for k, v in space.variables.items()}
+            try:
+                # Held where real cables get it: taut, or hanging slack.
+                statics = Statics(robot.build(design))
+                statics.solve(np.zeros(len(robot.actuators)), robot.rest_mode)
+                held = statics.solve(rng.uniform(robot.lower, robot.upper)).condensed.delta.a
+                exact = {}
+                for variable in learned_variables(robot):
+                    h = 0.01 * (space[variable].high - space[variable].low)
+                    ends = []
+                    for sign in (1.0, -1.0):
+                        moved = Statics(robot.build({**design, variable: design[variable] + sign * h}))
+                        moved.unilateral = np.zeros_like(moved.unilateral)
+                        for part in (0.25, 0.5, 0.75, 1.0):
+                            found = moved.solve(part * held)
+                        ends.append(found.condensed.delta.e)
+                    exact[variable] = (ends[0] - ends[1]) / (2 * h)
+            except (ConvergenceError, InfeasibleDesign):
+                continue
+            values = torch.tensor([[design[k] for k in space.names]], dtype=torch.float64, requires_grad=True)
+            effector = net(values, torch.as_tensor(held[None]))[1]
+            rows = [
+                torch.autograd.grad(effector[0, k], values, retain_graph=True)[0][0] for k in range(effector.shape[1])
+            ]
+            jacobian = torch.stack(rows).numpy()
+            for variable, truth in exact.items():
+                predicted = jacobian[:, space.names.index(variable)]
+                errors.append(np.linalg.norm(predicted - truth) / np.linalg.norm(truth))
+        result[f"{variant}: gradients compared"] = len(errors)
+        result[f"{variant}: relative error, median [%]"] = 100 * float(np.median(errors))
+        result[f"{variant}: relative error, three quarters are below [%]"] = 100 * float(np.quantile(errors, 0.75))
     return result
 
 

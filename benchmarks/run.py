@@ -9,7 +9,19 @@ from pathlib import Path
 
 import click
 
-from benchmarks import accuracy, carry, dynamics, robots, sensor_finger, speed, validation
+from benchmarks import (
+    accuracy,
+    carry,
+    dynamics,
+    export,
+    hybrid,
+    morphing,
+    networks,
+    robots,
+    sensor_finger,
+    speed,
+    validation,
+)
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError
 from softgym_envs.storage import write_json
@@ -28,6 +40,12 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "trajectories": accuracy.trajectories,
     "slack": accuracy.slack_states,
     "mesh_motion": accuracy.mesh_motion,
+    "positive_definite": accuracy.positive_definite,
+    "design_gradients": accuracy.design_gradients,
+    "networks": networks.networks,
+    "morphing": morphing.morphing,
+    "hybrid": hybrid.hybrid,
+    "deployed": export.deployed,
     "tracking": robots.tracking,
     "stiff_flop": robots.stiff_flop,
     "carry": carry.carry,

@@ -230,78 +230,87 @@ def notched_beam() -> dict[str, object]:
     }
 
 
+def surrogate_ids() -> list[str]:
+    """Environments whose physics is a surrogate unless told otherwise."""
+    from softgym_envs.envs.registration import ENVIRONMENTS
+
+    return [identifier for identifier, row in ENVIRONMENTS.items() if row.backend == "surrogate"]
+
+
+_BATCHED = """
+import json, sys, time
+import gymnasium, softgym_envs
+count, actions = int(sys.argv[2]), 60
+batch = gymnasium.make_vec(sys.argv[1], num_envs=count)
+batch.reset(seed=0)
+batch.action_space.seed(0)
+drawn = [batch.action_space.sample() for _ in range(actions)]
+for action in drawn:
+    batch.step(action)
+laps = []
+for _ in range(5):
+    start = time.perf_counter()
+    for action in drawn:
+        batch.step(action)
+    laps.append(time.perf_counter() - start)
+print(json.dumps(count * actions / sorted(laps)[2]))
+"""
+
+
 def surrogate_step() -> dict[str, object]:
-    """Surrogate environment steps per second, random increments, resets counted."""
+    """Surrogate environment steps per second, random increments, resets counted; batches in one and two processes."""
     import gymnasium
 
     import softgym_envs  # noqa: F401 - registers the IDs
 
     result: dict[str, object] = {}
-    for cables in (1, 2):
-        options = {"cables": cables}
-        env = gymnasium.make("SoftGym/FingerReach-v0", robot_options=options)
+    for identifier in surrogate_ids():
+        name = identifier.removeprefix("SoftGym/").removesuffix("-v0")
+        env = gymnasium.make(identifier)
         env.reset(seed=0)
-        walk = _random_walk(env, 2000, 0)
+        walk = _random_walk(env, 1000, 0)
         walk()
-        result[f"{cables} cable(s), single: steps per second"] = 2000 / _median_seconds(walk, 5)
-        for count in (64, 1024):
-            batch = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=count, robot_options=options)
-            batch.reset(seed=0)
-            batch.action_space.seed(0)
-            actions = [batch.action_space.sample() for _ in range(60)]
-
-            def walk_batch(batch=batch, actions=actions) -> None:
-                for action in actions:
-                    batch.step(action)
-
-            walk_batch()
-            seconds = _median_seconds(walk_batch, 5)
-            result[f"{cables} cable(s), {count} at once: steps per second"] = count * len(actions) / seconds
+        result[f"{name}, single: steps per second"] = 1000 / _median_seconds(walk, 5)
+        for processes in (1, 2):
+            running = [
+                subprocess.Popen([sys.executable, "-c", _BATCHED, identifier, "1024"], stdout=subprocess.PIPE)
+                for _ in range(processes)
+            ]
+            rates = [json.loads(process.communicate()[0]) for process in running]
+            label = f"{name}, 1024 at once in {processes} process(es): steps per second"
+            result[label] = float(sum(rates))
     return result
 
 
 def inference() -> dict[str, object]:
-    """Microseconds per state of the learned model: compiled kernel, and the same network in NumPy and in torch."""
+    """Microseconds per call of the shipped networks: state, condensed model, and the torch model for comparison."""
     import torch
 
     from softgym_envs.robots import make_robot
-    from softgym_envs.surrogate.model import _forward, _rows_forward
-    from softgym_envs.surrogate.pretrained import pretrained_model
+    from softgym_envs.surrogate.gradients import TorchModel
+    from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
 
-    model = pretrained_model(make_robot("finger"))
-    net = model._nets["state"]  # type: ignore[attr-defined]
-    layers = [(np.concatenate([net._first, net._design]), net._bias)]
-    layers += list(zip(net._hidden, net._hidden_bias, strict=True)) + [(net._last, net._last_bias)]
     torch.set_num_threads(1)
-    tensors = [(torch.as_tensor(w), torch.as_tensor(b)) for w, b in layers]
-
-    def in_torch(x):
-        for weight, bias in tensors[:-1]:
-            x = x @ weight + bias
-            x = x * torch.rsqrt(1.0 + x * x)
-        return x @ tensors[-1][0] + tensors[-1][1]
-
-    def by_kernel(actuation, prepared):
-        out = np.empty((len(actuation), net._last.shape[1]), dtype=np.float32)
-        weights = (net._hidden, net._hidden_bias, net._last, net._last_bias)
-        _rows_forward(actuation, net._first, prepared, *weights, out)
-
     result: dict[str, object] = {}
-    rng = np.random.default_rng(0)
-    for count in (1, 16, 256):
-        x = rng.uniform(-1, 1, (count, len(layers[0][0]))).astype(np.float32)
-        actuation, prepared = x[:, : model.count].copy(), net.prepare(x[:, model.count :])
-        tensor = torch.as_tensor(x)
-        repeats = 2000 // count + 10
-        candidates: dict[str, Callable[[], object]] = {
-            "as used": partial(net, actuation, prepared),
-            "compiled kernel": partial(by_kernel, actuation, prepared),
-            "NumPy": partial(_forward, x, layers),
-            "torch": partial(in_torch, tensor),
+    for variant, (robot, options) in shipped_robots().items():
+        body = make_robot(robot, **options)
+        model = pretrained_model(body)
+        rng = np.random.default_rng(0)
+        designs = np.array([list(body.design_space.sample(rng).values()) for _ in range(256)])
+        displacement = rng.uniform(body.lower, body.upper, (256, model.count))
+        contexts = {count: model.context(designs[:count]) for count in (1, 256)}
+        net = TorchModel(model)
+        tensors = torch.as_tensor(designs[:1]), torch.as_tensor(displacement[:1])
+        candidates: dict[str, tuple[Callable[[], object], int]] = {
+            "state, one": (partial(model.state, contexts[1], displacement[:1]), 1),
+            "state, each of 256": (partial(model.state, contexts[256], displacement), 256),
+            "condensed model, one": (partial(model.condensed, contexts[1], displacement[:1]), 1),
+            "condensed model, each of 256": (partial(model.condensed, contexts[256], displacement), 256),
+            "in torch, one": (partial(net, *tensors), 1),
         }
-        for name, work in candidates.items():
+        for name, (work, count) in candidates.items():
             work()
-            result[f"batch {count}, {name} [us per state]"] = 1e6 * _median_seconds(work, repeats) / count
+            result[f"{variant}: {name} [us]"] = 1e6 * _median_seconds(work, 2000 // count + 10) / count
     return result
 
 

@@ -165,6 +165,42 @@ def export(
 
 
 @cli.command()
+@click.argument("robot")
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--option", "options", multiple=True, help="Robot option, name=value (repeat).")
+@click.option("--design", "design", multiple=True, help="Design variable of a header, name=value in SI (repeat).")
+@click.option("--weights", type=click.Path(path_type=Path), help="Folder of weights (default: those that ship).")
+@click.option("--members", type=int, help="Members of the ensemble that are averaged (default: all).")
+@click.option("--name", default="softgym", show_default=True, help="Prefix of what a header defines.")
+def deploy(
+    robot: str,
+    files: tuple[Path, ...],
+    options: tuple[str, ...],
+    design: tuple[str, ...],
+    weights: Path | None,
+    members: int | None,
+    name: str,
+) -> None:
+    """Write a learned model to FILES: .h, one body as a C header, or .onnx, a graph that takes the design."""
+    from softgym_envs.surrogate.export import FORMATS, export_c, export_onnx
+    from softgym_envs.surrogate.pretrained import pretrained_model
+
+    for file in files:
+        if file.suffix not in FORMATS:
+            raise ConfigError(f"'{file}' must end with {' or '.join(FORMATS)}")
+    if design and all(file.suffix == ".onnx" for file in files):
+        raise ConfigError("--design is for a header (.h); an .onnx graph takes the design as an input")
+    model = pretrained_model(_robot(robot, options), weights)
+    chosen = _assignments(design, "design")
+    for file in files:
+        if file.suffix == ".h":
+            export_c(model, chosen, file, members=members, name=name)
+        else:
+            export_onnx(model, file, members=members)
+        click.echo(f"wrote {file}")
+
+
+@cli.command()
 @click.argument("environment")
 @click.option("--agent", default="qp", show_default=True, help="qp, qp_static, random or a policy file.")
 @click.option("--backend", help="surrogate or fem; default that of the environment.")

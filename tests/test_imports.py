@@ -17,7 +17,7 @@ PACKAGES = ("softgym_envs", "agents", "codesign")
 LAYERS = [
     {"softgym_envs.version", "softgym_envs.errors"},
     {"softgym_envs.storage"},
-    {"softgym_envs.designs", "softgym_envs.config", "softgym_envs.registry"},
+    {"softgym_envs.designs", "softgym_envs.config", "softgym_envs.registry", "softgym_envs.executors"},
     {"softgym_envs.mechanics"},
     {"softgym_envs.robots"},
     {"softgym_envs.surrogate"},

@@ -15,6 +15,7 @@ __all__ = ["BACKENDS", "make_backend"]
 BACKENDS: dict[str, str] = {
     "fem": "softgym_envs.backends.fem:FEMBackend",
     "surrogate": "softgym_envs.backends.surrogate:SurrogateBackend",
+    "hybrid": "softgym_envs.backends.hybrid:HybridBackend",
 }
 """Registry: name to ``module:class``, imported when used."""
 

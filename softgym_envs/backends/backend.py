@@ -31,6 +31,8 @@ class State:
         motion: time, velocities and energies of the body, where the backend knows dynamics.
         stable: the state is stable whatever drives the actuators (always True on the surrogate, which knows no other);
             in dynamics it is the tangent of the time step, with its inertia, that is positive definite.
+        uncertainty: of the effector [m]: 95 % of errors are smaller, where a learned model knows; 0 for FEM.
+        trusted: the state lies where the backend knows what it says; always True for FEM.
         nodes: deformed nodes [m], shape (n, 3), where the backend has them.
     """
 
@@ -45,6 +47,8 @@ class State:
     motion: Motion | None = None
     bonds: np.ndarray = field(default_factory=lambda: np.zeros(0))
     stable: bool = True
+    uncertainty: float = 0.0
+    trusted: bool = True
 
 
 class Backend(ABC):

@@ -17,10 +17,11 @@ from softgym_envs.robots.robot import Robot
 from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_model
 
-__all__ = ["Settled", "SurrogateBackend", "settle"]
+__all__ = ["Settled", "SurrogateBackend", "at_rest", "released", "settle"]
 
-#: Largest change of a slack cable's length left when its search ends [m].
-TOLERANCE = 1e-6
+#: Largest step left when a search ends [quarter of the actuator range]: 1e-6 m for a cable of 20 mm. Single precision
+#: does not carry much farther.
+TOLERANCE = 2e-4
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class Settled:
         effector: effector coordinates [m], shape (B, n_e).
         slack: slack actuators, shape (B, n_a).
         converged: whether the state was found, shape (B,); the other rows are not to be used.
+        uncertainty: of the effector [m], shape (B,).
+        trusted: whether the model knows the state, shape (B,).
     """
 
     displacement: np.ndarray
@@ -40,6 +43,33 @@ class Settled:
     effector: np.ndarray
     slack: np.ndarray
     converged: np.ndarray
+    uncertainty: np.ndarray
+    trusted: np.ndarray
+
+
+def released(model: SurrogateModel, context: Context, effort: np.ndarray, start: np.ndarray) -> Settled:
+    """Find the states under efforts (B, n_a), by Newton's method from displacements ``start`` (B, n_a)."""
+    displacement = start.copy()
+    limit = 0.25 * (model.robot.upper - model.robot.lower)
+    for _ in range(50):
+        found, effector, spread = model.state(context, displacement)
+        W = model.compliance(context, displacement)[:, : model.count, : model.count]
+        step = np.matmul(W, (effort - found)[:, :, None])[:, :, 0]
+        moving = (np.abs(step) > TOLERANCE * limit).any(axis=1)
+        if not moving.any():
+            break
+        displacement = displacement + np.clip(step, -limit, limit) * moving[:, None]
+    return Settled(
+        displacement, found, effector, np.zeros(found.shape, bool), ~moving, *model.trust(context, displacement, spread)
+    )
+
+
+def at_rest(model: SurrogateModel, context: Context, unilateral: np.ndarray) -> Settled:
+    """Bodies without effort; where loads would drag the actuators along, with actuators held at zero."""
+    zero = np.zeros((len(context.slot), model.count))
+    if model.card.get("loaded", False):
+        return settle(model, context, zero, zero, unilateral)
+    return released(model, context, zero, zero)
 
 
 def settle(
@@ -67,18 +97,19 @@ def settle(
         max_iterations: bound on the search; it ends after two or three.
     """
     guess = target if slack is None else np.where(slack, np.maximum(start, target), target)
-    effort, effector = model.state(context, guess)
+    effort, effector, spread = model.state(context, guess)
     wrong = unilateral & ((effort < 0.0) | (guess > target))
     loose = np.zeros(guess.shape, dtype=bool)
     converged = np.isfinite(effort).all(axis=1)
     if not wrong.any():
-        return Settled(guess, effort, effector, loose, converged)
+        return Settled(guess, effort, effector, loose, converged, *model.trust(context, guess, spread))
     displacement = guess.copy()
     searched = np.flatnonzero(wrong.any(axis=1))
     # Working copies of the rows still searched; they are written back as their search ends.
     rows, d, e, wanted = searched, guess[searched], effort[searched], target[searched]
     part = context if len(rows) == len(guess) else context.rows(rows)
     limit = 0.25 * (model.robot.upper - model.robot.lower)
+    tolerance = TOLERANCE * limit
     for iteration in range(max_iterations):
         if iteration % 4 == 0:
             # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
@@ -90,7 +121,7 @@ def settle(
         # Far steps are cut: the network is only asked where its neighbourhood of known states reaches.
         step = np.minimum(np.maximum(np.matmul(W, (taut - e)[:, :, None])[:, :, 0], -limit), limit)
         d = d + step
-        moving = (np.abs(step) > TOLERANCE).any(axis=1)
+        moving = (np.abs(step) > tolerance).any(axis=1)
         if not moving.all():
             # A last step below the tolerance is taken without asking the model again.
             displacement[rows[~moving]], effort[rows[~moving]] = d[~moving], taut[~moving]
@@ -98,11 +129,12 @@ def settle(
             if len(rows) == 0:
                 break
             d, wanted, W, part = d[moving], wanted[moving], W[moving], part.rows(moving)
-        e, effector[rows] = model.state(part, d)
+        e, effector[rows], spread[rows] = model.state(part, d)
     converged[rows] = False
-    loose[searched] = unilateral & (displacement[searched] > target[searched] + 10.0 * TOLERANCE)
+    loose[searched] = unilateral & (displacement[searched] > target[searched] + 10.0 * tolerance)
     effort = np.where(loose, 0.0, np.where(unilateral, np.maximum(effort, 0.0), effort))
-    return Settled(displacement, effort, effector, loose, converged)
+    trust = model.trust(context, displacement, spread)
+    return Settled(displacement, effort, effector, loose, converged, *trust)
 
 
 class SurrogateBackend(Backend):
@@ -112,13 +144,18 @@ class SurrogateBackend(Backend):
         robot: the family of bodies.
         design: first design; missing variables take their baseline.
         weights: folder of weights; default the shipped ones.
+        members: how many members of the ensemble to use, fewer for speed; default all.
     """
 
     def __init__(
-        self, robot: Robot, design: Mapping[str, float] | None = None, weights: str | Path | None = None
+        self,
+        robot: Robot,
+        design: Mapping[str, float] | None = None,
+        weights: str | Path | None = None,
+        members: int | None = None,
     ) -> None:
         self.robot = robot
-        self.model = pretrained_model(robot, weights)
+        self.model = pretrained_model(robot, weights, members)
         self._unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
         self.design = {}
         self.reset(robot.design_space.complete(design))
@@ -129,11 +166,10 @@ class SurrogateBackend(Backend):
             values = np.array([list(complete.values())])
             self._context = self.model.context(values)
             self.design = dict(complete)
-            zero = np.zeros((1, self.model.count))
-            effort, effector = self.model.state(self._context, zero)
-            self._rest = self._state(
-                zero[0], Settled(zero, effort, effector, zero.astype(bool), np.ones(1, dtype=bool))
-            )
+            rest = at_rest(self.model, self._context, self._unilateral)
+            if not rest.converged[0]:
+                raise ConvergenceError(f"the surrogate finds no rest of design {complete}")
+            self._rest = self._state(np.zeros(self.model.count), rest)
         self.state = self._rest
         return self.state
 
@@ -157,26 +193,13 @@ class SurrogateBackend(Backend):
         elif mode == "effort":
             if (command[self._unilateral] < 0.0).any():
                 raise ValueError(f"efforts {command.tolist()} must not be negative: the actuators cannot push")
-            settled = self._under_effort(command)
+            settled = released(self.model, self._context, command[None], self.state.displacement[None])
+            if not settled.converged[0]:
+                raise ConvergenceError(f"the surrogate finds no displacement for efforts {command.tolist()}")
         else:
             raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
         self.state = self._state(command, settled)
         return self.state
-
-    def _under_effort(self, effort: np.ndarray) -> Settled:
-        """Newton's method on ``effort(displacement) = effort``."""
-        displacement = self.state.displacement[None].copy()
-        limit = 0.25 * (self.robot.upper - self.robot.lower)
-        for _ in range(50):
-            found, effector = self.model.state(self._context, displacement)
-            W = self.model.compliance(self._context, displacement)[0, : self.model.count, : self.model.count]
-            step = np.clip(W @ (effort - found[0]), -limit, limit)
-            if np.abs(step).max() < TOLERANCE:
-                return Settled(
-                    displacement, found, effector, np.zeros_like(displacement, dtype=bool), np.ones(1, dtype=bool)
-                )
-            displacement = displacement + step
-        raise ConvergenceError(f"the surrogate finds no displacement for efforts {effort.tolist()} N")
 
     def restore(self, state: State) -> None:
         self.state = state
@@ -190,13 +213,15 @@ class SurrogateBackend(Backend):
             effort=settled.effort[0],
             effector=settled.effector[0].reshape(-1, 3),
             slack=settled.slack[0],
+            uncertainty=float(settled.uncertainty[0]),
+            trusted=bool(settled.trusted[0]),
         )
 
 
 class _SurrogateState(State):
     """A state whose condensed model is evaluated when it is asked for: agents that do not look at W do not pay."""
 
-    def __init__(self, model: SurrogateModel, context: Context, **fields: np.ndarray) -> None:
+    def __init__(self, model: SurrogateModel, context: Context, **fields: np.ndarray | float) -> None:
         for name, value in fields.items():
             object.__setattr__(self, name, value)
         object.__setattr__(self, "nodes", None)

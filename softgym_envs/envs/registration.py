@@ -45,7 +45,7 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/CableTrunkTrack-v0": EnvironmentRow("cable_trunk", "track", 100, backend="fem"),
     "SoftGym/TrunkReach-v0": EnvironmentRow("trunk", "reach", 50, backend="fem"),
     "SoftGym/TrunkTrack-v0": EnvironmentRow("trunk", "track", 100, backend="fem"),
-    "SoftGym/FingerPress-v0": EnvironmentRow("press_finger", "track", 100, backend="fem"),
+    "SoftGym/FingerPress-v0": EnvironmentRow("press_finger", "track", 100),
     "SoftGym/GripperPinch-v0": EnvironmentRow("two_finger_gripper", "track", 100, backend="fem"),
     "SoftGym/GripperManipulate-v0": EnvironmentRow("three_finger_gripper", "track", 100, backend="fem"),
     "SoftGym/TetrapodReach-v0": EnvironmentRow("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),

@@ -229,6 +229,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             "displacement": state.displacement.copy(),
             "effort": state.effort.copy(),
             "stable": state.stable,
+            "uncertainty": state.uncertainty,
+            "trusted": state.trusted,
             "converged": True,
         }
         velocity = state.velocity[0] if self.interface.moving else None

@@ -9,11 +9,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from softgym_envs.backends.surrogate import settle
+from softgym_envs.backends.surrogate import Settled, at_rest, settle
 from softgym_envs.envs.interface import Interface
 from softgym_envs.envs.soft_robot_env import design_names, merge_defaults
 from softgym_envs.envs.task import check_goals, make_task
 from softgym_envs.robots import make_robot
+from softgym_envs.surrogate.model import Context
 from softgym_envs.surrogate.pretrained import pretrained_model
 
 __all__ = ["SoftRobotVectorEnv"]
@@ -37,7 +38,7 @@ class SoftRobotVectorEnv(VectorEnv):
         action_mode: as for `SoftRobotEnv`.
         robot_options: options of the robot.
         task_options: options of the task.
-        backend_options: options of the backend (``weights``).
+        backend_options: options of the backend (``weights``, ``members``).
         defaults: as for `SoftRobotEnv`.
     """
 
@@ -87,7 +88,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self._fixed_design = self.design_space.complete(design)
         self._sampled = design_names(self.design_space, sample_design)
         shown = design_names(self.design_space, design_in_observation)
-        self.interface = Interface(self.robot, action_mode=action_mode, design_names=shown)
+        self.interface = Interface(self.robot, action_mode=action_mode, design_names=shown, axes=self.task.axes)
         self.single_action_space = self.interface.action_space
         self.single_observation_space = self.interface.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -97,8 +98,12 @@ class SoftRobotVectorEnv(VectorEnv):
         n = len(self.robot.actuators)
         baseline = np.tile(list(self._fixed_design.values()), (num_envs, 1))
         self.designs = baseline.astype(float)
-        self._context = self.model.context(self.designs)
+        # One body for all, until they differ.
+        self._context = Context.shared(self.model.context(self.designs[:1]), num_envs)
         self._rest_effort = np.zeros((num_envs, n))
+        self._rest_displacement = np.zeros((num_envs, n))
+        self._rest_uncertainty = np.zeros(num_envs)
+        self._rest_trusted = np.ones(num_envs, dtype=bool)
         self._rest_effector = np.zeros((num_envs, 3))
         self._unit_design = np.zeros((num_envs, len(shown)))
         self._command = np.zeros((num_envs, n))
@@ -109,9 +114,12 @@ class SoftRobotVectorEnv(VectorEnv):
         self._paths = np.zeros((num_envs, 1, 3))
         self._counts = np.ones(num_envs, dtype=np.int64)  # goals in each path
         self._converged = np.ones(num_envs, dtype=bool)
+        self._uncertainty = np.zeros(num_envs)
+        self._trusted = np.ones(num_envs, dtype=bool)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._changed = np.zeros(num_envs, dtype=bool)  # bodies that were given in reset and are not the fixed one
-        self._begin_bodies(np.arange(num_envs))
+        rest = at_rest(self.model, self._context.rows(np.zeros(1, dtype=np.int64)), self._unilateral)
+        self._take_rest(np.arange(num_envs), rest)
 
     # -- bodies -----------------------------------------------------------------------------------------------------
 
@@ -119,9 +127,12 @@ class SoftRobotVectorEnv(VectorEnv):
         """Prepare the models of changed designs."""
         context = self.model.context(self.designs[index])
         self._context.put(index, context)
-        zero = np.zeros((len(index), self._command.shape[1]))
-        effort, effector = self.model.state(context, zero)
-        self._rest_effort[index], self._rest_effector[index] = effort, effector[:, :3]
+        self._take_rest(index, at_rest(self.model, context, self._unilateral))
+
+    def _take_rest(self, index: np.ndarray, rest: Settled) -> None:
+        self._rest_displacement[index], self._rest_effort[index] = rest.displacement, rest.effort
+        self._rest_effector[index] = rest.effector[:, :3]
+        self._rest_uncertainty[index], self._rest_trusted[index] = rest.uncertainty, rest.trusted
         for column, name in enumerate(self.interface.design_names):
             values = self.designs[index, self.design_space.names.index(name)]
             self._unit_design[index, column] = self.design_space[name].to_unit(values)
@@ -151,10 +162,12 @@ class SoftRobotVectorEnv(VectorEnv):
             self._begin_bodies(index)
             self._changed[index] = False
         self._command[index] = 0.0
-        self._displacement[index] = 0.0
+        self._displacement[index] = self._rest_displacement[index]
         self._effort[index] = self._rest_effort[index]
         self._effector[index] = self._rest_effector[index]
         self._slack[index] = False
+        self._uncertainty[index] = self._rest_uncertainty[index]
+        self._trusted[index] = self._rest_trusted[index]
         self._converged[index] = True
         self._steps[index] = 0
         if goal is not None:
@@ -215,6 +228,7 @@ class SoftRobotVectorEnv(VectorEnv):
         if settled.converged.all():
             self._command, self._displacement = command, settled.displacement
             self._effort, self._slack, self._effector = settled.effort, settled.slack, settled.effector[:, :3]
+            self._uncertainty, self._trusted = settled.uncertainty, settled.trusted
         else:  # rows without a state stay where they were, and their episodes end
             found = settled.converged[:, None]
             self._command = np.where(found, command, self._command)
@@ -222,6 +236,8 @@ class SoftRobotVectorEnv(VectorEnv):
             self._effort = np.where(found, settled.effort, self._effort)
             self._slack = np.where(found, settled.slack, self._slack)
             self._effector = np.where(found, settled.effector[:, :3], self._effector)
+            self._uncertainty = np.where(settled.converged, settled.uncertainty, self._uncertainty)
+            self._trusted = np.where(settled.converged, settled.trusted, self._trusted)
         self._steps += 1
         info, reward = self._info()
         observation = self._observe()
@@ -265,6 +281,8 @@ class SoftRobotVectorEnv(VectorEnv):
             "displacement": self._displacement.copy(),
             "effort": self._effort.copy(),
             "stable": present,
+            "uncertainty": self._uncertainty.copy(),
+            "trusted": self._trusted.copy(),
             "converged": self._converged.copy(),
         }
         info |= {f"_{name}": present for name in tuple(info)}

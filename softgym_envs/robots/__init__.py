@@ -17,6 +17,7 @@ ROBOTS: dict[str, str] = {
     "cable_trunk": "softgym_envs.robots.cable_trunk:CableTrunk",
     "sensorized_finger": "softgym_envs.robots.sensorized_finger:SensorizedFinger",
     "trunk": "softgym_envs.robots.stiff_flop:StiffFlop",
+    "contact_finger": "softgym_envs.robots.contact_finger:ContactFinger",
     "press_finger": "softgym_envs.robots.grippers:PressFinger",
     "two_finger_gripper": "softgym_envs.robots.grippers:TwoFingerGripper",
     "tetrapod": "softgym_envs.robots.tetrapod:Tetrapod",

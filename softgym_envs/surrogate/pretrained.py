@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 from softgym_envs.errors import WeightsError
 from softgym_envs.robots.robot import Robot
 from softgym_envs.surrogate.model import SurrogateModel, load_model
 
-__all__ = ["pretrained_folder", "pretrained_model"]
+__all__ = ["pretrained_folder", "pretrained_model", "shipped_robots"]
 
 _ROOT = Path(__file__).parent / "weights"
 
@@ -18,8 +20,13 @@ def pretrained_folder(robot: Robot) -> Path:
     return _ROOT / robot.variant
 
 
-def pretrained_model(robot: Robot, weights: str | Path | None = None) -> SurrogateModel:
+def pretrained_model(robot: Robot, weights: str | Path | None = None, members: int | None = None) -> SurrogateModel:
     """Return the model of a robot, from a folder or from the shipped weights.
+
+    Args:
+        robot: the robot.
+        weights: folder of weights; default the shipped ones.
+        members: how many members of the ensemble to use, fewer for speed; default all.
 
     Raises:
         WeightsError: if there are none, or they are damaged or for another robot.
@@ -28,4 +35,13 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None) -> Surroga
     if weights is None and not folder.is_dir():
         shipped = sorted(p.name for p in _ROOT.iterdir()) if _ROOT.is_dir() else []
         raise WeightsError(f"no weights ship for '{robot.variant}'; shipped: {', '.join(shipped) or 'none'}")
-    return load_model(folder, robot)
+    return load_model(folder, robot, members)
+
+
+def shipped_robots() -> dict[str, tuple[str, dict[str, Any]]]:
+    """Variants with shipped weights: the robot and the options they were trained for."""
+    found = {}
+    for card in sorted(_ROOT.glob("*/model.json")):
+        config = json.loads(card.read_text())["config"]
+        found[card.parent.name] = (config["robot"], config["robot_options"])
+    return found

@@ -10,7 +10,17 @@ from scipy.spatial.transform import Rotation
 
 from softgym_envs.mechanics import constraints
 from softgym_envs.mechanics.beams import Beam, Section
-from softgym_envs.mechanics.constraints import Bond, Cable, Cavity, Chamber, Constraint, EmbeddedPoints, Point, Servo
+from softgym_envs.mechanics.constraints import (
+    Bond,
+    Cable,
+    Cavity,
+    Chamber,
+    Constraint,
+    EmbeddedPoints,
+    Point,
+    Pose,
+    Servo,
+)
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
@@ -81,6 +91,14 @@ def make_servo(nodes, tetrahedra):
     return Servo("servo", 4, np.array([0.2, 1.0, 0.3]), nodes)
 
 
+def make_pose(nodes, tetrahedra):
+    return Pose("pose", 4, 1, nodes)
+
+
+def make_turn(nodes, tetrahedra):
+    return Pose("pose", 4, 5, nodes)
+
+
 FACTORIES = {
     "Bond": make_bond,
     "Cable": make_cable,
@@ -88,6 +106,8 @@ FACTORIES = {
     "Cavity of quadratic triangles": make_quadratic_cavity,
     "Chamber": make_chamber,
     "Point": make_point,
+    "Pose": make_pose,
+    "Pose of a turn": make_turn,
     "Servo": make_servo,
 }
 

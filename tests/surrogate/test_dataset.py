@@ -1,17 +1,282 @@
-"""Datasets: resumable, atomic, and honest about damage."""
+"""Datasets: reproducible states, resumable generation that loses and repeats nothing, honest about damage."""
 
 import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
+from hypothesis import given
+from hypothesis import strategies as st
 
-from softgym_envs.errors import DataError
+from softgym_envs.errors import DataError, DesignError, InfeasibleDesign
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate import dataset
 from softgym_envs.surrogate.dataset import COLUMNS, generate_dataset, load_dataset
-from softgym_envs.surrogate.sampling import SamplingPlan, sample_group
+from softgym_envs.surrogate.sampling import (
+    SEQUENCES,
+    SamplingPlan,
+    learned_variables,
+    path_order,
+    sample_group,
+    select_states,
+)
 
 PLAN = SamplingPlan(groups=4, states=3, sequence="halton", seed=5)
+
+
+def full(data, n):
+    """Compliance matrices from their stored upper triangles."""
+    W = np.zeros((len(data["rest"]), n, n))
+    W[:, *np.triu_indices(n)] = data["compliance"]
+    return W + np.triu(W, 1).swapaxes(1, 2)
+
+
+def equal(a, b):
+    return all(a[name].dtype == b[name].dtype and (a[name] == b[name]).all() for name in COLUMNS)
+
+
+# -- plans ------------------------------------------------------------------------------------------------------------
+
+
+def test_malformed_plans():
+    with pytest.raises(ValueError, match=r"'grid' is unknown; allowed: 'halton', 'sobol', 'latin', 'random'"):
+        SamplingPlan(1, 1, "grid")
+    with pytest.raises(ValueError, match="groups = 0"):
+        SamplingPlan(0, 1)
+    with pytest.raises(ValueError, match="states = 0"):
+        SamplingPlan(1, 0)
+    for margin in (-0.1, 1.5, float("nan")):
+        with pytest.raises(ValueError, match=r"margin = .* is out of bounds; allowed: \[0, 1\]"):
+            SamplingPlan(1, 1, margin=margin)
+
+
+@given(
+    sequence=st.sampled_from(SEQUENCES),
+    seed=st.integers(0, 2**32),
+    dimension=st.integers(0, 8),
+    total=st.integers(1, 70),
+    stream=st.integers(0, 3),
+    ends=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+)
+def test_points_lie_in_the_unit_box_and_parts_equal_the_whole(sequence, seed, dimension, total, stream, ends):
+    first, last = sorted(int(end * total) for end in ends)
+    plan = SamplingPlan(total, 1, sequence, seed)
+    whole = plan.unit_points(dimension, 0, total, total, stream)
+    assert whole.shape == (total, dimension)
+    assert ((whole >= 0) & (whole <= 1)).all()
+    if last > first:
+        part = SamplingPlan(total, 1, sequence, seed).unit_points(dimension, first, last - first, total, stream)
+        np.testing.assert_array_equal(part, whole[first:last])
+
+
+@pytest.mark.parametrize("sequence", SEQUENCES)
+def test_streams_and_seeds_differ(sequence):
+    points = [
+        SamplingPlan(8, 4, sequence, seed).unit_points(3, 0, 8, 8, stream) for seed in (3, 4) for stream in (0, 1)
+    ]
+    for k, a in enumerate(points):
+        for b in points[:k]:
+            assert (a != b).all(axis=1).any()
+
+
+def test_sequences_spread_evenly():
+    total = 64
+    for sequence, share in (("latin", 1.0), ("sobol", 1.0), ("halton", 0.7), ("random", 0.0)):
+        points = SamplingPlan(total, 1, sequence).unit_points(3, 0, total, total, 0)
+        for column in points.T:  # strata of equal width that hold a point
+            assert len(set((column * total).astype(int))) >= share * total
+
+
+def test_designs():
+    robot = make_robot("finger")
+    space = robot.design_space
+    assert learned_variables(robot) == ("length", "height", "joint_height", "poisson_ratio")
+    designs = SamplingPlan(6, 1).designs(robot, 0, 6)
+    for name, variable in space.variables.items():
+        values = np.array([design[name] for design in designs])
+        if name == robot.stiffness_variable:
+            assert (values == variable.baseline).all()
+        else:
+            assert len(set(values)) == 6 and values.min() >= variable.low and values.max() <= variable.high
+    assert SamplingPlan(6, 1).designs(robot, 4, 2) == designs[4:]
+    assert SamplingPlan(3, 1, vary=()).designs(robot, 0, 3) == [space.baseline] * 3
+
+    plan = SamplingPlan(
+        20, 1, vary=("length", "poisson_ratio"), design={"height": 0.021}, bounds={"length": (0.0395, 0.0400)}
+    )
+    designs = plan.designs(robot, 0, 20)
+    assert {design["height"] for design in designs} == {0.021}
+    assert {design["joint_height"] for design in designs} == {space["joint_height"].baseline}
+    lengths, ratios = (np.array([design[name] for design in designs]) for name in ("length", "poisson_ratio"))
+    assert 0.0395 <= lengths.min() < lengths.max() <= 0.0400
+    assert np.ptp(ratios) > 0.8 * (space["poisson_ratio"].high - space["poisson_ratio"].low)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"vary": ("width",)}, "unknown design variable 'width'; allowed: length, height"),
+        ({"bounds": {"width": (0.0, 1.0)}}, "unknown design variable 'width'"),
+        ({"design": {"width": 1.0}}, "width"),
+        ({"design": {"young_modulus": 1.0}}, "young_modulus"),
+        (
+            {"bounds": {"length": (0.030, 0.040)}},
+            r"bounds of 'length' = \[0.03, 0.04\] leave its own, \[0.038, 0.042\]",
+        ),
+        ({"bounds": {"length": (0.041, 0.040)}}, "bounds of 'length'"),
+        ({"bounds": {"length": (0.039, float("nan"))}}, "bounds of 'length'"),
+        ({"bounds": {"young_modulus": (1e6, 2e6)}}, "bounds of 'young_modulus', which is not drawn; drawn: length"),
+        ({"vary": (), "bounds": {"length": (0.039, 0.040)}}, "bounds of 'length', which is not drawn; drawn: none"),
+        ({"design": {"length": 0.039}}, "a value of 'length', which is drawn"),
+    ],
+)
+def test_plans_that_do_not_fit_the_robot(tmp_path, options, message):
+    plan = SamplingPlan(1, 1, **options)
+    with pytest.raises(DesignError, match=message):
+        plan.designs(make_robot("finger"), 0, 1)
+    with pytest.raises(DesignError, match=message):
+        generate_dataset(tmp_path / "data", "finger", plan, progress=False)
+    assert not (tmp_path / "data").exists()
+
+
+# -- paths and choices ------------------------------------------------------------------------------------------------
+
+
+def length(points, start):
+    return np.linalg.norm(np.diff(np.concatenate([[start], points]), axis=0), axis=1).sum()
+
+
+@given(seed=st.integers(0, 2**32), count=st.integers(1, 40), dimension=st.integers(1, 6))
+def test_paths_visit_all(seed, count, dimension):
+    rng = np.random.default_rng(seed)
+    points, start = rng.random((count, dimension)), rng.random(dimension)
+    order = path_order(points, start)
+    assert sorted(order) == list(range(count))
+    assert order[0] == ((points - start) ** 2).sum(axis=1).argmin()
+
+
+def test_paths_are_short(rng):
+    for count, dimension in ((12, 2), (30, 4), (100, 2)):
+        points = rng.random((count, dimension))
+        start = np.zeros(dimension)
+        assert length(points[path_order(points, start)], start) < 0.8 * length(points, start)
+
+
+def test_paths_among_equal_points():
+    assert sorted(path_order(np.zeros((4, 2)), np.zeros(2))) == [0, 1, 2, 3]
+    assert path_order(np.zeros((0, 2)), np.zeros(2)).tolist() == []
+
+
+def states_along(t):
+    """Made-up states of one actuator and one effector, whose condensed model moves with ``t`` alone."""
+    W = np.broadcast_to(np.eye(4), (len(t), 4, 4)).copy()
+    W[:, 0, 3] = W[:, 3, 0] = 0.5 * t
+    effector = np.stack([np.zeros_like(t), np.ones_like(t), t], axis=1)
+    compliance = W[:, *np.triu_indices(4)]
+    return {
+        "displacement": np.zeros((len(t), 1)),
+        "effort": np.zeros((len(t), 1)),
+        "effector": effector,
+        "compliance": compliance,
+    }
+
+
+@given(
+    seed=st.integers(0, 2**32),
+    rows=st.integers(1, 60),
+    share=st.floats(0, 1),
+    kinds=st.integers(1, 60),
+)
+def test_states_are_chosen_once(seed, rows, share, kinds):
+    """Also where many are the same."""
+    data = states_along(np.random.default_rng(seed).integers(0, kinds, rows) / kinds)
+    count = max(1, round(share * rows))
+    chosen = select_states(data, count, seed)
+    assert len(set(chosen)) == count and (np.diff(chosen) > 0).all()
+    assert chosen[0] >= 0 and chosen[-1] < rows
+    np.testing.assert_array_equal(select_states(data, count, seed), chosen)
+
+
+def test_choice_covers_better_than_chance(rng):
+    t = np.concatenate([0.02 * rng.random(380), rng.random(20)])  # a crowd, and a few that go far
+    data = states_along(t)
+
+    def uncovered(chosen):
+        return np.abs(t[:, None] - t[chosen]).min(axis=1).max()
+
+    by_chance = np.median([uncovered(rng.choice(len(t), 12, replace=False)) for _ in range(50)])
+    for seed in range(3):
+        assert uncovered(select_states(data, 12, seed)) < 0.5 * by_chance
+
+
+def test_choice_where_there_are_contacts():
+    data, _ = sample_group(make_robot("finger", contacts=True), SamplingPlan(1, 3, vary=()), 0)
+    assert data["compliance"].shape == (4, 14 * 15 // 2)
+    assert len(select_states(data, 2)) == 2
+
+
+def test_choice_out_of_range():
+    data = states_along(np.arange(5.0))
+    assert select_states(data, 5).tolist() == [0, 1, 2, 3, 4]
+    for count in (0, 6):
+        with pytest.raises(ValueError, match=f"count = {count} states cannot be chosen from 5; allowed: 1 to 5"):
+            select_states(data, count)
+
+
+# -- states -----------------------------------------------------------------------------------------------------------
+
+
+def test_margin_lets_slack_cables_push_but_not_beyond_their_commands():
+    robot = make_robot("finger")
+    span = robot.upper - robot.lower
+    results = {}
+    for margin in (0.0, 0.05, 1.0):
+        plan = SamplingPlan(1, 14, seed=2, margin=margin, vary=())
+        data, failed = sample_group(robot, plan, 0)
+        assert failed == 0
+        fractions = plan.unit_points(2, 0, 14, 14, 1)
+        order = path_order(fractions, -robot.lower / span)
+        results[margin] = data, robot.lower + fractions[order] * span
+    taut, commands = results[0.0]
+    reached = taut["displacement"][1:]
+    slack = reached > commands + 1e-5
+    assert slack.any() and not slack.all(axis=1).any()
+    np.testing.assert_allclose(reached[~slack], commands[~slack], atol=1e-8)
+    assert taut["effort"].min() > -1e-6
+    moved = {}
+    for margin in (0.05, 1.0):
+        data, again = results[margin]
+        np.testing.assert_array_equal(again, commands)
+        pulled = reached - data["displacement"][1:]
+        moved[margin] = (pulled > 1e-6).any(axis=1)
+        assert moved[margin].any() and not moved[margin].all()
+        # Only slack cables are pulled back: by no more than the margin, and never below their command.
+        np.testing.assert_allclose(pulled[~slack], 0.0, atol=1e-8)
+        assert (pulled <= margin * span + 1e-8).all()
+        assert (data["displacement"][1:] >= commands - 1e-8).all()
+        assert data["effort"][1:][moved[margin]].min() < 0.0
+        assert data["effort"][1:][~moved[margin]].min() > -1e-6
+    assert results[1.0][0]["effort"].min() < results[0.05][0]["effort"].min()
+
+
+def test_infeasible_designs_are_left_out(monkeypatch):
+    robot = make_robot("trunk")
+
+    def refuse(design):
+        raise InfeasibleDesign("cannot be built")
+
+    monkeypatch.setattr(robot, "build", refuse)
+    assert sample_group(robot, PLAN, 0) == (None, PLAN.states)
+
+
+# -- datasets ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -20,17 +285,25 @@ def made(tmp_path_factory):
     return folder, generate_dataset(folder, "finger", PLAN, groups_per_shard=2, progress=False)
 
 
+@pytest.fixture(scope="module")
+def trunk(tmp_path_factory):
+    """A dataset of three shards that is quickly made."""
+    folder = tmp_path_factory.mktemp("trunk")
+    return folder, generate_dataset(folder, "trunk", PLAN, groups_per_shard=2, progress=False)
+
+
+@pytest.fixture
+def copied(trunk, tmp_path):
+    shutil.copytree(trunk[0], tmp_path / "data")
+    return tmp_path / "data"
+
+
 def test_columns_are_states_of_the_fem(made):
     _, data = made
     robot = make_robot("finger")
     assert set(data) == set(COLUMNS)
     assert data["rest"].sum() == 4 and len(data["rest"]) == 16
-    n = 5
-    for row in range(len(data["rest"])):
-        W = np.zeros((n, n))
-        W[np.triu_indices(n)] = data["compliance"][row]
-        W = W + np.triu(W, 1).T
-        assert np.linalg.eigvalsh(W)[0] > 0
+    assert (np.linalg.eigvalsh(full(data, 5))[:, 0] > 0).all()
     rest = data["rest"]
     assert np.abs(data["effort"][rest]).max() == 0.0
     assert np.abs(data["displacement"][rest]).max() < 1e-12
@@ -39,84 +312,297 @@ def test_columns_are_states_of_the_fem(made):
         assert (column >= low).all() and (column <= high).all()
 
 
-def test_finished_shards_are_kept_and_damaged_ones_made_again(made, capsys):
+def test_manifest_and_card(made):
     folder, data = made
-    first, second = folder / "shard_00000.npz", folder / "shard_00001.npz"
-    stamp = first.stat().st_mtime_ns
-    content = second.read_bytes()
-    second.write_bytes(content[: len(content) // 2])  # truncated
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["columns"]["displacement"] == ["cable_1", "cable_2"]
+    assert manifest["plan"]["sequence"] == "halton"
+    card = (folder / "README.md").read_text()
+    assert card.startswith("# States of robot `finger`\n\n16 equilibria of 4 bodies, by `softgym dataset`")
+    assert "0 bodies could not be built or have no rest, 0 commands have no equilibrium" in card
+    column = data["effector"][:, 1]
+    assert f"| effector: tip y | 16 | {column.min():.6g} | {column.max():.6g} |" in card
+    for label in ("design: joint_height", "displacement: cable_2", "effort: cable_1", "compliance: upper triangle"):
+        assert f"| {label}" in card
+
+
+def test_a_finished_dataset_is_only_read(copied, trunk, monkeypatch):
+    """So that trainings may share it, even while one of them has come first and looks it through."""
+    before = {path.name: path.stat().st_mtime_ns for path in copied.iterdir()}
+    with FileLock(copied / ".lock"):
+        again = generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
+        assert equal(again, trunk[1])
+        assert {path.name for path in copied.iterdir()} == set(before)
+    assert {path.name: path.stat().st_mtime_ns for path in copied.glob("[!.]*")} == {
+        name: stamp for name, stamp in before.items() if name[0] != "."
+    }
+
+
+def test_a_card_that_is_missing_is_written(copied, trunk):
+    card = copied / "README.md"
+    content = card.read_text()
+    card.unlink()
+    generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
+    assert card.read_text() == content == (trunk[0] / "README.md").read_text()
+
+
+def test_two_runs_at_once_are_refused(copied):
+    (copied / "shard_00001.npz").unlink()
+    with (
+        FileLock(copied / ".lock"),
+        pytest.raises(DataError, match=r"data' is being generated by another process; wait for it or use a new folder"),
+    ):
+        generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
+    assert not (copied / "shard_00001.npz").exists()
+    generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
+
+
+def test_what_killed_writers_left_is_cleared_away(copied, trunk):
+    (copied / "shard_00001.npz").unlink()
+    for name in (".shard_00001.npz.a1b2c3", ".README.md.x", ".manifest.json.y"):
+        (copied / name).write_bytes(b"PK\x03\x04")
+    (copied / ".mine").write_text("something else")
+    again = generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
+    assert equal(again, trunk[1])
+    assert {path.name for path in copied.iterdir()} == {
+        *(".lock", ".mine", "README.md", "manifest.json"),
+        *(f"shard_{k:05d}.npz" for k in range(2)),
+    }
+
+
+def rewritten(change):
+    def damage(path):
+        with np.load(path) as stored:
+            columns = dict(stored)
+        change(columns)
+        np.savez_compressed(path, **columns)
+
+    return damage
+
+
+def set_nan(columns):
+    columns["effort"][1, 0] = np.nan
+
+
+DAMAGES = {
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "empty": lambda path: path.write_bytes(b""),
+    "noise": lambda path: path.write_bytes(bytes(range(256)) * 20),
+    "flipped bits": lambda path: path.write_bytes(
+        bytes(255 - b if 300 < k < 320 else b for k, b in enumerate(path.read_bytes()))
+    ),
+    "folder": lambda path: (path.unlink(), path.mkdir()),
+    "not finite": rewritten(set_nan),
+    "column missing": rewritten(lambda columns: columns.pop("compliance")),
+    "column shorter": rewritten(lambda columns: columns.update(effector=columns["effector"][:-1])),
+    "column narrower": rewritten(lambda columns: columns.update(effector=columns["effector"][:, :-1])),
+    "column flat": rewritten(lambda columns: columns.update(compliance=columns["compliance"][:, 0])),
+    "column of one number": rewritten(lambda columns: columns.update(rest=np.float64(1.0))),
+    "column of words": rewritten(lambda columns: columns.update(rest=np.array(["rest"] * len(columns["rest"])))),
+    "column of objects": rewritten(lambda columns: columns.update(rest=columns["rest"].astype(object))),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_damaged_shards_are_named_set_aside_and_made_again(copied, trunk, damage, capsys):
+    first, second = copied / "shard_00000.npz", copied / "shard_00001.npz"
+    stamp, content = first.stat().st_mtime_ns, second.read_bytes()
+    damage(second)
     with pytest.raises(DataError, match="shard_00001"):
-        load_dataset(folder)
-    again = generate_dataset(folder, "finger", PLAN, groups_per_shard=2, progress=False)
-    assert "shard_00001" in capsys.readouterr().out
-    assert (folder / "shard_00001.corrupt").exists()
+        load_dataset(copied)
+    again = generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
+    said = capsys.readouterr().out
+    assert "shard_00001.npz" in said and "set aside as 'shard_00001.corrupt' and made again" in said
+    assert (copied / "shard_00001.corrupt").exists()
     assert first.stat().st_mtime_ns == stamp
-    for name in COLUMNS:
-        assert (again[name] == data[name]).all()
+    assert second.read_bytes() == content  # a shard has the same bytes whenever it is made
+    assert equal(again, trunk[1])
 
 
-def test_interruption_loses_no_finished_shard(tmp_path, monkeypatch, made):
-    """A crash in the second shard leaves the first, and no half-written file."""
-    calls = []
+def test_another_plan_does_not_mix(copied):
+    for options, name in (
+        ({"groups_per_shard": 3}, "groups_per_shard"),
+        ({"robot_options": {"elements": 9}}, "robot_"),
+    ):
+        with pytest.raises(DataError, match=f"holds another dataset .different: {name}"):
+            generate_dataset(copied, "trunk", PLAN, **{"groups_per_shard": 2, "progress": False, **options})
+    with pytest.raises(DataError, match=r"different: plan\)"):
+        generate_dataset(copied, "trunk", SamplingPlan(4, 3, "halton", 6), groups_per_shard=2, progress=False)
+    with pytest.raises(DataError, match="different: .*robot"):
+        generate_dataset(copied, "finger", PLAN, groups_per_shard=2, progress=False)
+
+
+@pytest.mark.parametrize("text", ['{"format": 2, "pl', "[]", '{"format": 1}', '{"format": 2, "plan": {}}'])
+def test_broken_manifest(copied, text):
+    (copied / "manifest.json").write_text(text)
+    with pytest.raises(DataError, match=r"manifest\.json"):
+        load_dataset(copied)
+    with pytest.raises(DataError, match=r"manifest\.json|different"):
+        generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
+
+
+def test_no_manifest(tmp_path):
+    with pytest.raises(DataError, match="manifest"):
+        load_dataset(tmp_path / "nowhere")
+
+
+def test_infeasible_designs_are_counted(tmp_path, monkeypatch, trunk):
     original = dataset.sample_group
 
     def sample(robot, plan, group):
-        calls.append(group)
+        return original(robot, plan, group) if group == 1 else (None, plan.states)
+
+    monkeypatch.setattr(dataset, "sample_group", sample)
+    data = generate_dataset(tmp_path / "one", "trunk", PLAN, groups_per_shard=2, progress=False)  # none of the second
+    assert data["rest"].sum() == 1
+    np.testing.assert_array_equal(data["effector"], trunk[1]["effector"][4:8])
+    card = (tmp_path / "one" / "README.md").read_text()
+    assert "4 equilibria of 1 bodies" in card and "3 bodies could not be built" in card
+    monkeypatch.setattr(dataset, "sample_group", lambda robot, plan, group: (None, plan.states))
+    with pytest.raises(DataError, match="no design of dataset '.*none' is feasible"):
+        generate_dataset(tmp_path / "none", "trunk", PLAN, groups_per_shard=2, progress=False)
+
+
+def test_two_workers_make_the_same_data(tmp_path, made):
+    data = generate_dataset(tmp_path, "finger", PLAN, groups_per_shard=2, workers=2, progress=False)
+    assert equal(data, made[1])
+    for shard in tmp_path.glob("shard_*"):
+        assert shard.read_bytes() == (made[0] / shard.name).read_bytes()
+
+
+def test_ray_makes_the_same_data(tmp_path, trunk):
+    pytest.importorskip("ray")
+    data = generate_dataset(tmp_path, "trunk", PLAN, groups_per_shard=2, workers=2, executor="ray", progress=False)
+    assert equal(data, trunk[1])
+    for shard in tmp_path.glob("shard_*"):
+        assert shard.read_bytes() == (trunk[0] / shard.name).read_bytes()
+
+
+def test_unknown_executor(tmp_path):
+    with pytest.raises(ValueError, match="executor = 'threads' is unknown"):
+        generate_dataset(tmp_path, "trunk", PLAN, executor="threads", progress=False)
+
+
+# -- runs that are stopped --------------------------------------------------------------------------------------------
+
+
+def test_interruption_loses_no_finished_shard(tmp_path, monkeypatch, trunk):
+    """An interruption in the second shard leaves the first, and no half-written file."""
+    original = dataset.sample_group
+
+    def sample(robot, plan, group):
         if group == 3:
             raise KeyboardInterrupt
         return original(robot, plan, group)
 
     monkeypatch.setattr(dataset, "sample_group", sample)
     with pytest.raises(KeyboardInterrupt):
-        generate_dataset(tmp_path, "finger", PLAN, groups_per_shard=2, progress=False)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["manifest.json", "shard_00000.npz"]
+        generate_dataset(tmp_path, "trunk", PLAN, groups_per_shard=2, progress=False)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", "manifest.json", "shard_00000.npz"]
     monkeypatch.setattr(dataset, "sample_group", original)
-    data = generate_dataset(tmp_path, "finger", PLAN, groups_per_shard=2, progress=False)
-    assert (data["effector"] == made[1]["effector"]).all()
+    assert equal(generate_dataset(tmp_path, "trunk", PLAN, groups_per_shard=2, progress=False), trunk[1])
 
 
-def test_two_workers_make_the_same_data(tmp_path, made):
-    data = generate_dataset(tmp_path, "finger", PLAN, groups_per_shard=2, workers=2, progress=False)
-    for name in COLUMNS:
-        assert (data[name] == made[1][name]).all()
+LONG = SamplingPlan(groups=160, states=2, sequence="random", seed=1)
+
+# What starts the runs: each in its own session, without the seconds that imports take.
+STARTER = f"""
+import os, sys
+import joblib.externals.loky.backend.resource_tracker
+from softgym_envs.surrogate.dataset import generate_dataset
+from softgym_envs.surrogate.sampling import SamplingPlan
+
+for folder in sys.stdin:
+    process = os.fork()
+    if process == 0:
+        os.setsid()
+        print(os.getpid(), flush=True)
+        generate_dataset(folder.strip(), "trunk", {LONG!r}, groups_per_shard=1, workers=2, progress=False)
+        os._exit(0)
+"""
 
 
-def test_another_plan_does_not_mix(made):
-    folder, _ = made
-    with pytest.raises(DataError, match="plan"):
-        generate_dataset(folder, "finger", SamplingPlan(4, 3, "halton", 6), groups_per_shard=2, progress=False)
-    manifest = json.loads((folder / "manifest.json").read_text())
-    assert manifest["columns"]["displacement"] == ["cable_1", "cable_2"]
+def alive(session):
+    """Processes of a session that are not yet dead."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            state = (folder / "stat").read_text().rsplit(")", 1)[1].split()[0]
+            if state not in "ZX" and os.getsid(int(folder.name)) == session:
+                found.append(int(folder.name))
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    return found
 
 
-def test_broken_manifest(tmp_path):
-    (tmp_path / "manifest.json").write_text('{"format": 1, "pl')
-    with pytest.raises(DataError, match=r"manifest\.json"):
-        load_dataset(tmp_path)
-    with pytest.raises(DataError, match="manifest"):
-        load_dataset(tmp_path / "nowhere")
+def wait(condition, seconds=300.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "took too long"
+        time.sleep(0.002)
 
 
-def test_plans():
-    with pytest.raises(ValueError, match=r"sobol.*halton"):
-        SamplingPlan(1, 1, "sobol")
-    with pytest.raises(ValueError, match="groups = 0"):
-        SamplingPlan(0, 1)
-    for sequence in ("halton", "random"):
-        plan = SamplingPlan(8, 4, sequence, 3)
-        whole = plan.unit_points(3, 0, 8, 0)
-        assert whole.min() >= 0 and whole.max() < 1
-        assert (plan.unit_points(3, 5, 2, 0) == whole[5:7]).all()
-        assert (plan.unit_points(3, 0, 8, 1) != whole).any()
+def test_ten_kills_lose_no_finished_shard_and_repeat_none(tmp_path, rng):
+    """kill -9 of the run alone or with its workers, as it starts or anywhere among its shards; then another run."""
+    folder = tmp_path / "data"
 
+    def shards():
+        """Name -> i-node, time and bytes, of what counts as finished."""
+        return {p.name: (p.stat().st_ino, p.stat().st_mtime_ns, p.read_bytes()) for p in folder.glob("shard_*")}
 
-def test_infeasible_designs_are_left_out(monkeypatch):
-    from softgym_envs.errors import InfeasibleDesign
+    finished, sessions, survivors, gained = {}, [], 0, []
+    with subprocess.Popen(
+        [sys.executable, "-c", STARTER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as starter:
+        try:
 
-    robot = make_robot("finger")
+            def start():
+                starter.stdin.write(f"{folder}\n".encode())
+                starter.stdin.flush()
+                sessions.append(int(starter.stdout.readline()))
+                return sessions[-1]
 
-    def refuse(design):
-        raise InfeasibleDesign("cannot be meshed")
+            for number in range(10):
+                session = start()
+                before = len(finished)
+                if number % 5 == 4:  # anywhere before the first shard
+                    time.sleep(rng.uniform(0.0, 1.0))
+                else:
+                    goal = before + int(rng.integers(1, 7))
+                    wait(lambda goal=goal: sum(1 for _ in folder.glob("shard_*")) >= goal)
+                    time.sleep(rng.uniform(0.0, 0.03))
+                if number % 2:
+                    os.killpg(session, signal.SIGKILL)
+                else:
+                    os.kill(session, signal.SIGKILL)
+                    survivors += len(alive(session)) > 0
+                    if number % 4:  # the next run starts while orphans are still at their shards
+                        wait(lambda session=session: not alive(session), 20.0)
+                now = shards()
+                assert now.items() >= finished.items()
+                gained.append(len(now) - before)
+                finished = now
+            assert survivors >= 3  # there were orphans to look after
+            assert sum(n > 0 for n in gained) >= 8 and len(finished) < LONG.groups, gained
 
-    monkeypatch.setattr(robot, "build", refuse)
-    assert sample_group(robot, PLAN, 0) is None
+            start()
+            wait(lambda: (folder / "README.md").exists())
+            wait(lambda: not any(alive(session) for session in sessions), 20.0)
+        finally:
+            starter.stdin.close()
+            for session in sessions:
+                for process in alive(session):
+                    os.kill(process, signal.SIGKILL)
+                # A killed group has nobody left to clear its semaphores away.
+                for left in Path("/dev/shm").glob(f"*[-_]{session}[-_]*"):
+                    shutil.rmtree(left) if left.is_dir() else left.unlink()
+
+    # Nothing is lost, repeated, left lying or different from a run that nobody stopped.
+    final = shards()
+    assert final.items() >= finished.items()
+    assert {path.name for path in folder.iterdir()} == {".lock", "README.md", "manifest.json", *final}
+    whole = tmp_path / "whole"
+    data = generate_dataset(whole, "trunk", LONG, groups_per_shard=1, progress=False)
+    assert {p.name: p.read_bytes() for p in whole.glob("shard_*")} == {name: s[2] for name, s in final.items()}
+    assert equal(load_dataset(folder), data)
+    assert (folder / "README.md").read_text() == (whole / "README.md").read_text()

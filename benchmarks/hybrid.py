@@ -1,0 +1,187 @@
+"""Learning online: a surrogate that knows a quarter of what the task asks, with finite elements at hand."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+
+from softgym_envs.robots.robot import Robot
+
+#: The surrogate knows the cables up to here [m], of 20 mm.
+KNOWN = 10e-3
+EPISODES = 40
+#: An error above this should have been flagged [m].
+BAD = 1e-3
+
+
+def sample(robot: Robot, states: int, seed: int, *, limit: float, sequence: str = "random") -> dict[str, np.ndarray]:
+    """Equilibria of the baseline body, its actuators commanded up to ``limit``."""
+    from softgym_envs.surrogate.sampling import SamplingPlan, sample_group
+
+    full = robot.actuators
+    robot.actuators = tuple(replace(actuator, high=limit) for actuator in full)
+    try:
+        data, _ = sample_group(robot, SamplingPlan(1, states, sequence, seed, vary=()), 0)
+    finally:
+        robot.actuators = full
+    assert data is not None
+    return data
+
+
+def make_weights(
+    folder: Path,
+    robot: Robot,
+    *,
+    limit: float = KNOWN,
+    states: int = 300,
+    members: int = 5,
+    width: int = 48,
+    steps: int = 1500,
+) -> None:
+    """Train a surrogate of the baseline body that knows displacements up to ``limit``, and write its weights."""
+    from softgym_envs.surrogate.model import FORMAT, Features
+    from softgym_envs.surrogate.networks import potential
+    from softgym_envs.surrogate.online import save_model
+    from softgym_envs.surrogate.sampling import learned_variables
+    from softgym_envs.surrogate.states import training_states
+    from softgym_envs.surrogate.training import Trainer, domain_of
+
+    training = sample(robot, states, 0, limit=limit, sequence="halton")
+    validation = sample(robot, max(states // 3, 20), 1, limit=limit)
+    card = {
+        "format": FORMAT,
+        "network": "potential",
+        "robot": robot.name,
+        "signature": robot.signature,
+        "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
+        "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
+    }
+    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
+    options = potential.Options(width=width, body_width=width // 2, members=members, steps=steps, batch_size=128)
+    tensors, _ = potential.train(
+        robot,
+        training_states(robot, training, features),
+        training_states(robot, validation, features),
+        Trainer(options, seed=0),
+    )
+    model = potential.Model(robot, tensors, card)
+    save_model(potential.Model(robot, tensors, {**card, "domain": domain_of(model, training, validation)}), folder)
+
+
+def flagging(model, data: dict[str, np.ndarray], limit: float) -> dict[str, object]:
+    """Which errors above 1 mm a model flags outside the box ``limit``, and what it flags in vain inside."""
+    context = model.context(data["design"])
+    _, effector, spread = model.state(context, data["displacement"])
+    uncertainty, trusted = model.trust(context, data["displacement"], spread)
+    error = np.linalg.norm(effector - data["effector"], axis=1)
+    outside = (data["displacement"] > 1.01 * limit).any(axis=1)
+    bad, fine = outside & (error > BAD), ~outside & (error <= BAD)
+    bound = model.card["domain"]["limit"]
+
+    def share(flags: np.ndarray, rows: np.ndarray) -> float | str:
+        return float(flags[rows].mean()) if rows.any() else "none there"
+
+    return {
+        "states outside with an error above 1 mm": int(bad.sum()),
+        "of these flagged by the spread alone": share(uncertainty > bound, bad),
+        "of these flagged by spread and domain": share(~trusted, bad),
+        "states inside": int(fine.sum()),
+        "false alarms of the spread inside": share(uncertainty > bound, fine),
+        "false alarms of spread and domain inside": share(~trusted, fine),
+        "share trusted outside": share(trusted, outside),
+        "largest error of a trusted state [mm]": 1e3 * float(error[trusted].max(initial=0.0)),
+    }
+
+
+def _follow(env: gymnasium.Env, goals: np.ndarray) -> list[np.ndarray]:
+    """Run the inverse QP to each goal; returns the last command of each episode."""
+    from agents.evaluation import make_agent
+
+    act, last = make_agent("qp"), []
+    for goal in goals:
+        observation, _ = env.reset(seed=0, options={"goal": goal})
+        ended = False
+        while not ended:
+            observation, _, terminated, truncated, _ = env.step(act(observation, env.unwrapped))
+            ended = terminated or truncated
+        last.append(env.unwrapped.state.command.copy())  # type: ignore[attr-defined]
+    return last
+
+
+def hybrid() -> dict[str, object]:
+    """FingerReach beyond what the surrogate was trained on: FEM calls of the hybrid backend, errors, flagged states.
+
+    The surrogate knows two cables of the baseline finger up to 10 mm; the goals need 10 to 20 mm of both. The inverse
+    QP goes to 40 of them on the hybrid backend, which learns between episodes, and on the finite elements.
+    """
+    import softgym_envs  # noqa: F401 - registers the IDs
+    from softgym_envs.backends.fem import FEMBackend
+    from softgym_envs.robots import make_robot
+    from softgym_envs.surrogate.model import load_model
+
+    robot = make_robot("finger")
+    reference = FEMBackend(robot)
+    rng = np.random.default_rng(0)
+    goals = np.stack([reference.probe(c).effector[0] for c in rng.uniform(KNOWN, robot.upper, (EPISODES, 2))])
+    result: dict[str, object] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        start = time.perf_counter()
+        make_weights(folder / "weights", robot)
+        result["first training, with its data [s]"] = time.perf_counter() - start
+        env = gymnasium.make(
+            "SoftGym/FingerReach-v0",
+            backend="hybrid",
+            backend_options={"weights": str(folder / "weights"), "retrain_after": 25},
+        )
+        backend = env.unwrapped.backend  # type: ignore[attr-defined]
+        calls = []
+        commands = []
+        for goal in goals:
+            before = backend.fem_calls
+            commands += _follow(env, goal[None])
+            calls.append(backend.fem_calls - before)
+        env.close()
+        given, learned = load_model(folder / "weights", robot), backend.model
+    fem = gymnasium.make("SoftGym/FingerReach-v0", backend="fem")
+    exact = _follow(fem, goals)
+    fem.close()
+    distances, reached = (
+        np.array([np.linalg.norm(reference.probe(c).effector[0] - g) for c, g in zip(found, goals, strict=True)])
+        for found in (commands, exact)
+    )
+    steps = backend.calls
+    result |= {
+        "episodes": EPISODES,
+        "states asked for": steps,
+        "FEM calls of the hybrid backend": backend.fem_calls,
+        "FEM calls, share of those on FEM alone": backend.fem_calls / steps,
+        "states from the condensed model of an FEM state beside them": backend.tangent_calls,
+        "FEM calls by ten episodes": ", ".join(str(sum(calls[k : k + 10])) for k in range(0, EPISODES, 10)),
+        "retrainings": backend.retrainings,
+        "time of one retraining [s]": backend.retraining_seconds / max(backend.retrainings, 1),
+        "distance to the goal at the end, judged by FEM: hybrid, mean [mm]": 1e3 * float(distances.mean()),
+        "distance to the goal at the end, judged by FEM: hybrid, worst [mm]": 1e3 * float(distances.max()),
+        "distance to the goal at the end: FEM alone, mean [mm]": 1e3 * float(reached.mean()),
+        "distance to the goal at the end: FEM alone, worst [mm]": 1e3 * float(reached.max()),
+    }
+    data = sample(robot, 600, 3, limit=float(robot.upper[0]))
+    inner = sample(robot, 200, 2, limit=KNOWN)
+    data = {k: np.concatenate([data[k], inner[k]]) for k in data}
+    for label, model in (
+        ("given weights, their own limit", given),
+        ("given weights, limit of the backend", backend.original),
+        ("after learning", learned),
+    ):
+        result |= {f"{label}: {k}": v for k, v in flagging(model, data, KNOWN).items()}
+    return result
+
+
+if __name__ == "__main__":
+    for key, value in hybrid().items():
+        print(f"{key:75s} {value:.6g}" if isinstance(value, float) else f"{key:75s} {value}")

@@ -1,0 +1,206 @@
+"""Networks compared on the same data: error against the number of FEM states, three seeds each.
+
+    python -m benchmarks.networks results/networks
+
+makes the data (one body each: the Soft Finger with two cables and the Diamond, as in thesis 4.3.1), trains every
+network on parts of it, and writes one JSON per run; it resumes where it was stopped. The runs this repository keeps are
+in ``benchmarks/data/networks.json``; ``softgym bench networks`` shows them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["networks", "standardised_loss"]
+
+KEPT = Path(__file__).parent / "data" / "networks.json"
+
+CASES: dict[str, dict[str, Any]] = {
+    "finger": {"robot": "finger", "robot_options": {"cables": 2}, "groups": 130, "margin": 0.1},
+    "diamond": {"robot": "diamond", "robot_options": {}, "groups": 32, "margin": 1.0},
+}
+"""Bodies; 50 states in each group. The Diamond's circle needs cables that push, so they are in its data."""
+
+NETWORKS: dict[str, dict[str, Any]] = {
+    "potential": {"kind": "potential", "members": 1, "steps": 4000, "batch_size": 128},
+    "residual": {"kind": "residual", "steps": 4000, "batch_size": 128},
+    "thesis": {"kind": "thesis", "steps": 4000, "batch_size": 128},
+    "rbf": {"kind": "rbf"},
+    "potential x 5": {"kind": "potential", "members": 5, "steps": 4000, "batch_size": 128},
+}
+SIZES = (50, 200, 800, 1600, 6400)
+SEEDS = (0, 1, 2)
+
+
+def standardised_loss(model: Any, training: dict[str, np.ndarray], test: dict[str, np.ndarray]) -> float:
+    """The test loss of the thesis: mean squared error of all entries of W and delta_free, in units of their spread."""
+    from softgym_envs.surrogate.states import full_compliance
+
+    rows, columns = np.triu_indices(model.size)
+
+    def outputs(W, effort, displacement, effector):
+        full = np.concatenate([effort, np.zeros_like(effector)], axis=1)
+        delta = np.concatenate([displacement, effector], axis=1)
+        return np.concatenate([W[:, rows, columns], delta - np.einsum("bij,bj->bi", W, full)], axis=1)
+
+    def truth(data):
+        W = full_compliance(data["compliance"], model.size)
+        return outputs(W, data["effort"], data["displacement"], data["effector"])
+
+    context = model.context(test["design"])
+    effort, effector, _ = model.state(context, test["displacement"])
+    predicted = outputs(model.compliance(context, test["displacement"]), effort, test["displacement"], effector)
+    spread = truth(training).std(axis=0)
+    varies = spread > 1e-9 * np.abs(truth(training)).max(axis=0)
+    return float((((predicted - truth(test))[:, varies] / spread[varies]) ** 2).mean())
+
+
+def _data(folder: Path, case: str) -> dict[str, dict[str, np.ndarray]]:
+    from softgym_envs.surrogate.dataset import generate_dataset
+    from softgym_envs.surrogate.sampling import SamplingPlan
+
+    given = CASES[case]
+    plans = {
+        "train": SamplingPlan(given["groups"], 50, "halton", 0, given["margin"], vary=()),
+        "validation": SamplingPlan(4, 50, "random", 1, given["margin"], vary=()),
+        "test": SamplingPlan(10, 50, "random", 2, given["margin"], vary=()),
+    }
+    return {
+        split: generate_dataset(
+            folder / case / split, given["robot"], plan, robot_options=given["robot_options"], groups_per_shard=2
+        )
+        for split, plan in plans.items()
+    }
+
+
+def _run(case: str, name: str, data: dict[str, dict[str, np.ndarray]], size: int, seed: int) -> dict[str, Any]:
+    import torch
+
+    from softgym_envs.robots import make_robot
+    from softgym_envs.surrogate.model import Features
+    from softgym_envs.surrogate.networks import network_module
+    from softgym_envs.surrogate.sampling import learned_variables
+    from softgym_envs.surrogate.states import training_states
+    from softgym_envs.surrogate.training import Trainer, test_errors
+
+    torch.set_num_threads(1)
+    robot = make_robot(CASES[case]["robot"], **CASES[case]["robot_options"])
+    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
+    # One rest state and ``size`` others, drawn anew for each seed.
+    others = np.flatnonzero(~data["train"]["rest"].astype(bool))
+    chosen = np.concatenate([[0], np.random.default_rng(seed).permutation(others)[:size]])
+    part = {k: v[chosen] for k, v in data["train"].items()}
+    module = network_module(NETWORKS[name]["kind"])
+    start = time.process_time()
+    tensors, _ = module.train(
+        robot,
+        training_states(robot, part, features),
+        training_states(robot, data["validation"], features),
+        Trainer(module.Options(**NETWORKS[name]), seed),
+    )
+    seconds = time.process_time() - start
+    model = module.Model(robot, tensors, {})
+    errors = test_errors(model, data["test"])
+    one = model.context(data["test"]["design"][:1])
+    row = data["test"]["displacement"][:1]
+    model.state(one, row)
+    laps = []
+    for _ in range(200):
+        start = time.perf_counter()
+        model.state(one, row)
+        laps.append(time.perf_counter() - start)
+    return {
+        "case": case,
+        "network": name,
+        "states": int(size),
+        "seed": seed,
+        "loss": standardised_loss(model, data["train"], data["test"]),
+        "training_cpu_seconds": seconds,
+        "microseconds_per_state": 1e6 * float(np.median(laps)),
+        "tensors": int(sum(v.size for v in tensors.values())),
+        **errors,
+    }
+
+
+def main(folder: Path) -> None:
+    """Make what is missing, and write all runs to ``benchmarks/data/networks.json``."""
+    from softgym_envs.config import provenance
+    from softgym_envs.storage import write_json
+
+    runs = []
+    for case in CASES:
+        data = _data(folder / "data", case)
+        available = int((~data["train"]["rest"].astype(bool)).sum())
+        for name in NETWORKS:
+            for size in SIZES:
+                for seed in SEEDS if "x 5" not in name else SEEDS[:1]:
+                    if size > available or ("x 5" in name and size not in (200, 1600)):
+                        continue
+                    path = folder / "runs" / f"{case}_{name.replace(' ', '')}_{size}_{seed}.json"
+                    if not path.exists():
+                        write_json(path, _run(case, name, data, size, seed))
+                    runs.append(json.loads(path.read_text()))
+                    last = runs[-1]
+                    print(
+                        f"{case:8s} {name:14s} {size:5d} states, seed {seed}: "
+                        f"effector {1e3 * last['effector_mean']:.4f} mm, loss {last['loss']:.2e}",
+                        flush=True,
+                    )
+    write_json(KEPT, {**provenance(), "runs": runs})
+
+
+def networks() -> dict[str, object]:
+    """Test errors of the networks by number of states: median of three seeds (smallest to largest)."""
+    runs = json.loads(KEPT.read_text())["runs"]
+    result: dict[str, object] = {}
+    for case in CASES:
+        for name in NETWORKS:
+            for size in SIZES:
+                found = [r for r in runs if (r["case"], r["network"], r["states"]) == (case, name, size)]
+                if not found:
+                    continue
+                key = f"{case}, {name}, {size} states"
+                for label, column, unit in (
+                    ("effector error, mean [mm]", "effector_mean", 1e3),
+                    ("loss as in the thesis", "loss", 1.0),
+                    ("W error, median [%]", "compliance_median", 1e2),
+                ):
+                    values = sorted(unit * r[column] for r in found)
+                    result[f"{key}: {label}"] = (
+                        f"{np.median(values):.3g} ({values[0]:.3g} to {values[-1]:.3g})"
+                        if len(values) > 1
+                        else f"{values[0]:.3g}"
+                    )
+                result[f"{key}: training [CPU s]"] = float(np.median([r["training_cpu_seconds"] for r in found]))
+        result |= _factor(case, [r for r in runs if r["case"] == case])
+    return result
+
+
+def _factor(case: str, runs: list[dict[str, Any]]) -> dict[str, object]:
+    """How many times fewer states the potential network needs for the best error the thesis' network reaches."""
+
+    def curve(name):
+        sizes = sorted({r["states"] for r in runs if r["network"] == name})
+        return sizes, [
+            np.median([r["effector_mean"] for r in runs if (r["network"], r["states"]) == (name, s)]) for s in sizes
+        ]
+
+    sizes, errors = curve("thesis")
+    best = int(np.argmin(errors))
+    ours, reached = curve("potential")
+    enough = [s for s, e in zip(ours, reached, strict=True) if e <= errors[best]]
+    if not enough:
+        return {f"{case}: states of the potential network for the thesis network's best error": "not reached"}
+    return {
+        f"{case}: times fewer states for the thesis network's best error (at {sizes[best]})": sizes[best] / enough[0]
+    }
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "results/networks"))

@@ -1,0 +1,91 @@
+"""One finger and the pose of whatever its contact points are tied to: the part that grippers are made of.
+
+A finger that holds a rigid object (thesis 4.3.2) knows of it only where its three contact points are, and they keep
+their triangle. So eight numbers say all: the shortening of its two cables, and the pose of that triangle. Driven in
+all of them, the finger's energy is a function of eight coordinates whose derivatives are the tensions of the cables
+and the wrench that the object exerts. A gripper of any number of turned and moved copies is the sum of such functions
+(`softgym_envs.control.fingers`): one learned model serves every finger of every gripper, by symmetry.
+
+That energy is not convex. A finger that is pulled and pushed would buckle if its cables and pose were free to give way,
+though held, or in a gripper, it is stable: of the fingers of the three-finger gripper under random commands two thirds
+have a ``W`` between actuators that is not positive definite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from softgym_envs.mechanics.constraints import Point, Pose
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.grippers import STRAIGHT, FingerRobot
+from softgym_envs.robots.robot import Actuator
+
+__all__ = ["ContactFinger"]
+
+
+class ContactFinger(FingerRobot):
+    """A two-cable finger whose three contact points are tied to a frame that is driven in all six directions.
+
+    The actuators are the two cables, then the displacement x, y, z [m] of the frame's origin from rest and its turn
+    rx, ry, rz, the components of ``sin(angle) * axis`` [1]; see `softgym_envs.mechanics.constraints.Pose`. Their
+    ranges hold 99 % of what the block of the three-finger gripper does under random commands of its cables, over its
+    design space; the finger that presses a button turns further (up to 90 degrees). The effector is the tip.
+
+    Args: as for `FingerRobot`.
+    """
+
+    name = "contact_finger"
+    effectors = ("tip",)
+    placements = ((STRAIGHT, (0.0, 0.0, 0.0)),)
+    cable_range = (-0.002, 0.020)
+    #: Name, smallest and largest value, and unit of the coordinates of the pose.
+    pose_ranges = (
+        ("x", -0.007, 0.007, "m"),
+        ("y", -0.006, 0.010, "m"),
+        ("z", -0.001, 0.024, "m"),
+        ("rx", -0.27, 0.27, "1"),
+        ("ry", -0.30, 0.30, "1"),
+        ("rz", -0.22, 0.22, "1"),
+    )
+    #: Origin of the frame from the middle of the contact points [m]. A finger bends about a point far above them, so
+    #: that with an origin there they would move aside and turn as one; with this one y and rx, and x and ry, are
+    #: nearly uncorrelated in a gripper, and a box of independent coordinates holds few poses that never occur.
+    origin = (0.0, 0.0, 0.030)
+
+    def __init__(
+        self,
+        *,
+        mesh_size: float = 8.0e-3,
+        meshing: str = "morph",
+        material: str = "corotational",
+        unilateral: bool = True,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        super().__init__(
+            mesh_size=mesh_size, meshing=meshing, material=material, unilateral=unilateral, gravity=gravity
+        )
+        pose = tuple(
+            Actuator(name, low, high, 0.05 * (high - low), unit, unilateral=False)
+            for name, low, high, unit in self.pose_ranges
+        )
+        self.actuators = (*self.actuators, *pose)
+        self.effort_scale = np.array([20.0, 20.0, 2.0, 2.0, 10.0, 0.2, 0.2, 0.05])
+
+    def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
+        """Middle of the tip."""
+        return self.finger.tip(design)
+
+    def object_frame(self, design: Mapping[str, float]) -> np.ndarray:
+        """Origin of the frame that the contact points are tied to [m], shape (3,)."""
+        return self.finger.contact_points(design).mean(axis=0) + self.origin
+
+    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+        """Tie the contact points to the frame and drive it; the effector is the tip."""
+        assert frame is not None
+        self.tie_contacts(model, frame)
+        for component, (name, *_) in enumerate(self.pose_ranges):
+            model.add("a", Pose(name, frame, component, model.nodes))
+        tip, reference = self.finger.tip(design), self.finger.tip(self.finger.reference_design)
+        model.add("e", Point("tip", self.material_point(model, 0, tip, reference)))

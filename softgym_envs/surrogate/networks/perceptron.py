@@ -1,0 +1,66 @@
+"""Plain perceptrons: the parts that the residual network and the thesis' network are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.errors import WeightsError
+
+__all__ = ["layers", "mean_scale", "perceptron", "standardise", "weights"]
+
+
+def layers(tensors: Mapping[str, np.ndarray], prefix: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Weights (in, out) and biases of a perceptron by its prefix, in single precision."""
+    found: list[tuple[np.ndarray, np.ndarray]] = []
+    while f"{prefix}.{len(found)}.weight" in tensors:
+        k = len(found)
+        # Stored as (out, in); used from the right, so transposed and contiguous.
+        weight = np.ascontiguousarray(tensors[f"{prefix}.{k}.weight"].T, dtype=np.float32)
+        found.append((weight, tensors[f"{prefix}.{k}.bias"].astype(np.float32)))
+    if not found:
+        raise WeightsError(f"the weights hold no layers named '{prefix}.*'")
+    return found
+
+
+def perceptron(inputs: int, outputs: int, width: int, depth: int, activation: str, seed: int) -> Any:
+    """A torch perceptron with seeded weights; ``activation`` is "algebraic" or "relu"."""
+    import torch
+    from torch import nn
+
+    class AlgebraicSigmoid(nn.Module):
+        def forward(self, x):
+            return x * torch.rsqrt(1.0 + x * x)
+
+    torch.manual_seed(seed)
+    sizes = [inputs, *([width] * depth)]
+    parts: list[nn.Module] = []
+    for a, b in zip(sizes[:-1], sizes[1:], strict=True):
+        parts += [nn.Linear(a, b), AlgebraicSigmoid() if activation == "algebraic" else nn.ReLU()]
+    parts.append(nn.Linear(width, outputs))
+    return nn.Sequential(*parts)
+
+
+def weights(net, prefix: str) -> dict[str, np.ndarray]:
+    """Its tensors, named as `layers` reads them."""
+    from torch import nn
+
+    linear = [layer for layer in net if isinstance(layer, nn.Linear)]
+    tensors = {}
+    for k, layer in enumerate(linear):
+        tensors[f"{prefix}.{k}.weight"] = layer.weight.detach().numpy().copy()
+        tensors[f"{prefix}.{k}.bias"] = layer.bias.detach().numpy().copy()
+    return tensors
+
+
+def mean_scale(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of columns; a constant column has scale 0, so its mean is its prediction."""
+    scale = values.std(axis=0)
+    return values.mean(axis=0), np.where(scale > 1e-12 * np.abs(values).max(), scale, 0.0)
+
+
+def standardise(values: np.ndarray, mean: np.ndarray | float, scale: np.ndarray) -> np.ndarray:
+    """Values in units of their spread; constant columns become 0."""
+    return np.where(scale > 0.0, (values - mean) / np.where(scale > 0.0, scale, 1.0), 0.0)

@@ -1,0 +1,487 @@
+"""One scalar for everything: the elastic energy of a body, as a function of its actuator displacements.
+
+Let ``Phi(delta_a, f)`` be the energy left in a body whose actuators are held at ``delta_a`` while a force ``f`` acts
+on its effector. Its first derivatives are the actuator efforts and (minus) the effector; its second derivatives hold
+the whole condensed model. To second order in ``f``
+
+    Phi = U(delta_a) - f . x(delta_a) - f^T C(delta_a) f / 2
+
+so with ``K = hess U`` and ``J = dx / d delta_a``
+
+    effort = grad U,   effector = x,   W_aa = K^-1,   W_ea = J W_aa,   W_ee = C + J W_aa J^T.
+
+The network is these three: ``U`` is convex in ``delta_a`` by construction (an input-convex network, Amos et al. 2017,
+arXiv:1609.07152), ``x`` a plain one, ``C = L L^T``. Hence, whatever the weights:
+
+* W is symmetric positive definite;
+* d delta / d effort of the surrogate is its own W: control and design work with exact derivatives;
+* cables that cannot push have one solution, ``min U`` over the displacements beyond their commands.
+
+Every FEM state teaches values and first derivatives of both (efforts, W_aa, W_ea), which is why few are needed.
+Layers of the design are apart from those of the actuation and evaluated once per body. An ensemble is the mean of its
+members' ``Phi``, and so a potential again; their spread is the uncertainty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numba import njit
+from pydantic import Field
+
+from softgym_envs.config import Config
+from softgym_envs.robots.robot import Robot
+from softgym_envs.surrogate.model import Context, SurrogateModel
+from softgym_envs.surrogate.states import States
+
+__all__ = ["Model", "Options", "train"]
+
+
+class Options(Config):
+    """Hyper-parameters."""
+
+    kind: Literal["potential"] = "potential"
+    width: int = Field(default=64, gt=0)
+    body_width: int = Field(default=64, gt=0)
+    members: int = Field(default=5, gt=0)
+    steps: int = Field(default=12_000, gt=0)
+    batch_size: int = Field(default=256, gt=0)
+    learning_rate: float = Field(default=3e-3, gt=0)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _evaluate(
+    u, slot, A1, A2, P, PT, B1, B2, V, c1, c2, a, b, d1, d2, quadratic, linear, x0, slope, effort, effector, spread
+):
+    """Gradient of the energy (rows, n), effector (rows, e) and its spread (rows,) at scaled actuation u (rows, n)."""
+    members, n, w = A1.shape
+    e = V.shape[2]
+    one, half = np.float32(1.0), np.float32(0.5)
+    share = np.float32(1.0 / members)
+    h, hp, z = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    upper, lower = np.empty(w, np.float32), np.empty(w, np.float32)
+    x = np.empty((members, e), np.float32)
+    for row in range(len(u)):
+        s = slot[row]
+        for i in range(n):
+            value = linear[s, i]
+            for j in range(n):
+                value += quadratic[s, i, j] * u[row, j]
+            effort[row, i] = value
+        for m in range(members):
+            # energy: forward
+            for j in range(w):
+                z[j] = c1[s, m, j]
+            for i in range(n):
+                for j in range(w):
+                    z[j] += u[row, i] * A1[m, i, j]
+            for j in range(w):
+                root = np.sqrt(one + z[j] * z[j])
+                h[j] = half * (z[j] + root)
+                hp[j] = half * (one + z[j] / root)
+                z[j] = c2[s, m, j]
+                lower[j] = b[s, m, j]
+            for i in range(n):
+                for j in range(w):
+                    z[j] += u[row, i] * A2[m, i, j]
+            for k in range(w):
+                for j in range(w):
+                    z[j] += h[k] * PT[m, k, j]
+            # and backward
+            for j in range(w):
+                upper[j] = a[s, m, j] * half * (one + z[j] / np.sqrt(one + z[j] * z[j]))
+            for k in range(w):
+                for j in range(w):
+                    lower[j] += upper[k] * P[m, k, j]
+            for j in range(w):
+                lower[j] *= hp[j]
+            for i in range(n):
+                value = np.float32(0.0)
+                for j in range(w):
+                    value += lower[j] * A1[m, i, j] + upper[j] * A2[m, i, j]
+                effort[row, i] += share * value
+            # effector
+            for j in range(w):
+                z[j] = d1[s, m, j]
+            for i in range(n):
+                for j in range(w):
+                    z[j] += u[row, i] * B1[m, i, j]
+            for j in range(w):
+                h[j] = z[j] / np.sqrt(one + z[j] * z[j])
+                z[j] = d2[s, m, j]
+            for k in range(w):
+                for j in range(w):
+                    z[j] += h[k] * B2[m, k, j]
+            for k in range(e):
+                value = x0[s, m, k]
+                for i in range(n):
+                    value += slope[s, m, k, i] * u[row, i]
+                x[m, k] = value
+            for j in range(w):
+                value = z[j] / np.sqrt(one + z[j] * z[j])
+                for k in range(e):
+                    x[m, k] += value * V[m, j, k]
+        # mean, and the largest standard deviation of a point
+        for k in range(e):
+            value = np.float32(0.0)
+            for m in range(members):
+                value += x[m, k]
+            effector[row, k] = share * value
+        largest = np.float32(0.0)
+        for first in range(0, e, 3):
+            value = np.float32(0.0)
+            for k in range(first, first + 3):
+                for m in range(members):
+                    value += (x[m, k] - effector[row, k]) ** 2
+            largest = max(largest, value)
+        spread[row] = np.sqrt(share * largest)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _differentiate(
+    u, slot, A1, A2, P, PT, B1, B2, V, H, c1, c2, a, b, d1, d2, quadratic, slope, held0, hessian, jacobian, held
+):
+    """Hessian of the energy (rows, n, n), Jacobian of the effector (rows, e, n), held compliance (rows, e, e)."""
+    members, n, w = A1.shape
+    e = V.shape[2]
+    entries = H.shape[2]
+    one, half = np.float32(1.0), np.float32(0.5)
+    share = np.float32(1.0 / members)
+    h, hp, hpp = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    z, upper, lower = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    through, first = np.empty((n, w), np.float32), np.empty((n, w), np.float32)
+    y = np.empty(entries, np.float32)
+    L = np.zeros((e, e), np.float32)
+    for row in range(len(u)):
+        s = slot[row]
+        for i in range(n):
+            for j in range(n):
+                hessian[row, i, j] = quadratic[s, i, j]
+        for k in range(e):
+            for i in range(n):
+                jacobian[row, k, i] = 0.0
+            for j in range(e):
+                held[row, k, j] = 0.0
+        for m in range(members):
+            for j in range(w):
+                z[j] = c1[s, m, j]
+            for i in range(n):
+                for j in range(w):
+                    z[j] += u[row, i] * A1[m, i, j]
+            for j in range(w):
+                r = one / np.sqrt(one + z[j] * z[j])
+                h[j] = half * (z[j] + one / r)
+                hp[j] = half * (one + z[j] * r)
+                hpp[j] = half * r * r * r
+                z[j] = c2[s, m, j]
+                lower[j] = b[s, m, j]
+            for i in range(n):
+                for j in range(w):
+                    first[i, j] = hp[j] * A1[m, i, j]
+                    through[i, j] = A2[m, i, j]
+                    z[j] += u[row, i] * A2[m, i, j]
+            for k in range(w):
+                for j in range(w):
+                    z[j] += h[k] * PT[m, k, j]
+                for i in range(n):
+                    for j in range(w):
+                        through[i, j] += first[i, k] * PT[m, k, j]
+            for j in range(w):
+                r = one / np.sqrt(one + z[j] * z[j])
+                upper[j] = a[s, m, j] * half * (one + z[j] * r)
+                z[j] = a[s, m, j] * half * r * r * r
+            for k in range(w):
+                for j in range(w):
+                    lower[j] += upper[k] * P[m, k, j]
+            for j in range(w):
+                lower[j] *= hpp[j]
+            for i in range(n):
+                for k in range(i + 1):
+                    value = np.float32(0.0)
+                    for j in range(w):
+                        value += A1[m, i, j] * lower[j] * A1[m, k, j] + through[i, j] * z[j] * through[k, j]
+                    hessian[row, i, k] += share * value
+            # effector and held compliance
+            for j in range(w):
+                z[j] = d1[s, m, j]
+            for i in range(n):
+                for j in range(w):
+                    z[j] += u[row, i] * B1[m, i, j]
+            for j in range(w):
+                r = one / np.sqrt(one + z[j] * z[j])
+                h[j] = z[j] * r
+                hp[j] = r * r * r
+                z[j] = d2[s, m, j]
+            for i in range(n):
+                for j in range(w):
+                    first[i, j] = hp[j] * B1[m, i, j]
+                    through[i, j] = 0.0
+            for k in range(w):
+                for j in range(w):
+                    z[j] += h[k] * B2[m, k, j]
+                for i in range(n):
+                    for j in range(w):
+                        through[i, j] += first[i, k] * B2[m, k, j]
+            for k in range(entries):
+                y[k] = held0[s, m, k]
+            for j in range(w):
+                r = one / np.sqrt(one + z[j] * z[j])
+                h[j] = z[j] * r
+                hp[j] = r * r * r
+                for k in range(entries):
+                    y[k] += h[j] * H[m, j, k]
+            for k in range(e):
+                for i in range(n):
+                    value = slope[s, m, k, i]
+                    for j in range(w):
+                        value += V[m, j, k] * hp[j] * through[i, j]
+                    jacobian[row, k, i] += share * value
+            k = 0
+            for i in range(e):
+                for j in range(i + 1):
+                    L[i, j] = np.exp(y[k]) if i == j else y[k]
+                    k += 1
+            for i in range(e):
+                for j in range(i + 1):
+                    value = np.float32(0.0)
+                    for k in range(j + 1):
+                        value += L[i, k] * L[j, k]
+                    held[row, i, j] += share * value
+        for i in range(n):
+            for k in range(i):
+                hessian[row, k, i] = hessian[row, i, k]
+        for i in range(e):
+            for k in range(i):
+                held[row, k, i] = held[row, i, k]
+
+
+class Model(SurrogateModel):
+    """An ensemble of potential networks (see the module)."""
+
+    network = "potential"
+
+    def __init__(
+        self, robot: Robot, tensors: Mapping[str, np.ndarray], card: Mapping[str, Any], members: int | None = None
+    ) -> None:
+        super().__init__(robot, tensors, card)
+        available = len(tensors["energy1"])
+        if members is not None and not 1 <= members <= available:
+            raise ValueError(f"members = {members} is out of bounds; these weights have 1 to {available}")
+        tensors = {
+            k: v[:members] if v.shape and not k.startswith("scale.") and k != "rest" else v for k, v in tensors.items()
+        }
+        self.tensors = tensors
+        self.members, self.width = tensors["energy1"].shape[:2]
+
+        def kernel(name, *axes):
+            return np.ascontiguousarray(np.transpose(tensors[name], axes), dtype=np.float32)
+
+        self.half_range = 0.5 * (robot.upper - robot.lower)
+        self.middle = robot.lower + self.half_range
+        self.energy_scale = float(tensors["scale.energy"].item())
+        self.effector_mean = tensors["scale.effector_mean"].astype(float)
+        self.effector_scale = float(tensors["scale.effector"].item())
+        self.held_scale = float(tensors["scale.held"].item())
+        self._effort_scale = self.energy_scale / self.half_range
+        A1, A2 = kernel("energy1", 0, 2, 1), kernel("energy2", 0, 2, 1)
+        P = np.logaddexp(0.0, tensors["pass_on"].astype(float)).astype(np.float32)
+        PT = np.ascontiguousarray(P.transpose(0, 2, 1))
+        B1, B2 = kernel("shape1", 0, 2, 1), kernel("shape2", 0, 2, 1)
+        self._weights = (A1, A2, P, PT, B1, B2, kernel("effector", 0, 2, 1))
+        self._held = kernel("held", 0, 2, 1)
+        layers = [(tensors[f"body.{k}.weight"], tensors[f"body.{k}.bias"]) for k in range(3)]
+        self._layers = [(w.astype(np.float32), v.astype(np.float32)[:, None]) for w, v in layers]
+        rest = tensors["rest"].astype(np.float32) if "rest" in tensors else None
+        self._rest = rest
+        if rest is not None and rest.shape != (self.count,):
+            raise ValueError(f"the rest has shape {rest.shape}, the robot {self.count} actuators")
+
+    def _prepare(self, design: np.ndarray) -> dict[str, np.ndarray]:
+        rows, n, e, w, M = len(design), self.count, self.effectors, self.width, self.members
+        x = design if design.shape[1] else np.zeros((rows, 1))
+        h = np.repeat(x[None].astype(np.float32), M, axis=0)
+        for k, (weight, bias) in enumerate(self._layers):
+            h = h @ weight.transpose(0, 2, 1) + bias
+            if k < 2:
+                h = h / np.sqrt(1.0 + h * h)
+        sizes = [w, w, w, w, n * (n + 1) // 2, n, e, e * n, e * (e + 1) // 2, w, w]
+        names = ("c1", "c2", "a", "b", "quadratic", "linear", "x0", "slope", "held", "d1", "d2")
+        parts = np.split(h.transpose(1, 0, 2), np.cumsum(sizes)[:-1], axis=2)
+        body = {k: np.ascontiguousarray(v) for k, v in zip(names, parts, strict=True)}
+        for name in ("a", "b"):
+            body[name] = np.logaddexp(np.float32(0.0), body[name] - np.float32(4.0))
+        lower = np.tril_indices(n)
+        factor = np.zeros((rows, M, n, n), dtype=np.float32)
+        factor[:, :, lower[0], lower[1]] = np.where(lower[0] == lower[1], np.exp(body["quadratic"]), body["quadratic"])
+        body["quadratic"] = (factor @ factor.swapaxes(2, 3)).mean(axis=1)
+        body["slope"] = body["slope"].reshape(rows, M, e, n)
+        body["linear"] = np.ascontiguousarray(body["linear"].mean(axis=1))
+        if self._rest is not None:
+            body["linear"] = np.zeros_like(body["linear"])
+            at_rest = self._gradient(body, np.repeat(self._rest[None], rows, axis=0), np.arange(rows))[0]
+            body["linear"] = -at_rest
+        return body
+
+    def _gradient(self, body: dict[str, np.ndarray], u: np.ndarray, slot: np.ndarray) -> tuple[np.ndarray, ...]:
+        effort = np.empty((len(u), self.count), dtype=np.float32)
+        effector = np.empty((len(u), self.effectors), dtype=np.float32)
+        spread = np.empty(len(u), dtype=np.float32)
+        _evaluate(  # type: ignore[call-arg]
+            u, slot, *self._weights, *(body[k] for k in ("c1", "c2", "a", "b", "d1", "d2")),
+            body["quadratic"], body["linear"], body["x0"], body["slope"], effort, effector, spread,
+        )  # fmt: skip
+        return effort, effector, spread
+
+    def _scaled(self, displacement: np.ndarray) -> np.ndarray:
+        return ((displacement - self.middle) / self.half_range).astype(np.float32)
+
+    def _state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        effort, effector, spread = self._gradient(context.arrays, self._scaled(displacement), context.slot)
+        if self.members == 1:
+            spread = np.full(len(effort), np.inf)
+        position = effector * self.effector_scale + self.effector_mean
+        return effort * self._effort_scale, position, spread * self.effector_scale
+
+    def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        u, body = self._scaled(displacement), context.arrays
+        rows, n, e = len(u), self.count, self.effectors
+        hessian = np.empty((rows, n, n), dtype=np.float32)
+        jacobian = np.empty((rows, e, n), dtype=np.float32)
+        held = np.empty((rows, e, e), dtype=np.float32)
+        _differentiate(  # type: ignore[call-arg]
+            u, context.slot, *self._weights, self._held, *(body[k] for k in ("c1", "c2", "a", "b", "d1", "d2")),
+            body["quadratic"], body["slope"], body["held"], hessian, jacobian, held,
+        )  # fmt: skip
+        K = hessian.astype(float) * (self._effort_scale[:, None] / self.half_range)
+        J = jacobian.astype(float) * (self.effector_scale / self.half_range)
+        W = np.empty((rows, self.size, self.size))
+        a, c = slice(0, n), slice(n, None)
+        W_aa = np.linalg.inv(K)
+        W[:, a, a] = 0.5 * (W_aa + W_aa.swapaxes(1, 2))
+        W[:, c, a] = J @ W[:, a, a]
+        W[:, a, c] = W[:, c, a].swapaxes(1, 2)
+        moved = W[:, c, a] @ J.swapaxes(1, 2)
+        W[:, c, c] = 0.5 * (moved + moved.swapaxes(1, 2)) + held.astype(float) * self.held_scale
+        return W
+
+
+def train(
+    robot: Robot, training: States, validation: States, trainer: Any
+) -> tuple[dict[str, np.ndarray], dict[str, list[dict[str, float]]]]:
+    """Train the members one after the other; each has its own seed, order of batches and bootstrap weights none."""
+    import torch
+
+    from softgym_envs.surrogate.networks.potential_torch import PotentialNet
+
+    options: Options = trainer.options
+    n, e = training.effort.shape[1], training.effector.shape[1]
+    scales = _scales(robot, training)
+    data = {key: _targets(robot, states, scales) for key, states in (("t", training), ("v", validation))}
+    effort_spread = float(((data["t"][4].mT @ data["t"][2][:, :, None]) ** 2).mean())
+    rest = None
+    if training.unloaded:
+        middle = 0.5 * (robot.upper + robot.lower)
+        rest = (0.0 - middle) / (robot.upper - middle)
+    states: list[dict[str, np.ndarray]] = []
+    histories = {}
+    for member in range(options.members):
+        torch.manual_seed(trainer.seed + 1000 * member)
+        net = PotentialNet(n, e, training.design.shape[1], options.width, options.body_width, rest)
+
+        def loss(rows, net=net):
+            batch = data["v"] if rows is None else [part[rows] for part in data["t"]]
+            return potential_loss(net, batch, effort_spread)
+
+        name = f"member {member}"
+        histories[name] = trainer.optimise(name, net, loss, len(training), seed=trainer.seed + 1000 * member)
+        states.append({k: v.detach().numpy().copy() for k, v in net.state_dict().items()})
+    return stack_members(states, scales), histories
+
+
+def stack_members(states: list[dict[str, np.ndarray]], scales: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Weights of `Model` from the states of its members in torch."""
+    tensors = {k: np.stack([state[k] for state in states]) for k in states[0] if k != "rest"}
+    linear = sorted({k.split(".")[1] for k in tensors if k.startswith("body.")}, key=int)
+    for k, layer in enumerate(linear):  # numbered without the activations between them
+        for part in ("weight", "bias"):
+            tensors[f"body.{k}.{part}"] = tensors.pop(f"body.{layer}.{part}")
+    if "rest" in states[0]:
+        tensors["rest"] = states[0]["rest"]
+    return tensors | {f"scale.{k}": v for k, v in scales.items()}
+
+
+def unstack_members(tensors: Mapping[str, np.ndarray]) -> tuple[list[dict[str, np.ndarray]], dict[str, np.ndarray]]:
+    """States of the members in torch and the scales, from the weights of `Model`: the inverse of `stack_members`."""
+    scales = {k.removeprefix("scale."): np.asarray(v) for k, v in tensors.items() if k.startswith("scale.")}
+    states: list[dict[str, np.ndarray]] = []
+    for member in range(len(tensors["energy1"])):
+        state = {}
+        for k, v in tensors.items():
+            if k.startswith("scale."):
+                continue
+            if k.startswith("body."):  # in torch the activations between the layers are numbered too
+                _, layer, part = k.split(".")
+                k = f"body.{2 * int(layer)}.{part}"
+            state[k] = v if k == "rest" else v[member]
+        states.append(state)
+    return states, scales
+
+
+def _scales(robot: Robot, states: States) -> dict[str, np.ndarray]:
+    """What makes energy, effector and held compliance of order one."""
+    n = states.effort.shape[1]
+    half = 0.5 * (robot.upper - robot.lower)
+    K = np.linalg.inv(states.W[:, :n, :n])
+    return {
+        "energy": np.array(np.median(np.einsum("bii->bi", K) * half**2)),
+        "effector_mean": states.effector.mean(axis=0),
+        "effector": np.array(max(float(states.effector.std(axis=0).max()), 1e-9)),
+        "held": np.array(np.median(np.einsum("bii->bi", states.W[:, n:, n:]))),
+    }
+
+
+def _targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) -> list:
+    """Scaled targets: design, actuation, effort, effector, factor of W_aa, Jacobian, whitening of C, and C."""
+    import torch
+
+    n = states.effort.shape[1]
+    a, c = slice(0, n), slice(n, None)
+    half = 0.5 * (robot.upper - robot.lower)
+    W_aa = states.W[:, a, a] / half[:, None] / half * scales["energy"]
+    J = np.linalg.solve(states.W[:, a, a], states.W[:, a, c]).swapaxes(1, 2)
+    W_ee = states.W[:, c, c] / scales["held"]
+    size = W_ee.shape[1]
+    C = W_ee - J @ states.W[:, a, c] / scales["held"]
+    # A body without freedom left (a rigid direction) has C = 0 up to rounding: a factor needs a little more.
+    floor = 1e-6 * np.einsum("bii->b", W_ee)[:, None, None] / size
+    C = 0.5 * (C + C.swapaxes(1, 2)) + 2.0 * size * floor * np.eye(size)
+    whitening = np.linalg.inv(np.linalg.cholesky(C + 0.03 * W_ee))
+    parts = (
+        states.design,
+        states.actuation,
+        states.effort * half / scales["energy"],
+        (states.effector - scales["effector_mean"]) / scales["effector"],
+        np.linalg.cholesky(0.5 * (W_aa + W_aa.swapaxes(1, 2))),
+        J * half / scales["effector"],
+        whitening,
+        C,
+    )
+    return [torch.as_tensor(np.ascontiguousarray(part), dtype=torch.float32) for part in parts]
+
+
+def potential_loss(net, batch: list, effort_spread: float):
+    """Sum of mean squared errors: efforts and W_aa in the metric of W_aa itself, C in its own, effector and Jacobian plain."""
+    import torch
+
+    design, u, effort, effector, S, J, whitening, C = batch
+    gradient, hessian, x, jacobian, L = net(design, u)
+    terms = (
+        ((S.mT @ (gradient - effort)[:, :, None]) ** 2).mean() / effort_spread,
+        ((S.mT @ hessian @ S - torch.eye(S.shape[1])) ** 2).mean(),
+        ((x - effector) ** 2).mean(),
+        ((jacobian - J) ** 2).mean(),
+        ((whitening @ (L @ L.mT - C) @ whitening.mT) ** 2).mean(),
+    )
+    return sum(terms)

@@ -1,0 +1,209 @@
+"""The hybrid backend: who answers when, how states go on from one to the other, and what is learned in between."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+import softgym_envs  # noqa: F401  (registers the environments)
+from benchmarks.hybrid import make_weights
+from softgym_envs.backends import make_backend
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.backends.hybrid import HybridBackend
+from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.errors import ConvergenceError, DataError, WeightsError
+from softgym_envs.robots import make_robot
+
+LIMIT = 8e-3
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return make_robot("finger", cables=1)
+
+
+@pytest.fixture(scope="module")
+def weights(robot, tmp_path_factory):
+    """A small ensemble that knows the cable up to 8 mm; shared with the tests of online learning."""
+    folder = tmp_path_factory.getbasetemp() / "finger_8mm"
+    if not (folder / "model.json").exists():
+        make_weights(folder, robot, limit=LIMIT, states=30, members=3, width=24, steps=400)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fem(robot):
+    return FEMBackend(robot)
+
+
+def assert_same(a, b):
+    for name in ("command", "displacement", "effort", "effector", "slack"):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-9, err_msg=name)
+
+
+def test_finite_elements_cost_nothing_while_the_surrogate_is_trusted(robot, weights, monkeypatch):
+    monkeypatch.setattr(robot, "build", lambda design=None: pytest.fail("the body was built"), raising=False)
+    backend = HybridBackend(robot, weights=weights)
+    surrogate = SurrogateBackend(robot, weights=weights)
+    for command in (0.002, 0.005, 0.0077):
+        state, expected = backend.step(np.array([command])), surrogate.step(np.array([command]))
+        assert state.trusted and state.nodes is None
+        np.testing.assert_array_equal(state.effector, expected.effector)
+    backend.reset()
+    assert (backend.calls, backend.fem_calls) == (3, 0)
+
+
+def test_finite_elements_answer_where_it_is_not(robot, weights, fem):
+    backend = HybridBackend(robot, weights=weights)
+    fem.reset()
+    state, expected = backend.step(np.array([0.015])), fem.step(np.array([0.015]))
+    np.testing.assert_allclose(state.effector, expected.effector, atol=1e-7)
+    np.testing.assert_allclose(state.condensed.compliance, expected.condensed.compliance, rtol=1e-4)
+    assert state.trusted and state.uncertainty == 0.0 and state.nodes is not None
+    assert backend.fem_calls == 2  # the rest of the body, and this
+    assert_same(backend.step(np.array([0.015])), state)  # standing still asks for nothing new
+    beside, expected = backend.step(np.array([0.015015])), fem.step(np.array([0.015015]))
+    assert backend.fem_calls == 2
+    np.testing.assert_allclose(beside.effector, expected.effector, atol=2e-7)
+    np.testing.assert_allclose(beside.effort, expected.effort, rtol=1e-5)
+    assert beside.displacement == pytest.approx(0.015015) and not beside.slack.any()
+    back = backend.step(np.array([0.004]))
+    assert back.nodes is None and back.slack.tolist() == [False]
+    np.testing.assert_allclose(back.effector, fem.step(np.array([0.004])).effector, atol=3e-4)
+    again = backend.step(np.array([0.016]))
+    np.testing.assert_allclose(again.effector, fem.step(np.array([0.016])).effector, atol=1e-7)
+    assert (backend.calls, backend.fem_calls, backend.tangent_calls) == (5, 3, 2)
+
+
+def test_probe_and_restore_know_both(robot, weights):
+    backend = HybridBackend(robot, weights=weights)
+    near = backend.step(np.array([0.005]))
+    far = backend.probe(np.array([0.016]))
+    assert backend.state is near and far.nodes is not None
+    backend.restore(far)
+    assert backend.state is far
+    assert backend.probe(np.array([0.006])).nodes is None and backend.state is far
+    backend.restore(near)
+    np.testing.assert_allclose(backend.step(np.array([0.016])).effector, far.effector, atol=1e-7)
+
+
+def test_efforts(robot, weights, fem):
+    backend = HybridBackend(robot, weights=weights)
+    fem.reset()
+    strong, weak = fem.step(np.array([0.015])).effort, fem.step(np.array([0.005])).effort
+    assert np.abs(backend.step(weak, "effort").displacement - 0.005).max() < 1e-4 and backend.fem_calls == 0
+    state = backend.step(strong, "effort")
+    assert state.nodes is not None and np.abs(state.displacement - 0.015).max() < 1e-6
+    calls = backend.fem_calls
+    beside, expected = backend.step(1.0005 * strong, "effort"), fem.step(1.0005 * strong, "effort")
+    assert backend.fem_calls == calls and not beside.slack.any()
+    np.testing.assert_allclose(beside.displacement, expected.displacement, atol=1e-8)
+    with pytest.raises(ValueError, match="negative"):
+        backend.step(-strong, "effort")
+
+
+def test_slack_cables_go_on_from_one_to_the_other(weights, tmp_path):
+    """Two cables, weights that know nothing of them: everything by the finite elements and their condensed models."""
+    robot = make_robot("finger")
+    folder = tmp_path / "weights"
+    make_weights(folder, robot, limit=0.002, states=6, members=2, width=8, steps=4)
+    backend, fem = HybridBackend(robot, weights=folder, tolerance=1e-9), FEMBackend(robot)
+    for command in ([0.015, 0.0], [0.015005, 0.0], [0.015005, 1e-5]):
+        state, expected = backend.step(np.array(command)), fem.step(np.array(command))
+        assert state.slack.tolist() == expected.slack.tolist() == [False, True]
+        np.testing.assert_allclose(state.displacement, expected.displacement, atol=1e-7)
+        np.testing.assert_allclose(state.effector, expected.effector, atol=1e-7)
+        np.testing.assert_allclose(state.effort, expected.effort, rtol=1e-4, atol=1e-6)
+    assert (backend.calls, backend.fem_calls) == (3, 2)
+
+
+def test_an_unknown_body_is_left_to_the_finite_elements(robot, weights):
+    backend = HybridBackend(robot, weights=weights)
+    state = backend.reset({"length": 0.041})
+    assert state.nodes is not None and backend.fem_calls == 1
+    np.testing.assert_allclose(state.effector, FEMBackend(robot, {"length": 0.041}).state.effector, atol=1e-9)
+    assert backend.step(np.array([0.003])).nodes is not None
+    assert backend.reset({}).nodes is None
+    # A stiffness only scales efforts: the body is known.
+    assert backend.reset({"young_modulus": 5e6}).nodes is None
+
+
+def test_a_failed_step_keeps_the_state(robot, weights, monkeypatch):
+    backend = HybridBackend(robot, weights=weights)
+    kept = backend.step(np.array([0.012]))
+
+    def fail(*arguments, **options):
+        raise ConvergenceError("no")
+
+    monkeypatch.setattr(backend._fem, "step", fail)
+    with pytest.raises(ConvergenceError):
+        backend.step(np.array([0.019]))
+    assert backend.state is kept
+
+
+def test_it_learns_between_episodes_and_goes_on_from_its_folder(robot, weights, fem, tmp_path):
+    options = {"weights": weights, "folder": tmp_path, "retrain_after": 20, "steps": 200}
+    backend = HybridBackend(robot, **options)
+    commands = np.linspace(0.0085, 0.015, 25)[:, None]
+    first = backend.model
+    for command in commands:
+        assert backend.step(command).nodes is not None
+    assert backend.model is first  # within an episode the physics does not change
+    assert len(list(tmp_path.glob("states_*.npz"))) == 2  # what an interruption would not lose
+    backend.reset()
+    assert backend.retrainings == 1 and backend.retraining_seconds > 0.0
+    before = backend.fem_calls
+    for command in commands[2:-2]:
+        state = backend.step(command)
+        assert state.uncertainty < 2e-4
+    saved = 1.0 - (backend.fem_calls - before) / len(commands[2:-2])
+    assert saved > 0.7
+    fem.reset()
+    middle = fem.step(np.array([0.0118]))
+    np.testing.assert_allclose(backend.step(np.array([0.0118])).effector, middle.effector, atol=5e-4)
+    assert not SurrogateBackend(robot, weights=weights).step(np.array([0.0118])).trusted
+    # Weights that learned are ordinary weights.
+    assert SurrogateBackend(robot, weights=tmp_path / "weights").step(np.array([0.0118])).nodes is None
+    resumed = HybridBackend(robot, **options)
+    assert resumed.retrainings == 0
+    assert all(np.array_equal(resumed.model.tensors[k], v) for k, v in backend.model.tensors.items())
+    # With other options the kept states are learned anew, at once.
+    assert HybridBackend(robot, **{**options, "steps": 3}).retrainings == 1
+    with pytest.raises(DataError, match="another robot"):
+        HybridBackend(make_robot("finger", cables=1, mesh_size=0.01), weights=weights, folder=tmp_path)
+
+
+def test_environment(weights, tmp_path):
+    options = {"weights": str(weights), "folder": str(tmp_path), "retrain_after": 0}
+    env = gymnasium.make(
+        "SoftGym/FingerReach-v0", backend="hybrid", robot_options={"cables": 1}, backend_options=options
+    )
+    env.reset(seed=0, options={"goal": np.array([0.0, 0.05, -0.09])})
+    for _ in range(12):
+        *_, info = env.step(np.ones(1, dtype=np.float32))
+    backend = env.unwrapped.backend
+    assert info["trusted"] and info["uncertainty"] == 0.0
+    assert backend.calls == 12 and backend.fem_calls > 2
+    env.reset(seed=1)
+    assert backend.retrainings == 0 and list(tmp_path.glob("states_*.npz"))
+    env.close()
+
+
+def test_errors(robot, weights):
+    with pytest.raises(ValueError, match="retrain_after = -1"):
+        make_backend("hybrid", robot, weights=weights, retrain_after=-1)
+    with pytest.raises(ValueError, match=r"steps = 1\.5"):
+        make_backend("hybrid", robot, weights=weights, steps=1.5)
+    with pytest.raises(ValueError, match="tolerance"):
+        make_backend("hybrid", robot, weights=weights, tolerance=0.0)
+    with pytest.raises(WeightsError, match="2 or more"):
+        make_backend("hybrid", robot, weights=weights, members=1)
+    backend = make_backend("hybrid", robot, weights=weights)
+    with pytest.raises(ValueError, match="forces.*fem"):
+        backend.step(np.array([0.001]), force=np.ones(3))
+    with pytest.raises(ValueError, match="finite"):
+        backend.step(np.array([np.nan]))
+    with pytest.raises(ValueError, match="mode"):
+        backend.step(np.array([0.001]), mode="magic")
+    assert backend.calls == 0
