@@ -17,13 +17,30 @@ from typing import Any
 
 import numpy as np
 
+from softgym_envs.config import provenance
+from softgym_envs.storage import write_json
+
 __all__ = ["networks", "standardised_loss"]
 
 KEPT = Path(__file__).parent / "data" / "networks.json"
 
 CASES: dict[str, dict[str, Any]] = {
-    "finger": {"robot": "finger", "robot_options": {"cables": 2}, "groups": 130, "margin": 0.1},
-    "diamond": {"robot": "diamond", "robot_options": {}, "groups": 32, "margin": 1.0},
+    "finger": {
+        "robot": "finger",
+        "robot_options": {"cables": 2},
+        "groups": 130,
+        "margin": 0.1,
+        "sizes": (50, 200, 800, 6400),
+        "tracking": 500,
+    },
+    "diamond": {
+        "robot": "diamond",
+        "robot_options": {},
+        "groups": 32,
+        "margin": 1.0,
+        "sizes": (50, 200, 1600),
+        "tracking": 200,
+    },
 }
 """Bodies; 50 states in each group. The Diamond's circle needs cables that push, so they are in its data."""
 
@@ -34,8 +51,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "rbf": {"kind": "rbf"},
     "potential x 5": {"kind": "potential", "members": 5, "steps": 4000, "batch_size": 128},
 }
-SIZES = (50, 200, 800, 1600, 6400)
 SEEDS = (0, 1, 2)
+#: Networks that are trained on every number of states; the others on 200 and on all.
+CURVES = ("potential", "thesis")
 
 
 def standardised_loss(model: Any, training: dict[str, np.ndarray], test: dict[str, np.ndarray]) -> float:
@@ -128,40 +146,83 @@ def _run(case: str, name: str, data: dict[str, dict[str, np.ndarray]], size: int
     }
 
 
-def main(folder: Path) -> None:
-    """Make what is missing, and write all runs to ``benchmarks/data/networks.json``."""
-    from softgym_envs.config import provenance
-    from softgym_envs.storage import write_json
+def _track(case: str, data: dict[str, dict[str, np.ndarray]], size: int, folder: Path) -> dict[str, Any]:
+    """Tracking with a network that learned ``size`` states chosen by k-means (thesis 5.3)."""
+    import torch
 
-    runs = []
-    for case in CASES:
-        data = _data(folder / "data", case)
-        available = int((~data["train"]["rest"].astype(bool)).sum())
-        for name in NETWORKS:
-            for size in SIZES:
-                for seed in SEEDS if "x 5" not in name else SEEDS[:1]:
-                    if size > available or ("x 5" in name and size not in (200, 1600)):
-                        continue
-                    path = folder / "runs" / f"{case}_{name.replace(' ', '')}_{size}_{seed}.json"
-                    if not path.exists():
-                        write_json(path, _run(case, name, data, size, seed))
-                    runs.append(json.loads(path.read_text()))
-                    last = runs[-1]
-                    print(
-                        f"{case:8s} {name:14s} {size:5d} states, seed {seed}: "
-                        f"effector {1e3 * last['effector_mean']:.4f} mm, loss {last['loss']:.2e}",
-                        flush=True,
-                    )
-    write_json(KEPT, {**provenance(), "runs": runs})
+    from benchmarks.robots import predicted_path
+    from softgym_envs.robots import make_robot
+    from softgym_envs.surrogate.model import FORMAT, Features
+    from softgym_envs.surrogate.networks import potential
+    from softgym_envs.surrogate.online import save_model
+    from softgym_envs.surrogate.sampling import learned_variables, select_states
+    from softgym_envs.surrogate.states import stable_rows, training_states
+    from softgym_envs.surrogate.training import Trainer
+
+    torch.set_num_threads(1)
+    robot = make_robot(CASES[case]["robot"], **CASES[case]["robot_options"])
+    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
+    usable = np.flatnonzero(stable_rows(robot, data["train"]) & ~data["train"]["rest"].astype(bool))
+    pool = {k: v[usable] for k, v in data["train"].items()}
+    chosen = np.concatenate([[0], usable[select_states(pool, size - 1)]])
+    part = {k: v[chosen] for k, v in data["train"].items()}
+    options = potential.Options(members=1, steps=8000, batch_size=128)
+    states = {k: training_states(robot, d, features) for k, d in (("t", part), ("v", data["validation"]))}
+    tensors, _ = potential.train(robot, states["t"], states["v"], Trainer(options, 0))
+    card = {
+        "format": FORMAT,
+        "network": "potential",
+        "robot": robot.name,
+        "signature": robot.signature,
+        "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
+        "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
+    }
+    save_model(potential.Model(robot, tensors, card), folder)
+    track = {**CASES[case]["robot_options"], **({"unilateral": False} if case == "diamond" else {})}
+    return {"case": case, "states": size, **predicted_path(CASES[case]["robot"], options=track, weights=folder)}
+
+
+def main(folder: Path) -> None:
+    """Make what is missing, and write all runs to ``benchmarks/data/networks.json``, also when it is stopped."""
+    try:
+        for case, given in CASES.items():
+            data = _data(folder / "data", case)
+            path = folder / "runs" / f"{case}_tracking.json"
+            if not path.exists():
+                write_json(path, _track(case, data, given["tracking"], folder / "models" / case))
+            for seed in SEEDS:
+                for name in NETWORKS:
+                    for size in given["sizes"]:
+                        if name not in CURVES and size not in (200, given["sizes"][-1]):
+                            continue
+                        if "x 5" in name and seed:
+                            continue
+                        path = folder / "runs" / f"{case}_{name.replace(' ', '')}_{size}_{seed}.json"
+                        if not path.exists():
+                            write_json(path, _run(case, name, data, size, seed))
+                        last = json.loads(path.read_text())
+                        print(
+                            f"{case:8s} {name:14s} {size:5d} states, seed {seed}: "
+                            f"effector {1e3 * last['effector_mean']:.4f} mm, loss {last['loss']:.2e}",
+                            flush=True,
+                        )
+    finally:
+        found = [json.loads(path.read_text()) for path in sorted((folder / "runs").glob("*.json"))]
+        runs, tracks = [r for r in found if "network" in r], [r for r in found if "network" not in r]
+        write_json(KEPT, {**provenance(), "runs": runs, "tracking": tracks})
 
 
 def networks() -> dict[str, object]:
     """Test errors of the networks by number of states: median of three seeds (smallest to largest)."""
-    runs = json.loads(KEPT.read_text())["runs"]
+    kept = json.loads(KEPT.read_text())
+    runs = kept["runs"]
     result: dict[str, object] = {}
+    for track in kept["tracking"]:
+        name = f"{track['case']}, {track['states']} states chosen by k-means"
+        result |= {f"{name}: {k}": v for k, v in track.items() if k not in ("case", "states")}
     for case in CASES:
         for name in NETWORKS:
-            for size in SIZES:
+            for size in CASES[case]["sizes"]:
                 found = [r for r in runs if (r["case"], r["network"], r["states"]) == (case, name, size)]
                 if not found:
                     continue

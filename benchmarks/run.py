@@ -47,6 +47,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "hybrid": hybrid.hybrid,
     "deployed": export.deployed,
     "tracking": robots.tracking,
+    "predicted_tracking": robots.predicted_tracking,
     "stiff_flop": robots.stiff_flop,
     "carry": carry.carry,
     "sensor_finger": sensor_finger.published,

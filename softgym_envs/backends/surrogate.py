@@ -53,8 +53,7 @@ def released(model: SurrogateModel, context: Context, effort: np.ndarray, start:
     limit = 0.25 * (model.robot.upper - model.robot.lower)
     for _ in range(50):
         found, effector, spread = model.state(context, displacement)
-        W = model.compliance(context, displacement)[:, : model.count, : model.count]
-        step = np.matmul(W, (effort - found)[:, :, None])[:, :, 0]
+        step = np.linalg.solve(model.stiffness(context, displacement), (effort - found)[:, :, None])[:, :, 0]
         moving = (np.abs(step) > TOLERANCE * limit).any(axis=1)
         if not moving.any():
             break
@@ -113,7 +112,7 @@ def settle(
     for iteration in range(max_iterations):
         if iteration % 4 == 0:
             # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
-            W = model.compliance(part, d)[:, : model.count, : model.count]
+            W = np.linalg.inv(model.stiffness(part, d))
         try:
             taut = solve_complementarity(W, d - np.matmul(W, e[:, :, None])[:, :, 0] - wanted, unilateral)
         except np.linalg.LinAlgError:  # a network that does not keep W positive definite
@@ -129,8 +128,10 @@ def settle(
             if len(rows) == 0:
                 break
             d, wanted, W, part = d[moving], wanted[moving], W[moving], part.rows(moving)
-        e, effector[rows], spread[rows] = model.state(part, d)
+        e = model.effort(part, d)
     converged[rows] = False
+    found = displacement[searched]
+    _, effector[searched], spread[searched] = model.state(context.rows(searched), found)
     loose[searched] = unilateral & (displacement[searched] > target[searched] + 10.0 * tolerance)
     effort = np.where(loose, 0.0, np.where(unilateral, np.maximum(effort, 0.0), effort))
     trust = model.trust(context, displacement, spread)

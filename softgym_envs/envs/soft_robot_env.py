@@ -51,7 +51,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
     Args:
         robot: registry name of the robot.
         task: registry name of the task.
-        backend: ``"surrogate"`` or ``"fem"``.
+        backend: ``"surrogate"``, ``"fem"``, or ``"hybrid"`` of both.
         design: body of every episode unless given in `reset`; missing variables take their baseline.
         sample_design: draw the body at each reset: True for all variables, or their names.
         design_in_observation: show the body to the agent: True for all variables, or their names.

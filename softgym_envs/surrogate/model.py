@@ -161,6 +161,14 @@ class SurrogateModel(ABC):
         effort, effector, spread = self._state(context, displacement)
         return effort * context.stiffness[context.slot], effector, spread
 
+    def effort(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        """Return the efforts alone, (B, n_a), at displacements (B, n_a)."""
+        return self._effort(context, displacement) * context.stiffness[context.slot]
+
+    def stiffness(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        """Return the inverse of W between actuators alone, (B, n_a, n_a), at displacements (B, n_a)."""
+        return self._stiffness(context, displacement) * context.stiffness[context.slot][:, :, None]
+
     def trust(self, context: Context, displacement: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Judge predictions at displacements (B, n_a) by their spread (B,).
 
@@ -194,6 +202,12 @@ class SurrogateModel(ABC):
     @abstractmethod
     def _state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Efforts at baseline stiffness, effector positions and their spread."""
+
+    def _effort(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        return self._state(context, displacement)[0]
+
+    def _stiffness(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        return np.linalg.inv(self._compliance(context, displacement)[:, : self.count, : self.count])
 
     @abstractmethod
     def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:

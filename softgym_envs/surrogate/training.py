@@ -71,6 +71,7 @@ class FitConfig(Config):
     data: DataConfig
     network: NetworkOptions = Field(default_factory=network_module("potential").Options)
     workers: int = Field(default=2, gt=0)
+    executor: Literal["loky", "ray"] = "loky"
     seed: int = 0
 
 
@@ -225,6 +226,7 @@ def generate(config: FitConfig, data_folder: str | Path, *, progress: bool = Tru
             robot_options=config.robot_options,
             groups_per_shard=10,
             workers=config.workers,
+            executor=config.executor,
             progress=progress,
         )
         for split in SPLITS
@@ -254,7 +256,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         for column in split.values():
             digest.update(np.ascontiguousarray(column).tobytes())
     asked: dict[str, Any] = {
-        "config": config.model_dump(mode="json", exclude={"workers"}),
+        "config": config.model_dump(mode="json", exclude={"workers", "executor"}),
         "data_sha256": digest.hexdigest(),
     }
     card_path = folder / "model.json"
@@ -281,7 +283,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         "signature": robot.signature,
         "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
         "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
-        "config": config.model_dump(mode="json"),
+        "config": config.model_dump(mode="json", exclude={"executor"}),
         "domain": domain_of(model, data["train"], data["validation"]),
         "loaded": bool(robot.build().loads.any()),
         "states": {split: len(rows) for split, rows in states.items()},

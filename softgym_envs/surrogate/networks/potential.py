@@ -51,114 +51,195 @@ class Options(Config):
     learning_rate: float = Field(default=3e-3, gt=0)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-def _evaluate(
-    u, slot, A1, A2, P, PT, B1, B2, V, c1, c2, a, b, d1, d2, quadratic, linear, x0, slope, effort, effector, spread
-):
-    """Gradient of the energy (rows, n), effector (rows, e) and its spread (rows,) at scaled actuation u (rows, n)."""
+_FAST: Any = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
+#: Rows evaluated together: each weight is then fetched once for all of them.
+_ROWS = 4
+
+
+@njit(**_FAST)
+def _multiply(h, weights, z, rows):
+    """``z += h @ weights`` for the first ``rows`` rows, four at a time."""
+    inputs, width = weights.shape
+    first = 0
+    while first + 4 <= rows:
+        for k in range(inputs):
+            h0, h1, h2, h3 = h[first, k], h[first + 1, k], h[first + 2, k], h[first + 3, k]
+            for j in range(width):
+                weight = weights[k, j]
+                z[first, j] += h0 * weight
+                z[first + 1, j] += h1 * weight
+                z[first + 2, j] += h2 * weight
+                z[first + 3, j] += h3 * weight
+        first += 4
+    for row in range(first, rows):
+        for k in range(inputs):
+            value = h[row, k]
+            for j in range(width):
+                z[row, j] += value * weights[k, j]
+
+
+@njit(**_FAST)
+def _efforts(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, effort):
+    """Gradient of the energy (rows, n) at scaled actuation u (rows, n) of bodies ``slot`` (rows,)."""
     members, n, w = A1.shape
+    one, half, share = np.float32(1.0), np.float32(0.5), np.float32(1.0 / members)
+    h, hp = np.empty((_ROWS, w), np.float32), np.empty((_ROWS, w), np.float32)
+    z, lower = np.empty((_ROWS, w), np.float32), np.empty((_ROWS, w), np.float32)
+    for start in range(0, len(u), _ROWS):
+        rows = min(_ROWS, len(u) - start)
+        part = u[start : start + rows]
+        for r in range(rows):
+            s = slot[start + r]
+            for i in range(n):
+                value = linear[s, i]
+                for j in range(n):
+                    value += quadratic[s, i, j] * part[r, j]
+                effort[start + r, i] = value
+        for m in range(members):
+            for r in range(rows):
+                s = slot[start + r]
+                for j in range(w):
+                    z[r, j] = c1[s, m, j]
+            _multiply(part, A1[m], z, rows)
+            for r in range(rows):
+                s = slot[start + r]
+                for j in range(w):
+                    root = np.sqrt(one + z[r, j] * z[r, j])
+                    h[r, j] = half * (z[r, j] + root)
+                    hp[r, j] = half * (one + z[r, j] / root)
+                    z[r, j] = c2[s, m, j]
+                    lower[r, j] = b[s, m, j]
+            _multiply(part, A2[m], z, rows)
+            _multiply(h, PT[m], z, rows)
+            for r in range(rows):
+                s = slot[start + r]
+                for j in range(w):
+                    z[r, j] = a[s, m, j] * half * (one + z[r, j] / np.sqrt(one + z[r, j] * z[r, j]))
+            _multiply(z, P[m], lower, rows)
+            for r in range(rows):
+                for i in range(n):
+                    value = np.float32(0.0)
+                    for j in range(w):
+                        value += lower[r, j] * hp[r, j] * A1[m, i, j] + z[r, j] * A2[m, i, j]
+                    effort[start + r, i] += share * value
+
+
+@njit(**_FAST)
+def _effectors(u, slot, B1, B2, V, d1, d2, x0, slope, effector, spread):
+    """Effector (rows, e) and its spread (rows,) at scaled actuation u (rows, n) of bodies ``slot`` (rows,)."""
+    members, n, w = B1.shape
     e = V.shape[2]
-    one, half = np.float32(1.0), np.float32(0.5)
-    share = np.float32(1.0 / members)
-    h, hp, z = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
-    upper, lower = np.empty(w, np.float32), np.empty(w, np.float32)
-    x = np.empty((members, e), np.float32)
+    one, share = np.float32(1.0), np.float32(1.0 / members)
+    h, z = np.empty((_ROWS, w), np.float32), np.empty((_ROWS, w), np.float32)
+    x = np.empty((_ROWS, members, e), np.float32)
+    for start in range(0, len(u), _ROWS):
+        rows = min(_ROWS, len(u) - start)
+        part = u[start : start + rows]
+        for m in range(members):
+            for r in range(rows):
+                s = slot[start + r]
+                for j in range(w):
+                    z[r, j] = d1[s, m, j]
+            _multiply(part, B1[m], z, rows)
+            for r in range(rows):
+                s = slot[start + r]
+                for j in range(w):
+                    h[r, j] = z[r, j] / np.sqrt(one + z[r, j] * z[r, j])
+                    z[r, j] = d2[s, m, j]
+            _multiply(h, B2[m], z, rows)
+            for r in range(rows):
+                s = slot[start + r]
+                for k in range(e):
+                    value = x0[s, m, k]
+                    for i in range(n):
+                        value += slope[s, m, k, i] * part[r, i]
+                    x[r, m, k] = value
+                for j in range(w):
+                    value = z[r, j] / np.sqrt(one + z[r, j] * z[r, j])
+                    for k in range(e):
+                        x[r, m, k] += value * V[m, j, k]
+        # mean, and the largest standard deviation of a point
+        for r in range(rows):
+            for k in range(e):
+                value = np.float32(0.0)
+                for m in range(members):
+                    value += x[r, m, k]
+                effector[start + r, k] = share * value
+            largest = np.float32(0.0)
+            for first in range(0, e, 3):
+                value = np.float32(0.0)
+                for k in range(first, first + 3):
+                    for m in range(members):
+                        value += (x[r, m, k] - effector[start + r, k]) ** 2
+                largest = max(largest, value)
+            spread[start + r] = np.sqrt(share * largest)
+
+
+@njit(**_FAST)
+def _hessians(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratic, hessian):
+    """Hessian of the energy (rows, n, n) at scaled actuation u (rows, n) of bodies ``slot`` (rows,)."""
+    members, n, w = A1.shape
+    one, half, share = np.float32(1.0), np.float32(0.5), np.float32(1.0 / members)
+    h, z = np.empty((1, w), np.float32), np.empty((1, w), np.float32)
+    hp, hpp = np.empty(w, np.float32), np.empty(w, np.float32)
+    upper, lower = np.empty((1, w), np.float32), np.empty((1, w), np.float32)
+    through, first = np.empty((n, w), np.float32), np.empty((n, w), np.float32)
     for row in range(len(u)):
         s = slot[row]
+        part = u[row : row + 1]
         for i in range(n):
-            value = linear[s, i]
             for j in range(n):
-                value += quadratic[s, i, j] * u[row, j]
-            effort[row, i] = value
+                hessian[row, i, j] = quadratic[s, i, j]
         for m in range(members):
-            # energy: forward
             for j in range(w):
-                z[j] = c1[s, m, j]
+                z[0, j] = c1[s, m, j]
+            _multiply(part, A1[m], z, 1)
+            for j in range(w):
+                r = one / np.sqrt(one + z[0, j] * z[0, j])
+                h[0, j] = half * (z[0, j] + one / r)
+                hp[j] = half * (one + z[0, j] * r)
+                hpp[j] = half * r * r * r
+                z[0, j] = c2[s, m, j]
+                lower[0, j] = b[s, m, j]
             for i in range(n):
                 for j in range(w):
-                    z[j] += u[row, i] * A1[m, i, j]
+                    first[i, j] = hp[j] * A1[m, i, j]
+                    through[i, j] = A2[m, i, j]
+            _multiply(part, A2[m], z, 1)
+            _multiply(h, PT[m], z, 1)
+            _multiply(first, PT[m], through, n)
             for j in range(w):
-                root = np.sqrt(one + z[j] * z[j])
-                h[j] = half * (z[j] + root)
-                hp[j] = half * (one + z[j] / root)
-                z[j] = c2[s, m, j]
-                lower[j] = b[s, m, j]
+                r = one / np.sqrt(one + z[0, j] * z[0, j])
+                upper[0, j] = a[s, m, j] * half * (one + z[0, j] * r)
+                z[0, j] = a[s, m, j] * half * r * r * r
+            _multiply(upper, P[m], lower, 1)
             for i in range(n):
-                for j in range(w):
-                    z[j] += u[row, i] * A2[m, i, j]
-            for k in range(w):
-                for j in range(w):
-                    z[j] += h[k] * PT[m, k, j]
-            # and backward
-            for j in range(w):
-                upper[j] = a[s, m, j] * half * (one + z[j] / np.sqrt(one + z[j] * z[j]))
-            for k in range(w):
-                for j in range(w):
-                    lower[j] += upper[k] * P[m, k, j]
-            for j in range(w):
-                lower[j] *= hp[j]
-            for i in range(n):
-                value = np.float32(0.0)
-                for j in range(w):
-                    value += lower[j] * A1[m, i, j] + upper[j] * A2[m, i, j]
-                effort[row, i] += share * value
-            # effector
-            for j in range(w):
-                z[j] = d1[s, m, j]
-            for i in range(n):
-                for j in range(w):
-                    z[j] += u[row, i] * B1[m, i, j]
-            for j in range(w):
-                h[j] = z[j] / np.sqrt(one + z[j] * z[j])
-                z[j] = d2[s, m, j]
-            for k in range(w):
-                for j in range(w):
-                    z[j] += h[k] * B2[m, k, j]
-            for k in range(e):
-                value = x0[s, m, k]
-                for i in range(n):
-                    value += slope[s, m, k, i] * u[row, i]
-                x[m, k] = value
-            for j in range(w):
-                value = z[j] / np.sqrt(one + z[j] * z[j])
-                for k in range(e):
-                    x[m, k] += value * V[m, j, k]
-        # mean, and the largest standard deviation of a point
-        for k in range(e):
-            value = np.float32(0.0)
-            for m in range(members):
-                value += x[m, k]
-            effector[row, k] = share * value
-        largest = np.float32(0.0)
-        for first in range(0, e, 3):
-            value = np.float32(0.0)
-            for k in range(first, first + 3):
-                for m in range(members):
-                    value += (x[m, k] - effector[row, k]) ** 2
-            largest = max(largest, value)
-        spread[row] = np.sqrt(share * largest)
+                for k in range(i + 1):
+                    value = np.float32(0.0)
+                    for j in range(w):
+                        value += (
+                            A1[m, i, j] * lower[0, j] * hpp[j] * A1[m, k, j] + through[i, j] * z[0, j] * through[k, j]
+                        )
+                    hessian[row, i, k] += share * value
+        for i in range(n):
+            for k in range(i):
+                hessian[row, k, i] = hessian[row, i, k]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-def _differentiate(
-    u, slot, A1, A2, P, PT, B1, B2, V, H, c1, c2, a, b, d1, d2, quadratic, slope, held0, hessian, jacobian, held
-):
-    """Hessian of the energy (rows, n, n), Jacobian of the effector (rows, e, n), held compliance (rows, e, e)."""
-    members, n, w = A1.shape
+@njit(**_FAST)
+def _jacobians(u, slot, B1, B2, V, H, d1, d2, slope, held0, jacobian, held):
+    """Jacobian of the effector (rows, e, n) and held compliance (rows, e, e) of bodies ``slot`` (rows,)."""
+    members, n, w = B1.shape
     e = V.shape[2]
     entries = H.shape[2]
-    one, half = np.float32(1.0), np.float32(0.5)
-    share = np.float32(1.0 / members)
-    h, hp, hpp = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
-    z, upper, lower = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    one, share = np.float32(1.0), np.float32(1.0 / members)
+    h, z, hp = np.empty((1, w), np.float32), np.empty((1, w), np.float32), np.empty(w, np.float32)
     through, first = np.empty((n, w), np.float32), np.empty((n, w), np.float32)
     y = np.empty(entries, np.float32)
     L = np.zeros((e, e), np.float32)
     for row in range(len(u)):
         s = slot[row]
-        for i in range(n):
-            for j in range(n):
-                hessian[row, i, j] = quadratic[s, i, j]
+        part = u[row : row + 1]
         for k in range(e):
             for i in range(n):
                 jacobian[row, k, i] = 0.0
@@ -166,72 +247,26 @@ def _differentiate(
                 held[row, k, j] = 0.0
         for m in range(members):
             for j in range(w):
-                z[j] = c1[s, m, j]
-            for i in range(n):
-                for j in range(w):
-                    z[j] += u[row, i] * A1[m, i, j]
+                z[0, j] = d1[s, m, j]
+            _multiply(part, B1[m], z, 1)
             for j in range(w):
-                r = one / np.sqrt(one + z[j] * z[j])
-                h[j] = half * (z[j] + one / r)
-                hp[j] = half * (one + z[j] * r)
-                hpp[j] = half * r * r * r
-                z[j] = c2[s, m, j]
-                lower[j] = b[s, m, j]
-            for i in range(n):
-                for j in range(w):
-                    first[i, j] = hp[j] * A1[m, i, j]
-                    through[i, j] = A2[m, i, j]
-                    z[j] += u[row, i] * A2[m, i, j]
-            for k in range(w):
-                for j in range(w):
-                    z[j] += h[k] * PT[m, k, j]
-                for i in range(n):
-                    for j in range(w):
-                        through[i, j] += first[i, k] * PT[m, k, j]
-            for j in range(w):
-                r = one / np.sqrt(one + z[j] * z[j])
-                upper[j] = a[s, m, j] * half * (one + z[j] * r)
-                z[j] = a[s, m, j] * half * r * r * r
-            for k in range(w):
-                for j in range(w):
-                    lower[j] += upper[k] * P[m, k, j]
-            for j in range(w):
-                lower[j] *= hpp[j]
-            for i in range(n):
-                for k in range(i + 1):
-                    value = np.float32(0.0)
-                    for j in range(w):
-                        value += A1[m, i, j] * lower[j] * A1[m, k, j] + through[i, j] * z[j] * through[k, j]
-                    hessian[row, i, k] += share * value
-            # effector and held compliance
-            for j in range(w):
-                z[j] = d1[s, m, j]
-            for i in range(n):
-                for j in range(w):
-                    z[j] += u[row, i] * B1[m, i, j]
-            for j in range(w):
-                r = one / np.sqrt(one + z[j] * z[j])
-                h[j] = z[j] * r
+                r = one / np.sqrt(one + z[0, j] * z[0, j])
+                h[0, j] = z[0, j] * r
                 hp[j] = r * r * r
-                z[j] = d2[s, m, j]
+                z[0, j] = d2[s, m, j]
             for i in range(n):
                 for j in range(w):
                     first[i, j] = hp[j] * B1[m, i, j]
                     through[i, j] = 0.0
-            for k in range(w):
-                for j in range(w):
-                    z[j] += h[k] * B2[m, k, j]
-                for i in range(n):
-                    for j in range(w):
-                        through[i, j] += first[i, k] * B2[m, k, j]
+            _multiply(h, B2[m], z, 1)
+            _multiply(first, B2[m], through, n)
             for k in range(entries):
                 y[k] = held0[s, m, k]
             for j in range(w):
-                r = one / np.sqrt(one + z[j] * z[j])
-                h[j] = z[j] * r
+                r = one / np.sqrt(one + z[0, j] * z[0, j])
                 hp[j] = r * r * r
                 for k in range(entries):
-                    y[k] += h[j] * H[m, j, k]
+                    y[k] += z[0, j] * r * H[m, j, k]
             for k in range(e):
                 for i in range(n):
                     value = slope[s, m, k, i]
@@ -249,9 +284,6 @@ def _differentiate(
                     for k in range(j + 1):
                         value += L[i, k] * L[j, k]
                     held[row, i, j] += share * value
-        for i in range(n):
-            for k in range(i):
-                hessian[row, k, i] = hessian[row, i, k]
         for i in range(e):
             for k in range(i):
                 held[row, k, i] = held[row, i, k]
@@ -289,7 +321,7 @@ class Model(SurrogateModel):
         P = np.logaddexp(0.0, tensors["pass_on"].astype(float)).astype(np.float32)
         PT = np.ascontiguousarray(P.transpose(0, 2, 1))
         B1, B2 = kernel("shape1", 0, 2, 1), kernel("shape2", 0, 2, 1)
-        self._weights = (A1, A2, P, PT, B1, B2, kernel("effector", 0, 2, 1))
+        self._energy, self._shape = (A1, A2, P, PT), (B1, B2, kernel("effector", 0, 2, 1))
         self._held = kernel("held", 0, 2, 1)
         layers = [(tensors[f"body.{k}.weight"], tensors[f"body.{k}.bias"]) for k in range(3)]
         self._layers = [(w.astype(np.float32), v.astype(np.float32)[:, None]) for w, v in layers]
@@ -320,41 +352,47 @@ class Model(SurrogateModel):
         body["linear"] = np.ascontiguousarray(body["linear"].mean(axis=1))
         if self._rest is not None:
             body["linear"] = np.zeros_like(body["linear"])
-            at_rest = self._gradient(body, np.repeat(self._rest[None], rows, axis=0), np.arange(rows))[0]
-            body["linear"] = -at_rest
+            body["linear"] = -self._gradient(body, np.repeat(self._rest[None], rows, axis=0), np.arange(rows))
         return body
 
-    def _gradient(self, body: dict[str, np.ndarray], u: np.ndarray, slot: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _gradient(self, body: dict[str, np.ndarray], u: np.ndarray, slot: np.ndarray) -> np.ndarray:
         effort = np.empty((len(u), self.count), dtype=np.float32)
-        effector = np.empty((len(u), self.effectors), dtype=np.float32)
-        spread = np.empty(len(u), dtype=np.float32)
-        _evaluate(  # type: ignore[call-arg]
-            u, slot, *self._weights, *(body[k] for k in ("c1", "c2", "a", "b", "d1", "d2")),
-            body["quadratic"], body["linear"], body["x0"], body["slope"], effort, effector, spread,
-        )  # fmt: skip
-        return effort, effector, spread
+        coefficients = (body["c1"], body["c2"], body["a"], body["b"], body["quadratic"], body["linear"])
+        _efforts(u, slot, *self._energy, *coefficients, effort)
+        return effort
 
     def _scaled(self, displacement: np.ndarray) -> np.ndarray:
         return ((displacement - self.middle) / self.half_range).astype(np.float32)
 
+    def _effort(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        return self._gradient(context.arrays, self._scaled(displacement), context.slot) * self._effort_scale
+
     def _state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        effort, effector, spread = self._gradient(context.arrays, self._scaled(displacement), context.slot)
+        u, body, slot = self._scaled(displacement), context.arrays, context.slot
+        effector = np.empty((len(u), self.effectors), dtype=np.float32)
+        spread = np.empty(len(u), dtype=np.float32)
+        coefficients = (body["d1"], body["d2"], body["x0"], body["slope"])
+        _effectors(u, slot, *self._shape, *coefficients, effector, spread)
         if self.members == 1:
-            spread = np.full(len(effort), np.inf)
+            spread = np.full(len(u), np.inf)
         position = effector * self.effector_scale + self.effector_mean
-        return effort * self._effort_scale, position, spread * self.effector_scale
+        return self._gradient(body, u, slot) * self._effort_scale, position, spread * self.effector_scale
+
+    def _stiffness(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        u, body = self._scaled(displacement), context.arrays
+        hessian = np.empty((len(u), self.count, self.count), dtype=np.float32)
+        coefficients = (body["c1"], body["c2"], body["a"], body["b"], body["quadratic"])
+        _hessians(u, context.slot, *self._energy, *coefficients, hessian)
+        return hessian.astype(float) * (self._effort_scale[:, None] / self.half_range)
 
     def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         u, body = self._scaled(displacement), context.arrays
         rows, n, e = len(u), self.count, self.effectors
-        hessian = np.empty((rows, n, n), dtype=np.float32)
         jacobian = np.empty((rows, e, n), dtype=np.float32)
         held = np.empty((rows, e, e), dtype=np.float32)
-        _differentiate(  # type: ignore[call-arg]
-            u, context.slot, *self._weights, self._held, *(body[k] for k in ("c1", "c2", "a", "b", "d1", "d2")),
-            body["quadratic"], body["slope"], body["held"], hessian, jacobian, held,
-        )  # fmt: skip
-        K = hessian.astype(float) * (self._effort_scale[:, None] / self.half_range)
+        coefficients = (body["d1"], body["d2"], body["slope"], body["held"])
+        _jacobians(u, context.slot, *self._shape, self._held, *coefficients, jacobian, held)
+        K = self._stiffness(context, displacement)
         J = jacobian.astype(float) * (self.effector_scale / self.half_range)
         W = np.empty((rows, self.size, self.size))
         a, c = slice(0, n), slice(n, None)
@@ -472,7 +510,7 @@ def _targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) -> lis
 
 
 def potential_loss(net, batch: list, effort_spread: float):
-    """Sum of mean squared errors: efforts and W_aa in the metric of W_aa itself, C in its own, effector and Jacobian plain."""
+    """Sum of mean squared errors: efforts and W_aa in the metric of W_aa, C in its own, effector and Jacobian plain."""
     import torch
 
     design, u, effort, effector, S, J, whitening, C = batch
