@@ -49,6 +49,8 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "residual": {"kind": "residual", "steps": 4000, "batch_size": 128},
     "thesis": {"kind": "thesis", "steps": 4000, "batch_size": 128},
     "rbf": {"kind": "rbf"},
+    "potential, 5 times the steps": {"kind": "potential", "members": 1, "steps": 20_000, "batch_size": 256},
+    "residual, 5 times the steps": {"kind": "residual", "steps": 20_000, "batch_size": 256},
     "potential x 5": {"kind": "potential", "members": 5, "steps": 4000, "batch_size": 128},
 }
 SEEDS = (0, 1, 2)
@@ -195,9 +197,9 @@ def main(folder: Path) -> None:
                     for size in given["sizes"]:
                         if name not in CURVES and size not in (200, given["sizes"][-1]):
                             continue
-                        if "x 5" in name and seed:
+                        if ("5" in name and seed) or ("times" in name and size != given["sizes"][-1]):
                             continue
-                        path = folder / "runs" / f"{case}_{name.replace(' ', '')}_{size}_{seed}.json"
+                        path = folder / "runs" / f"{case}_{name.replace(' ', '').replace(',', '_')}_{size}_{seed}.json"
                         if not path.exists():
                             write_json(path, _run(case, name, data, size, seed))
                         last = json.loads(path.read_text())

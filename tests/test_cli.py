@@ -49,7 +49,7 @@ def test_rollout_evaluate_and_record(monkeypatch, capsys, tmp_path):
 
 
 def test_dataset_fit_and_train(monkeypatch, capsys, tmp_path):
-    tiny = ["workers=1", "network.epochs=3", "network.width=16", "robot_options.cables=1"]
+    tiny = ["workers=1", "network.steps=3", "network.width=16", "robot_options.cables=1"]
     tiny += [f"data.{s}.groups=2" for s in ("train", "validation", "test")]
     tiny += [f"data.{s}.states=3" for s in ("train", "validation", "test")]
     config = ROOT / "configs" / "surrogate" / "finger_1cable.yaml"
