@@ -11,7 +11,6 @@ import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.complementarity import solve_complementarity
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.robot import Robot
 from softgym_envs.surrogate.model import Context, SurrogateModel
@@ -50,7 +49,7 @@ class Settled:
 def released(model: SurrogateModel, context: Context, effort: np.ndarray, start: np.ndarray) -> Settled:
     """Find the states under efforts (B, n_a), by Newton's method from displacements ``start`` (B, n_a)."""
     displacement = start.copy()
-    limit = 0.25 * (model.robot.upper - model.robot.lower)
+    limit = model.span
     for _ in range(50):
         found, effector, spread = model.state(context, displacement)
         step = np.linalg.solve(model.stiffness(context, displacement), (effort - found)[:, :, None])[:, :, 0]
@@ -96,46 +95,12 @@ def settle(
         max_iterations: bound on the search; it ends after two or three.
     """
     guess = target if slack is None else np.where(slack, np.maximum(start, target), target)
-    effort, effector, spread = model.state(context, guess)
-    wrong = unilateral & ((effort < 0.0) | (guess > target))
-    loose = np.zeros(guess.shape, dtype=bool)
-    converged = np.isfinite(effort).all(axis=1)
-    if not wrong.any():
-        return Settled(guess, effort, effector, loose, converged, *model.trust(context, guess, spread))
-    displacement = guess.copy()
-    searched = np.flatnonzero(wrong.any(axis=1))
-    # Working copies of the rows still searched; they are written back as their search ends.
-    rows, d, e, wanted = searched, guess[searched], effort[searched], target[searched]
-    part = context if len(rows) == len(guess) else context.rows(rows)
-    limit = 0.25 * (model.robot.upper - model.robot.lower)
-    tolerance = TOLERANCE * limit
-    for iteration in range(max_iterations):
-        if iteration % 4 == 0:
-            # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
-            W = np.linalg.inv(model.stiffness(part, d))
-        try:
-            taut = solve_complementarity(W, d - np.matmul(W, e[:, :, None])[:, :, 0] - wanted, unilateral)
-        except np.linalg.LinAlgError:  # a network that does not keep W positive definite
-            break
-        # Far steps are cut: the network is only asked where its neighbourhood of known states reaches.
-        step = np.minimum(np.maximum(np.matmul(W, (taut - e)[:, :, None])[:, :, 0], -limit), limit)
-        d = d + step
-        moving = (np.abs(step) > tolerance).any(axis=1)
-        if not moving.all():
-            # A last step below the tolerance is taken without asking the model again.
-            displacement[rows[~moving]], effort[rows[~moving]] = d[~moving], taut[~moving]
-            rows = rows[moving]
-            if len(rows) == 0:
-                break
-            d, wanted, W, part = d[moving], wanted[moving], W[moving], part.rows(moving)
-        e = model.effort(part, d)
-    converged[rows] = False
-    found = displacement[searched]
-    _, effector[searched], spread[searched] = model.state(context.rows(searched), found)
-    loose[searched] = unilateral & (displacement[searched] > target[searched] + 10.0 * tolerance)
-    effort = np.where(loose, 0.0, np.where(unilateral, np.maximum(effort, 0.0), effort))
-    trust = model.trust(context, displacement, spread)
-    return Settled(displacement, effort, effector, loose, converged, *trust)
+    displacement, effort, converged = model.search(context, target, guess, unilateral, TOLERANCE, max_iterations)
+    effector, spread = model.effector(context, displacement)
+    loose = unilateral & (displacement > target + (10.0 * TOLERANCE) * model.span)
+    if loose.any():
+        effort = np.where(loose, 0.0, np.where(unilateral, np.maximum(effort, 0.0), effort))
+    return Settled(displacement, effort, effector, loose, converged, *model.trust(context, displacement, spread))
 
 
 class SurrogateBackend(Backend):

@@ -36,18 +36,16 @@ MOVING = {"dynamics": True}
 ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/FingerReach-v0": EnvironmentRow("finger", "reach", 50),
     "SoftGym/FingerTrack-v0": EnvironmentRow("finger", "track", 100),
-    "SoftGym/DiamondReach-v0": EnvironmentRow("diamond", "reach", 50, backend="fem"),
+    "SoftGym/DiamondReach-v0": EnvironmentRow("diamond", "reach", 50),
     # The published circle asks for cables that push back on their way out.
-    "SoftGym/DiamondTrack-v0": EnvironmentRow(
-        "diamond", "track", 100, backend="fem", robot_options={"unilateral": False}
-    ),
-    "SoftGym/CableTrunkReach-v0": EnvironmentRow("cable_trunk", "reach", 50, backend="fem"),
-    "SoftGym/CableTrunkTrack-v0": EnvironmentRow("cable_trunk", "track", 100, backend="fem"),
-    "SoftGym/TrunkReach-v0": EnvironmentRow("trunk", "reach", 50, backend="fem"),
-    "SoftGym/TrunkTrack-v0": EnvironmentRow("trunk", "track", 100, backend="fem"),
+    "SoftGym/DiamondTrack-v0": EnvironmentRow("diamond", "track", 100, robot_options={"unilateral": False}),
+    "SoftGym/CableTrunkReach-v0": EnvironmentRow("cable_trunk", "reach", 50),
+    "SoftGym/CableTrunkTrack-v0": EnvironmentRow("cable_trunk", "track", 100),
+    "SoftGym/TrunkReach-v0": EnvironmentRow("trunk", "reach", 50),
+    "SoftGym/TrunkTrack-v0": EnvironmentRow("trunk", "track", 100),
     "SoftGym/FingerPress-v0": EnvironmentRow("press_finger", "track", 100),
-    "SoftGym/GripperPinch-v0": EnvironmentRow("two_finger_gripper", "track", 100, backend="fem"),
-    "SoftGym/GripperManipulate-v0": EnvironmentRow("three_finger_gripper", "track", 100, backend="fem"),
+    "SoftGym/GripperPinch-v0": EnvironmentRow("two_finger_gripper", "track", 100),
+    "SoftGym/GripperManipulate-v0": EnvironmentRow("three_finger_gripper", "track", 100),
     "SoftGym/TetrapodReach-v0": EnvironmentRow("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
     "SoftGym/TetrapodTrack-v0": EnvironmentRow("tetrapod", "track", 100, backend="fem", backend_options=MOVING),
     "SoftGym/TetrapodCarry-v0": EnvironmentRow("tetrapod", "carry", 100, backend="fem", backend_options=MOVING),

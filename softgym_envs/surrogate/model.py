@@ -18,6 +18,7 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace
 from softgym_envs.errors import WeightsError
+from softgym_envs.mechanics.complementarity import solve_complementarity
 from softgym_envs.mechanics.condensation import CondensedModel, Roles
 from softgym_envs.robots.robot import Robot
 from softgym_envs.surrogate.networks import network_module
@@ -127,6 +128,8 @@ class SurrogateModel(ABC):
         self.effectors = 3 * len(robot.effectors)
         self.size = self.count + self.effectors
         self.roles: Roles = (("a", self.count), ("e", self.effectors))
+        #: A quarter of the actuators' ranges, the unit of steps and tolerances of searches.
+        self.span = 0.25 * (robot.upper - robot.lower)
 
         domain = self.card.get("domain", {})
         self._inflation = float(domain.get("inflation", 1.0))
@@ -164,6 +167,57 @@ class SurrogateModel(ABC):
     def effort(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         """Return the efforts alone, (B, n_a), at displacements (B, n_a)."""
         return self._effort(context, displacement) * context.stiffness[context.slot]
+
+    def effector(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the effectors [m] (B, n_e) and their spread [m] (B,) alone."""
+        return self._state(context, displacement)[1:]
+
+    def search(
+        self,
+        context: Context,
+        target: np.ndarray,
+        guess: np.ndarray,
+        unilateral: np.ndarray,
+        tolerance: float,
+        iterations: int,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find the displacements that real cables reach: Newton's method on the complementarity problem, with W.
+
+        Args:
+            context: prepared bodies.
+            target: commanded displacements, shape (B, n_a).
+            guess: where the search begins, shape (B, n_a).
+            unilateral: actuators that cannot push, shape (n_a,).
+            tolerance: largest step left [quarter of the actuator range].
+            iterations: bound on the steps; it ends after two or three.
+
+        Returns:
+            Displacements (B, n_a), efforts (B, n_a), and whether they were found (B,).
+        """
+        displacement, effort = guess.copy(), self.effort(context, guess)
+        converged = np.isfinite(effort).all(axis=1)
+        rows = np.flatnonzero((unilateral & ((effort < 0.0) | (guess > target))).any(axis=1))
+        d, e, wanted, part = guess[rows], effort[rows], target[rows], context.rows(rows)
+        for iteration in range(iterations):
+            if len(rows) == 0:
+                break
+            if iteration % 4 == 0:
+                # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
+                W = np.linalg.inv(self.stiffness(part, d))
+            try:
+                taut = solve_complementarity(W, d - np.matmul(W, e[:, :, None])[:, :, 0] - wanted, unilateral)
+            except np.linalg.LinAlgError:  # a network that does not keep W positive definite
+                break
+            # Far steps are cut: the network is only asked where its neighbourhood of known states reaches.
+            step = np.clip(np.matmul(W, (taut - e)[:, :, None])[:, :, 0], -self.span, self.span)
+            d = d + step
+            moving = (np.abs(step) > tolerance * self.span).any(axis=1)
+            # A last step below the tolerance is taken without asking the model again.
+            displacement[rows[~moving]], effort[rows[~moving]] = d[~moving], taut[~moving]
+            rows, d, wanted, W, part = rows[moving], d[moving], wanted[moving], W[moving], part.rows(moving)
+            e = self.effort(part, d)
+        converged[rows] = False
+        return displacement, effort, converged
 
     def stiffness(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         """Return the inverse of W between actuators alone, (B, n_a, n_a), at displacements (B, n_a)."""

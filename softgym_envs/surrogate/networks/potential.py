@@ -32,6 +32,7 @@ from numba import njit
 from pydantic import Field
 
 from softgym_envs.config import Config
+from softgym_envs.mechanics.complementarity import _solve
 from softgym_envs.robots.robot import Robot
 from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.states import States
@@ -289,6 +290,72 @@ def _jacobians(u, slot, B1, B2, V, H, d1, d2, slope, held0, jacobian, held):
                 held[row, k, i] = held[row, i, k]
 
 
+@njit(**_FAST)
+def _search(
+    target, guess, unilateral, limit, tolerance, iterations, middle, half, scale, stiffness, slot,
+    A1, A2, P, PT, c1, c2, a, b, quadratic, linear, displacement, effort, converged,
+):  # fmt: skip
+    """Newton's method on the complementarity problem of each row; see `SurrogateModel.search`."""
+    n = target.shape[1]
+    u, g = np.empty((1, n), np.float32), np.empty((1, n), np.float32)
+    K = np.empty((1, n, n), np.float32)
+    W, gap, taut = np.empty((1, n, n)), np.empty((1, n)), np.empty((1, n))
+    d, e = np.empty(n), np.empty(n)
+    for row in range(len(target)):
+        one = slot[row : row + 1]
+        factor = stiffness[slot[row], 0]
+        for i in range(n):
+            d[i] = guess[row, i]
+        found = False
+        for iteration in range(iterations + 1):
+            for i in range(n):
+                u[0, i] = (d[i] - middle[i]) / half[i]
+            _efforts(u, one, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, g)
+            finite, right = True, iteration == 0
+            for i in range(n):
+                e[i] = g[0, i] * scale[i] * factor
+                finite = finite and np.isfinite(e[i])
+                if unilateral[i] and (e[i] < 0.0 or d[i] > target[row, i]):
+                    right = False
+            if not finite or right:
+                found = finite
+                for i in range(n):
+                    effort[row, i] = e[i]
+                break
+            if iteration % 4 == 0:
+                # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
+                _hessians(u, one, A1, A2, P, PT, c1, c2, a, b, quadratic, K)
+                for i in range(n):
+                    for j in range(n):
+                        W[0, i, j] = K[0, i, j] * scale[i] / half[j] * factor
+                W[0] = np.linalg.inv(W[0])
+            for i in range(n):
+                value = d[i] - target[row, i]
+                for j in range(n):
+                    value -= W[0, i, j] * e[j]
+                gap[0, i] = value
+            if _solve(W, gap, unilateral, taut) >= 0:
+                break
+            moving = False
+            for i in range(n):
+                step = 0.0
+                for j in range(n):
+                    step += W[0, i, j] * (taut[0, j] - e[j])
+                # Far steps are cut: the network is only asked where its neighbourhood of known states reaches.
+                step = min(max(step, -limit[i]), limit[i])
+                d[i] += step
+                moving = moving or abs(step) > tolerance[i]
+            if not moving:
+                # A last step below the tolerance is taken without asking the model again.
+                found = True
+                for i in range(n):
+                    effort[row, i] = taut[0, i]
+                break
+        converged[row] = found
+        for i in range(n):
+            displacement[row, i] = d[i]
+
+
 class Model(SurrogateModel):
     """An ensemble of potential networks (see the module)."""
 
@@ -368,15 +435,36 @@ class Model(SurrogateModel):
         return self._gradient(context.arrays, self._scaled(displacement), context.slot) * self._effort_scale
 
     def _state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        u, body, slot = self._scaled(displacement), context.arrays, context.slot
+        return self._effort(context, displacement), *self.effector(context, displacement)
+
+    def effector(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        u, body = self._scaled(displacement), context.arrays
         effector = np.empty((len(u), self.effectors), dtype=np.float32)
         spread = np.empty(len(u), dtype=np.float32)
         coefficients = (body["d1"], body["d2"], body["x0"], body["slope"])
-        _effectors(u, slot, *self._shape, *coefficients, effector, spread)
+        _effectors(u, context.slot, *self._shape, *coefficients, effector, spread)
         if self.members == 1:
             spread = np.full(len(u), np.inf)
-        position = effector * self.effector_scale + self.effector_mean
-        return self._gradient(body, u, slot) * self._effort_scale, position, spread * self.effector_scale
+        return effector * self.effector_scale + self.effector_mean, spread * self.effector_scale
+
+    def search(
+        self,
+        context: Context,
+        target: np.ndarray,
+        guess: np.ndarray,
+        unilateral: np.ndarray,
+        tolerance: float,
+        iterations: int,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        body = context.arrays
+        displacement, effort = np.empty(guess.shape), np.empty(guess.shape)
+        converged = np.empty(len(guess), dtype=bool)
+        _search(
+            target, guess, unilateral, self.span, tolerance * self.span, iterations, self.middle, self.half_range,
+            self._effort_scale, context.stiffness, context.slot, *self._energy,
+            *(body[k] for k in ("c1", "c2", "a", "b", "quadratic", "linear")), displacement, effort, converged,
+        )  # fmt: skip
+        return displacement, effort, converged
 
     def _stiffness(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         u, body = self._scaled(displacement), context.arrays

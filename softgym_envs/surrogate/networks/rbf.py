@@ -46,8 +46,9 @@ class Model(SurrogateModel):
         points, values = tensors["points"].astype(float), tensors["values"].astype(float)
         self._scales = tensors["mean"].astype(float), tensors["scale"].astype(float)
         kernel, neighbors = KERNELS[int(tensors["kernel"].item())], int(tensors["neighbors"].item())
+        self._used = tensors["used"].astype(bool)
         self._interpolate = RBFInterpolator(
-            points, values, kernel=kernel, neighbors=neighbors if neighbors < len(points) else None
+            points[:, self._used], values, kernel=kernel, neighbors=neighbors if neighbors < len(points) else None
         )
 
     def _prepare(self, design: np.ndarray) -> dict[str, np.ndarray]:
@@ -55,7 +56,7 @@ class Model(SurrogateModel):
 
     def _outputs(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x = np.concatenate([self.features.actuation(displacement), context.gather()["design"]], axis=1)
-        y = self._interpolate(x) * self._scales[1] + self._scales[0]
+        y = self._interpolate(x[:, self._used]) * self._scales[1] + self._scales[0]
         entries = self.size * (self.size + 1) // 2
         return full_compliance(y[:, :entries], self.size), y[:, entries:]
 
@@ -87,6 +88,8 @@ def train(
         "values": standardise(y[first], mean, scale),
         "mean": mean,
         "scale": scale,
+        # Inputs that never change, as of a single body, would make the problem singular.
+        "used": np.ptp(x, axis=0) > 1e-9,
         "kernel": np.array(KERNELS.index(options.kernel)),
         "neighbors": np.array(options.neighbors),
     }, {}
