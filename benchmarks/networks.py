@@ -60,8 +60,12 @@ CURVES = ("potential", "thesis")
 
 def standardised_loss(model: Any, training: dict[str, np.ndarray], test: dict[str, np.ndarray]) -> float:
     """The test loss of the thesis: mean squared error of all entries of W and delta_free, in units of their spread."""
-    from softgym_envs.surrogate.states import full_compliance
+    from softgym_envs.surrogate.states import full_compliance, stable_rows
 
+    training, test = (
+        {k: v[stable] for k, v in data.items()}
+        for data, stable in ((d, stable_rows(model.robot, d)) for d in (training, test))
+    )
     rows, columns = np.triu_indices(model.size)
 
     def outputs(W, effort, displacement, effector):
@@ -136,15 +140,15 @@ def _run(case: str, name: str, data: dict[str, dict[str, np.ndarray]], size: int
         model.state(one, row)
         laps.append(time.perf_counter() - start)
     return {
+        **errors,
         "case": case,
         "network": name,
-        "states": int(size),
+        "states": int(size),  # it learned from, beside the rest state
         "seed": seed,
         "loss": standardised_loss(model, data["train"], data["test"]),
         "training_cpu_seconds": seconds,
         "microseconds_per_state": 1e6 * float(np.median(laps)),
-        "tensors": int(sum(v.size for v in tensors.values())),
-        **errors,
+        "numbers": int(sum(v.size for v in tensors.values())),
     }
 
 
