@@ -44,7 +44,7 @@ def make_weights(
     steps: int = 1500,
 ) -> None:
     """Train a surrogate of the baseline body that knows displacements up to ``limit``, and write its weights."""
-    from softgym_envs.surrogate.model import FORMAT, Features
+    from softgym_envs.surrogate.model import Features, card_of
     from softgym_envs.surrogate.networks import potential
     from softgym_envs.surrogate.online import save_model
     from softgym_envs.surrogate.sampling import learned_variables
@@ -53,14 +53,7 @@ def make_weights(
 
     training = sample(robot, states, 0, limit=limit, sequence="halton")
     validation = sample(robot, max(states // 3, 20), 1, limit=limit)
-    card = {
-        "format": FORMAT,
-        "network": "potential",
-        "robot": robot.name,
-        "signature": robot.signature,
-        "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
-        "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
-    }
+    card = card_of(robot, "potential")
     features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
     options = potential.Options(width=width, body_width=width // 2, members=members, steps=steps, batch_size=128)
     tensors, _ = potential.train(

@@ -158,7 +158,7 @@ def _track(case: str, data: dict[str, dict[str, np.ndarray]], size: int, folder:
 
     from benchmarks.robots import predicted_path
     from softgym_envs.robots import make_robot
-    from softgym_envs.surrogate.model import FORMAT, Features
+    from softgym_envs.surrogate.model import Features, card_of
     from softgym_envs.surrogate.networks import potential
     from softgym_envs.surrogate.online import save_model
     from softgym_envs.surrogate.sampling import learned_variables, select_states
@@ -175,14 +175,7 @@ def _track(case: str, data: dict[str, dict[str, np.ndarray]], size: int, folder:
     options = potential.Options(members=1, steps=8000, batch_size=128)
     states = {k: training_states(robot, d, features) for k, d in (("t", part), ("v", data["validation"]))}
     tensors, _ = potential.train(robot, states["t"], states["v"], Trainer(options, 0))
-    card = {
-        "format": FORMAT,
-        "network": "potential",
-        "robot": robot.name,
-        "signature": robot.signature,
-        "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
-        "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
-    }
+    card = card_of(robot, "potential")
     save_model(potential.Model(robot, tensors, card), folder)
     track = {**CASES[case]["robot_options"], **({"unilateral": False} if case == "diamond" else {})}
     return {"case": case, "states": size, **predicted_path(CASES[case]["robot"], options=track, weights=folder)}

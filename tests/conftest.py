@@ -117,3 +117,19 @@ def finger(request, fingers):
     model.set_gravity((0.0, 0.0, 0.0))
     model.refresh_loads()
     return SimpleNamespace(robot=robot, model=model, statics=Statics(model, tolerance=1e-12))
+
+
+@pytest.fixture(scope="session")
+def robot():
+    """The finger with one cable, of the small ensemble `weights`."""
+    return make_robot("finger", cables=1)
+
+
+@pytest.fixture(scope="session")
+def weights(robot, tmp_path_factory):
+    """A small ensemble that knows the cable of a finger up to 8 mm."""
+    from benchmarks.hybrid import make_weights
+
+    folder = tmp_path_factory.mktemp("finger_8mm")
+    make_weights(folder, robot, limit=8e-3, states=30, members=3, width=24, steps=400)
+    return folder

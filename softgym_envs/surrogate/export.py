@@ -648,6 +648,8 @@ def _features(model: Model, g: _Builder) -> Any:
 
 def _graph(model: Model, onnx: Any) -> Any:
     """The graph; values of members are (M, B, ...)."""
+    from softgym_envs.surrogate.networks.potential import body_parts
+
     g = _Builder(onnx)
     n, e, w = model.count, model.effectors, model.width
     t = {key: np.asarray(array, dtype=float) for key, array in model.tensors.items()}
@@ -658,7 +660,7 @@ def _graph(model: Model, onnx: Any) -> Any:
         h = g("Add", g("MatMul", h, t[f"body.{k}.weight"].swapaxes(1, 2)), t[f"body.{k}.bias"][:, None])
         if k < 2:
             h = g("Mul", h, g.reciprocal_root(h))
-    sizes = [w, w, w, w, n * (n + 1) // 2, n, e, e * n, e * (e + 1) // 2, w, w]
+    sizes = list(body_parts(n, e, w).values())
     c1, c2, a, b, quadratic, linear, x0, slope, held, d1, d2 = g.split(h, sizes)
     a, b = (g("Softplus", g("Sub", value, 4.0)) for value in (a, b))
     factor = g.triangular(quadratic, n)

@@ -24,7 +24,7 @@ from softgym_envs.robots.robot import Robot
 from softgym_envs.surrogate.networks import network_module
 from softgym_envs.surrogate.sampling import learned_variables
 
-__all__ = ["Context", "Features", "SurrogateModel", "load_model"]
+__all__ = ["Context", "Features", "SurrogateModel", "card_of", "load_model"]
 
 FORMAT = 2
 
@@ -114,11 +114,12 @@ class SurrogateModel(ABC):
     """
 
     network: ClassVar[str]
+    ensemble: ClassVar[bool] = False
 
     def __init__(
         self, robot: Robot, tensors: Mapping[str, np.ndarray], card: Mapping[str, Any], members: int | None = None
     ) -> None:
-        if members not in (None, 1) and self.network != "potential":
+        if members not in (None, 1) and not self.ensemble:
             raise ValueError(f"members = {members} is out of bounds; these weights have one")
         self.robot = robot
         self.tensors = tensors
@@ -268,6 +269,18 @@ class SurrogateModel(ABC):
         """W at baseline stiffness."""
 
 
+def card_of(robot: Robot, network: str) -> dict[str, Any]:
+    """What every card says: by it `load_model` knows whether weights are for a robot."""
+    return {
+        "format": FORMAT,
+        "network": network,
+        "robot": robot.name,
+        "signature": robot.signature,
+        "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
+        "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
+    }
+
+
 def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> SurrogateModel:
     """Load weights (``model.safetensors``) and their card (``model.json``) for a robot.
 
@@ -307,11 +320,12 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
             + ", ".join(f"{k} = {found.get(k)!r}, asked {wanted[k]!r}" for k in different)
             + "; use backend='fem' or train weights with 'softgym fit'"
         )
-    bounds = {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()}
-    ranges = [[actuator.low, actuator.high] for actuator in robot.actuators]
-    for name, asked in (("design_variables", bounds), ("actuators", ranges)):
-        if card.get(name) != asked:
-            raise WeightsError(f"weights '{folder.name}' are for other {name}: {card.get(name)}, asked {asked}")
+    expected = card_of(robot, card["network"])
+    for name in ("design_variables", "actuators"):
+        if card.get(name) != expected[name]:
+            raise WeightsError(
+                f"weights '{folder.name}' are for other {name}: {card.get(name)}, asked {expected[name]}"
+            )
     try:
         tensors = load_file(weights_path)
     except (SafetensorError, OSError, ValueError) as error:

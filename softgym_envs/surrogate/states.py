@@ -53,6 +53,14 @@ class States:
         rows = self.rest_rows
         return bool(np.abs(self.displacement[rows]).max() < 1e-9 and np.abs(self.effort[rows]).max() < 1e-9)
 
+    @property
+    def entries(self) -> np.ndarray:
+        """What the thesis learns: the upper triangle of W, row by row, then delta_free, shape (N, k)."""
+        effort = np.concatenate([self.effort, np.zeros_like(self.effector)], axis=1)
+        delta = np.concatenate([self.displacement, self.effector], axis=1)
+        free = delta - np.einsum("bij,bj->bi", self.W, effort)
+        return np.concatenate([self.W[:, *np.triu_indices(self.W.shape[1])], free], axis=1)
+
     def rows(self, index: np.ndarray) -> States:
         """Some of the states. Rest states they refer to are not brought along: only for networks without rest."""
         parts = {f.name: getattr(self, f.name)[index] for f in fields(self)}

@@ -21,7 +21,7 @@ from softgym_envs.errors import DataError
 from softgym_envs.robots import make_robot
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.surrogate.dataset import generate_dataset
-from softgym_envs.surrogate.model import FORMAT, Features, SurrogateModel, load_model
+from softgym_envs.surrogate.model import Features, SurrogateModel, card_of, load_model
 from softgym_envs.surrogate.networks import NETWORKS, network_module
 from softgym_envs.surrogate.sampling import SamplingPlan, learned_variables
 from softgym_envs.surrogate.states import full_compliance, stable_rows, training_states
@@ -277,12 +277,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     model = module.Model(robot, tensors, {})
     errors = test_errors(model, data["test"])
     card = {
-        "format": FORMAT,
-        "network": config.network.kind,
-        "robot": robot.name,
-        "signature": robot.signature,
-        "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
-        "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
+        **card_of(robot, config.network.kind),
         "config": config.model_dump(mode="json", exclude={"executor"}),
         "domain": domain_of(model, data["train"], data["validation"]),
         "loaded": bool(robot.build().loads.any()),

@@ -15,21 +15,7 @@ from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.errors import ConvergenceError, DataError, WeightsError
 from softgym_envs.robots import make_robot
 
-LIMIT = 8e-3
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return make_robot("finger", cables=1)
-
-
-@pytest.fixture(scope="module")
-def weights(robot, tmp_path_factory):
-    """A small ensemble that knows the cable up to 8 mm; shared with the tests of online learning."""
-    folder = tmp_path_factory.getbasetemp() / "finger_8mm"
-    if not (folder / "model.json").exists():
-        make_weights(folder, robot, limit=LIMIT, states=30, members=3, width=24, steps=400)
-    return folder
+LIMIT = 8e-3  # that of `weights`
 
 
 @pytest.fixture(scope="module")

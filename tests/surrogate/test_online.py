@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.hybrid import make_weights, sample
+from benchmarks.hybrid import sample
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.dataset import COLUMNS
@@ -15,21 +15,7 @@ from softgym_envs.surrogate.model import load_model
 from softgym_envs.surrogate.networks.potential import Model, stack_members, unstack_members
 from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of, rehearsal_states, save_model
 
-LIMIT = 8e-3
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return make_robot("finger", cables=1)
-
-
-@pytest.fixture(scope="module")
-def weights(robot, tmp_path_factory):
-    """A small ensemble that knows the cable up to 8 mm; shared with the tests of the hybrid backend."""
-    folder = tmp_path_factory.getbasetemp() / "finger_8mm"
-    if not (folder / "model.json").exists():
-        make_weights(folder, robot, limit=LIMIT, states=30, members=3, width=24, steps=400)
-    return folder
+LIMIT = 8e-3  # that of `weights`
 
 
 @pytest.fixture(scope="module")

@@ -52,6 +52,14 @@ class Options(Config):
     learning_rate: float = Field(default=3e-3, gt=0)
 
 
+def body_parts(n: int, e: int, w: int) -> dict[str, int]:
+    """Names and sizes of the coefficients that the design layers give to a body, in their order."""
+    entries_a, entries_e = n * (n + 1) // 2, e * (e + 1) // 2
+    sizes = (w, w, w, w, entries_a, n, e, e * n, entries_e, w, w)
+    names = ("c1", "c2", "a", "b", "quadratic", "linear", "x0", "slope", "held", "d1", "d2")
+    return dict(zip(names, sizes, strict=True))
+
+
 _FAST: Any = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
 #: Rows evaluated together: each weight is then fetched once for all of them.
 _ROWS = 4
@@ -360,6 +368,7 @@ class Model(SurrogateModel):
     """An ensemble of potential networks (see the module)."""
 
     network = "potential"
+    ensemble = True
 
     def __init__(
         self, robot: Robot, tensors: Mapping[str, np.ndarray], card: Mapping[str, Any], members: int | None = None
@@ -405,10 +414,9 @@ class Model(SurrogateModel):
             h = h @ weight.transpose(0, 2, 1) + bias
             if k < 2:
                 h = h / np.sqrt(1.0 + h * h)
-        sizes = [w, w, w, w, n * (n + 1) // 2, n, e, e * n, e * (e + 1) // 2, w, w]
-        names = ("c1", "c2", "a", "b", "quadratic", "linear", "x0", "slope", "held", "d1", "d2")
-        parts = np.split(h.transpose(1, 0, 2), np.cumsum(sizes)[:-1], axis=2)
-        body = {k: np.ascontiguousarray(v) for k, v in zip(names, parts, strict=True)}
+        sizes = body_parts(n, e, w)
+        parts = np.split(h.transpose(1, 0, 2), np.cumsum(list(sizes.values()))[:-1], axis=2)
+        body = {k: np.ascontiguousarray(v) for k, v in zip(sizes, parts, strict=True)}
         for name in ("a", "b"):
             body[name] = np.logaddexp(np.float32(0.0), body[name] - np.float32(4.0))
         lower = np.tril_indices(n)

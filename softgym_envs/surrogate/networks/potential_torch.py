@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from softgym_envs.surrogate.networks.potential import body_parts
+
 __all__ = ["PotentialNet"]
 
 
@@ -45,7 +47,7 @@ class PotentialNet(nn.Module):
         super().__init__()
         n, e, w = count, effectors, width
         self.n, self.e, self.w = n, e, w
-        self.sizes = body_sizes(n, e, w)
+        self.sizes = list(body_parts(n, e, w).values())
         self.body = nn.Sequential(
             nn.Linear(max(design, 1), body_width),
             _Sigmoid(),
@@ -129,8 +131,3 @@ class PotentialNet(nn.Module):
         jacobian = body["slope"] + (inner @ self.effector.T).mT
         held = self._triangular(body["held"] + g2 @ self.held.T, self.lower_e, self.e)
         return gradient, hessian, effector, jacobian, held
-
-
-def body_sizes(n: int, e: int, w: int) -> list[int]:
-    """Sizes of the coefficients a body gives: c1, c2, a, b, quadratic, linear, x0, slope, held, d1, d2."""
-    return [w, w, w, w, n * (n + 1) // 2, n, e, e * n, e * (e + 1) // 2, w, w]

@@ -14,9 +14,10 @@ from pydantic import Field
 
 from softgym_envs.config import Config
 from softgym_envs.robots.robot import Robot
-from softgym_envs.surrogate.model import Context, SurrogateModel
+from softgym_envs.surrogate.model import Context
+from softgym_envs.surrogate.networks.direct import DirectModel
 from softgym_envs.surrogate.networks.perceptron import mean_scale, standardise
-from softgym_envs.surrogate.states import States, full_compliance
+from softgym_envs.surrogate.states import States
 
 __all__ = ["Model", "Options", "train"]
 
@@ -32,7 +33,7 @@ class Options(Config):
 KERNELS = ("thin_plate_spline", "cubic", "quintic", "linear")
 
 
-class Model(SurrogateModel):
+class Model(DirectModel):
     """Interpolated condensed models (see the module)."""
 
     network = "rbf"
@@ -54,31 +55,16 @@ class Model(SurrogateModel):
     def _prepare(self, design: np.ndarray) -> dict[str, np.ndarray]:
         return {"design": design}
 
-    def _outputs(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _entries(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         x = np.concatenate([self.features.actuation(displacement), context.gather()["design"]], axis=1)
-        y = self._interpolate(x[:, self._used]) * self._scales[1] + self._scales[0]
-        entries = self.size * (self.size + 1) // 2
-        return full_compliance(y[:, :entries], self.size), y[:, entries:]
-
-    def _state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        W, free = self._outputs(context, displacement)
-        a, e = slice(0, self.count), slice(self.count, self.size)
-        effort = np.linalg.solve(W[:, a, a], (displacement - free[:, a])[:, :, None])
-        return effort[:, :, 0], (W[:, e, a] @ effort)[:, :, 0] + free[:, e], np.full(len(effort), np.inf)
-
-    def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        return self._outputs(context, displacement)[0]
+        return self._interpolate(x[:, self._used]) * self._scales[1] + self._scales[0]
 
 
 def train(
     robot: Robot, training: States, validation: States, trainer: Any
 ) -> tuple[dict[str, np.ndarray], dict[str, list[dict[str, float]]]]:
     """Keep the states themselves; repeated ones once."""
-    n = training.W.shape[1]
-    effort = np.concatenate([training.effort, np.zeros_like(training.effector)], axis=1)
-    delta = np.concatenate([training.displacement, training.effector], axis=1)
-    free = delta - np.einsum("bij,bj->bi", training.W, effort)
-    y = np.concatenate([training.W[:, *np.triu_indices(n)], free], axis=1)
+    y = training.entries
     x = np.concatenate([training.actuation, training.design], axis=1)
     x, first = np.unique(np.round(x, 9), axis=0, return_index=True)
     mean, scale = mean_scale(y)

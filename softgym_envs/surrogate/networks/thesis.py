@@ -10,7 +10,8 @@ from pydantic import Field
 
 from softgym_envs.config import Config
 from softgym_envs.robots.robot import Robot
-from softgym_envs.surrogate.model import Context, SurrogateModel
+from softgym_envs.surrogate.model import Context
+from softgym_envs.surrogate.networks.direct import DirectModel
 from softgym_envs.surrogate.networks.perceptron import layers, mean_scale, perceptron, standardise, weights
 from softgym_envs.surrogate.states import States
 
@@ -28,7 +29,7 @@ class Options(Config):
     learning_rate: float = Field(default=1e-3, gt=0)
 
 
-class Model(SurrogateModel):
+class Model(DirectModel):
     """The thesis' network (eq. 4.2, 4.11, 4.12): two ReLU perceptrons.
 
     G maps the design to (W0, free0), F maps (delta, W0, free0) to (W, free).
@@ -45,7 +46,6 @@ class Model(SurrogateModel):
         super().__init__(robot, tensors, card, members)
         self._rest, self._main = layers(tensors, "rest"), layers(tensors, "main")
         self._scales = {k: tensors[k].astype(float) for k in ("rest_mean", "rest_scale", "main_mean", "main_scale")}
-        self._upper = np.triu_indices(self.size)
 
     @staticmethod
     def _relu(x: np.ndarray, parts: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
@@ -57,24 +57,10 @@ class Model(SurrogateModel):
     def _prepare(self, design: np.ndarray) -> dict[str, np.ndarray]:
         return {"rest": self._relu(design.astype(np.float32), self._rest)}
 
-    def _outputs(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        arrays = context.gather()
-        x = np.concatenate([self.features.actuation(displacement).astype(np.float32), arrays["rest"]], axis=1)
-        y = self._relu(x, self._main).astype(float) * self._scales["main_scale"] + self._scales["main_mean"]
-        W = np.empty((len(y), self.size, self.size))
-        entries = len(self._upper[0])
-        W[:, self._upper[0], self._upper[1]] = y[:, :entries]
-        W[:, self._upper[1], self._upper[0]] = y[:, :entries]
-        return W, y[:, entries:]
-
-    def _state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        W, free = self._outputs(context, displacement)
-        a, e = slice(0, self.count), slice(self.count, self.size)
-        effort = np.linalg.solve(W[:, a, a], (displacement - free[:, a])[:, :, None])
-        return effort[:, :, 0], (W[:, e, a] @ effort)[:, :, 0] + free[:, e], np.full(len(effort), np.inf)
-
-    def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        return self._outputs(context, displacement)[0]
+    def _entries(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        rest = context.gather()["rest"]
+        x = np.concatenate([self.features.actuation(displacement).astype(np.float32), rest], axis=1)
+        return self._relu(x, self._main).astype(float) * self._scales["main_scale"] + self._scales["main_mean"]
 
 
 def train(
@@ -88,15 +74,7 @@ def train(
     def tensor(x):
         return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
 
-    def outputs(arrays: States) -> np.ndarray:
-        n = arrays.W.shape[1]
-        upper = np.triu_indices(n)
-        effort = np.concatenate([arrays.effort, np.zeros_like(arrays.effector)], axis=1)
-        delta = np.concatenate([arrays.displacement, arrays.effector], axis=1)
-        free = delta - np.einsum("bij,bj->bi", arrays.W, effort)
-        return np.concatenate([arrays.W[:, upper[0], upper[1]], free], axis=1)
-
-    y = {"train": outputs(training), "validation": outputs(validation)}
+    y = {"train": training.entries, "validation": validation.entries}
     arrays = {"train": training, "validation": validation}
     main_mean, main_scale = mean_scale(y["train"])
     rest_mean, rest_scale = mean_scale(y["train"][training.rest_rows])
