@@ -1,10 +1,10 @@
 """Networks compared on the same data: error against the number of FEM states, three seeds each.
 
-    python -m benchmarks.networks results/networks
+    python -m benchmarks.networks results/networks 2
 
 makes the data (one body each: the Soft Finger with two cables and the Diamond, as in thesis 4.3.1), trains every
-network on parts of it, and writes one JSON per run; it resumes where it was stopped. The runs this repository keeps are
-in ``benchmarks/data/networks.json``; ``softgym bench networks`` shows them.
+network on parts of it in so many processes, and writes one JSON per run; it resumes where it was stopped. The runs
+that this repository keeps are in ``benchmarks/data/networks.json``; ``softgym bench networks`` shows them.
 """
 
 from __future__ import annotations
@@ -41,8 +41,17 @@ CASES: dict[str, dict[str, Any]] = {
         "sizes": (50, 200, 1600),
         "tracking": 200,
     },
+    "diamond that is only pulled": {
+        "robot": "diamond",
+        "robot_options": {},
+        "groups": 135,
+        "margin": 0.0,
+        "sizes": (200, 6500),
+        "tracking": None,
+    },
 }
-"""Bodies; 50 states in each group. The Diamond's circle needs cables that push, so they are in its data."""
+"""Bodies; 50 states in each group. The Diamond's circle needs cables that push, so they are in its data. The third is
+the thesis' own set: as many states, and cables that are pulled by 0 to 30 mm."""
 
 NETWORKS: dict[str, dict[str, Any]] = {
     "potential": {"kind": "potential", "members": 1, "steps": 4000, "batch_size": 128},
@@ -85,7 +94,7 @@ def standardised_loss(model: Any, training: dict[str, np.ndarray], test: dict[st
     return float((((predicted - truth(test))[:, varies] / spread[varies]) ** 2).mean())
 
 
-def _data(folder: Path, case: str) -> dict[str, dict[str, np.ndarray]]:
+def _data(folder: Path, case: str, workers: int) -> dict[str, dict[str, np.ndarray]]:
     from softgym_envs.surrogate.dataset import generate_dataset
     from softgym_envs.surrogate.sampling import SamplingPlan
 
@@ -97,13 +106,18 @@ def _data(folder: Path, case: str) -> dict[str, dict[str, np.ndarray]]:
     }
     return {
         split: generate_dataset(
-            folder / case / split, given["robot"], plan, robot_options=given["robot_options"], groups_per_shard=2
+            folder / case.replace(" ", "") / split,
+            given["robot"],
+            plan,
+            robot_options=given["robot_options"],
+            groups_per_shard=2,
+            workers=workers,
         )
         for split, plan in plans.items()
     }
 
 
-def _run(case: str, name: str, data: dict[str, dict[str, np.ndarray]], size: int, seed: int) -> dict[str, Any]:
+def _run(path: Path, case: str, name: str, data: dict[str, dict[str, np.ndarray]], size: int, seed: int) -> Path:
     import torch
 
     from softgym_envs.robots import make_robot
@@ -139,7 +153,7 @@ def _run(case: str, name: str, data: dict[str, dict[str, np.ndarray]], size: int
         start = time.perf_counter()
         model.state(one, row)
         laps.append(time.perf_counter() - start)
-    return {
+    result = {
         **errors,
         "case": case,
         "network": name,
@@ -150,9 +164,11 @@ def _run(case: str, name: str, data: dict[str, dict[str, np.ndarray]], size: int
         "microseconds_per_state": 1e6 * float(np.median(laps)),
         "numbers": int(sum(v.size for v in tensors.values())),
     }
+    write_json(path, result)
+    return path
 
 
-def _track(case: str, data: dict[str, dict[str, np.ndarray]], size: int, folder: Path) -> dict[str, Any]:
+def _track(path: Path, case: str, data: dict[str, dict[str, np.ndarray]], size: int, folder: Path) -> Path:
     """Tracking with a network that learned ``size`` states chosen by k-means (thesis 5.3)."""
     import torch
 
@@ -178,37 +194,45 @@ def _track(case: str, data: dict[str, dict[str, np.ndarray]], size: int, folder:
     card = card_of(robot, "potential")
     save_model(potential.Model(robot, tensors, card), folder)
     track = {**CASES[case]["robot_options"], **({"unilateral": False} if case == "diamond" else {})}
-    return {"case": case, "states": size, **predicted_path(CASES[case]["robot"], options=track, weights=folder)}
+    found = predicted_path(CASES[case]["robot"], options=track, weights=folder)
+    write_json(path, {"case": case, "states": size, **found})
+    return path
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, workers: int = 1) -> None:
     """Make what is missing, and write all runs to ``benchmarks/data/networks.json``, also when it is stopped."""
+    from softgym_envs.executors import run_jobs
+
+    runs = folder / "runs"
+    jobs: list[tuple[Any, tuple]] = []
+    for case, given in CASES.items():
+        data = _data(folder / "data", case, workers)
+        stem = case.replace(" ", "")
+        if given["tracking"]:
+            path = runs / f"{stem}_tracking.json"
+            jobs.append((_track, (path, case, data, given["tracking"], folder / "models" / case)))
+        for seed in SEEDS:
+            for name in NETWORKS:
+                for size in given["sizes"]:
+                    if name not in CURVES and size not in (200, given["sizes"][-1]):
+                        continue
+                    if ("5" in name and seed) or ("times" in name and size != given["sizes"][-1]):
+                        continue
+                    path = runs / f"{stem}_{name.replace(' ', '').replace(',', '_')}_{size}_{seed}.json"
+                    jobs.append((_run, (path, case, name, data, size, seed)))
     try:
-        for case, given in CASES.items():
-            data = _data(folder / "data", case)
-            path = folder / "runs" / f"{case}_tracking.json"
-            if not path.exists():
-                write_json(path, _track(case, data, given["tracking"], folder / "models" / case))
-            for seed in SEEDS:
-                for name in NETWORKS:
-                    for size in given["sizes"]:
-                        if name not in CURVES and size not in (200, given["sizes"][-1]):
-                            continue
-                        if ("5" in name and seed) or ("times" in name and size != given["sizes"][-1]):
-                            continue
-                        path = folder / "runs" / f"{case}_{name.replace(' ', '').replace(',', '_')}_{size}_{seed}.json"
-                        if not path.exists():
-                            write_json(path, _run(case, name, data, size, seed))
-                        last = json.loads(path.read_text())
-                        print(
-                            f"{case:8s} {name:14s} {size:5d} states, seed {seed}: "
-                            f"effector {1e3 * last['effector_mean']:.4f} mm, loss {last['loss']:.2e}",
-                            flush=True,
-                        )
+        for path in run_jobs([job for job in jobs if not job[1][0].exists()], workers):
+            last = json.loads(path.read_text())
+            if "network" in last:
+                print(
+                    f"{last['case']:8s} {last['network']:14s} {last['states']:5d} states, seed {last['seed']}: "
+                    f"effector {1e3 * last['effector_mean']:.4f} mm, loss {last['loss']:.2e}",
+                    flush=True,
+                )
     finally:
-        found = [json.loads(path.read_text()) for path in sorted((folder / "runs").glob("*.json"))]
-        runs, tracks = [r for r in found if "network" in r], [r for r in found if "network" not in r]
-        write_json(KEPT, {**provenance(), "runs": runs, "tracking": tracks})
+        found = [json.loads(path.read_text()) for path in sorted(runs.glob("*.json"))]
+        trained, tracks = [r for r in found if "network" in r], [r for r in found if "network" not in r]
+        write_json(KEPT, {**provenance(), "runs": trained, "tracking": tracks})
 
 
 def networks() -> dict[str, object]:
@@ -263,4 +287,4 @@ def _factor(case: str, runs: list[dict[str, Any]]) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "results/networks"))
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "results/networks"), *map(int, sys.argv[2:3]))

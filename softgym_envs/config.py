@@ -116,16 +116,12 @@ def _allowed(model: type[BaseModel], path: list[str]) -> str:
     return ", ".join(model.model_fields)
 
 
-def provenance() -> dict[str, Any]:
-    """What made a result: versions, git commit, time, machine."""
-    versions = {"softgym-envs": __version__, "python": platform.python_version()}
-    for package in ("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "optuna", "gmsh", "proxsuite"):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    root = Path(__file__).resolve().parent.parent
-    commit = None
+def commit_of(root: Path) -> str | None:
+    """Commit of a source tree, with ``-dirty`` where files differ from it; None where it cannot be known.
+
+    A clone is asked by git; a source archive (``git archive``, a download of a tag) carries it in a file.
+    """
+    archived = root / ".git_archival.txt"
     if (root / ".git").exists():
         try:
             done = subprocess.run(
@@ -135,9 +131,24 @@ def provenance() -> dict[str, Any]:
                 timeout=10,
                 check=False,
             )
-            commit = done.stdout.strip() or None
         except (OSError, subprocess.TimeoutExpired):
-            commit = None
+            return None
+        return done.stdout.strip() or None
+    if archived.exists():
+        node = archived.read_text().removeprefix("node:").strip()
+        return None if node.startswith("$") else node[:12]
+    return None
+
+
+def provenance() -> dict[str, Any]:
+    """What made a result: versions, git commit, time, machine."""
+    versions = {"softgym-envs": __version__, "python": platform.python_version()}
+    for package in ("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "optuna", "gmsh", "proxsuite"):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    commit = commit_of(Path(__file__).resolve().parent.parent)
     return {
         "commit": commit,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -76,7 +76,7 @@ class FitConfig(Config):
 
 
 class Trainer:
-    """Trains the parts of a model one after the other; a finished part is kept on disk and not trained again.
+    """Trains the parts of a model; a finished part is kept on disk and not trained again.
 
     Args:
         options: hyper-parameters of the network.
@@ -84,10 +84,20 @@ class Trainer:
         folder: where finished parts are kept, or None.
         key: what the parts depend on (configuration and data); parts of another key are trained anew.
         progress: show progress bars.
+        workers: parts that do not build on each other are trained by so many processes.
     """
 
-    def __init__(self, options: Any, seed: int, folder: Path | None = None, key: str = "", progress: bool = False):
-        self.options, self.seed, self.folder, self.key, self.progress = options, seed, folder, key, progress
+    def __init__(
+        self,
+        options: Any,
+        seed: int,
+        folder: Path | None = None,
+        key: str = "",
+        progress: bool = False,
+        workers: int = 1,
+    ) -> None:
+        self.options, self.seed, self.folder, self.key = options, seed, folder, key
+        self.progress, self.workers = progress, workers
 
     def optimise(
         self, name: str, net: Any, loss: Callable, train_size: int, seed: int | None = None
@@ -265,11 +275,11 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         same = all(model.card["config"].get(k) == v for k, v in asked["config"].items())
         if same and model.card["data_sha256"] == asked["data_sha256"]:
             return model.card["test"]
-    torch.set_num_threads(config.workers)
+    torch.set_num_threads(1)
     features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
     states = {split: training_states(robot, data[split], features) for split in SPLITS}
     key = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:12]
-    trainer = Trainer(config.network, config.seed, folder / "parts", key, progress)
+    trainer = Trainer(config.network, config.seed, folder / "parts", key, progress, config.workers)
     start = time.perf_counter()
     module = network_module(config.network.kind)
     tensors, histories = module.train(robot, states["train"], states["validation"], trainer)

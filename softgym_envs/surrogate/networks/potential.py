@@ -32,6 +32,7 @@ from numba import njit
 from pydantic import Field
 
 from softgym_envs.config import Config
+from softgym_envs.executors import run_jobs
 from softgym_envs.mechanics.complementarity import _solve
 from softgym_envs.robots.robot import Robot
 from softgym_envs.surrogate.model import Context, SurrogateModel
@@ -504,34 +505,44 @@ class Model(SurrogateModel):
 def train(
     robot: Robot, training: States, validation: States, trainer: Any
 ) -> tuple[dict[str, np.ndarray], dict[str, list[dict[str, float]]]]:
-    """Train the members one after the other; each has its own seed, order of batches and bootstrap weights none."""
-    import torch
+    """Train the members, ``trainer.workers`` at a time; each has its own seed and order of batches, all the same data.
 
-    from softgym_envs.surrogate.networks.potential_torch import PotentialNet
-
+    A process that runs one member uses one thread, so the weights do not depend on the number of workers.
+    """
     options: Options = trainer.options
-    n, e = training.effort.shape[1], training.effector.shape[1]
     scales = _scales(robot, training)
     data = {key: _targets(robot, states, scales) for key, states in (("t", training), ("v", validation))}
-    effort_spread = float(((data["t"][4].mT @ data["t"][2][:, :, None]) ** 2).mean())
     rest = None
     if training.unloaded:
         middle = 0.5 * (robot.upper + robot.lower)
         rest = (0.0 - middle) / (robot.upper - middle)
-    states: list[dict[str, np.ndarray]] = []
-    histories = {}
-    for member in range(options.members):
-        torch.manual_seed(trainer.seed + 1000 * member)
-        net = PotentialNet(n, e, training.design.shape[1], options.width, options.body_width, rest)
+    jobs = [(_train_member, (trainer, member, data, rest)) for member in range(options.members)]
+    found = sorted(run_jobs(jobs, trainer.workers), key=lambda result: result[0])
+    return stack_members([state for _, state, _ in found], scales), {f"member {k}": rows for k, _, rows in found}
 
-        def loss(rows, net=net):
-            batch = data["v"] if rows is None else [part[rows] for part in data["t"]]
-            return potential_loss(net, batch, effort_spread)
 
-        name = f"member {member}"
-        histories[name] = trainer.optimise(name, net, loss, len(training), seed=trainer.seed + 1000 * member)
-        states.append({k: v.detach().numpy().copy() for k, v in net.state_dict().items()})
-    return stack_members(states, scales), histories
+def _train_member(
+    trainer: Any, member: int, data: dict[str, list], rest: np.ndarray | None
+) -> tuple[int, dict[str, np.ndarray], list[dict[str, float]]]:
+    """Number, state and history of one member."""
+    import torch
+
+    from softgym_envs.surrogate.networks.potential_torch import PotentialNet
+
+    torch.set_num_threads(1)
+    options: Options = trainer.options
+    seed = trainer.seed + 1000 * member
+    torch.manual_seed(seed)
+    design, _, effort, effector, S = data["t"][:5]
+    net = PotentialNet(effort.shape[1], effector.shape[1], design.shape[1], options.width, options.body_width, rest)
+    effort_spread = float(((S.mT @ effort[:, :, None]) ** 2).mean())
+
+    def loss(rows):
+        batch = data["v"] if rows is None else [part[rows] for part in data["t"]]
+        return potential_loss(net, batch, effort_spread)
+
+    history = trainer.optimise(f"member {member}", net, loss, len(design), seed=seed)
+    return member, {k: v.detach().numpy().copy() for k, v in net.state_dict().items()}, history
 
 
 def stack_members(states: list[dict[str, np.ndarray]], scales: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
