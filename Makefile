@@ -26,9 +26,12 @@ SYSTEM_CHECK := import gmsh, pyvista; plotter = pyvista.Plotter(off_screen=True,
 	plotter.add_mesh(pyvista.Sphere()); sys = __import__("sys"); \
 	sys.exit(not plotter.screenshot(return_img=True).std() > 0)
 
+# Tests of studies in a database start a PostgreSQL server of their own. Debian keeps its programs off the search path.
+POSTGRES_CHECK := ls /usr/lib/postgresql/*/bin/initdb || command -v initdb
+
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: setup demo test lint types bench docs docs-images lock clean
+.PHONY: setup postgres demo test lint types bench docs docs-images lock clean
 
 setup: $(VENV)/.stamp-system
 
@@ -51,6 +54,19 @@ $(VENV)/.stamp-system: $(VENV)/.stamp
 		echo "setup: gmsh or off-screen pictures do not work here; install (Debian names): $(SYSTEM_PACKAGES)" >&2; \
 	fi
 
+# The package would make and start a server of the system's own, which the tests do not use: NO_CLUSTER keeps it from that.
+NO_CLUSTER := /etc/postgresql-common/createcluster.d/softgym-setup.conf
+postgres:
+	@check() { { $(POSTGRES_CHECK); } >/dev/null 2>&1; }; \
+	if ! check && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "setup: installing PostgreSQL, for the tests of shared studies"; \
+		mkdir -p $(dir $(NO_CLUSTER)) && echo "create_main_cluster = false" > $(NO_CLUSTER); \
+		{ apt-get update && DEBIAN_FRONTEND=noninteractive \
+			apt-get install -y --no-install-recommends postgresql; } </dev/null || true; \
+		rm -f $(NO_CLUSTER); \
+	fi; \
+	check || echo "setup: PostgreSQL is missing, its tests are skipped; install (Debian name): postgresql" >&2
+
 demo: setup
 	$(BIN)/softgym codesign --config configs/codesign/finger_reach.yaml --folder $(DEMO)
 	@echo "report: $(CURDIR)/$(DEMO)/report.html"
@@ -61,7 +77,7 @@ test bench docs docs-images: export OPENBLAS_NUM_THREADS = 1
 test bench docs docs-images: export MKL_NUM_THREADS = 1
 test bench docs docs-images: export NUMBA_NUM_THREADS = 1
 
-test: setup
+test: setup postgres
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
 
 bench: setup

@@ -16,7 +16,11 @@ __all__ = ["EnvironmentConfig", "SACConfig", "TrainConfig"]
 
 
 class EnvironmentConfig(Config):
-    """An environment: its ID and the options of ``gymnasium.make``; the backend is by default that of its row."""
+    """An environment: its ID and the options of ``gymnasium.make``; the backend is by default that of its row.
+
+    With ``on_qp`` the agent acts on top of the inverse QP: the action that is done is
+    ``clip(action of the QP + on_qp * action of the agent, -1, 1)``.
+    """
 
     id: str
     backend: str = "surrogate"
@@ -27,6 +31,7 @@ class EnvironmentConfig(Config):
     robot_options: dict[str, Any] = {}
     task_options: dict[str, Any] = {}
     backend_options: dict[str, Any] = {}
+    on_qp: float = Field(default=0.0, ge=0, le=2, description="share of the agent's action on top of the QP's; 0: no QP")
 
     @model_validator(mode="before")
     @classmethod
@@ -47,7 +52,7 @@ class EnvironmentConfig(Config):
         return self.model_copy(update={"backend": backend, "backend_options": options})
 
     def _options(self, overrides: dict[str, Any]) -> dict[str, Any]:
-        options = self.model_dump(exclude={"id"})
+        options = self.model_dump(exclude={"id", "on_qp"})
         return {**options, **overrides}
 
     def make(self, **overrides: Any) -> gymnasium.Env:
@@ -56,7 +61,13 @@ class EnvironmentConfig(Config):
 
         import softgym_envs  # noqa: F401 - registers the IDs
 
-        return gymnasium.make(self.id, **self._options(overrides))
+        env = gymnasium.make(self.id, **self._options(overrides))
+        return self._wrapped(env) if self.on_qp else env
+
+    def _wrapped(self, env: gymnasium.Env) -> gymnasium.Env:
+        from agents.on_qp import OnQP
+
+        return OnQP(env, self.on_qp)
 
     def make_vec(self, num_envs: int, **overrides: Any) -> gymnasium.vector.VectorEnv:
         """Return the batched environment on the surrogate, or one process for each environment on finite elements."""
@@ -64,14 +75,25 @@ class EnvironmentConfig(Config):
 
         import softgym_envs  # noqa: F401 - registers the IDs
 
-        options: dict[str, Any] = {}
-        if self.backend != "surrogate":
-            mode = gymnasium.vector.AutoresetMode.SAME_STEP
-            options = {
-                "vectorization_mode": "async" if num_envs > 1 else "sync",
-                "vector_kwargs": {"autoreset_mode": mode},
-            }
-        return gymnasium.make_vec(self.id, num_envs=num_envs, **options, **self._options(overrides))
+        if self.backend == "surrogate":
+            envs = gymnasium.make_vec(self.id, num_envs=num_envs, **self._options(overrides))
+            if not self.on_qp:
+                return envs
+            from agents.on_qp import VectorOnQP
+
+            return VectorOnQP(envs, self.on_qp)
+        return gymnasium.make_vec(
+            self.id,
+            num_envs=num_envs,
+            vectorization_mode="async" if num_envs > 1 else "sync",
+            vector_kwargs={
+                "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP,
+                # Said, because joblib's workers have a start method of their own that cannot pickle these.
+                **({"context": "fork"} if num_envs > 1 else {}),
+            },
+            wrappers=[self._wrapped] if self.on_qp else [],
+            **self._options(overrides),
+        )
 
 
 class SACConfig(Config):
@@ -88,6 +110,9 @@ class SACConfig(Config):
     net_arch: list[int] = [128, 128]
     ent_coef: float | str = "auto"
     target_entropy: float | Literal["auto"] = "auto"
+    hindsight: float = Field(
+        default=0.0, ge=0, le=1, description="share of samples whose goal is an effector reached later; 0.8 is k = 4"
+    )
 
     @field_validator("ent_coef")
     @classmethod

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from agents.baselines import BASELINES, Agent, make_baseline
 from agents.config import EnvironmentConfig
 from agents.policy import Policy
-from softgym_envs.errors import ConvergenceError
 
-__all__ = ["AGENTS", "Evaluation", "evaluate", "make_agent", "sample_goals"]
+__all__ = ["AGENTS", "Evaluation", "evaluate", "evaluation_set", "make_agent", "sample_goals"]
 
-Agent = Callable[[np.ndarray, Any], np.ndarray]
-"""``agent(observation, env.unwrapped) -> action``."""
-
-AGENTS = ("qp", "qp_static", "random")
+AGENTS = BASELINES
 """Names of agents that need no training."""
 
 
@@ -94,52 +90,31 @@ def sample_goals(
         env.close()
 
 
+def evaluation_set(
+    environment: EnvironmentConfig, count: int, seed: int
+) -> tuple[list[dict[str, float]] | None, np.ndarray]:
+    """Draw ``count`` bodies and goals [m] (count, p, 3) as an environment does; no bodies where it has but one."""
+    if not environment.sample_design:
+        return None, sample_goals(environment, count, seed)
+    env = environment.make()
+    designs, goals = [], []
+    for i in range(count):
+        env.reset(seed=seed if i == 0 else None)
+        designs.append(env.unwrapped.design)  # type: ignore[attr-defined]
+        goals.append(env.unwrapped.path.copy())  # type: ignore[attr-defined]
+    env.close()
+    return designs, np.stack(goals)
+
+
 def make_agent(agent: str | Path, seed: int = 0) -> Agent:
     """Return ``agent(observation, env.unwrapped) -> action``.
 
     Args:
-        agent: ``"random"``; ``"qp"``, the inverse QP on the condensed model of the present state, which in dynamics is
-            that of the next time step; ``"qp_static"``, the inverse QP on the static equilibrium under the present
-            command, which knows no momentum; or a policy file.
+        agent: one of `AGENTS`, see `agents.baselines.make_baseline`, or a policy file or the name of a shipped one.
         seed: of the random agent.
     """
-    if agent == "random":
-        rng = np.random.default_rng(seed)
-        return lambda observation, env: rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
-    if agent in ("qp", "qp_static"):
-        from softgym_envs.control import InverseQP
-
-        controllers: WeakKeyDictionary[Any, InverseQP] = WeakKeyDictionary()
-
-        def control(observation: np.ndarray, env: Any) -> np.ndarray:
-            state = env.state
-            model, slack = state.condensed, state.slack
-            if agent == "qp_static" and env.backend.moving:
-                try:
-                    still = env.backend.probe(state.command)
-                except ConvergenceError:  # no equilibrium there: wait for the next
-                    return env.interface.action(state.command, state.command)
-                model, slack = still.condensed, still.slack
-            if env not in controllers or not state.command.any():  # a fresh one for each episode
-                body = env.robot
-                unilateral = np.array([actuator.unilateral for actuator in body.actuators])
-                weights = np.resize(env.task.axes, 3 * len(body.effectors))
-                # Only the first effector has a goal.
-                weights[3:] = 0.0
-                controllers[env] = InverseQP(
-                    body.lower,
-                    body.upper,
-                    body.rates,
-                    unilateral,
-                    goal_weights=None if weights.all() else weights,
-                )
-            try:
-                command = controllers[env].solve(model, env.goal, state.command, slack)
-            except ConvergenceError:  # a QP that fails holds still
-                command = state.command
-            return env.interface.action(command, state.command)
-
-        return control
+    if agent in AGENTS:
+        return make_baseline(str(agent), seed)
     policy = Policy(agent)
     return lambda observation, env: policy(observation)
 
@@ -155,8 +130,8 @@ def evaluate(
     """Run one episode per goal.
 
     Args:
-        agent: ``"qp"``, ``"random"`` or the path of a policy.
-        environment: where; its ``backend`` decides the physics.
+        agent: one of `AGENTS`, or the path of a policy.
+        environment: where; its ``backend`` decides the physics. Its ``on_qp`` counts for policies only.
         goals: goals or paths of goals [m], shape (n, 3) or (n, p, 3).
         design: the body, or one for each goal (default: the environment's).
         seed: seed of the random agent and of the environment.
@@ -165,6 +140,8 @@ def evaluate(
     goals = goals[:, None, :] if goals.ndim == 2 else goals
     if agent not in AGENTS and environment.backend == "surrogate":
         return _evaluate_batch(Policy(agent), environment, goals, design, seed)
+    if agent in AGENTS:
+        environment = environment.model_copy(update={"on_qp": 0.0})
     env = environment.make(sample_design=False)
     act = make_agent(agent, seed)
     rows = []
@@ -202,25 +179,28 @@ def _evaluate_batch(
     """All episodes at once on the batched surrogate environment."""
     count = len(goals)
     env = environment.make_vec(count, sample_design=False)
+    columns = {name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "length")}
+    running = np.ones(count, dtype=bool)
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
-        returns, efforts, distances = np.zeros(count), np.zeros(count), np.zeros(count)
-        length = 0
-        while True:
-            observation, reward, _, truncated, info = env.step(policy(observation))
-            length += 1
-            final = info.get("final_info", info)
-            returns += reward
-            efforts += np.abs(final["effort"]).mean(axis=1)
-            distances += final["distance"]
-            if truncated.all():
-                return Evaluation(
-                    final["distance"].copy(),
-                    distances / length,
-                    returns,
-                    final["is_success"].copy(),
-                    efforts / length,
-                    count * length,
-                )
+        while running.any():
+            observation, reward, terminated, truncated, info = env.step(policy(observation))
+            last = info.get("final_info", info)
+            columns["distance"] = np.where(running, last["distance"], columns["distance"])
+            columns["success"] = np.where(running, last["is_success"] & last["converged"], columns["success"])
+            columns["mean"] += running * last["distance"]
+            columns["return"] += running * reward
+            columns["effort"] += running * np.abs(last["effort"]).mean(axis=1)
+            columns["length"] += running
+            running &= ~(terminated | truncated)
     finally:
         env.close()
+    length = columns["length"]
+    return Evaluation(
+        columns["distance"],
+        columns["mean"] / length,
+        columns["return"],
+        columns["success"].astype(bool),
+        columns["effort"] / length,
+        int(length.sum()),
+    )

@@ -6,13 +6,14 @@ import csv
 import json
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from agents.config import TrainConfig
-from agents.evaluation import Evaluation, evaluate, sample_goals
+from agents.evaluation import Evaluation, evaluate, evaluation_set
 from agents.policy import policy_path, read_tensors, save_policy
 from softgym_envs.config import provenance, save_resolved
 from softgym_envs.errors import DataError, WeightsError
@@ -21,10 +22,12 @@ from softgym_envs.storage import atomic_write
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
 
+    from agents.joint import DesignProposer
+
 __all__ = ["train"]
 
 _EVALUATION_SEED = 1_000_003
-_BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "ends")
 _CURVE = ("step", "seconds", "success_rate", "mean_distance", "worst_distance", "mean_return")
 
 
@@ -34,13 +37,15 @@ def train(
     *,
     initial: str | Path | None = None,
     report: Callable[[int, Evaluation], bool] | None = None,
+    proposer: DesignProposer | None = None,
     progress: bool = True,
 ) -> Path:
     """Train a SAC policy, or go on with an interrupted training in ``folder``.
 
-    Writes ``policy.safetensors`` (actor and critics) with its card, ``curve.csv``, TensorBoard logs, and a
-    ``checkpoint.safetensors`` from which an interrupted run resumes (weights, optimiser moments, replay buffer and
-    random states; running episodes start anew).
+    Writes ``policy.safetensors`` (actor and critics) with its card, ``curve.csv``, TensorBoard logs where TensorBoard is
+    installed, and a ``checkpoint.safetensors`` from which an interrupted run resumes as if it had not been (weights,
+    optimiser moments, replay buffer and random states; all episodes start anew after each evaluation). The policy is
+    the one with the largest mean return among those that were evaluated; the card names its step.
 
     Args:
         config: what to train.
@@ -48,6 +53,7 @@ def train(
         initial: policy to start from (actor and critics): a file or the name of a shipped one; overrides that of the
             configuration.
         report: called after each evaluation with its step and outcome; True stops the training early.
+        proposer: draws the sampled bodies, and learns along with the policy; default: evenly over their box.
         progress: show a progress bar.
 
     Returns:
@@ -69,7 +75,7 @@ def train(
     result = folder / "policy.safetensors"
     resolved = folder / "config.yaml"
     if resolved.exists():
-        if yaml.safe_load(resolved.read_text()) != config.model_dump(mode="json"):
+        if TrainConfig.model_validate(yaml.safe_load(resolved.read_text())) != config:
             raise DataError(f"'{folder}' holds a training with another configuration; use a new folder")
         if result.exists():
             return result
@@ -79,18 +85,23 @@ def train(
     model = _make_model(config, folder)
     checkpoint = folder / "checkpoint.safetensors"
     curve: list[dict[str, float]] = []
+    best: dict[str, np.ndarray] = {}
     if checkpoint.exists():
-        curve = _restore(model, checkpoint)
+        curve, best = _restore(model, checkpoint)
     elif config.initial is not None:
         start_from = policy_path(config.initial)
         _load_weights(model, read_tensors(start_from), start_from)
-    designs, goals = _evaluation_set(config)
+    if proposer is not None:
+        proposer.attach(model, config, folder)
+    designs, goals = evaluation_set(config.environment, config.evaluation_episodes, _EVALUATION_SEED)
 
     start = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
     bar = tqdm(total=config.steps, initial=model.num_timesteps, unit="step", desc=folder.name, disable=not progress)
     stopped = False
     with bar:
         while model.num_timesteps < config.steps and not stopped:
+            if proposer is not None:
+                proposer.begin(model)
             target = min(config.steps, (model.num_timesteps // config.report_every + 1) * config.report_every)
             _learn(model, target, bar)
             scratch = folder / "latest.safetensors"
@@ -106,40 +117,38 @@ def train(
                     "mean_return": outcome.mean_return,
                 }
             )
+            # A proposer leaves the bodies of the evaluation behind: its policy is the last one.
+            if proposer is not None or curve[-1]["mean_return"] >= max(row["mean_return"] for row in curve):
+                best = _weights(model)
             bar.set_postfix_str(f"success {outcome.success_rate:.0%}, distance {1e3 * outcome.mean_distance:.2f} mm")
             for name in ("success_rate", "mean_distance", "mean_return"):
                 model.logger.record(f"evaluation/{name}", curve[-1][name])
             model.logger.dump(model.num_timesteps)
             _write_curve(folder / "curve.csv", curve)
-            _save_checkpoint(model, checkpoint, curve)
+            if proposer is not None:
+                proposer.save(model.num_timesteps)
+            _save_checkpoint(model, checkpoint, curve, best)
             stopped = report is not None and bool(report(model.num_timesteps, outcome))
     card = {
         "config": config.model_dump(mode="json"),
         "steps": int(model.num_timesteps),
+        "best_step": _best_step(curve) if proposer is None else int(model.num_timesteps),
         "stopped_early": stopped,
         "curve": curve,
         "provenance": provenance(),
     }
-    save_policy(result, _weights(model), card)
+    if proposer is not None:
+        proposer.finish(model)
+    save_policy(result, best, card)
     for leftover in (folder / "latest.safetensors", folder / "latest.json", checkpoint):
         leftover.unlink(missing_ok=True)
     model.get_env().close()  # type: ignore[union-attr]
     return result
 
 
-def _evaluation_set(config: TrainConfig) -> tuple[list[dict[str, float]] | None, np.ndarray]:
-    """Bodies and goals of the learning curve: a body for each goal where bodies are sampled, else the one body."""
-    environment, count = config.environment, config.evaluation_episodes
-    if not environment.sample_design:
-        return None, sample_goals(environment, count, _EVALUATION_SEED)
-    env = environment.make()
-    designs, goals = [], []
-    for i in range(count):
-        env.reset(seed=_EVALUATION_SEED if i == 0 else None)
-        designs.append(env.unwrapped.design)  # type: ignore[attr-defined]
-        goals.append(env.unwrapped.path.copy())  # type: ignore[attr-defined]
-    env.close()
-    return designs, np.stack(goals)
+def _best_step(curve: list[dict[str, float]]) -> int:
+    """Step of the evaluation with the largest mean return, the last of equal ones."""
+    return int(max(curve, key=lambda row: (row["mean_return"], row["step"]))["step"])
 
 
 def _make_model(config: TrainConfig, folder: Path) -> SAC:
@@ -150,6 +159,15 @@ def _make_model(config: TrainConfig, folder: Path) -> SAC:
 
     env = SB3VecEnv(config.environment.make_vec(config.num_envs))
     sac = config.sac
+    buffer: dict[str, Any] = {}
+    if sac.hindsight:
+        from agents.hindsight import HindsightBuffer
+
+        single = config.environment.make()
+        known: Any = single.unwrapped
+        options = {"interface": known.interface, "task": known.task, "share": sac.hindsight}
+        buffer = {"replay_buffer_class": HindsightBuffer, "replay_buffer_kwargs": options}
+        single.close()
     model = SAC(
         "MlpPolicy",
         env,
@@ -163,19 +181,21 @@ def _make_model(config: TrainConfig, folder: Path) -> SAC:
         gradient_steps=sac.gradient_steps,
         ent_coef=sac.ent_coef,
         target_entropy=sac.target_entropy,
-        policy_kwargs={"net_arch": list(sac.net_arch)},
+        policy_kwargs={"net_arch": list(sac.net_arch), "optimizer_kwargs": {"fused": True}},
         seed=config.seed,
         device="cpu",
+        **buffer,
     )
     # stable-baselines3 counts progress within one call of learn(); ours spans the whole training.
     fall = sac.final_learning_rate - sac.learning_rate
     model.lr_schedule = lambda _: sac.learning_rate + fall * min(model.num_timesteps / config.steps, 1.0)
-    model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
+    formats = ["tensorboard"] if find_spec("tensorboard") else []
+    model.set_logger(configure(str(folder / "tensorboard"), formats))
     return model
 
 
 def _learn(model: SAC, target: int, bar: Any) -> None:
-    """Advance to ``target`` steps, showing them on the bar."""
+    """Advance to ``target`` steps from new episodes, showing them on the bar."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Tick(BaseCallback):
@@ -183,6 +203,13 @@ def _learn(model: SAC, target: int, bar: Any) -> None:
             bar.update(self.training_env.num_envs)
             return True
 
+    # A resumed run cannot go on with running episodes and generators in other processes, so no run does.
+    model._last_obs = None
+    if model.num_timesteps:
+        seeds = np.random.SeedSequence([model.seed or 0, model.num_timesteps])
+        model.get_env().seed(int(seeds.generate_state(1)[0]))  # type: ignore[union-attr]
+    if hasattr(model.replay_buffer, "cut"):
+        model.replay_buffer.cut()
     model.learn(target - model.num_timesteps, callback=Tick(), reset_num_timesteps=False, log_interval=20)
 
 
@@ -219,11 +246,14 @@ def _optimisers(model: SAC) -> dict[str, Any]:
     return found
 
 
-def _save_checkpoint(model: SAC, path: Path, curve: list[dict[str, float]]) -> None:
+def _save_checkpoint(
+    model: SAC, path: Path, curve: list[dict[str, float]], best: dict[str, np.ndarray]
+) -> None:
     import torch
     from safetensors.numpy import save
 
     tensors = {f"weights/{name}": value for name, value in _weights(model).items()}
+    tensors |= {f"best/{name}": value for name, value in best.items()}
     for name, optimiser in _optimisers(model).items():
         for key, moments in optimiser.state_dict()["state"].items():
             for part, value in moments.items():
@@ -231,20 +261,17 @@ def _save_checkpoint(model: SAC, path: Path, curve: list[dict[str, float]]) -> N
     buffer: Any = model.replay_buffer
     filled = buffer.buffer_size if buffer.full else buffer.pos
     for name in _BUFFER:
-        tensors[f"buffer/{name}"] = getattr(buffer, name)[:filled]
+        if hasattr(buffer, name):
+            tensors[f"buffer/{name}"] = getattr(buffer, name)[:filled]
     tensors["random/torch"] = torch.get_rng_state().numpy()
     _, keys, *position = np.random.get_state()  # noqa: NPY002 - stable-baselines3 samples with the global generator
     tensors["random/numpy"] = np.asarray(keys)
-    vector_env: Any = model.get_env().env  # type: ignore[union-attr]
-    generator = vector_env.np_random
     meta = {
         "step": int(model.num_timesteps),
         "updates": int(model._n_updates),
         "position": int(buffer.pos),
         "full": bool(buffer.full),
         "numpy": [int(position[0]), int(position[1]), float(position[2])],
-        # Environments in processes of their own have one generator each, out of reach.
-        "environment": None if isinstance(generator, tuple) else generator.bit_generator.state,
         "actions": model.action_space.np_random.bit_generator.state,
         "curve": curve,
     }
@@ -253,8 +280,8 @@ def _save_checkpoint(model: SAC, path: Path, curve: list[dict[str, float]]) -> N
         stream.write(save(arrays, metadata={"state": json.dumps(meta)}))
 
 
-def _restore(model: SAC, path: Path) -> list[dict[str, float]]:
-    """Take up a checkpoint; returns the learning curve so far."""
+def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, np.ndarray]]:
+    """Take up a checkpoint; returns the learning curve and the weights of the best policy so far."""
     import torch
     from safetensors import safe_open
 
@@ -274,22 +301,15 @@ def _restore(model: SAC, path: Path) -> list[dict[str, float]]:
         optimiser.load_state_dict(state)
     buffer: Any = model.replay_buffer
     for name in _BUFFER:
-        stored = tensors[f"buffer/{name}"]
-        getattr(buffer, name)[: len(stored)] = stored
+        if hasattr(buffer, name):
+            stored = tensors[f"buffer/{name}"]
+            getattr(buffer, name)[: len(stored)] = stored
     buffer.pos, buffer.full = meta["position"], meta["full"]
     model.num_timesteps, model._n_updates = meta["step"], meta["updates"]
     torch.set_rng_state(torch.as_tensor(tensors["random/torch"]))
     np.random.set_state(("MT19937", tensors["random/numpy"], *meta["numpy"]))  # noqa: NPY002 - as above
-    env: Any = model.get_env()
-    if meta["environment"] is None:
-        # Environments in processes of their own keep their generators: they start anew, from a seed of this step.
-        env.env.reset(seed=model.num_timesteps)
-    else:
-        env.env.reset(seed=0)
-        env.env.np_random.bit_generator.state = meta["environment"]
-    env.cancel_seed()  # else the first reset would start the random goals and bodies anew
     model.action_space.np_random.bit_generator.state = meta["actions"]
-    return meta["curve"]
+    return meta["curve"], {k.removeprefix("best/"): v for k, v in tensors.items() if k.startswith("best/")}
 
 
 def _write_curve(path: Path, curve: list[dict[str, float]]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,8 @@ class SB3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions: np.ndarray | None = None
         self._seed: int | None = None
+        #: Called at the end of each episode with its sub-environment and its return.
+        self.on_episode: Callable[[int, float], None] = lambda index, total: None
 
     def reset(self) -> np.ndarray:
         observation, info = self.env.reset(seed=self._seed)
@@ -39,10 +41,6 @@ class SB3VecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         self._seed = seed
         return [seed] * self.num_envs
-
-    def cancel_seed(self) -> None:
-        """Forget a seed that waits for the next reset."""
-        self._seed = None
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
@@ -60,6 +58,7 @@ class SB3VecEnv(VecEnv):
                 "episode": {"r": float(self._return[i]), "l": int(self._length[i])},
                 "is_success": bool(info["final_info"]["is_success"][i]),
             }
+            self.on_episode(int(i), float(self._return[i]))
             self._return[i] = 0.0
             self._length[i] = 0
         return observation, reward.astype(np.float32), done, infos

@@ -12,8 +12,10 @@ import click
 from benchmarks import (
     accuracy,
     carry,
+    codesign_scale,
     dynamics,
     export,
+    gpu,
     hybrid,
     morphing,
     networks,
@@ -34,6 +36,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "fem_speed": speed.fem_speed,
     "notched_beam": speed.notched_beam,
     "surrogate_step": speed.surrogate_step,
+    "gpu_step": gpu.gpu_step,
     "inference": speed.inference,
     "memory": speed.memory,
     "test_set": accuracy.test_set,
@@ -53,6 +56,8 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "sensor_finger": sensor_finger.published,
     "validation": validation.validation,
     "dynamics": dynamics.dynamics,
+    "codesign_kills": codesign_scale.kills,
+    "codesign_profile": codesign_scale.profile,
 }
 """Registry of benchmarks."""
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import warnings
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from agents.config import EnvironmentConfig, SACConfig
+from agents.joint import PROPOSERS
+from codesign.objectives import OBJECTIVES
 from softgym_envs.config import Config
 from softgym_envs.designs import DesignSpace
 from softgym_envs.envs.registration import ENVIRONMENTS
@@ -17,19 +20,52 @@ from softgym_envs.robots import make_robot
 from softgym_envs.robots.robot import Robot
 
 __all__ = [
+    "JOURNAL",
     "PRUNERS",
     "SAMPLERS",
+    "STRATEGIES",
     "FinalistsConfig",
     "GoalsConfig",
+    "JointConfig",
     "PrunerConfig",
     "SamplerConfig",
     "ScreenConfig",
+    "Strategy",
     "StudyConfig",
     "TrainingConfig",
     "ZoneConfig",
     "construct",
     "robot_of",
 ]
+
+JOURNAL = "journal"
+"""``storage`` of a study whose trials are kept in its folder."""
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """How a body gets its score.
+
+    Args:
+        trains: each trial trains a policy of its own.
+        policy: it needs a design-conditioned policy: to start from where it trains, else as the judge of all bodies.
+        proposer: name in `agents.joint.PROPOSERS`: bodies and their judge are first trained together.
+    """
+
+    trains: bool = False
+    policy: bool = False
+    proposer: str | None = None
+
+
+STRATEGIES: dict[str, Strategy] = {
+    "scratch": Strategy(trains=True),
+    "warm_start": Strategy(trains=True, policy=True),
+    "policy": Strategy(policy=True),
+    "critic": Strategy(proposer="critic"),
+    "distribution": Strategy(proposer="distribution"),
+    "qp": Strategy(),
+}
+"""Registry: name to strategy."""
 
 SAMPLERS: dict[str, str] = {
     "tpe": "TPESampler",
@@ -40,7 +76,6 @@ SAMPLERS: dict[str, str] = {
     "random": "RandomSampler",
 }
 """Registry: name to class of `optuna.samplers`."""
-
 PRUNERS: dict[str, str] = {
     "none": "NopPruner",
     "median": "MedianPruner",
@@ -48,8 +83,11 @@ PRUNERS: dict[str, str] = {
     "hyperband": "HyperbandPruner",
     "successive_halving": "SuccessiveHalvingPruner",
     "threshold": "ThresholdPruner",
+    "wilcoxon": "WilcoxonPruner",
 }
-"""Registry: name to class of `optuna.pruners`. Their steps are environment steps of training."""
+"""Registry: name to class of `optuna.pruners`. Their steps are environment steps of training; those of ``"wilcoxon"``,
+for strategies that train nothing in a trial, are goals, each of which is compared with the same goal of the best body.
+"""
 
 
 def robot_of(environment: EnvironmentConfig) -> Robot:
@@ -104,7 +142,7 @@ class SamplerConfig(Config):
 class PrunerConfig(Config):
     """Who stops hopeless trials: ``name`` of `PRUNERS`, and further arguments of its class."""
 
-    name: Literal["none", "median", "percentile", "hyperband", "successive_halving", "threshold"] = "none"
+    name: Literal["none", "median", "percentile", "hyperband", "successive_halving", "threshold", "wilcoxon"] = "none"
     options: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -162,7 +200,7 @@ class GoalsConfig(Config):
 
 
 class TrainingConfig(Config):
-    """Training inside one trial; see `agents.config.TrainConfig`. Not used by the strategy ``"qp"``.
+    """Training inside one trial; see `agents.config.TrainConfig`. Only for strategies whose trials train.
 
     Attributes:
         steps: environment steps of one trial.
@@ -178,6 +216,30 @@ class TrainingConfig(Config):
     evaluation_episodes: int = Field(default=32, ge=1)
     num_envs: int = Field(default=16, ge=1)
     seed: int = Field(default=0, ge=0)
+    sac: SACConfig = Field(default_factory=SACConfig)
+
+
+class JointConfig(Config):
+    """Training of bodies and policy together, before the trials; for the strategies ``"critic"``, ``"distribution"``.
+
+    Attributes:
+        steps: environment steps.
+        report_every: environment steps between two checkpoints, and two questions to the critic.
+        evaluation_episodes: episodes behind each point of the learning curve.
+        num_envs: environments in parallel.
+        seed: of everything in it.
+        keep: number of its most promising bodies that become trials.
+        options: arguments of the proposer, see `agents.joint`.
+        sac: hyper-parameters.
+    """
+
+    steps: int = Field(default=40_000, ge=1)
+    report_every: int = Field(default=4_000, ge=1)
+    evaluation_episodes: int = Field(default=32, ge=1)
+    num_envs: int = Field(default=16, ge=1)
+    seed: int = Field(default=0, ge=0)
+    keep: int = Field(default=4, ge=1, le=32)
+    options: dict[str, float] = Field(default_factory=dict)
     sac: SACConfig = Field(default_factory=SACConfig)
 
 
@@ -210,11 +272,16 @@ class FinalistsConfig(Config):
         choose: who names the winner: the ``"surrogate"`` score of the trials, or the ``"fem"`` score of the finalists
             on the same goals. Never the unseen goals.
         fem_options: options of the FEM backend.
+        seeds: policies trained anew for each finalist, with seeds 1, 2, ... beside that of the trial; 0: the policy of
+            the trial itself is tested.
+        steps: environment steps of each of them; default: those of a trial.
     """
 
     count: int = Field(default=3, ge=0)
     choose: Literal["surrogate", "fem"] = "surrogate"
     fem_options: dict[str, Any] = Field(default_factory=dict)
+    seeds: int = Field(default=0, ge=0)
+    steps: int | None = Field(default=None, ge=1)
 
 
 class StudyConfig(Config):
@@ -226,12 +293,24 @@ class StudyConfig(Config):
         environment: robot, task and backend of the trials. Its ``design`` (default: the robot's baseline) is the
             baseline body of the study and gives the variables that are not optimised.
         variables: names of the design variables to optimise.
-        objective: what is optimised: success rate and return upwards, mean final distance downwards.
-        strategy: ``"warm_start"`` fine-tunes a design-conditioned policy in each trial, ``"scratch"`` trains a new one,
-            ``"qp"`` trains none and scores a body by the inverse QP.
-        policy: design-conditioned policy to start from, for ``"warm_start"``: a file or the name of a shipped one.
+        objective: what is optimised, a name in `codesign.objectives.OBJECTIVES`; the winner is the best in it.
+        also: further objectives: the study then looks for the Pareto front of all of them.
+        limits: largest allowed values of objectives that are better when smaller, smallest of the others [SI]; a body
+            that breaks one cannot win.
+        strategy: ``"scratch"`` trains a policy in each trial (plain nesting), ``"warm_start"`` fine-tunes a
+            design-conditioned one, ``"policy"`` lets it judge bodies as it is, ``"critic"`` and ``"distribution"``
+            train bodies and a policy together and then let it judge, ``"qp"`` trains none and asks the inverse QP.
+        policy: design-conditioned policy, for ``"warm_start"`` and ``"policy"``: a file or the name of a shipped one.
+        joint: training of bodies and policy together, for ``"critic"`` and ``"distribution"``.
         trials: number of bodies, the baseline and those of the screen included.
         workers: processes, one thread each.
+        executor: what they are: ``"processes"`` of this machine, or tasks of a ``"ray"`` cluster.
+        storage: where trials are kept: the ``"journal"`` of the folder, for one machine, or a PostgreSQL database that
+            many machines share, ``postgresql://user@host:port/database``.
+        heartbeat: a worker of a database that gave no sign of life for so long counts as dead, and its trial runs
+            again [s].
+        patience: how long a database that does not answer is waited for [s].
+        attempts: workers that a body may cost without any progress of its training, before it counts as infeasible.
         sampler: who proposes bodies.
         pruner: who stops hopeless trials.
         goals: what the body has to reach.
@@ -244,17 +323,43 @@ class StudyConfig(Config):
     title: str = ""
     environment: EnvironmentConfig
     variables: tuple[str, ...] = Field(min_length=1)
-    objective: Literal["success_rate", "mean_distance", "mean_return"] = "mean_distance"
-    strategy: Literal["warm_start", "scratch", "qp"] = "warm_start"
+    objective: str = "mean_distance"
+    also: tuple[str, ...] = ()
+    limits: dict[str, float] = Field(default_factory=dict)
+    strategy: Literal["warm_start", "scratch", "policy", "critic", "distribution", "qp"] = "warm_start"
     policy: str | None = None
+    joint: JointConfig = Field(default_factory=JointConfig)
     trials: int = Field(ge=1)
     workers: int = Field(default=1, ge=1)
+    executor: Literal["processes", "ray"] = "processes"
+    storage: str = JOURNAL
+    heartbeat: float = Field(default=60.0, ge=1.0)
+    patience: float = Field(default=600.0, ge=0.0)
+    attempts: int = Field(default=5, ge=1)
     sampler: SamplerConfig = Field(default_factory=SamplerConfig)
     pruner: PrunerConfig = Field(default_factory=PrunerConfig)
     goals: GoalsConfig = Field(default_factory=GoalsConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
     screen: ScreenConfig = Field(default_factory=ScreenConfig)
     finalists: FinalistsConfig = Field(default_factory=FinalistsConfig)
+
+    @field_validator("storage")
+    @classmethod
+    def _known_storage(cls, storage: str) -> str:
+        if storage == JOURNAL:
+            return storage
+        from sqlalchemy.engine import make_url
+        from sqlalchemy.exc import ArgumentError
+
+        try:
+            url = make_url(storage)
+        except ArgumentError:
+            raise ValueError(f"allowed: {JOURNAL}, postgresql://user@host:port/database") from None
+        if url.password is not None or "password" in url.query:
+            raise ValueError("the address must hold no password, it is written to files; use ~/.pgpass or PGPASSWORD")
+        if url.get_backend_name() != "postgresql" or not url.database:
+            raise ValueError(f"allowed: {JOURNAL}, postgresql://user@host:port/database")
+        return storage
 
     @field_validator("environment")
     @classmethod
@@ -272,29 +377,80 @@ class StudyConfig(Config):
             raise ValueError(f"variables: '{repeated[0]}' is named twice")
         for name in (*self.variables, *(self.goals.vary or ())):
             space[name]
-        if self.strategy == "warm_start" and not self.policy:
-            raise ValueError("strategy 'warm_start' needs 'policy', the file of a trained design-conditioned policy")
-        if self.strategy != "warm_start" and self.policy:
-            raise ValueError(f"policy = '{self.policy}' is of no use to strategy '{self.strategy}'; remove it")
-        if self.strategy != "qp" and self.environment.backend != "surrogate":
-            raise ValueError(
-                f"environment.backend = '{self.environment.backend}' is for strategy 'qp' only; allowed: surrogate"
-            )
-        if self.strategy == "qp" and self.pruner.name != "none":
-            raise ValueError(f"pruner '{self.pruner.name}' has nothing to stop in strategy 'qp'; allowed: none")
-        if self.strategy != "qp" and self.training.report_every > self.training.steps:
-            raise ValueError(
-                f"training.report_every = {self.training.report_every} exceeds training.steps = {self.training.steps}"
-            )
+        self._check_objectives()
+        self._check_strategy()
         if self.screen.enabled and self.screen.goals > self.goals.count:
             raise ValueError(f"screen.goals = {self.screen.goals} exceeds goals.count = {self.goals.count}")
-        if 1 + self.screen.kept > self.trials:
+        first = self.screen.kept + (self.joint.keep if self.plan.proposer else 0)
+        if 1 + first > self.trials:
             raise ValueError(
-                f"trials = {self.trials} is too few for the baseline and {self.screen.kept} bodies kept by the screen"
+                f"trials = {self.trials} is too few for the baseline and {first} bodies found before the trials"
             )
         if self.finalists.count >= self.trials and self.trials > 1:
             raise ValueError(f"finalists.count = {self.finalists.count} must be below trials = {self.trials}")
         return self
+
+    def _check_objectives(self) -> None:
+        named = (self.objective, *self.also, *self.limits)
+        for name in named:
+            if name not in OBJECTIVES:
+                raise ValueError(f"unknown objective '{name}'; allowed: {', '.join(OBJECTIVES)}")
+        objectives = (self.objective, *self.also)
+        repeated = [name for name in objectives if objectives.count(name) > 1]
+        if repeated:
+            raise ValueError(f"objective '{repeated[0]}' is named twice")
+        if self.also and self.pruner.name != "none":
+            raise ValueError(f"pruner '{self.pruner.name}' compares one number, and there are several; allowed: none")
+        if (self.also or self.limits) and self.sampler.name == "cmaes":
+            raise ValueError("sampler 'cmaes' knows neither several objectives nor limits; allowed: tpe, gp, nsgaii")
+
+    def _check_strategy(self) -> None:
+        plan, training = self.plan, self.training
+        if plan.policy and not self.policy:
+            raise ValueError(f"strategy '{self.strategy}' needs 'policy', a trained design-conditioned policy")
+        if not plan.policy and self.policy:
+            raise ValueError(f"policy = '{self.policy}' is of no use to strategy '{self.strategy}'; remove it")
+        if self.strategy != "qp" and self.environment.backend != "surrogate" and plan.proposer:
+            raise ValueError(
+                f"environment.backend = '{self.environment.backend}' has no joint training; allowed: surrogate"
+            )
+        shown = self.environment.design_in_observation
+        if plan.proposer and shown is not True and not set(self.variables) <= set(shown or ()):
+            raise ValueError(
+                f"strategy '{self.strategy}' needs a policy that sees the body: name {', '.join(self.variables)} in "
+                "environment.design_in_observation"
+            )
+        if plan.proposer:
+            try:
+                PROPOSERS[plan.proposer](**self.joint.options)
+            except TypeError as error:
+                raise ValueError(f"joint.options: {error}") from None
+            if self.joint.report_every > self.joint.steps:
+                raise ValueError(
+                    f"joint.report_every = {self.joint.report_every} exceeds joint.steps = {self.joint.steps}"
+                )
+        pruner = self.pruner.name
+        if not plan.trains and pruner not in ("none", "wilcoxon"):
+            raise ValueError(
+                f"pruner '{pruner}' has no training to stop in strategy '{self.strategy}'; allowed: none, wilcoxon"
+            )
+        if pruner == "wilcoxon" and not OBJECTIVES[self.objective].per_goal:
+            allowed = ", ".join(name for name, objective in OBJECTIVES.items() if objective.per_goal)
+            raise ValueError(f"pruner 'wilcoxon' compares goals, '{self.objective}' has none; allowed: {allowed}")
+        if plan.trains and pruner == "wilcoxon":
+            raise ValueError(
+                f"pruner 'wilcoxon' compares goals, strategy '{self.strategy}' reports its training; "
+                f"allowed: {', '.join(name for name in PRUNERS if name != 'wilcoxon')}"
+            )
+        if plan.trains and training.report_every > training.steps:
+            raise ValueError(
+                f"training.report_every = {training.report_every} exceeds training.steps = {training.steps}"
+            )
+
+    @property
+    def plan(self) -> Strategy:
+        """What the strategy does."""
+        return STRATEGIES[self.strategy]
 
     @property
     def robot(self) -> Robot:

@@ -8,15 +8,28 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from codesign.folder import StudyFolder
 from codesign.jobs import Job
+from codesign.judge import JUDGE
 from codesign.objectives import OBJECTIVES, rank_key
-from codesign.trial import assess
+from codesign.trial import assess, training_config
+from softgym_envs.envs.registration import ENVIRONMENTS
 
-__all__ = ["BACKENDS", "Finalist", "best_trials", "choose_winner", "evaluations", "finalist_jobs", "finalists"]
+__all__ = [
+    "BACKENDS",
+    "Finalist",
+    "best_trials",
+    "choose_winner",
+    "evaluations",
+    "finalist_jobs",
+    "finalists",
+    "pareto_trials",
+]
 
 BACKENDS = ("surrogate", "fem")
-"""Backends every finalist is tested on, the one of the trials first."""
+"""Backends every finalist is tested on; where a robot has no surrogate, FEM alone."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +57,25 @@ class Finalist:
 
 
 def best_trials(folder: StudyFolder) -> list[dict[str, Any]]:
-    """Results of the complete trials, best first."""
+    """Results of the complete trials, best first: those that keep the limits, then those that break them least."""
     complete = [result for result in folder.results() if result["state"] == "complete"]
-    return sorted(complete, key=lambda r: (*rank_key(r["score"], r["evaluation"]), -r["number"]), reverse=True)
+
+    def key(result: dict[str, Any]) -> tuple[float, ...]:
+        excess = sum(max(0.0, value) for value in result["violations"] or ())
+        return (-excess, *rank_key(result["score"], result["evaluation"]), -result["number"])
+
+    return sorted(complete, key=key, reverse=True)
+
+
+def pareto_trials(folder: StudyFolder) -> list[dict[str, Any]]:
+    """Results of the trials that keep the limits and that no other such trial beats in every objective."""
+    allowed = [r for r in best_trials(folder) if all(value <= 0.0 for value in r["violations"] or ())]
+    scores = np.array([result["scores"] for result in allowed])
+
+    def beaten(own: np.ndarray) -> bool:
+        return bool(((scores >= own).all(axis=1) & (scores > own).any(axis=1)).any())
+
+    return [result for result, own in zip(allowed, scores, strict=True) if not beaten(own)]
 
 
 def finalists(folder: StudyFolder) -> list[Finalist]:
@@ -67,8 +96,31 @@ def finalists(folder: StudyFolder) -> list[Finalist]:
     ]
 
 
-def _path(folder: StudyFolder, finalist: Finalist, agent: str, backend: str, goals: str) -> Path:
-    return folder.path / "finalists" / f"trial{finalist.number:04d}-{agent}-{backend}-{goals}.json"
+def _path(folder: StudyFolder, finalist: Finalist, agent: str, backend: str, goals: str, seed: int) -> Path:
+    name = f"trial{finalist.number:04d}-{agent}{f'-seed{seed}' if seed else ''}-{backend}-{goals}.json"
+    return folder.path / "finalists" / name
+
+
+def seeds_of(folder: StudyFolder, agent: str) -> range:
+    """Seeds of the policies that a finalist is tested with; 0 is the policy of the trial itself."""
+    count = folder.config.finalists.seeds
+    return range(1, count + 1) if agent == "sac" and count else range(1)
+
+
+def trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
+    """The policy of a finalist trained anew with a seed, from where the policies of the trials start."""
+    from agents.training import train
+
+    config = folder.config
+    training = training_config(folder, finalist.design)
+    steps = config.finalists.steps or training.steps
+    training = training.model_copy(
+        update={"seed": training.seed + seed, "steps": steps, "report_every": min(training.report_every, steps)}
+    )
+    initial = config.policy if config.plan.trains else str(folder.path / JUDGE)
+    name = f"trial{finalist.number:04d}-seed{seed}"
+    with folder.lock(f"training-{name}"):
+        return train(training, folder.path / "finalists" / name, initial=initial, progress=False)
 
 
 def finalist_jobs(folder: StudyFolder) -> list[Job]:
@@ -76,37 +128,67 @@ def finalist_jobs(folder: StudyFolder) -> list[Job]:
     config = folder.config
     own = config.environment
     options = {"surrogate": {}, "fem": config.finalists.fem_options, own.backend: own.backend_options}
+    backends = BACKENDS if ENVIRONMENTS[own.id].backend == "surrogate" else ("fem",)
     environments = {
         backend: own.model_copy(update={"backend": backend, "backend_options": options[backend]})
-        for backend in BACKENDS
+        for backend in backends
     }
 
-    def make(finalist: Finalist, agent: str, backend: str, goals: str) -> dict[str, Any]:
-        controller = folder.path / finalist.policy if agent == "sac" and finalist.policy else agent
+    def make(finalist: Finalist, agent: str, backend: str, goals: str, seed: int) -> dict[str, Any]:
+        controller: str | Path = agent
+        if agent == "sac" and finalist.policy:
+            controller = trained_policy(folder, finalist, seed) if seed else folder.path / finalist.policy
         return {
             "trial": finalist.number,
             "agent": agent,
             "backend": backend,
             "goals": goals,
+            "seed": seed,
             **assess(controller, environments[backend], folder.goals[goals], finalist.design),
         }
 
     jobs = []
-    for backend in reversed(BACKENDS):
+    for backend in reversed(backends):
         for finalist in finalists(folder):
             tests = [(agent, "unseen") for agent in finalist.agents]
             if config.finalists.choose == "fem" and backend == "fem":
                 tests.append((finalist.agents[0], "selection"))
             for agent, goals in tests:
-                arguments = (finalist, agent, backend, goals)
-                jobs.append(Job(_path(folder, *arguments), partial(make, *arguments)))
+                for seed in seeds_of(folder, agent):
+                    arguments = (finalist, agent, backend, goals, seed)
+                    jobs.append(Job(_path(folder, *arguments), partial(make, *arguments)))
     return jobs
 
 
 def evaluations(folder: StudyFolder) -> list[dict[str, Any]]:
-    """All evaluations of the present finalists that are done."""
+    """All evaluations of the present finalists that are done; those with several seeds as their mean, goal by goal."""
     paths = [job.path for job in finalist_jobs(folder)]
-    return [json.loads(path.read_text()) for path in sorted(paths) if path.exists()]
+    groups: dict[tuple, list[dict[str, Any]]] = {}
+    for path in sorted(path for path in paths if path.exists()):
+        record = json.loads(path.read_text())
+        groups.setdefault(tuple(record[key] for key in ("trial", "agent", "backend", "goals")), []).append(record)
+    return [_mean(records) for records in groups.values()]
+
+
+def _mean(records: list[dict[str, Any]]) -> dict[str, Any]:
+    """One record of several seeds."""
+    failed = [record for record in records if "error" in record]
+    if failed or len(records) == 1:
+        return (failed or records)[0]
+    merged: dict[str, Any] = {key: records[0][key] for key in ("trial", "agent", "backend", "goals")}
+    merged["seeds"] = [record["seed"] for record in records]
+    for key in records[0]:
+        if key in merged or key == "seed":
+            continue
+        values = np.array([record[key] for record in records], dtype=float)
+        if key in ("steps", "seconds", "cpu_seconds"):
+            merged[key] = float(values.sum())
+        elif key == "worst_distance":
+            merged[key] = float(values.max())
+        else:
+            merged[key] = values.mean(axis=0).tolist()
+    merged["of_seeds"] = {key: [record[key] for record in records] for key in ("success_rate", "mean_distance")}
+    return merged
 
 
 def choose_winner(folder: StudyFolder, records: list[dict[str, Any]]) -> Finalist | None:

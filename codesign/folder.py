@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from codesign.config import StudyConfig
+from codesign.config import JOURNAL, StudyConfig
 from codesign.goals import draw_goals
-from softgym_envs.config import load_config, save_resolved
+from codesign.storages import StudyStorage, file_lock, open_storage
+from softgym_envs.config import check_config, load_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.storage import write_json
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["StudyFolder"]
 
 # What may change between two runs of one study.
-EXTENSIBLE = ("name", "title", "trials", "workers", "finalists")
+EXTENSIBLE = ("name", "title", "trials", "workers", "executor", "heartbeat", "patience", "attempts", "finalists")
 
 
 class StudyFolder:
@@ -30,7 +31,7 @@ class StudyFolder:
     It holds::
 
         config.yaml  provenance.json  goals.json
-        journal.log                    Optuna's journal
+        journal.log                    Optuna's journal; or study.json, which study of the database this is
         screen/000.json ...            QP score of each candidate of the screen
         trials/0000/ ...               training of each trial, and its result.json once it is finished
         finalists/*.json               one evaluation each
@@ -38,7 +39,8 @@ class StudyFolder:
         locks/                         locks of the operating system: they die with their holder
         results.json  trials.csv  finalists.csv  report.html
 
-    Every file is either whole or absent.
+    Every file is either whole or absent. With a database, every machine may have such a folder: it then holds copies of
+    all results, and the policies and training files of the trials that ran there.
 
     Args:
         path: the folder; see `create` for a new one.
@@ -48,36 +50,72 @@ class StudyFolder:
         self.path = Path(path).resolve()
 
     @classmethod
-    def create(cls, path: str | Path, config: StudyConfig) -> StudyFolder:
+    def create(cls, path: str | Path, config: StudyConfig, *, wait: bool = False) -> StudyFolder:
         """Make the folder of a study, or open it to continue.
 
+        Args:
+            path: the folder.
+            config: the study.
+            wait: whether to wait for a database that does not answer; by default a wrong address is told at once.
+
         Raises:
-            ConfigError: if the folder holds another study.
+            ConfigError: if the folder, or the study of this name in the database, is of another study.
         """
         folder = cls(path)
         folder.path.mkdir(parents=True, exist_ok=True)
         with folder.lock("study"):
-            if not (folder.path / "config.yaml").exists():
-                if (folder.path / "journal.log").exists():
-                    raise ConfigError(f"folder '{path}' holds a journal but no config.yaml; use another folder")
+            new = not (folder.path / "config.yaml").exists()
+            if new and (folder.path / "journal.log").exists():
+                raise ConfigError(f"folder '{path}' holds a journal but no config.yaml; use another folder")
+            if not new:
+                _accept(folder.config, config, f"folder '{path}'", "folder")
+            goals = folder._agree(config, str(path), wait) if config.storage != JOURNAL else None
+            if new or folder.config != config:
                 save_resolved(folder.path, config)
-            else:
-                folder._accept(config, str(path))
+                folder.__dict__.pop("config", None)
             if not (folder.path / "goals.json").exists():
-                write_json(folder.path / "goals.json", draw_goals(config))
+                write_json(folder.path / "goals.json", draw_goals(config) if goals is None else goals)
         return folder
 
-    def _accept(self, config: StudyConfig, shown: str) -> None:
-        old, new = (c.model_dump(mode="json") for c in (self.config, config))
-        for key in new:
-            if key not in EXTENSIBLE and old[key] != new[key]:
-                raise ConfigError(
-                    f"folder '{shown}' holds a study with another '{key}'; use another folder, or change only: "
-                    f"{', '.join(EXTENSIBLE)}"
-                )
-        if old != new:
-            save_resolved(self.path, config)
-            del self.config
+    def _agree(self, config: StudyConfig, shown: str, wait: bool) -> dict[str, Any]:
+        """Agree with the other machines on configuration and goals of a study; return the goals."""
+        from codesign.postgres import PostgresStorage
+
+        storage = PostgresStorage(
+            config.storage, config.name, grace=config.heartbeat, patience=config.patience, wait=wait
+        )
+        known = self.path / "study.json"
+        mine = json.loads(known.read_text())["id"] if known.exists() else None
+
+        def accept(shared: dict[str, Any] | None) -> dict[str, Any]:
+            if shared is None:
+                if mine is not None:
+                    raise ConfigError(
+                        f"the study '{config.name}' of folder '{shown}' is not in storage '{config.storage}'; use "
+                        "another folder to begin anew"
+                    )
+                return {"config": config.model_dump(mode="json"), "goals": draw_goals(config)}
+            where = f"storage '{config.storage}'"
+            if "config" not in shared:
+                raise ConfigError(f"{where} holds a study '{config.name}' that is none of co-design; use another name")
+            if mine not in (None, shared["id"]):
+                raise ConfigError(f"{where} holds another study '{config.name}' than folder '{shown}'; use another one")
+            old = check_config(StudyConfig, shared["config"], f"study '{config.name}' of {where}")
+            _accept(old, config, where, "name")
+            return {"config": config.model_dump(mode="json"), "goals": shared["goals"]}
+
+        shared = storage.agree(accept, 1 + len(config.also))
+        if mine is None:
+            write_json(known, {"id": shared["id"]})
+        return shared["goals"]
+
+    def open_storage(self) -> StudyStorage:
+        """Open the storage of the trials.
+
+        Raises:
+            ConfigError: if the database cannot be opened.
+        """
+        return open_storage(self.path, self.config)
 
     @cached_property
     def config(self) -> StudyConfig:
@@ -98,11 +136,8 @@ class StudyFolder:
         return json.loads(path.read_text()) if path.exists() else {"command": "", "wall_seconds": {}}
 
     def lock(self, name: str) -> BaseFileLock:
-        """Return a lock shared by all processes of the study. The operating system frees it when its holder dies."""
-        from filelock import FileLock
-
-        (self.path / "locks").mkdir(parents=True, exist_ok=True)
-        return FileLock(self.path / "locks" / f"{name}.lock", poll_interval=0.01)
+        """Return a lock shared by all processes of the folder; see `codesign.storages.file_lock`."""
+        return file_lock(self.path, name)
 
     def trial(self, number: int) -> Path:
         """Folder of a trial."""
@@ -117,3 +152,24 @@ class StudyFolder:
         """Results of all finished trials, by number."""
         paths = sorted((self.path / "trials").glob("[0-9]*/result.json"))
         return [json.loads(path.read_text()) for path in paths]
+
+
+def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str) -> None:
+    """Raise unless a study can go on with a new configuration.
+
+    Args:
+        old: its configuration so far.
+        new: what it is to be now.
+        where: that holds the study.
+        use: what to change to begin another one.
+    """
+    before, after = (config.model_dump(mode="json") for config in (old, new))
+    extensible = EXTENSIBLE if new.storage == JOURNAL else (*(key for key in EXTENSIBLE if key != "name"), "storage")
+    if (old.storage == JOURNAL) != (new.storage == JOURNAL):
+        raise ConfigError(f"{where} holds a study with storage '{old.storage}', got '{new.storage}'; use another {use}")
+    for key in after:
+        if key not in extensible and before[key] != after[key]:
+            raise ConfigError(
+                f"{where} holds a study with another '{key}'; use another {use}, or change only: "
+                f"{', '.join(extensible)}"
+            )

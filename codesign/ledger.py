@@ -1,8 +1,8 @@
 """Who runs which trial.
 
-Every change of it happens under one lock of the operating system, so no trial is lost, run twice or one too many. A
-trial belongs to a worker, and a worker holds a lock of its own while it lives: a trial whose worker's lock is free was
-left behind (``kill -9``, power cut). Its result is taken over if it was already written; else its body is queued again.
+Every change of it happens while no other process is at it, so no trial is lost, run twice or one too many. A trial
+belongs to a worker, and a worker shows that it lives (`codesign.storages`): a trial whose worker does not was left
+behind (``kill -9``, power cut). Its result is taken over if it was already written; else its body is queued again.
 """
 
 from __future__ import annotations
@@ -10,21 +10,27 @@ from __future__ import annotations
 import os
 import socket
 import uuid
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from codesign.config import PRUNERS, SAMPLERS, StudyConfig, construct
 from codesign.folder import StudyFolder
+from codesign.storages import StudyStorage
+from softgym_envs.errors import DataError
+from softgym_envs.storage import write_json
 
 if TYPE_CHECKING:
     import optuna
 
 __all__ = ["Ledger", "open_study"]
 
-STUDY = "codesign"
-JOURNAL_LOCK = "journal"
+T = TypeVar("T")
+
+TOLD = ("success_rate", "mean_distance", "mean_return")
+"""What Optuna is told of an evaluation beside its score, for people who look there (``optuna-dashboard``)."""
 
 
 def make_sampler(config: StudyConfig, number: int) -> optuna.samplers.BaseSampler:
@@ -65,40 +71,31 @@ def distributions(config: StudyConfig) -> dict[str, optuna.distributions.BaseDis
     }
 
 
-def open_storage(folder: StudyFolder) -> optuna.storages.BaseStorage:
-    """Open Optuna's journal of a folder, and mend it if a crash cut off its last line."""
-    from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend
-
-    path = folder.path / "journal.log"
-    lock = folder.lock(JOURNAL_LOCK)
-    with lock:
-        # Whoever held this lock is gone, so a line without an end was cut off by a crash and was never acted upon.
-        if path.exists() and (data := path.read_bytes()) and not data.endswith(b"\n"):
-            with path.open("rb+") as stream:
-                stream.truncate(data.rfind(b"\n") + 1)
-    # Unlike Optuna's own lock files, these are freed by the kernel when their holder is killed.
-    return JournalStorage(JournalFileBackend(str(path), lock_obj=lock))  # type: ignore[arg-type]
-
-
-def open_study(
-    folder: StudyFolder, storage: optuna.storages.BaseStorage | None = None, number: int = 0
-) -> optuna.Study:
-    """Open the Optuna study of a folder; it always maximises the score, see `codesign.objectives`.
+def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number: int = 0) -> optuna.Study:
+    """Open the Optuna study of a folder; it always maximises the scores, see `codesign.objectives`.
 
     Args:
         folder: the study.
-        storage: an open journal, opened anew by default.
+        storage: its storage, opened anew by default.
         number: trial that the sampler is for.
+
+    Raises:
+        DataError: if a database does not have it any more.
     """
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = open_storage(folder) if storage is None else storage
+    storage = folder.open_storage() if storage is None else storage
     sampler, pruner = make_sampler(folder.config, number), make_pruner(folder.config)
-    if STUDY in optuna.get_all_study_names(storage):
-        return optuna.load_study(study_name=STUDY, storage=storage, sampler=sampler, pruner=pruner)
-    return optuna.create_study(study_name=STUDY, storage=storage, direction="maximize", sampler=sampler, pruner=pruner)
+    try:
+        return optuna.load_study(study_name=storage.study, storage=storage.optuna, sampler=sampler, pruner=pruner)
+    except KeyError:
+        if storage.shared:
+            raise DataError(f"storage '{folder.config.storage}' has no study '{storage.study}'") from None
+    directions = [optuna.study.StudyDirection.MAXIMIZE] * (1 + len(folder.config.also))
+    return optuna.create_study(
+        study_name=storage.study, storage=storage.optuna, directions=directions, sampler=sampler, pruner=pruner
+    )
 
 
 class Ledger:
@@ -111,19 +108,23 @@ class Ledger:
     def __init__(self, folder: StudyFolder) -> None:
         self.folder = folder
         self.worker = f"worker-{uuid.uuid4().hex[:12]}"
-        self._alive = folder.lock(self.worker)
-        self._lock = folder.lock("study")
-        with self._lock:
-            self._storage = open_storage(folder)
-            self.study = open_study(folder, self._storage)
+        self.storage = folder.open_storage()
+        self._presence = self.storage.present(self.worker)
+        self._claimed: set[int] = set()
+        self._mirrored: set[int] = set()
+        self._exclusively(lambda study: None)
 
     def __enter__(self) -> Ledger:
-        self._alive.acquire()
+        self._presence.__enter__()
         return self
 
-    def __exit__(self, *exception: object) -> None:
-        Path(self._alive.lock_file).unlink(missing_ok=True)
-        self._alive.release()
+    def __exit__(self, *exception: Any) -> None:
+        self._presence.__exit__(*exception)
+
+    @property
+    def study(self) -> optuna.Study:
+        """The Optuna study, to be read."""
+        return open_study(self.folder, self.storage)
 
     def enqueue(self, bodies: list[tuple[str, dict[str, float]]]) -> None:
         """Queue bodies, each once however often this is called.
@@ -131,78 +132,144 @@ class Ledger:
         Args:
             bodies: unique origin (such as ``"baseline"``) and value of each optimised variable [SI].
         """
-        with self._lock:
-            known = {trial.user_attrs.get("origin") for trial in self.study.get_trials(deepcopy=False)}
+
+        def action(study: optuna.Study) -> None:
+            known = {trial.user_attrs.get("origin") for trial in study.get_trials(deepcopy=False)}
             for origin, values in bodies:
                 if origin not in known:
-                    self.study.enqueue_trial(values, user_attrs={"origin": origin})
+                    study.enqueue_trial(values, user_attrs={"origin": origin})
+
+        self._exclusively(action)
 
     def claim(self) -> optuna.Trial | None:
         """Take the next trial, or None if the study has as many as were asked for."""
-        config = self.folder.config
-        with self._lock:
-            if not self._claimable():
-                return None
-            number = len(self.study.get_trials(deepcopy=False))
-            trial = open_study(self.folder, self._storage, number).ask(distributions(config))
-            trial.set_user_attr("worker", self.worker)
-            trial.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
-            if "origin" not in trial.user_attrs:
-                trial.set_user_attr("origin", f"sampler {trial.number}")
-                trial.set_user_attr("sampler_seed", trial_seed(config, trial.number))
-            self._inherit(trial)
+        trial = self._exclusively(self._claim)
+        if trial is not None:
+            self._claimed.add(trial.number)
+            self._inherit_folder(trial)
         return trial
 
-    def finish(self, result: dict[str, Any]) -> None:
-        """Enter the result of a trial."""
-        with self._lock:
-            self._tell(result)
+    def finish(self, result: dict[str, Any]) -> bool:
+        """Enter the result of a trial.
+
+        Returns:
+            False if the trial was taken from this worker, which was thought dead: the result is then dropped.
+        """
+
+        def action(study: optuna.Study) -> bool:
+            from optuna.trial import TrialState
+
+            trial = study.get_trials(deepcopy=False)[result["number"]]
+            if trial.state == TrialState.RUNNING and trial.user_attrs.get("worker") == self.worker:
+                self._tell(study, trial, result)
+                return True
+            return trial.user_attrs.get("result") == result  # it was entered, and the answer got lost
+
+        self._publish(result)
+        return self._exclusively(action)
 
     def left(self) -> int:
         """Number of trials still to be finished, running ones included."""
         from optuna.trial import TrialState
 
-        with self._lock:
-            trials = self.study.get_trials(deepcopy=False)
+        trials = self._exclusively(lambda study: study.get_trials(deepcopy=False))
         done = sum(trial.state in (TrialState.COMPLETE, TrialState.PRUNED) for trial in trials)
         queued = sum(trial.state in (TrialState.WAITING, TrialState.RUNNING) for trial in trials)
         return max(self.folder.config.trials - done, queued)
 
     def claimable(self) -> bool:
         """Tell whether there is a trial to take, after taking over what dead workers left behind."""
-        with self._lock:
-            return self._claimable()
+        return self._exclusively(self._claimable)
 
-    # -- under the lock ---------------------------------------------------------------------------------------------
-
-    def _claimable(self) -> bool:
+    def mirror(self) -> None:
+        """Copy the results of trials that ran on other machines into the folder."""
         from optuna.trial import TrialState
 
-        self._recover()
-        trials = self.study.get_trials(deepcopy=False)
+        if not self.storage.shared:
+            return
+        for trial in self.storage.patiently(lambda: self.study.get_trials(deepcopy=False)):
+            if trial.number in self._mirrored or not trial.state.is_finished():
+                continue
+            path = self.folder.trial(trial.number) / "result.json"
+            if trial.state == TrialState.FAIL:  # its body runs, or ran, again
+                path.unlink(missing_ok=True)
+            elif self.folder.result(trial.number) != trial.user_attrs["result"]:
+                write_json(path, trial.user_attrs["result"])
+            self._mirrored.add(trial.number)
+
+    def _publish(self, result: dict[str, Any]) -> None:
+        """Give the policy of a trial to other machines, before they can learn of it."""
+        if self.storage.shared and result["agent"] != "qp":
+            policy = Path(result["agent"])
+            names = [path.as_posix() for path in (policy, policy.with_suffix(".json"))]
+            self.storage.publish({name: (self.folder.path / name).read_bytes() for name in names})
+
+    def _exclusively(self, action: Callable[[optuna.Study], T]) -> T:
+        """Return what ``action`` does with the study while no other process is at it."""
+        return self.storage.exclusively(lambda: action(open_study(self.folder, self.storage)))
+
+    # -- what happens exclusively -----------------------------------------------------------------------------------
+
+    def _claim(self, study: optuna.Study) -> optuna.Trial | None:
+        import optuna
+        from optuna.trial import TrialState
+
+        config = self.folder.config
+        for taken in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+            if taken.user_attrs.get("worker") == self.worker and taken.number not in self._claimed:
+                # It was claimed, and the answer got lost.
+                return optuna.Trial(study, taken._trial_id)
+        if not self._claimable(study):
+            return None
+        number = len(study.get_trials(deepcopy=False))
+        trial = open_study(self.folder, self.storage, number).ask(distributions(config))
+        trial.set_user_attr("worker", self.worker)
+        trial.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
+        if "origin" not in trial.user_attrs:
+            trial.set_user_attr("origin", f"sampler {trial.number}")
+            trial.set_user_attr("sampler_seed", trial_seed(config, trial.number))
+        if "replaces" in trial.user_attrs:
+            replaced = study.get_trials(deepcopy=False)[trial.user_attrs["replaces"]]
+            for step, value in replaced.intermediate_values.items():
+                trial.report(value, step)
+        return trial
+
+    def _claimable(self, study: optuna.Study) -> bool:
+        from optuna.trial import TrialState
+
+        self._recover(study)
+        trials = study.get_trials(deepcopy=False)
         counted = sum(trial.state != TrialState.FAIL for trial in trials)
         return counted < self.folder.config.trials or any(trial.state == TrialState.WAITING for trial in trials)
 
-    def _tell(self, result: dict[str, Any]) -> None:
+    def _tell(self, study: optuna.Study, trial: optuna.trial.FrozenTrial, result: dict[str, Any]) -> None:
         from optuna.trial import TrialState
 
+        told = {key: value for key, value in (result.get("evaluation") or {}).items() if key in TOLD}
+        if result.get("reason"):
+            told["reason"] = result["reason"]
+        if self.storage.shared:
+            told["result"] = result
+        for key, value in told.items():
+            self.storage.optuna.set_trial_user_attr(trial._trial_id, key, value)
         if result["state"] == "complete":
-            self.study.tell(result["number"], result["score"])
+            study.tell(trial.number, result["scores"])
         else:
             # An infeasible body is pruned without a value: samplers then rank it last, while failures teach nothing.
-            self.study.tell(result["number"], state=TrialState.PRUNED)
+            study.tell(trial.number, state=TrialState.PRUNED)
 
-    def _recover(self) -> None:
+    def _recover(self, study: optuna.Study) -> None:
         from optuna.trial import TrialState
 
-        trials = self.study.get_trials(deepcopy=False)
+        trials = study.get_trials(deepcopy=False)
         replaced = {trial.user_attrs.get("replaces") for trial in trials}
         for trial in trials:
             if trial.state != TrialState.RUNNING or self._lives(trial.user_attrs.get("worker")):
                 continue
             result = self.folder.result(trial.number)
-            if result is not None:
-                self._tell(result)
+            if result is not None and result["number"] == trial.number:
+                self._publish(result)
+                self._tell(study, trial, result)
                 continue
             # Queued before it is written off: a crash between the two does not lose it, and the mark keeps it single.
             if trial.number not in replaced:
@@ -213,32 +280,27 @@ class Ledger:
                     for key in ("origin", "sampler_seed"):
                         if key in trial.user_attrs:
                             marks[key] = trial.user_attrs[key]
-                    self.study.enqueue_trial(values, user_attrs=marks)
-            self.study.tell(trial.number, state=TrialState.FAIL)
+                    earlier = trials[trial.user_attrs["replaces"]] if "replaces" in trial.user_attrs else None
+                    progress = len(trial.intermediate_values) > len(earlier.intermediate_values if earlier else ())
+                    marks["attempt"] = 1 if progress else trial.user_attrs.get("attempt", 1) + 1
+                    study.enqueue_trial(values, user_attrs=marks)
+            study.tell(trial.number, state=TrialState.FAIL)
 
     def _lives(self, worker: str | None) -> bool:
-        from filelock import Timeout
+        # Without a worker it was left by one that was killed in here.
+        return worker is not None and (worker == self.worker or self.storage.lives(worker))
 
-        if worker is None:  # killed while it held the lock that we hold now
-            return False
-        if worker == self.worker:
-            return True
-        lock = self.folder.lock(worker)
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            return True
-        Path(lock.lock_file).unlink(missing_ok=True)
-        lock.release()
-        return False
+    # ---------------------------------------------------------------------------------------------------------------
 
-    def _inherit(self, trial: optuna.Trial) -> None:
-        """Give a queued-again trial the training folder and the reports of the one that it replaces."""
-        number = trial.user_attrs.get("replaces")
-        if number is None:
+    def _inherit_folder(self, trial: optuna.Trial) -> None:
+        """Give a trial that runs again what those before it left here of its training."""
+        new, marks = self.folder.trial(trial.number), trial.user_attrs
+        if "replaces" not in marks:
             return
-        old, new = self.folder.trial(number), self.folder.trial(trial.number)
-        if old.exists() and not new.exists():
-            old.rename(new)
-        for step, value in self.study.get_trials(deepcopy=False)[number].intermediate_values.items():
-            trial.report(value, step)
+        trials = self.storage.patiently(lambda: self.study.get_trials(deepcopy=False))
+        while not new.exists() and "replaces" in marks:
+            old = self.folder.trial(marks["replaces"])
+            if old.exists():
+                old.rename(new)
+                (new / "result.json").unlink(missing_ok=True)
+            marks = trials[marks["replaces"]].user_attrs

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["OBJECTIVES", "Objective", "rank_key"]
+__all__ = ["OBJECTIVES", "Objective", "rank_key", "violations"]
 
 
 @dataclass(frozen=True)
@@ -14,11 +14,12 @@ class Objective:
     """One way to judge an evaluation.
 
     Args:
-        key: field of `agents.evaluation.Evaluation`.
+        key: field of a trial's evaluation, see `codesign.trial.assess`.
         label: for people.
         unit: unit that people read.
         scale: from SI to ``unit``.
         sign: 1 if more is better, -1 if less is.
+        per_goal: field that has its value for each goal, where there is one.
     """
 
     key: str
@@ -26,6 +27,7 @@ class Objective:
     unit: str
     scale: float
     sign: int
+    per_goal: str = ""
 
     def score(self, record: Mapping[str, Any]) -> float:
         """Score of a stored evaluation, larger is better [SI]."""
@@ -45,12 +47,20 @@ class Objective:
 OBJECTIVES: dict[str, Objective] = {
     objective.key: objective
     for objective in (
-        Objective("success_rate", "Success rate", "%", 100.0, 1),
-        Objective("mean_distance", "Mean final distance", "mm", 1e3, -1),
-        Objective("mean_return", "Mean return", "", 1.0, 1),
+        Objective("success_rate", "Success rate", "%", 100.0, 1, "successes"),
+        Objective("mean_distance", "Mean final distance", "mm", 1e3, -1, "distances"),
+        Objective("mean_return", "Mean return", "", 1.0, 1, "returns"),
+        Objective("mean_tracking_distance", "Mean tracking distance", "mm", 1e3, -1),
+        Objective("mean_effort", "Mean actuator effort", "", 1.0, -1),
+        Objective("material_volume", "Material volume", "cm3", 1e6, -1),
     )
 }
 """Registry: name to objective."""
+
+
+def violations(limits: Mapping[str, float], record: Mapping[str, Any]) -> list[float]:
+    """By how much an evaluation breaks each limit [SI]; not positive where it keeps it."""
+    return [-(OBJECTIVES[name].sign) * (float(record[name]) - limit) for name, limit in limits.items()]
 
 
 def rank_key(score: float, record: Mapping[str, Any]) -> tuple[float, float]:

@@ -21,6 +21,7 @@ __all__ = [
     "importance",
     "overlay",
     "parallel",
+    "pareto",
     "picture",
     "place",
     "present",
@@ -112,13 +113,19 @@ def history(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> 
     done = [t for t in trials if t["state"] == "complete"]
     roles = _roles(results)
     with _figure(6.2, 3.2) as (_, (ax,), out):
-        kinds = (("sampler", MUTED, "o"), ("screen", "#d97706", "D"))
+        kinds = (("sampler", MUTED, "o"), ("screen", "#d97706", "D"), ("joint", "#7c3aed", "^"))
         for kind, colour, marker in kinds:
             part = [t for t in done if t["origin"].startswith(kind) and roles.get(t["number"]) != "winner"]
             if part:
                 values = [objective.shown(t["score"]) for t in part]
                 ax.scatter(
-                    [t["number"] for t in part], values, 26, colour, marker=marker, label=f"from the {kind}", zorder=3
+                    [t["number"] for t in part],
+                    values,
+                    26,
+                    colour,
+                    marker=marker,
+                    label=f"from the {kind}{' training' if kind == 'joint' else ''}",
+                    zorder=3,
                 )
         for trial in done:
             if (role := roles.get(trial["number"])) is not None:
@@ -142,6 +149,27 @@ def history(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> 
         ax.set(xlabel="trial", ylabel=_axis(objective))
         ax.legend(fontsize=8, ncols=2)
     return out[0]
+
+
+def pareto(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> str | None:
+    """All complete trials in the first two objectives, with the Pareto front of all of them."""
+    if len(results["objectives"]) < 2:
+        return None
+    first, second = (OBJECTIVES[name] for name in results["objectives"][:2])
+    complete = [trial for trial in trials if trial["state"] == "complete"]
+    points = {t["number"]: (first.shown(t["scores"][0]), second.shown(t["scores"][1])) for t in complete}
+    roles = _roles(results)
+    with _figure(6.4, 3.6) as (figure, (ax,), image):
+        ax.plot(*zip(*points.values(), strict=True), "o", color=OTHER, ms=5, label="bodies")
+        front = sorted(points[number] for number in results["pareto"])
+        if front:  # else no body keeps the limits
+            ax.plot(*zip(*front, strict=True), "o-", color=WINNER, ms=5, lw=1, label="Pareto front")
+        for number, name in roles.items():
+            if number in points:
+                ax.annotate(name, points[number], textcoords="offset points", xytext=(6, 6), color=MUTED)
+        ax.set(xlabel=_axis(first), ylabel=_axis(second))
+        ax.legend()
+    return image[0]
 
 
 def _axis(objective: Any) -> str:

@@ -20,9 +20,12 @@ __all__ = ["write_report"]
 
 AGENTS = {"sac": "SAC policy", "qp": "Inverse QP"}
 BACKENDS = {"fem": "FEM", "surrogate": "Surrogate"}
-STRATEGIES = {
+CONTROLLERS = {
     "warm_start": "SAC, fine-tuned in each trial from one design-conditioned policy",
     "scratch": "SAC, trained from scratch in each trial",
+    "policy": "SAC, one design-conditioned policy that judges every body",
+    "critic": "SAC, trained together with bodies that its critic proposes, then judge of every body",
+    "distribution": "SAC, trained together with a distribution of bodies, then judge of every body",
     "qp": "inverse QP on the condensed model, no training",
 }
 IMAGE_SIZE = (420, 420)
@@ -174,13 +177,28 @@ def _question(study: StudyFolder, results: Mapping[str, Any]) -> list[tuple[str,
             "Physics",
             f"{BACKENDS.get(config.environment.backend, config.environment.backend)} in the search, FEM in the test",
         ),
-        ("Controller", STRATEGIES[config.strategy]),
+        ("Controller", CONTROLLERS[config.strategy]),
         ("Goals", f"{origin}; {goals.unseen_count} others for the final test"),
         ("Budget", f"{config.trials} bodies ({done})"),
         ("Search", f"sampler {config.sampler.name}, pruner {config.pruner.name}" + _screen_text(study)),
     ]
-    if config.strategy != "qp":
+    if config.plan.trains:
         rows.insert(7, ("Training", f"{config.training.steps:,} environment steps a trial"))
+    if config.plan.proposer:
+        rows.insert(7, ("Training", f"{config.joint.steps:,} environment steps on many bodies, none in a trial"))
+    if config.finalists.seeds:
+        steps = config.finalists.steps or config.training.steps
+        rows.append(("Final test", f"{config.finalists.seeds} policies trained anew for each body, {steps:,} steps"))
+    if config.also:
+        others = ", ".join(OBJECTIVES[name].label.lower() for name in config.also)
+        rows.insert(3, ("Beside it", f"{others}; {len(results['pareto'])} bodies on the Pareto front"))
+    if config.limits:
+        limits = (
+            f"{OBJECTIVES[name].label.lower()} {'at most' if OBJECTIVES[name].sign < 0 else 'at least'} "
+            f"{value * OBJECTIVES[name].scale:g} {OBJECTIVES[name].unit}".rstrip()
+            for name, value in config.limits.items()
+        )
+        rows.insert(3, ("Limits", "; ".join(limits)))
     return rows
 
 
@@ -307,6 +325,7 @@ def _comparison_row(row: Mapping[str, Any]) -> dict[str, Any]:
 def _search(trials: list[dict[str, Any]], results: Mapping[str, Any]) -> list[tuple[str, str]]:
     figures = (
         ("Every trial, and the best so far", plots.history(trials, results)),
+        ("Several objectives", plots.pareto(trials, results)),
         ("Learning inside the trials", plots.curves(trials, results)),
         ("Bodies and their objective", plots.parallel(trials, results)),
         ("Which variables matter", plots.importance(results)),
@@ -403,11 +422,17 @@ def _trial_table(trials: list[dict[str, Any]], results: Mapping[str, Any]) -> di
 def _cost_rows(cost: Mapping[str, Any]) -> list[dict[str, str]]:
     steps = {
         "screen": f"{cost['screen_steps']:,}",
+        "judge": f"{cost['joint_steps']:,}",
         "trials": f"{cost['training_steps']:,} of training, {cost['report_steps']:,} of its reports, "
         f"{cost['selection_steps']:,} of scores",
         "finalists": f"{cost['test_steps_fem']:,} on FEM, {cost['test_steps_surrogate']:,} on the surrogate",
     }
-    titles = {"screen": "Screen by the inverse QP", "trials": "Trials", "finalists": "Final test"}
+    titles = {
+        "screen": "Screen by the inverse QP",
+        "judge": "Bodies and policy together",
+        "trials": "Trials",
+        "finalists": "Final test",
+    }
 
     def minutes(seconds: float | None) -> str:
         return "-" if seconds is None else f"{seconds / 60:.1f} min"
@@ -420,7 +445,7 @@ def _cost_rows(cost: Mapping[str, Any]) -> list[dict[str, str]]:
             "wall": minutes(cost["wall_seconds"].get(part)),
         }
         for part, title in titles.items()
-        if part != "screen" or cost["screen_steps"]
+        if part not in ("screen", "judge") or cost["cpu_seconds"][part]
     ]
     total = {
         "part": "Together",

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
+import json
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from codesign.finalists import BACKENDS, Finalist, choose_winner, evaluations, finalists
+from codesign.finalists import BACKENDS, Finalist, choose_winner, evaluations, finalists, pareto_trials
 from codesign.folder import StudyFolder
 from codesign.ledger import open_study
 from codesign.objectives import OBJECTIVES
@@ -37,11 +39,13 @@ def bootstrap_interval(values: Sequence[float] | np.ndarray) -> tuple[float, flo
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
-def rate_interval(successes: int, count: int) -> tuple[float, float]:
-    """95 % Wilson interval of a success rate."""
+def rate_interval(successes: Sequence[float]) -> tuple[float, float]:
+    """95 % interval of a success rate: Wilson's; of goals with several seeds, which are shares, the bootstrap's."""
     from scipy.stats import binomtest
 
-    found = binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
+    if not set(successes) <= {0.0, 1.0}:
+        return bootstrap_interval(successes)
+    found = binomtest(int(sum(successes)), len(successes)).proportion_ci(CONFIDENCE, method="wilson")
     return float(found.low), float(found.high)
 
 
@@ -73,7 +77,7 @@ def _compare(baseline: Mapping[str, Any], winner: Mapping[str, Any]) -> dict[str
         **{
             role: {
                 "success_rate": record["success_rate"],
-                "success_interval": rate_interval(sum(record["successes"]), len(change)),
+                "success_interval": rate_interval(record["successes"]),
                 "mean_distance": record["mean_distance"],
                 "distance_interval": bootstrap_interval(distances[role]),
                 "worst_distance": record["worst_distance"],
@@ -126,11 +130,14 @@ def importance(folder: StudyFolder) -> dict[str, float]:
 
     study = open_study(folder)
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    if len(complete) < 8 or len(folder.config.variables) < 2 or len({trial.value for trial in complete}) < 3:
+    if len(complete) < 8 or len(folder.config.variables) < 2 or len({trial.values[0] for trial in complete}) < 3:
         return {}
     evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=0.25)
+    first = (lambda trial: -trial.values[0]) if folder.config.also else None
     try:
-        found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+        with warnings.catch_warnings():  # it says that it takes small values for good ones, which these are
+            warnings.filterwarnings("ignore", "PedAnovaImportanceEvaluator computes", UserWarning)
+            found = optuna.importance.get_param_importances(study, evaluator=evaluator, target=first)
     except (ValueError, RuntimeError):  # no quantile of the trials can be told apart
         return {}
     return {name: float(value) for name, value in found.items()}
@@ -140,7 +147,10 @@ def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[st
     screened = [record["qp"] for record in screen_records(folder)]
     judged = [trial[key] for trial in trials for key in ("qp", "evaluation") if trial[key] and trial["agent"] != key]
     config, row = folder.config, ENVIRONMENTS[folder.config.environment.id]
+    path = folder.path / "judge" / "judge.json"
+    judge = json.loads(path.read_text()) if path.exists() else {"training_steps": 0, "cpu_seconds": 0.0}
     return {
+        "joint_steps": judge["training_steps"],
         "training_steps": sum(trial["training_steps"] for trial in trials),
         "report_steps": sum(len(trial["curve"]) for trial in trials)
         * config.training.evaluation_episodes
@@ -153,6 +163,7 @@ def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[st
         },
         "cpu_seconds": {
             "screen": sum(record.get("cpu_seconds", 0.0) for record in screened),
+            "judge": judge["cpu_seconds"],
             "trials": sum(trial["cpu_seconds"] for trial in trials),
             "finalists": sum(record.get("cpu_seconds", 0.0) for record in tests),
         },
@@ -215,7 +226,10 @@ def collect(folder: StudyFolder) -> dict[str, Any]:
         "baseline": _body(baseline),
         "winner": _body(winner),
         "comparison": comparison,
-        "transfer": [row for key in OBJECTIVES for row in _transfer(unseen, key)],
+        "objectives": [config.objective, *config.also],
+        "limits": config.limits,
+        "pareto": [r["number"] for r in pareto_trials(folder)] if config.also else [],
+        "transfer": [row for key, o in OBJECTIVES.items() if o.per_goal for row in _transfer(unseen, key)],
         "finalists": [
             {"trial": body.number, "role": body.role, "design": body.design, "score": body.score} for body in bodies
         ],

@@ -16,6 +16,8 @@ from agents.policy import policy_path
 from codesign.config import StudyConfig
 from codesign.finalists import finalist_jobs
 from codesign.folder import StudyFolder
+from codesign.jobs import missing_jobs
+from codesign.judge import judge_jobs, promising_bodies
 from codesign.ledger import Ledger
 from codesign.objectives import OBJECTIVES
 from codesign.processes import run_workers
@@ -26,14 +28,17 @@ from softgym_envs.storage import write_json
 
 __all__ = ["run_study"]
 
+MIRROR_INTERVAL = 1.0
+"""Time between two looks for what other machines finished [s]."""
+
 
 def run_study(
     config: StudyConfig, folder: str | Path, *, workers: int | None = None, progress: bool = True
 ) -> dict[str, Any]:
     """Run a study, or continue it: whatever is finished is kept, and nothing is done twice.
 
-    Several calls may work on one folder at the same time. A folder keeps its study; only the number of trials, of
-    workers and the finalists may change from call to call.
+    Several calls may work on one folder at the same time, and, with a database as storage, on many machines. A folder
+    keeps its study; only how much is run and by whom may change from call to call (`codesign.folder.EXTENSIBLE`).
 
     Args:
         config: the study.
@@ -45,7 +50,8 @@ def run_study(
         What is in ``results.json``.
 
     Raises:
-        ConfigError: if the folder holds another study, or the number of workers is not positive.
+        ConfigError: if the folder or the database holds another study, the database cannot be opened, or the number
+            of workers is not positive.
         WeightsError: if the policy to start from is missing.
         SoftGymError: if a worker was stopped by an error.
     """
@@ -60,6 +66,9 @@ def run_study(
         if config.screen.enabled:
             with _timed(study, "screen"):
                 _run_screen(study, count, printer)
+        if judge_jobs(study):
+            with _timed(study, "judge"):
+                _make_judge(study, printer)
         with _timed(study, "trials"):
             _run_trials(study, count, printer)
         if config.finalists.count:
@@ -76,7 +85,7 @@ def run_study(
 
 def _run_screen(study: StudyFolder, workers: int, printer: _Printer) -> None:
     jobs = screen_jobs(study)
-    missing = [job for job in jobs if not job.path.exists()]
+    missing = missing_jobs(study, jobs)
     if missing:
         printer.say(f"screen: {len(missing)} bodies by the inverse QP")
         stopped = run_workers(study, "screen", min(workers, len(missing)))
@@ -85,26 +94,48 @@ def _run_screen(study: StudyFolder, workers: int, printer: _Printer) -> None:
     printer.say(f"screen: kept {len(kept)} of {len(jobs)} bodies")
 
 
+def _make_judge(study: StudyFolder, printer: _Printer) -> None:
+    jobs = judge_jobs(study)
+    if missing_jobs(study, jobs):
+        if study.config.plan.proposer:
+            printer.say(f"judge: training bodies and policy together, {study.config.joint.steps:,} steps")
+        stopped = run_workers(study, "judge", 1)
+        _demand(all(job.path.exists() for job in jobs), "judge", stopped)
+
+
 def _run_trials(study: StudyFolder, workers: int, printer: _Printer) -> None:
     config = study.config
     with Ledger(study) as ledger:
-        ledger.enqueue([("baseline", {name: config.baseline[name] for name in config.variables}), *kept_bodies(study)])
+        baseline = ("baseline", {name: config.baseline[name] for name in config.variables})
+        ledger.enqueue([baseline, *promising_bodies(study), *kept_bodies(study)])
+        ledger.mirror()
         printer.trials(quiet=True)
+        looked = time.monotonic()
+
+        def tick() -> None:
+            nonlocal looked
+            if time.monotonic() - looked > MIRROR_INTERVAL:
+                ledger.mirror()
+                looked = time.monotonic()
+            printer.trials()
+
         if ledger.left():
             finished = len(study.results())
             printer.say(f"study '{config.name}': {config.trials} trials, {finished} of them finished before")
         while ledger.left():
             if ledger.claimable():
-                stopped = run_workers(study, "trials", min(workers, ledger.left()), printer.trials)
+                stopped = run_workers(study, "trials", min(workers, ledger.left()), tick)
                 _demand(stopped is None or ledger.left() == 0, "trials", stopped)
-            else:  # another call on this folder is at the last ones
-                printer.trials()
+            else:  # another call is at the last ones
+                tick()
                 time.sleep(0.5)
+        ledger.mirror()
+        printer.trials()
 
 
 def _run_finalists(study: StudyFolder, workers: int, printer: _Printer) -> None:
     jobs = finalist_jobs(study)
-    missing = [job for job in jobs if not job.path.exists()]
+    missing = missing_jobs(study, jobs)
     if missing:
         bodies = len({job.path.name.partition("-")[0] for job in jobs})
         printer.say(f"test: {bodies} bodies on {study.config.goals.unseen_count} unseen goals, surrogate and FEM")

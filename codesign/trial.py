@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.config import EnvironmentConfig, TrainConfig
+from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
-from codesign.objectives import OBJECTIVES, Objective
+from codesign.judge import JUDGE, judge_policy
+from codesign.objectives import OBJECTIVES, Objective, violations
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import write_json
 
@@ -21,7 +23,10 @@ if TYPE_CHECKING:
 
     from agents.evaluation import Evaluation
 
-__all__ = ["assess", "run_trial"]
+__all__ = ["assess", "merge", "run_trial", "training_config"]
+
+PIECE = 8
+"""Goals between two questions to the pruner, for strategies that train nothing in a trial."""
 
 
 def assess(
@@ -56,6 +61,7 @@ def assess(
         "distances": np.asarray(evaluation.distances, dtype=float).tolist(),
         "returns": np.asarray(evaluation.returns, dtype=float).tolist(),
         "successes": np.asarray(evaluation.successes, dtype=bool).tolist(),
+        "mean_tracking_distance": float(evaluation.mean_distances.mean()),
         "mean_effort": float(evaluation.efforts.mean()),
         "steps": int(evaluation.steps),
         "seconds": time.perf_counter() - started,
@@ -79,6 +85,50 @@ def training_config(folder: StudyFolder, design: Mapping[str, float]) -> TrainCo
         evaluation_episodes=training.evaluation_episodes,
         report_every=training.report_every,
     )
+
+
+def merge(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """One evaluation from those of parts of its goals."""
+    counts = [len(part["distances"]) for part in parts]
+    merged: dict[str, Any] = {}
+    for key in parts[0]:
+        values = [part[key] for part in parts]
+        if key == "worst_distance":
+            merged[key] = max(values)
+        elif isinstance(values[0], list):
+            merged[key] = [value for part in values for value in part]
+        elif key in ("steps", "seconds", "cpu_seconds"):
+            merged[key] = sum(values)
+        else:
+            merged[key] = float(np.average(values, weights=counts))
+    return merged
+
+
+def _assess_by_goals(
+    folder: StudyFolder, trial: optuna.Trial, agent: str | Path, design: Mapping[str, float]
+) -> tuple[dict[str, Any], bool]:
+    """Evaluate an agent on a body, a few goals at a time, until the pruner has seen enough.
+
+    Returns:
+        The evaluation of the goals so far, and whether the pruner stopped it.
+    """
+    config, goals = folder.config, folder.goals["selection"]
+    if config.pruner.name == "none":
+        return assess(agent, config.environment, goals, design), False
+    objective = OBJECTIVES[config.objective]
+    parts: list[dict[str, Any]] = []
+    known = set(trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values)
+    for start in range(0, len(goals), PIECE):
+        part = assess(agent, config.environment, goals[start : start + PIECE], design)
+        if "error" in part:
+            return part, False
+        parts.append(part)
+        for k, value in enumerate(part[objective.per_goal]):
+            if start + k not in known:
+                trial.report(objective.sign * float(value), start + k)
+        if trial.user_attrs.get("origin") != "baseline" and start + PIECE < len(goals) and trial.should_prune():
+            return merge(parts), True
+    return merge(parts), False
 
 
 class _Reporter:
@@ -120,26 +170,61 @@ def run_trial(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
         "design": design,
         "state": "complete",
         "score": None,
+        "scores": None,
+        "violations": None,
         "reason": None,
         "agent": "qp",
         "evaluation": None,
-        "qp": assess("qp", config.environment, goals, design),
+        "qp": None,
         "curve": [],
         "training_steps": 0,
     }
+    evaluation: dict[str, Any] | None
     try:
-        if "error" in result["qp"]:
-            raise InfeasibleDesign(result["qp"]["error"])
-        evaluation = result["qp"] if config.strategy == "qp" else _train_and_assess(folder, trial, result)
+        if config.strategy == "qp":
+            result["qp"] = evaluation = _judged(folder, trial, "qp", result)
+        else:
+            result["qp"] = assess("qp", config.environment, goals, design)
+            if "error" in result["qp"]:
+                raise InfeasibleDesign(result["qp"]["error"])
+            if config.plan.trains:
+                evaluation = _train_and_assess(folder, trial, result)
+            else:
+                result["agent"] = JUDGE
+                evaluation = _judged(folder, trial, judge_policy(folder), result)
         if evaluation is not None:
-            result.update(evaluation=evaluation, score=OBJECTIVES[config.objective].score(evaluation))
+            _score(config, evaluation, result)
+            for name, value in zip(config.limits, result["violations"] or (), strict=False):
+                trial.set_constraint(name, value)
     except (InfeasibleDesign, ConvergenceError) as error:
         result.update(state="infeasible", reason=str(error))
-    if result["score"] is not None and not np.isfinite(result["score"]):
-        result.update(state="infeasible", reason=f"the score is {result['score']}", score=None)
+        result["qp"] = result["qp"] or {"error": str(error)}
+    if result["scores"] is not None and not np.isfinite(result["scores"]).all():
+        result.update(state="infeasible", reason=f"the scores are {result['scores']}", score=None, scores=None)
     result.update(seconds=time.perf_counter() - started, cpu_seconds=time.process_time() - cpu, finished_at=time.time())
     write_json(folder.trial(trial.number) / "result.json", result)
     return result
+
+
+def _judged(folder: StudyFolder, trial: optuna.Trial, agent: str | Path, result: dict[str, Any]) -> dict[str, Any]:
+    """Evaluate an agent that is the same for all bodies; ``result`` tells if the pruner stopped it."""
+    evaluation, pruned = _assess_by_goals(folder, trial, agent, result["design"])
+    if "error" in evaluation:
+        raise InfeasibleDesign(evaluation["error"])
+    if pruned:
+        seen, count = len(evaluation["distances"]), len(folder.goals["selection"])
+        result.update(state="pruned", reason=f"stopped by the pruner after {seen} of {count} goals")
+    return evaluation
+
+
+def _score(config: StudyConfig, evaluation: dict[str, Any], result: dict[str, Any]) -> None:
+    """Enter an evaluation, with what it says of the objectives and the limits."""
+    if "material_volume" in (config.objective, *config.also, *config.limits):
+        evaluation["material_volume"] = config.robot.build(result["design"]).volume
+    result["evaluation"] = evaluation
+    if result["state"] == "complete":
+        scores = [OBJECTIVES[name].score(evaluation) for name in (config.objective, *config.also)]
+        result.update(score=scores[0], scores=scores, violations=violations(config.limits, evaluation))
 
 
 def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str, Any]) -> dict[str, Any] | None:
@@ -151,7 +236,7 @@ def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str
     policy = train(
         training_config(folder, result["design"]),
         folder.trial(trial.number),
-        initial=config.policy if config.strategy == "warm_start" else None,
+        initial=config.policy,
         report=reporter,
         progress=False,
     )

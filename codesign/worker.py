@@ -6,15 +6,24 @@ import os
 import signal
 import sys
 import threading
+import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from codesign.finalists import finalist_jobs
+from codesign.finalists import finalist_jobs, finalists
 from codesign.folder import StudyFolder
 from codesign.jobs import run_jobs
+from codesign.judge import judge_jobs
 from codesign.ledger import Ledger
 from codesign.screen import screen_jobs
 from codesign.trial import run_trial
-from softgym_envs.errors import SoftGymError
+from softgym_envs.errors import DataError, SoftGymError
+from softgym_envs.storage import atomic_write
+
+if TYPE_CHECKING:
+    import optuna
 
 __all__ = ["PHASES", "run_trials"]
 
@@ -23,13 +32,59 @@ def run_trials(folder: StudyFolder) -> None:
     """Run trials until the study has as many as were asked for."""
     with Ledger(folder) as ledger:
         while (trial := ledger.claim()) is not None:
-            ledger.finish(run_trial(folder, trial))
+            run = _give_up if trial.user_attrs.get("attempt", 1) > folder.config.attempts else run_trial
+            # Where the storage goes away in the middle, training goes on from its last checkpoint.
+            ledger.finish(ledger.storage.patiently(partial(run, folder, trial)))
 
 
-PHASES = {
+def _give_up(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
+    """Result of a body that cost too many workers; see `codesign.trial.run_trial`."""
+    reason = f"{folder.config.attempts} workers died of it"
+    return {
+        "number": trial.number,
+        "origin": trial.user_attrs["origin"],
+        "sampler_seed": trial.user_attrs.get("sampler_seed"),
+        "process": trial.user_attrs["process"],
+        "design": folder.config.space.complete({**folder.config.baseline, **trial.params}),
+        "state": "infeasible",
+        "score": None,
+        "scores": None,
+        "violations": None,
+        "reason": reason,
+        "agent": "qp",
+        "evaluation": None,
+        "qp": {"error": reason},
+        "curve": [],
+        "training_steps": 0,
+        "seconds": 0.0,
+        "cpu_seconds": 0.0,
+        "finished_at": time.time(),
+    }
+
+
+def _test_finalists(folder: StudyFolder) -> None:
+    """Run the check on FEM, with the policies of trials that ran elsewhere."""
+    storage = folder.open_storage()
+    policies = [Path(body.policy) for body in finalists(folder) if body.policy is not None]
+    for path in (folder.path / name for policy in policies for name in (policy, policy.with_suffix(".json"))):
+        if path.exists():
+            continue
+        name = path.relative_to(folder.path).as_posix()
+        content = storage.fetch(name)
+        if content is None:
+            raise DataError(
+                f"policy '{name}' is neither in folder '{folder.path}' nor in storage '{folder.config.storage}'"
+            )
+        with atomic_write(path) as stream:
+            stream.write(content)
+    run_jobs(folder, finalist_jobs(folder))
+
+
+PHASES: dict[str, Callable[[StudyFolder], None]] = {
+    "judge": lambda folder: run_jobs(folder, judge_jobs(folder)),
     "screen": lambda folder: run_jobs(folder, screen_jobs(folder)),
     "trials": run_trials,
-    "finalists": lambda folder: run_jobs(folder, finalist_jobs(folder)),
+    "finalists": _test_finalists,
 }
 """What a worker can be told to do."""
 

@@ -357,19 +357,103 @@ def evaluate(
 @_config
 @click.option("--folder", type=click.Path(path_type=Path), help="Where results go (default: results/<name>).")
 @click.option("--workers", type=int, help="Worker processes (default: the config's).")
+@click.option("--storage", help="PostgreSQL database that machines share (default: the config's, or the folder).")
 @_quiet
 @_overrides
-def codesign(config: Path, folder: Path | None, workers: int | None, quiet: bool, overrides: tuple[str, ...]) -> None:
+def codesign(
+    config: Path,
+    folder: Path | None,
+    workers: int | None,
+    storage: str | None,
+    quiet: bool,
+    overrides: tuple[str, ...],
+) -> None:
     """Optimise body and controller together; resumes, and ends with a report."""
     from codesign.config import StudyConfig
     from codesign.report import write_report
     from codesign.study import run_study
     from softgym_envs.config import load_config
 
-    study = load_config(config, StudyConfig, overrides)
+    study = load_config(config, StudyConfig, (*overrides, *([f"storage={storage}"] if storage else [])))
     folder = Path("results") / study.name if folder is None else folder
     run_study(study, folder, workers=workers, progress=not quiet)
     click.echo(f"report: {write_report(folder)}")
+
+
+_results = click.option("--folder", type=click.Path(path_type=Path), help="Where results go (default: results/<name>).")
+
+
+@cli.command()
+@_config
+@_results
+@_quiet
+@_overrides
+def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
+    """Show which design variables matter: one at a time, Morris or Sobol; resumes."""
+    from codesign.design.config import SensitivityConfig
+    from codesign.design.sensitivity import analyse
+    from softgym_envs.config import load_config
+
+    study = load_config(config, SensitivityConfig, overrides)
+    folder = Path("results") / study.name if folder is None else folder
+    result = analyse(study, folder, progress=not quiet)
+    for metric, table in result["indices"].items():
+        keys = list(next(iter(table.values())))
+        click.echo(f"\n{metric:24s} " + " ".join(f"{key:>16s}" for key in keys))
+        for variable, row in table.items():
+            click.echo(f"  {variable:22s} " + " ".join(f"{row[key]:16.5g}" for key in keys))
+    click.echo(f"\n{result['designs']} designs, {result['infeasible']} infeasible; wrote {folder}")
+
+
+@cli.command()
+@_config
+@_results
+@_quiet
+@_overrides
+def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
+    """Search the best bodies without a controller, by Optuna (resumes) or along gradients."""
+    from codesign.design import gradient
+    from codesign.design.config import OptimiseConfig
+    from codesign.design.search import search
+    from softgym_envs.config import load_config
+
+    study = load_config(config, OptimiseConfig, overrides)
+    folder = Path("results") / study.name if folder is None else folder
+    if study.solver.method == "gradient":
+        result = gradient.optimise(study, folder)
+        click.echo(json.dumps(result["best"], indent=2))
+        click.echo(f"{len(result['descents'])} descents, {result['seconds']:.2f} s; wrote {folder}")
+        return
+    result = search(study, folder, progress=not quiet)
+    click.echo(
+        json.dumps([result["front"][0], result["front"][-1]] if len(study.objectives) > 1 else result["front"][0])
+    )
+    click.echo(
+        f"{len(result['front'])} designs on the front of {result['feasible']} feasible and {result['infeasible']} "
+        f"infeasible ones; wrote {folder}"
+    )
+
+
+@cli.command()
+@_config
+@_results
+@_overrides
+def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> None:
+    """Fit design variables to measured states in a CSV or JSON file."""
+    from codesign.design.calibration import calibrate as run
+    from codesign.design.config import CalibrationConfig
+    from softgym_envs.config import load_config
+
+    study = load_config(config, CalibrationConfig, overrides)
+    folder = Path("results") / study.name if folder is None else folder
+    result = run(study, folder)
+    for name in study.fit:
+        text = f"{name} = {result['design'][name]:.6g}"
+        if result["interval"] is not None:
+            text += ", {:g} % interval {:.6g} to {:.6g}".format(100 * result["level"], *result["interval"][name])
+        click.echo(text)
+    errors = ", ".join(f"{name} {value:.3g}" for name, value in result["errors"].items())
+    click.echo(f"root mean square errors: {errors} [SI]; {result['seconds']:.1f} s; wrote {folder}")
 
 
 @cli.command()

@@ -20,6 +20,12 @@ class Interface:
         design_names: design variables shown in the observation, none for an empty tuple.
         axes: which coordinates of the effector count in the error, shape (3,); default all.
         moving: show velocities, as an agent needs in dynamics.
+
+    Attributes:
+        reach: what positions are divided by [m].
+        error_scale: distance to the goal that is shown as one half [m].
+        slices: where the parts of an observation are: command, displacement, effort, effector, goal, error, velocity,
+            design.
     """
 
     def __init__(
@@ -41,10 +47,25 @@ class Interface:
         self.lower, self.upper, self.rates = robot.lower, robot.upper, robot.rates
         self._middle = 0.5 * (self.lower + self.upper)
         self._half = 0.5 * (self.upper - self.lower)
-        self._reach = 1.25 * robot.size
+        self.reach = 1.25 * robot.size
+        self.error_scale = robot.motion / 2.5
         n = len(robot.actuators)
         self.action_space = spaces.Box(-1.0, 1.0, (n,), np.float32)
-        self.observation_space = spaces.Box(-1.0, 1.0, (3 * n + 9 + 3 * moving + len(design_names),), np.float32)
+        self.slices: dict[str, slice] = {}
+        start = 0
+        for name, size in (
+            ("command", n),
+            ("displacement", n),
+            ("effort", n),
+            ("effector", 3),
+            ("goal", 3),
+            ("error", 3),
+            ("velocity", 3 * moving),
+            ("design", len(design_names)),
+        ):
+            self.slices[name] = slice(start, start + size)
+            start += size
+        self.observation_space = spaces.Box(-1.0, 1.0, (start,), np.float32)
 
     def check_action(self, action: np.ndarray) -> np.ndarray:
         """Return the action as float64, clipped to [-1, 1].
@@ -92,17 +113,35 @@ class Interface:
         Efforts and errors have no bound of their own and are squashed by x / (1 + |x|), which loses nothing.
         """
         relative = effort / self.robot.effort_scale
-        error = self.axes * (goal - effector) * (2.5 / self.robot.motion)
         speed = velocity / self.robot.size if self.moving and velocity is not None else None
         parts = (
             (command - self._middle) / self._half,
             (displacement - self._middle) / self._half,
             relative / (1.0 + np.abs(relative)),
-            effector / self._reach,
-            goal / self._reach,
-            error / (1.0 + np.abs(error)),
+            effector / self.reach,
+            *self._show_goal(effector, goal),
             *(() if speed is None else (speed / (1.0 + np.abs(speed)),)),
             unit_design,
         )
         observation = np.concatenate(parts, axis=-1)
         return np.minimum(np.maximum(observation, -1.0), 1.0).astype(np.float32)
+
+    def _show_goal(self, effector: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        error = self.axes * (goal - effector) / self.error_scale
+        return goal / self.reach, error / (1.0 + np.abs(error))
+
+    def effector(self, observation: np.ndarray) -> np.ndarray:
+        """The first effector [m] (..., 3) that observations (..., d) show, with their seven digits."""
+        return observation[..., self.slices["effector"]].astype(float) * self.reach
+
+    def effort_share(self, observation: np.ndarray) -> np.ndarray:
+        """The mean effort over its scale (...) that observations (..., d) show."""
+        squashed = np.abs(observation[..., self.slices["effort"]].astype(float))
+        return (squashed / (1.0 - np.minimum(squashed, 1.0 - 1e-7))).mean(axis=-1)
+
+    def with_goal(self, observation: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Observations (..., d) as they would be with other goals [m] (..., 3)."""
+        changed = observation.copy()
+        shown = np.concatenate(self._show_goal(self.effector(observation), goal), axis=-1)
+        changed[..., self.slices["goal"].start : self.slices["error"].stop] = np.clip(shown, -1.0, 1.0)
+        return changed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from softgym_envs.backends.surrogate import Settled, at_rest, settle
 from softgym_envs.envs.interface import Interface
 from softgym_envs.envs.soft_robot_env import design_names, merge_defaults
 from softgym_envs.envs.task import check_goals, make_task
+from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.model import Context
 from softgym_envs.surrogate.pretrained import pretrained_model
@@ -88,6 +89,9 @@ class SoftRobotVectorEnv(VectorEnv):
         self._fixed_design = self.design_space.complete(design)
         self._sampled = design_names(self.design_space, sample_design)
         shown = design_names(self.design_space, design_in_observation)
+        #: Draws the sampled variables, in unit coordinates [-1, 1], for sub-environments ``index``: shape
+        #: (len(index), number of sampled variables). Replace it to draw bodies in another way.
+        self.design_sampler: Callable[[np.random.Generator, np.ndarray], np.ndarray] = self._draw_evenly
         self.interface = Interface(self.robot, action_mode=action_mode, design_names=shown, axes=self.task.axes)
         self.single_action_space = self.interface.action_space
         self.single_observation_space = self.interface.observation_space
@@ -121,6 +125,9 @@ class SoftRobotVectorEnv(VectorEnv):
         rest = at_rest(self.model, self._context.rows(np.zeros(1, dtype=np.int64)), self._unilateral)
         self._take_rest(np.arange(num_envs), rest)
 
+    def _draw_evenly(self, rng: np.random.Generator, index: np.ndarray) -> np.ndarray:
+        return rng.uniform(-1.0, 1.0, (len(self._sampled), len(index))).T
+
     # -- bodies -----------------------------------------------------------------------------------------------------
 
     def _begin_bodies(self, index: np.ndarray) -> None:
@@ -153,8 +160,8 @@ class SoftRobotVectorEnv(VectorEnv):
             self._changed[index] = True
         elif self._sampled:
             names = self.design_space.names
-            for name in self._sampled:
-                draws = self.np_random.uniform(-1.0, 1.0, len(index))
+            for column, draws in enumerate(self.design_sampler(self.np_random, index).T):
+                name = self._sampled[column]
                 self.designs[index, names.index(name)] = self.design_space[name].from_unit(draws)
             self._begin_bodies(index)
         elif self._changed[index].any():
@@ -183,6 +190,33 @@ class SoftRobotVectorEnv(VectorEnv):
     def _kinematics(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
         context = self._context.rows(index)
         return settle(self.model, context, commands, np.zeros_like(commands), self._unilateral).effector[:, :3]
+
+    # -- what controllers look at -----------------------------------------------------------------------------------
+
+    @property
+    def command(self) -> np.ndarray:
+        """Present commands, shape (num_envs, n_a)."""
+        return self._command
+
+    @property
+    def slack(self) -> np.ndarray:
+        """Actuators that hang slack, shape (num_envs, n_a)."""
+        return self._slack
+
+    @property
+    def goals(self) -> np.ndarray:
+        """Present goals [m], shape (num_envs, 3)."""
+        return self.task.goals(self._paths, self._counts, self._steps)
+
+    @property
+    def condensed(self) -> CondensedModel:
+        """Condensed models of the present states, evaluated when asked for; leading shape (num_envs,)."""
+        batch = self.model.condensed(self._context, self._displacement)
+        effort, delta = batch.effort.copy(), batch.delta.array
+        # Slack cables carry no effort, whatever the network's last digits say.
+        effort[:, : self.model.count] = self._effort
+        free = delta - np.einsum("bij,bj->bi", batch.compliance, effort)
+        return CondensedModel(batch.compliance, free, effort, batch.roles)
 
     # -- Gymnasium --------------------------------------------------------------------------------------------------
 
@@ -255,16 +289,13 @@ class SoftRobotVectorEnv(VectorEnv):
             info |= {"final_obs": final_obs, "_final_obs": truncated.copy()}
         return observation, reward, np.zeros(self.num_envs, dtype=bool), truncated, info
 
-    def _goals(self) -> np.ndarray:
-        return self.task.goals(self._paths, self._counts, self._steps)
-
     def _observe(self) -> np.ndarray:
         return self.interface.observe(
-            self._command, self._displacement, self._effort, self._effector, self._goals(), self._unit_design
+            self._command, self._displacement, self._effort, self._effector, self.goals, self._unit_design
         )
 
     def _info(self) -> tuple[dict[str, Any], np.ndarray]:
-        goals = self._goals()
+        goals = self.goals
         distance = self.task.distance(self._effector, goals)
         share = np.abs(self._effort / self.robot.effort_scale).mean(axis=1)
         terms = self.task.reward_terms(distance, share)

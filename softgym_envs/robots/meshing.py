@@ -1,7 +1,8 @@
 """Meshes from gmsh, behind a content-keyed cache and a time limit.
 
 A geometry is a function ``build(**parameters)`` that draws one volume in the current gmsh model **in millimetres**;
-it runs in a process of its own, because OpenCASCADE may hang on an infeasible shape. Nodes come back in metres.
+it runs in a process of its own, because OpenCASCADE may hang on an infeasible shape. Nodes come back in metres. SciPy
+and the mechanics are imported where they are used: loading them would take that process longer than a coarse mesh.
 """
 
 from __future__ import annotations
@@ -20,12 +21,8 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
-from softgym_envs.mechanics.constraints.cavity import enclosed_volume
-from softgym_envs.mechanics.tetrahedra import boundary_triangles, orient_corners
 from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
 __all__ = ["BodyMesh", "mesh_geometry", "run_gmsh"]
@@ -55,6 +52,8 @@ class BodyMesh:
 
     def surface(self) -> np.ndarray:
         """Return the boundary triangles (k, 3), seen counter-clockwise from outside the material."""
+        from softgym_envs.mechanics.tetrahedra import boundary_triangles, orient_corners
+
         return boundary_triangles(orient_corners(self.nodes, self.tetrahedra)[0])
 
     def cavities(
@@ -69,6 +68,11 @@ class BodyMesh:
         Returns:
             Triangles (k, 3) of each cavity, seen counter-clockwise from inside it.
         """
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components
+
+        from softgym_envs.mechanics.constraints.cavity import enclosed_volume
+
         triangles = self.surface()
         pairs = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
         graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(self.nodes),) * 2)

@@ -12,8 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix, csc_matrix, identity
-from scipy.sparse.linalg import splu
 
 from softgym_envs.robots.meshing import BodyMesh
 
@@ -71,6 +69,9 @@ def mean_ratio(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 def _extension(count: int, edges: np.ndarray, weights: np.ndarray, known: np.ndarray, anchor: float):
     """Return a function that extends displacements from the ``known`` nodes by a weighted graph Laplacian."""
+    from scipy.sparse import coo_matrix, csc_matrix, identity  # here: see `softgym_envs.robots.meshing`
+    from scipy.sparse.linalg import splu
+
     i, j = edges.T
     w = coo_matrix((weights, (i, j)), shape=(count, count)).tocsc()
     w = w + w.T

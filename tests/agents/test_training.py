@@ -66,7 +66,12 @@ def test_same_seed_same_policy(trained, tmp_path):
     assert other.read_bytes() != trained.read_bytes()
 
 
-def test_interrupted_training_resumes(tmp_path, monkeypatch):
+@pytest.mark.parametrize("hindsight", [0.0, 0.8])
+def test_interrupted_training_resumes_as_if_it_had_not_been(hindsight, tmp_path, monkeypatch):
+    # 200 steps of 8 environments end in the middle of episodes.
+    config = CONFIG.model_copy(update={"sac": CONFIG.sac.model_copy(update={"hindsight": hindsight})})
+    uninterrupted = train(config, tmp_path / "uninterrupted", progress=False).read_bytes()
+    folder = tmp_path / "interrupted"
     original = training._learn
     reached = []
 
@@ -78,25 +83,20 @@ def test_interrupted_training_resumes(tmp_path, monkeypatch):
 
     monkeypatch.setattr(training, "_learn", learn)
     with pytest.raises(KeyboardInterrupt):
-        train(CONFIG, tmp_path, progress=False)
-    assert (tmp_path / "checkpoint.safetensors").exists() and not (tmp_path / "policy.safetensors").exists()
+        train(config, folder, progress=False)
+    assert (folder / "checkpoint.safetensors").exists() and not (folder / "policy.safetensors").exists()
     steps = []
     monkeypatch.setattr(
         training, "_learn", lambda model, target, bar: (steps.append(model.num_timesteps), original(model, target, bar))
     )
-    fresh = training._make_model(CONFIG, tmp_path / "fresh")
-    resumed = training._make_model(CONFIG, tmp_path / "resumed")
-    training._restore(resumed, tmp_path / "checkpoint.safetensors")
-    for model in (fresh, resumed):
-        model.env.reset()
-    assert (fresh.env.env.unwrapped._paths != resumed.env.env.unwrapped._paths).all()  # new goals, not the first ones
-    train(CONFIG, tmp_path, progress=False)
+    train(config, folder, progress=False)
     assert steps == [200]  # went on where it was
-    with open(tmp_path / "curve.csv") as stream:
+    with open(folder / "curve.csv") as stream:
         assert [int(r["step"]) for r in csv.DictReader(stream)] == [200, 400]
-    before = (tmp_path / "policy.safetensors").stat().st_mtime_ns
-    train(CONFIG, tmp_path, progress=False)
-    assert (tmp_path / "policy.safetensors").stat().st_mtime_ns == before  # done is done
+    assert (folder / "policy.safetensors").read_bytes() == uninterrupted
+    before = (folder / "policy.safetensors").stat().st_mtime_ns
+    train(config, folder, progress=False)
+    assert (folder / "policy.safetensors").stat().st_mtime_ns == before  # done is done
 
 
 def test_damaged_checkpoint_is_named(tmp_path, monkeypatch):
@@ -197,7 +197,7 @@ def test_goals_repeat_and_belong_to_the_body():
 def test_shipped_policies_were_made_by_the_shipped_configs(name):
     config = load_config(CONFIGS / "agents" / f"{name}.yaml", TrainConfig)
     card = Policy(name).card
-    assert card["config"] == config.model_dump(mode="json")
+    assert TrainConfig.model_validate(card["config"]) == config
     assert card["steps"] == config.steps and not card["stopped_early"]
     with pytest.raises(WeightsError, match="unknown policy 'octopus'.*finger_reach"):
         Policy("octopus")

@@ -36,7 +36,31 @@ BAD = {
         "percentile",
     ),
     "pruner without reports": ({"pruner": {"name": "median"}}, "median", "none"),
-    "unknown objective": ({"objective": "beauty"}, "objective", "'success_rate'"),
+    "unknown objective": ({"objective": "beauty"}, "beauty", "success_rate"),
+    "unknown second objective": ({"also": ["beauty"]}, "beauty", "success_rate"),
+    "unknown limit": ({"limits": {"beauty": 1.0}}, "beauty", "success_rate"),
+    "an objective twice": ({"also": ["mean_distance"]}, "mean_distance", "twice"),
+    "limits for a sampler that knows none": (
+        {"limits": {"mean_effort": 1.0}, "sampler": {"name": "cmaes"}},
+        "cmaes",
+        "tpe",
+    ),
+    "pruner of several objectives": ({"also": ["mean_effort"], "pruner": {"name": "wilcoxon"}}, "wilcoxon", "none"),
+    "goals of an objective that has none": (
+        {"objective": "mean_effort", "pruner": {"name": "wilcoxon"}},
+        "mean_effort",
+        "mean_distance",
+    ),
+    "judge that does not see the body": ({"strategy": "critic"}, "critic", "design_in_observation"),
+    "unknown option of joint training": (
+        {
+            "strategy": "critic",
+            "environment": {"id": "SoftGym/FingerReach-v0", "design_in_observation": True},
+            "joint": {"keep": 1, "options": {"luck": 1}},
+        },
+        "luck",
+        "joint.options",
+    ),
     "unknown strategy": ({"strategy": "luck"}, "strategy", "'scratch'"),
     "no policy": ({"strategy": "warm_start"}, "policy", "warm_start"),
     "useless policy": ({"policy": "a.safetensors"}, "a.safetensors", "qp"),
@@ -54,8 +78,11 @@ BAD = {
         "report_every = 200",
         "steps = 100",
     ),
-    "training on FEM": (
-        {"strategy": "scratch", "environment": {"id": "SoftGym/FingerReach-v0", "backend": "fem"}},
+    "joint training on FEM": (
+        {
+            "strategy": "critic",
+            "environment": {"id": "SoftGym/FingerReach-v0", "backend": "fem", "design_in_observation": True},
+        },
         "fem",
         "surrogate",
     ),

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import pytest
 from optuna.trial import TrialState
 
-from codesign.ledger import JOURNAL_LOCK, Ledger, open_study
+from codesign.ledger import Ledger, open_study
+from codesign.storages import JOURNAL_LOCK
 from softgym_envs.storage import write_json
 
 
 def die(ledger):
-    """What the operating system does when a worker is killed."""
-    ledger._alive.release(force=True)
+    """What the operating system does when a worker is killed: its locks are free."""
+    ledger._presence.__exit__(None, None, None)
+    ledger._presence = nullcontext()
 
 
-def result(trial, **changes):
-    return {"number": trial.number, "state": "complete", "score": 0.5, **changes}
+def result(trial, score=0.5, **changes):
+    return {"number": trial.number, "state": "complete", "score": score, "scores": [score], **changes}
 
 
 def states(ledger):

@@ -50,6 +50,7 @@ def pretend(monkeypatch):
             efforts=np.ones(len(goals)),
             success_rate=float((distances < 2e-3).mean()),
             mean_distance=float(distances.mean()),
+            mean_distances=distances,
             worst_distance=float(distances.max()),
             mean_return=1.0,
             steps=50,

@@ -1,0 +1,155 @@
+"""Agents that need no training: the inverse QP in several forms, and random actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.control import InverseQP, PICorrection
+from softgym_envs.envs.task import Task
+from softgym_envs.errors import ConvergenceError, WeightsError
+from softgym_envs.robots.robot import Robot
+
+__all__ = ["BASELINES", "PI_GAINS", "Agent", "InverseQPAgent", "make_baseline", "make_controller"]
+
+Agent = Callable[[np.ndarray, Any], np.ndarray]
+"""``agent(observation, env.unwrapped) -> action``."""
+
+PI_GAINS = (0.1, 0.3)
+"""Proportional and integral gain per control step. The plant answers a correction within one step, so that the integral
+alone leaves 0.7^k of an error after k steps; the gains of the thesis (0.01 and 0.002) are for many calls a goal."""
+
+
+def make_controller(robot: Robot, task: Task) -> InverseQP:
+    """Return the inverse QP of a robot for the goals of a task: those of the first effector, along the task's axes."""
+    weights = np.resize(task.axes, 3 * len(robot.effectors))
+    weights[3:] = 0.0
+    return InverseQP(
+        robot.lower,
+        robot.upper,
+        robot.rates,
+        np.array([actuator.unilateral for actuator in robot.actuators]),
+        goal_weights=None if weights.all() else weights,
+    )
+
+
+class InverseQPAgent:
+    """The inverse QP on the condensed model of the plant's present state; in dynamics, of its next time step."""
+
+    def __init__(self) -> None:
+        self._controllers: WeakKeyDictionary[Any, InverseQP] = WeakKeyDictionary()
+
+    def __call__(self, observation: Any, env: Any) -> np.ndarray:
+        """Return the action, shape (n_a,), in the state of ``env``; where no command is found, that of standing still.
+
+        An episode begins where no actuator is commanded.
+        """
+        present = env.state.command
+        if env not in self._controllers or not present.any():
+            self._begin(env)
+        try:
+            command = self._solve(env, self._controllers[env], present)
+        except ConvergenceError:
+            command = present
+        return env.interface.action(command, present)
+
+    def _begin(self, env: Any) -> None:
+        self._controllers[env] = make_controller(env.robot, env.task)
+
+    def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
+        return controller.solve(env.state.condensed, env.goal, present, env.state.slack)
+
+
+class StaticQPAgent(InverseQPAgent):
+    """The inverse QP on the static equilibrium under the present command: it knows no momentum."""
+
+    def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
+        still = env.backend.probe(present) if env.backend.moving else env.state
+        return controller.solve(still.condensed, env.goal, present, still.slack)
+
+
+class ModelQPAgent(InverseQPAgent):
+    """The inverse QP on a model of the plant that sees its commands only: the surrogate's, open loop or with PI.
+
+    On FEM, as on a physical robot, the model is then not the plant. Robots without a surrogate are predicted by their
+    static equilibrium.
+
+    Args:
+        closed: move the goal by a PI on the measured effector (thesis Algorithm 2).
+    """
+
+    def __init__(self, closed: bool) -> None:
+        super().__init__()
+        self._closed = closed
+        self._models: WeakKeyDictionary[Any, Backend | None] = WeakKeyDictionary()
+        self._corrections: WeakKeyDictionary[Any, PICorrection] = WeakKeyDictionary()
+
+    def _begin(self, env: Any) -> None:
+        super()._begin(env)
+        self._corrections[env] = PICorrection(*PI_GAINS)
+        if env not in self._models:
+            try:
+                self._models[env] = SurrogateBackend(env.robot, env.design)
+            except WeightsError:
+                self._models[env] = None
+        model = self._models[env]
+        if model is not None:
+            model.reset(env.design)
+
+    def _predict(self, env: Any, command: np.ndarray) -> State:
+        model = self._models[env]
+        return env.backend.probe(command) if model is None else model.step(command)
+
+    def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
+        expected = self._predict(env, present)
+        if not self._closed:
+            return controller.solve(expected.condensed, env.goal, present, expected.slack)
+        axes, correction = env.task.axes, self._corrections[env]
+        # Coordinates that do not count are left out of the error.
+        measured = np.where(axes > 0.0, env.state.effector[0], env.goal)
+        aim = correction.correct(env.goal, measured)
+        command = controller.solve(expected.condensed, aim, present, expected.slack)
+        model = expected.condensed
+        reached = model.delta.e + model.W.ea @ (controller.effort - model.lambda_.a)
+        correction.hold(axes * (aim - reached))
+        return command
+
+
+def _random(seed: int) -> Agent:
+    rng = np.random.default_rng(seed)
+    return lambda observation, env: rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+
+
+_MAKERS: dict[str, Callable[[int], Agent]] = {
+    "qp": lambda seed: InverseQPAgent(),
+    "qp_static": lambda seed: StaticQPAgent(),
+    "qp_model": lambda seed: ModelQPAgent(closed=False),
+    "qp_pi": lambda seed: ModelQPAgent(closed=True),
+    "random": _random,
+}
+
+BASELINES = tuple(_MAKERS)
+"""Names of agents that need no training."""
+
+
+def make_baseline(name: str, seed: int = 0) -> Agent:
+    """Return an agent that needs no training.
+
+    Args:
+        name: ``"qp"``, the inverse QP on the condensed model of the plant's present state, which in dynamics is that of
+            the next time step; ``"qp_static"``, on the static equilibrium under the present command, which knows no
+            momentum; ``"qp_model"``, on the surrogate, whatever the plant is; ``"qp_pi"``, that with a PI on the
+            measured effector; ``"random"``.
+        seed: of the random agent.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    if name not in _MAKERS:
+        raise ValueError(f"agent = {name!r} is unknown; allowed: {', '.join(BASELINES)}")
+    return _MAKERS[name](seed)

@@ -1,0 +1,108 @@
+"""Hindsight goals: an episode that missed its goal shows how to reach the places where it came."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from softgym_envs.envs.interface import Interface
+from softgym_envs.envs.task import Task
+
+__all__ = ["HindsightBuffer"]
+
+
+class HindsightBuffer(ReplayBuffer):
+    """A replay buffer of flat observations in which a share of the samples gets another goal (HER, strategy future).
+
+    The other goal is an effector reached at or after the transition in the same episode, and the reward is what the
+    task gives for it (Andrychowicz et al., 2017). Their k goals for each stored transition are a share of k / (k + 1).
+
+    Args:
+        *args: as for `ReplayBuffer`.
+        interface: layout of the observations.
+        task: gives rewards; its goal stays where it is during an episode.
+        share: of samples with another goal.
+        **kwargs: as for `ReplayBuffer`.
+
+    Attributes:
+        ends: position of the last transition of each stored one's episode, -1 while it runs, shape (size, num_envs).
+
+    Raises:
+        ValueError: for a task whose goal moves: what followed then belongs to other goals.
+    """
+
+    def __init__(self, *args: Any, interface: Interface, task: Task, share: float, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if task.horizon != 1:
+            raise ValueError(f"hindsight = {share} needs a goal that stays; task '{task.name}' moves it; allowed: 0")
+        self.interface, self.task, self.share = interface, task, share
+        self.ends = np.full((self.buffer_size, self.n_envs), -1, dtype=np.int64)
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one transition of every environment."""
+        position = self.pos
+        # What is overwritten no longer belongs to its episode; the rest of that episode keeps its end.
+        self.ends[position] = -1
+        super().add(obs, next_obs, action, reward, done, infos)
+        self._end(np.flatnonzero(done), position)
+
+    def cut(self) -> None:
+        """End all running episodes: the environments are about to be reset."""
+        if self.pos > 0 or self.full:
+            self._end(np.arange(self.n_envs), (self.pos - 1) % self.buffer_size)
+
+    def _end(self, environments: np.ndarray, position: int) -> None:
+        for column in environments:
+            k = position
+            for _ in range(self.buffer_size):
+                if self.ends[k, column] != -1 or not (self.full or k < self.pos):
+                    break
+                self.ends[k, column] = position
+                k = (k - 1) % self.buffer_size
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        columns = np.random.randint(0, self.n_envs, len(batch_inds))  # noqa: NPY002 - as stable-baselines3 does
+        ends = self.ends[batch_inds, columns]
+        newest = (self.pos - 1) % self.buffer_size
+        left = (np.where(ends < 0, newest, ends) - batch_inds) % self.buffer_size
+        draws = np.random.random((2, len(batch_inds)))  # noqa: NPY002
+        later = (batch_inds + (draws[0] * (left + 1)).astype(np.int64)) % self.buffer_size
+        observations = self.observations[batch_inds, columns]
+        following = self.next_observations[batch_inds, columns]
+        rewards = self.rewards[batch_inds, columns].copy()
+
+        # A reward of exactly zero is that of a step that was not found; no goal makes it better.
+        chosen = np.flatnonzero((draws[1] < self.share) & (rewards != 0.0))
+        goals = self.interface.effector(self.next_observations[later[chosen], columns[chosen]])
+        observations[chosen] = self.interface.with_goal(observations[chosen], goals)
+        reached = following[chosen]
+        following[chosen] = self.interface.with_goal(reached, goals)
+        distance = self.task.distance(self.interface.effector(reached), goals)
+        terms = self.task.reward_terms(distance, self.interface.effort_share(reached))
+        rewards[chosen] = np.prod(list(terms.values()), axis=0)
+
+        ended = self.dones[batch_inds, columns] * (1.0 - self.timeouts[batch_inds, columns])
+        return ReplayBufferSamples(
+            *(
+                self.to_torch(values)
+                for values in (
+                    observations,
+                    self.actions[batch_inds, columns],
+                    following,
+                    ended[:, None].astype(np.float32),
+                    rewards[:, None],
+                )
+            )
+        )

@@ -1,0 +1,202 @@
+"""Train and evaluate many configurations with several seeds, one process each.
+
+    python -m agents.sweep --configs configs/agents/*.yaml --seeds 0 1 2 --processes 16 --folder results/agents
+
+Trainings go to ``FOLDER/runs/<config>/seed<k>``, what `agents.results` reads to ``FOLDER/results/<config>``:
+``seed<k>.json`` for each policy and ``baselines.json`` for the agents that need no training, all on the same unseen
+goals. A finished part is not run again, and a training that was killed goes on from its checkpoint.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.config import load_config, provenance
+from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.executors import run_jobs
+from softgym_envs.storage import write_json
+
+__all__ = ["evaluate_baselines", "sweep", "train_and_evaluate", "unseen_goals"]
+
+TEST_SEED = 2_000_003
+"""Seed of the goals that no training and no choice of a policy sees."""
+
+
+def unseen_goals(environment: EnvironmentConfig, count: int) -> tuple[list[dict[str, float]] | None, np.ndarray]:
+    """Bodies (None: the one body) and goals [m] (n, p, 3) of the final evaluation; n = 1 where the goal is always the same."""
+    from agents.evaluation import evaluation_set
+
+    designs, goals = evaluation_set(environment, count, TEST_SEED)
+    if designs is None and (goals == goals[0]).all():
+        goals = goals[:1]
+    return designs, goals
+
+
+def _evaluations(
+    environment: EnvironmentConfig, agents: dict[str, str | Path], goals: int, fem_goals: int
+) -> dict[str, dict[str, Any]]:
+    """Evaluate agents on the environment's backend and on FEM: ``{backend: {agent: columns}}``, SI."""
+    from agents.evaluation import evaluate
+
+    designs, paths = unseen_goals(environment, max(goals, fem_goals))
+    counts = {environment.backend: goals, "fem": fem_goals}
+    found: dict[str, dict[str, Any]] = {}
+    for backend, count in counts.items():
+        if count < 1:
+            continue
+        found[backend] = {}
+        for name, agent in agents.items():
+            begun = time.perf_counter()
+            outcome = evaluate(
+                agent,
+                environment.on(backend),
+                paths[:count],
+                design=None if designs is None else designs[:count],
+                seed=TEST_SEED,
+            )
+            found[backend][name] = {
+                "distances": _short(outcome.distances),
+                "mean_distances": _short(outcome.mean_distances),
+                "returns": _short(outcome.returns),
+                "successes": outcome.successes.astype(int).tolist(),
+                "steps": outcome.steps,
+                "seconds": round(time.perf_counter() - begun, 2),
+            }
+    return found
+
+
+def _short(values: np.ndarray) -> list[float]:
+    return [float(f"{value:.6g}") for value in values]
+
+
+def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goals: int) -> Path:
+    """Train one configuration with one seed and evaluate its policy; returns the file of the result."""
+    from agents.policy import Policy
+    from agents.training import train
+
+    name = path.stem
+    result = folder / "results" / name / f"seed{seed}.json"
+    if result.exists():
+        return result
+    config = load_config(path, TrainConfig).model_copy(update={"seed": seed})
+    begun = time.process_time()
+    policy = train(config, folder / "runs" / name / f"seed{seed}", progress=False)
+    spent = time.process_time() - begun
+    card = Policy(policy).card
+    write_json(
+        result,
+        {
+            "config": card["config"],
+            "seed": seed,
+            "steps": card["steps"],
+            "best_step": card["best_step"],
+            "cpu_seconds": round(spent, 1),
+            "horizon": ENVIRONMENTS[config.environment.id].max_episode_steps,
+            "curve": card["curve"],
+            "evaluations": _evaluations(config.environment, {"sac": policy}, goals, fem_goals),
+            "provenance": provenance(),
+        },
+    )
+    return result
+
+
+def evaluate_baselines(path: Path, folder: Path, goals: int, fem_goals: int) -> Path:
+    """Evaluate the agents that need no training on the goals of a configuration; returns the file of the result."""
+    result = folder / "results" / path.stem / "baselines.json"
+    if result.exists():
+        return result
+    environment = load_config(path, TrainConfig).environment
+    agents: dict[str, str | Path] = {name: name for name in ("qp", "qp_model", "qp_pi", "random")}
+    write_json(
+        result,
+        {
+            "environment": environment.model_dump(mode="json"),
+            "horizon": ENVIRONMENTS[environment.id].max_episode_steps,
+            "evaluations": _evaluations(environment, agents, goals, fem_goals),
+            "provenance": provenance(),
+        },
+    )
+    return result
+
+
+def _attempt(function: Callable[..., Path], arguments: tuple[Any, ...]) -> tuple[str, str | None]:
+    """Run a job; an error of one must not end the others."""
+    label = " ".join(str(a) for a in arguments[:2] if not isinstance(a, Path)) or "baselines"
+    label = f"{arguments[0].stem} {label}"
+    try:
+        function(*arguments)
+    except Exception:
+        return label, traceback.format_exc()
+    return label, None
+
+
+def _cost(config: TrainConfig) -> float:
+    """Rough CPU seconds of a training, to begin with the longest."""
+    step = 0.02 if config.environment.backend == "fem" else 1e-4
+    return config.steps * (step + 0.005 * config.sac.gradient_steps / config.num_envs)
+
+
+def sweep(
+    configs: Sequence[Path], seeds: Sequence[int], processes: int, folder: Path, *, goals: int = 100, fem_goals: int = 10
+) -> int:
+    """Run every configuration with every seed, and the baselines of each; returns how many jobs failed.
+
+    Args:
+        configs: YAML files of `TrainConfig`.
+        seeds: of the trainings.
+        processes: at a time.
+        folder: where everything goes.
+        goals: unseen goals on the environment's own backend.
+        fem_goals: unseen goals on FEM, 0 for none.
+
+    Raises:
+        ConfigError: if a file is not valid, before anything runs.
+    """
+    loaded = {path: load_config(path, TrainConfig) for path in configs}
+    jobs: list[tuple[float, Callable[..., Path], tuple[Any, ...]]] = []
+    for path, config in loaded.items():
+        jobs += [(_cost(config), train_and_evaluate, (path, seed, folder, goals, fem_goals)) for seed in seeds]
+        jobs.append((0.0, evaluate_baselines, (path, folder, goals, fem_goals)))
+    jobs.sort(key=lambda job: -job[0])
+    begun, failed = time.perf_counter(), 0
+    finished = run_jobs([(_attempt, job[1:]) for job in jobs], processes)
+    for done, (label, error) in enumerate(finished, 1):
+        failed += error is not None
+        print(f"{time.perf_counter() - begun:7.1f} s  {done}/{len(jobs)}  {label}  {error or 'done'}", flush=True)
+    return failed
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of ``python -m agents.sweep``."""
+    parser = argparse.ArgumentParser(prog="python -m agents.sweep", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--configs", type=Path, nargs="+", required=True)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("--goals", type=int, default=100, help="unseen goals on the environment's own backend")
+    parser.add_argument("--fem-goals", type=int, default=10, help="unseen goals on FEM; 0 for none")
+    given = parser.parse_args(arguments)
+    # Read by the worker processes, which are started afterwards.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = "1"
+    if find_spec("platformdirs") is None:
+        os.environ.setdefault("SOFTGYM_CACHE", str(given.folder / "cache"))
+    failed = sweep(
+        given.configs, given.seeds, given.processes, given.folder, goals=given.goals, fem_goals=given.fem_goals
+    )
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,290 @@
+"""Co-design strategies on equal questions: regret against environment steps and CPU time, three repeats each.
+
+    python -m benchmarks.strategies results/strategies 2
+
+First the ground truth: 64 bodies of the Soft Finger (4 x 4 x 4 over length, height, joint height), each with a policy
+trained until it improves no more, in the work zone of ``configs/codesign/finger_reach.yaml``. Then every strategy,
+three times with other seeds. Everything lies in the folder, and a second call goes on where the first was stopped. The
+numbers that this repository keeps are in ``benchmarks/data/strategies.json``; ``softgym bench strategies`` shows them.
+
+The score of a body between those of the grid is that of the inverse QP, which is cheap, plus what the trained policies
+lack to it, interpolated (thin plate spline). Regret is the part of the way from the baseline body to the best one that
+is left: 100 % at the baseline, 0 % at the best.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.config import load_config, provenance
+from softgym_envs.storage import write_json
+
+__all__ = ["strategies"]
+
+KEPT = Path(__file__).parent / "data" / "strategies.json"
+QUESTION = Path(__file__).parent.parent / "configs" / "codesign" / "finger_reach.yaml"
+VARIABLES = ("length", "height", "joint_height")
+LEVELS = (-0.9, -0.3, 0.3, 0.9)
+"""Of each variable, in unit coordinates."""
+TRUTH_STEPS = 16_000
+REPEATS = 3
+PRETRAINING = 80_000
+"""Environment steps behind the policy ``finger_reach_designs``."""
+
+PLAIN = {
+    "policy": None,
+    "screen": {"enabled": False},
+    "pruner": {"name": "none"},
+    "finalists": {"count": 0},
+    "workers": 1,
+}
+STRATEGIES: dict[str, dict[str, Any]] = {
+    "plain nesting": {
+        "strategy": "scratch",
+        "trials": 16,
+        "training": {"steps": 16_000, "report_every": 16_000, "num_envs": 16},
+    },
+    "plain nesting, Hyperband": {
+        "strategy": "scratch",
+        "trials": 16,
+        "training": {"steps": 16_000, "report_every": 2_000, "num_envs": 16},
+        "pruner": {"name": "hyperband"},
+    },
+    "warm start": {"strategy": "warm_start", "policy": "finger_reach_designs", "trials": 16},
+    "warm start, screen (default)": {
+        "strategy": "warm_start",
+        "policy": "finger_reach_designs",
+        "trials": 16,
+        "screen": {"enabled": True, "candidates": 40, "keep": 0.1, "goals": 10},
+        "pruner": {"name": "percentile", "options": {"percentile": 60.0, "n_startup_trials": 5}},
+    },
+    "inverse QP": {"strategy": "qp", "trials": 40},
+    "policy as judge": {"strategy": "policy", "policy": "finger_reach_designs", "trials": 40},
+    "policy as judge, Wilcoxon": {
+        "strategy": "policy",
+        "policy": "finger_reach_designs",
+        "trials": 40,
+        "pruner": {"name": "wilcoxon"},
+    },
+    "critic": {"strategy": "critic", "trials": 16, "joint": {"steps": 80_000, "report_every": 8_000}},
+    "distribution": {"strategy": "distribution", "trials": 16, "joint": {"steps": 80_000, "report_every": 8_000}},
+}
+
+
+def _question(**changes: Any) -> Any:
+    """The study of the question with other values."""
+    from codesign.config import StudyConfig
+
+    base = load_config(QUESTION, StudyConfig).model_dump(mode="json")
+    return StudyConfig.model_validate({**base, **changes})
+
+
+def _study(name: str, repeat: int) -> Any:
+    given = {**PLAIN, **STRATEGIES[name]}
+    base = _question().model_dump(mode="json")
+    for part in ("training", "joint"):
+        given[part] = {**base[part], "seed": repeat, **given.get(part, {})}
+    if given["strategy"] == "scratch":
+        given["training"] = {**given["training"], "sac": {**given["training"]["sac"], "learning_starts": 1_000}}
+    given["sampler"] = {"name": "tpe", "seed": repeat, "options": {"n_startup_trials": 6}}
+    if not given["screen"]["enabled"]:
+        given["screen"] = {"enabled": False}
+    return _question(name=f"repeat{repeat}", **given)
+
+
+def _truth(path: Path, values: tuple[float, ...], folder: Path) -> Path:
+    """Score of one body of the grid: train from the design-conditioned policy, and evaluate."""
+    import torch
+
+    from agents.training import train
+    from codesign.folder import StudyFolder
+    from codesign.trial import assess, training_config
+
+    torch.set_num_threads(1)
+    study = StudyFolder.create(folder / "question", _question(**PLAIN, strategy="qp", trials=1))
+    config, space = study.config, study.config.space
+    design = config.baseline | {n: float(space[n].from_unit(v)) for n, v in zip(VARIABLES, values, strict=True)}
+    training = training_config(study, design).model_copy(
+        update={"steps": TRUTH_STEPS, "report_every": 2_000, "evaluation_episodes": 40}
+    )
+    run = path.with_suffix("")
+    policy = train(training, run, initial="finger_reach_designs", progress=False)
+    goals = study.goals["selection"]
+    curve = json.loads(policy.with_suffix(".json").read_text())["curve"]
+    write_json(
+        path,
+        {
+            "unit": list(values),
+            "design": design,
+            "sac": assess(policy, config.environment, goals, design),
+            "qp": assess("qp", config.environment, goals, design),
+            "curve": [[row["step"], row["mean_distance"]] for row in curve],
+        },
+    )
+    return path
+
+
+def _run_study(path: Path, name: str, repeat: int) -> Path:
+    from codesign.folder import StudyFolder
+    from codesign.study import run_study
+
+    run_study(_study(name, repeat), path.parent, progress=False)
+    folder = StudyFolder(path.parent)
+    results = json.loads((path.parent / "results.json").read_text())
+    cost = results["cost"]
+    before = cost["joint_steps"] + cost["screen_steps"]
+    cpu = cost["cpu_seconds"]["judge"] + cost["cpu_seconds"]["screen"]
+    rows = []
+    for trial in sorted(folder.results(), key=lambda trial: trial["finished_at"]):
+        evaluation = trial["evaluation"] or {}
+        reports = len(trial["curve"]) * folder.config.training.evaluation_episodes * 50
+        rows.append(
+            {
+                "design": trial["design"],
+                "score": trial["score"],
+                # The inverse QP that every trial is also scored by is not needed, so it does not count.
+                "steps": trial["training_steps"] + reports + evaluation.get("steps", 0),
+                "cpu_seconds": trial["cpu_seconds"] - (0.0 if trial["agent"] == "qp" else trial["qp"]["cpu_seconds"]),
+            }
+        )
+    write_json(path, {"name": name, "repeat": repeat, "steps": before, "cpu_seconds": cpu, "trials": rows})
+    return path
+
+
+def main(folder: Path, workers: int = 1) -> None:
+    """Make what is missing, and write all to ``benchmarks/data/strategies.json``, also when it is stopped."""
+    from softgym_envs.executors import run_jobs
+
+    folder = folder.resolve()
+    jobs: list[tuple[Any, tuple]] = []
+    for values in itertools.product(LEVELS, repeat=len(VARIABLES)):
+        name = "_".join(f"{value:+.1f}" for value in values)
+        jobs.append((_truth, (folder / "truth" / f"{name}.json", values, folder)))
+    for repeat in range(REPEATS):
+        for name in STRATEGIES:
+            place = folder / name.replace(" ", "_").replace(",", "") / str(repeat)
+            jobs.append((_run_study, (place / "regret.json", name, repeat)))
+    missing = [job for job in jobs if not job[1][0].exists()]
+    try:
+        for done, path in enumerate(run_jobs(missing, workers), 1):
+            print(f"[{done}/{len(missing)}] {path.relative_to(folder)}", flush=True)
+    finally:
+        truth = [json.loads(path.read_text()) for path in sorted((folder / "truth").glob("*.json"))]
+        runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*/*/regret.json"))]
+        kept = {**provenance(), "truth": [_short(point) for point in truth], "runs": runs}
+        if len(truth) == len(LEVELS) ** len(VARIABLES):
+            kept |= _judge(truth, runs)
+        write_json(KEPT, kept)
+
+
+def _short(point: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "unit": point["unit"],
+        "sac": point["sac"]["mean_distance"],
+        "qp": point["qp"]["mean_distance"],
+        "curve": point["curve"],
+    }
+
+
+def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Add the true score and the regret to every trial of every run."""
+    from scipy.interpolate import RBFInterpolator
+    from scipy.optimize import minimize
+
+    from codesign.trial import assess
+
+    config = _question()
+    space = config.space
+    from codesign.goals import draw_goals
+
+    goals = np.array(draw_goals(config)["selection"])
+    x = np.array([point["unit"] for point in truth])
+    lack = np.array([point["sac"]["mean_distance"] - point["qp"]["mean_distance"] for point in truth])
+    residual = RBFInterpolator(x, lack)
+    left_out = [
+        lack[i] - RBFInterpolator(np.delete(x, i, 0), np.delete(lack, i))(x[i : i + 1])[0] for i in range(len(x))
+    ]
+
+    def score(unit: np.ndarray) -> float:
+        design = config.baseline | {n: float(space[n].from_unit(v)) for n, v in zip(VARIABLES, unit, strict=True)}
+        qp = assess("qp", config.environment, goals, design)
+        return qp["mean_distance"] + float(residual(unit[None])[0]) if "error" not in qp else float("inf")
+
+    def unit_of(design: dict[str, float]) -> np.ndarray:
+        return np.array([float(space[name].to_unit(design[name])) for name in VARIABLES])
+
+    start = x[int(np.argmin([point["sac"]["mean_distance"] for point in truth]))]
+    found = minimize(
+        lambda unit: score(np.clip(unit, -1.0, 1.0)),
+        start,
+        method="Nelder-Mead",
+        options={"maxfev": 120, "initial_simplex": start + 0.2 * np.vstack([np.zeros(3), -np.sign(start) * np.eye(3)])},
+    )
+    known = {}
+    candidates = [float(found.fun)]
+    for run in runs:
+        for trial in run["trials"]:
+            key = tuple(np.round(unit_of(trial["design"]), 9))
+            if key not in known:
+                known[key] = score(np.array(key))
+            trial["true_score"] = known[key]
+            candidates.append(known[key])
+    best, baseline = min(candidates), score(unit_of(config.baseline))
+    for run in runs:
+        steps, cpu, incumbent = run["steps"], run["cpu_seconds"], None
+        curve = []
+        for trial in run["trials"]:
+            steps, cpu = steps + trial["steps"], cpu + trial["cpu_seconds"]
+            if trial["score"] is not None and (incumbent is None or trial["score"] > incumbent["score"]):
+                incumbent = trial
+            if incumbent is not None:
+                regret = (incumbent["true_score"] - best) / (baseline - best)
+                curve.append([steps, round(cpu, 1), regret])
+        run["regret"] = curve
+    return {
+        "best": best,
+        "baseline": baseline,
+        "best_body": found.x.tolist(),
+        "interpolation_error": float(np.median(np.abs(left_out))),
+        "converged_within": float(
+            np.median([abs(p["curve"][-1][1] - min(v for _, v in p["curve"][:-1])) for p in truth])
+        ),
+    }
+
+
+def strategies() -> dict[str, object]:
+    """Regret of the co-design strategies by environment steps: median of three repeats (smallest to largest)."""
+    kept = json.loads(KEPT.read_text())
+    result: dict[str, object] = {
+        "bodies of the ground truth": len(kept["truth"]),
+        "baseline, true score [mm]": 1e3 * kept["baseline"],
+        "best body, true score [mm]": 1e3 * kept["best"],
+        "interpolation of the ground truth, median error left out [mm]": 1e3 * kept["interpolation_error"],
+    }
+    for name in STRATEGIES:
+        runs = [run for run in kept["runs"] if run["name"] == name]
+        if not runs:
+            continue
+        last = sorted(run["regret"][-1] for run in runs)
+
+        def spread(values: list[float], form: str) -> str:
+            values = sorted(values)
+            return f"{np.median(values):{form}} ({values[0]:{form}} to {values[-1]:{form}})"
+
+        result[f"{name}: regret at the end [%]"] = spread([100 * row[2] for row in last], ".2f")
+        result[f"{name}: environment steps"] = spread([row[0] for row in last], ",.0f")
+        result[f"{name}: CPU minutes"] = spread([row[1] / 60 for row in last], ".1f")
+        for limit in (0.1, 0.01):
+            reached = [next((row[0] for row in run["regret"] if row[2] <= limit), np.inf) for run in runs]
+            result[f"{name}: environment steps to {limit:.0%} regret"] = spread(reached, ",.0f")
+    return result
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "results/strategies"), *map(int, sys.argv[2:3]))

@@ -1,0 +1,260 @@
+"""A study in a real PostgreSQL server: several machines, dead workers, a server that goes away."""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+import time
+from contextlib import contextmanager
+
+import optuna
+import pytest
+import sqlalchemy as sql
+
+from benchmarks.codesign_scale import Sweep, faults
+from benchmarks.postgres_server import find_programs, temporary_server
+from codesign.config import StudyConfig
+from codesign.folder import StudyFolder
+from codesign.jobs import Job, missing_jobs, run_jobs
+from codesign.ledger import Ledger
+from codesign.postgres import SIGN, PostgresStorage
+from codesign.study import run_study
+from codesign.worker import run_trials
+from softgym_envs.errors import ConfigError, DataError, SoftGymError
+
+GRACE = 1.0
+
+
+@pytest.fixture(scope="module")
+def server():
+    if find_programs() is None:
+        reason = "PostgreSQL is not installed (Debian: apt-get install postgresql)"
+        if os.environ.get("CI_REQUIRES_POSTGRES"):
+            pytest.fail(f"{reason}, and CI_REQUIRES_POSTGRES is set")
+        pytest.skip(reason)
+    with temporary_server() as running:
+        yield running
+
+
+@pytest.fixture
+def machine(server, tmp_path, tiny, request):
+    """Function ``machine(folder, **changes) -> StudyFolder``: the folder of one machine that takes part in a study."""
+    study = re.sub(r"\W", "-", request.node.name)
+
+    def make(folder="a", **changes):
+        data = tiny(name=study, storage=server.address, heartbeat=GRACE, patience=30.0)
+        return StudyFolder.create(tmp_path / folder, StudyConfig.model_validate({**data, **changes}))
+
+    return make
+
+
+@contextmanager
+def doomed(folder):
+    """A ledger whose worker is killed at the end of the block: its signs of life stop, and nobody is told."""
+    ledger = Ledger(folder)
+    ledger.storage._execute(SIGN, worker=ledger.worker)
+    yield ledger
+
+
+def result(trial, score=0.5):
+    return {"number": trial.number, "state": "complete", "score": score, "scores": [score], "agent": "qp"}
+
+
+def states(ledger):
+    return [trial.state.name for trial in ledger.study.get_trials(deepcopy=False)]
+
+
+def wait_for(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it takes too long"
+        time.sleep(0.05)
+
+
+def test_machines_share_the_budget_and_the_goals(machine):
+    a, b = machine("a", trials=3), machine("b", trials=3)
+    assert (a.path / "goals.json").read_bytes() == (b.path / "goals.json").read_bytes()
+    assert (a.path / "study.json").read_bytes() == (b.path / "study.json").read_bytes()
+    with Ledger(a) as one, Ledger(b) as two:
+        bodies = [("baseline", {"height": 0.02, "joint_height": 0.006})]
+        one.enqueue(bodies)
+        two.enqueue(bodies)
+        claimed = [one.claim(), two.claim(), one.claim()]
+        assert [trial.number for trial in claimed] == [0, 1, 2]
+        assert [trial.user_attrs["origin"] for trial in claimed] == ["baseline", "sampler 1", "sampler 2"]
+        assert two.claim() is None
+        for ledger, trial in zip((one, two, one), claimed, strict=True):
+            assert ledger.finish(result(trial))
+        assert one.left() == two.left() == 0
+        for ledger in (one, two):
+            ledger.mirror()
+        assert a.results() == b.results() == [result(trial) for trial in claimed]
+
+
+def test_body_of_a_dead_worker_runs_again_on_another_machine(machine):
+    a, b = machine("a", trials=1), machine("b", trials=1)
+    with Ledger(b) as survivor:
+        with doomed(a) as victim:
+            lost = victim.claim()
+            lost.report(0.25, 10)
+            assert survivor.claim() is None  # it gave a sign of life just now
+        wait_for(lambda: survivor.claimable())
+        again = survivor.claim()
+        assert (again.number, again.params) == (1, lost.params)
+        assert again.user_attrs["origin"] == lost.user_attrs["origin"]
+        assert survivor.study.trials[1].intermediate_values == {10: 0.25}
+        # It was not dead, only out of reach: too late, its trial is another's.
+        assert not victim.finish(result(lost, score=9.0))
+        assert survivor.finish(result(again))
+        assert states(survivor) == ["FAIL", "COMPLETE"]
+        victim.mirror()
+        assert a.results() == [result(again)]
+
+
+def test_signs_of_life_keep_a_trial(machine):
+    folder = machine(trials=1)
+    with Ledger(folder) as worker, Ledger(folder) as other:
+        trial = worker.claim()
+        time.sleep(2.5 * GRACE)
+        assert not other.claimable()
+        assert worker.finish(result(trial))
+
+
+def test_time_without_the_server_does_not_count(machine, server):
+    folder = machine(trials=1, heartbeat=3.0)
+    with doomed(folder) as ledger, Ledger(folder) as other:
+        ledger.claim()
+        server.stop()
+        time.sleep(3.2)
+        server.start()
+        assert not other.claimable()
+        wait_for(lambda: other.claimable())
+
+
+def test_transaction_takes_place_whole_or_not_at_all(machine):
+    folder = machine(trials=2)
+    with Ledger(folder) as ledger:
+        original, cut = ledger._claim, []
+
+        def claim(study):
+            trial = original(study)
+            if not cut:  # the server ends the connection at the last moment
+                with ledger.storage._engine.connect() as connection:
+                    ended = connection.execute(
+                        sql.text("SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE state LIKE 'idle in%'")
+                    )
+                    cut.extend(ended.scalars())
+            return trial
+
+        ledger._claim = claim
+        trial = ledger.claim()
+        assert cut == [True]
+        assert (trial.number, states(ledger)) == (0, ["RUNNING"])
+        assert ledger.finish(result(trial))
+        assert ledger.claim().number == 1
+        assert ledger.claim() is None
+
+
+def test_answers_that_got_lost(machine):
+    folder = machine(trials=2)
+    with Ledger(folder) as ledger:
+        first = ledger._exclusively(ledger._claim)  # done, but nobody was told
+        trial = ledger.claim()
+        assert (trial.number, trial.params) == (first.number, first.params)
+        assert ledger.finish(result(trial))
+        assert ledger.finish(result(trial))
+        assert not ledger.finish(result(trial, score=1.0))
+        assert states(ledger) == ["COMPLETE"]
+
+
+def test_body_that_kills_its_workers_is_given_up(machine):
+    folder = machine(trials=1, attempts=2)
+    with Ledger(folder) as watcher:
+        for number in range(2):
+            wait_for(watcher.claimable)
+            with doomed(folder) as victim:
+                assert victim.claim().number == number
+        wait_for(watcher.claimable)
+        run_trials(folder)
+        watcher.mirror()
+        (found,) = folder.results()
+    assert (found["number"], found["state"], found["reason"]) == (2, "infeasible", "2 workers died of it")
+
+
+def test_jobs_are_shared(machine):
+    a, b = machine("a"), machine("b")
+    made = []
+
+    def job(folder, name):
+        return Job(folder.path / "screen" / f"{name}.json", lambda: made.append(name) or {"name": name})
+
+    run_jobs(a, [job(a, "0")])
+    assert missing_jobs(b, [job(b, "0")]) == []
+    with a.open_storage().attempt("screen/1.json") as mine:
+        assert mine
+        thread = threading.Thread(target=run_jobs, args=(b, [job(b, "1"), job(b, "2")]))
+        thread.start()
+        wait_for(lambda: (b.path / "screen" / "2.json").exists())
+        assert not (b.path / "screen" / "1.json").exists()
+    thread.join()
+    assert made == ["0", "2", "1"]
+    assert (b.path / "screen" / "1.json").exists()
+
+
+def test_files_do_not_change(machine):
+    storage = machine().open_storage()
+    assert storage.fetch("trials/0000/policy.safetensors") is None
+    storage.publish({"trials/0000/policy.safetensors": b"\x00\xff"})
+    storage.publish({"trials/0000/policy.safetensors": b"other"})
+    assert storage.fetch("trials/0000/policy.safetensors") == b"\x00\xff"
+
+
+def test_other_studies_are_refused(machine, server, tmp_path, tiny):
+    a = machine("a")
+    with pytest.raises(ConfigError, match="another 'variables'; use another name, or change only: title, trials"):
+        machine("b", variables=["height"])
+    assert not (tmp_path / "b" / "config.yaml").exists()
+    with pytest.raises(ConfigError, match="another 'name'; use another folder"):
+        machine("a", name="other")
+    with pytest.raises(ConfigError, match=r"holds a study with storage 'postgresql://.*', got 'journal'"):
+        machine("a", storage="journal")
+    machine("b", trials=9)
+    storage = PostgresStorage(server.address, a.config.name)
+    optuna.delete_study(study_name=a.config.name, storage=storage.optuna)
+    with pytest.raises(ConfigError, match="is not in storage"):
+        machine("a")
+    with pytest.raises(DataError, match="has no study"):
+        Ledger(a)
+    machine("c")
+    with pytest.raises(ConfigError, match="holds another study"):
+        machine("a")
+
+
+def test_server_that_cannot_be_reached(tiny, tmp_path):
+    data = tiny(storage="postgresql://nobody@127.0.0.1:1/none", patience=1.0)
+    with pytest.raises(
+        ConfigError, match=r"storage 'postgresql://nobody@127.0.0.1:1/none' cannot be opened: .*refused"
+    ):
+        run_study(StudyConfig.model_validate(data), tmp_path / "study", progress=False)
+    assert not (tmp_path / "study" / "config.yaml").exists()
+    with pytest.raises(SoftGymError, match=r"has not answered for 1 s: .*start the server and run the same command"):
+        PostgresStorage(data["storage"], "tiny", patience=1.0, wait=True)
+
+
+def test_sweep_with_killed_workers_and_a_restarted_server(machine, server):
+    """Twelve trials on two machines; three kills, and two restarts of the server, of which one is a crash."""
+    folders = [machine(name, trials=12, goals={"count": 2, "unseen_count": 2, "training_count": 2}) for name in "ab"]
+    with Sweep(folders, seed=0) as sweep:
+        for step in ("kill", "restart", "kill", "crash", "kill"):
+            sweep.run_for(trials=2)
+            if step == "kill":
+                sweep.kill()
+            else:
+                server.restart("fast" if step == "restart" else "immediate")
+        sweep.run_for(trials=12)
+    for folder in folders:
+        with Ledger(folder) as ledger:
+            ledger.mirror()
+        assert faults(folder, sweep.seen) == []
+    assert folders[0].results() == folders[1].results()

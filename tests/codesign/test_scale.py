@@ -1,0 +1,146 @@
+"""Workers that are killed, executors, and the dashboard: what needs no database."""
+
+from __future__ import annotations
+
+import json
+import sys
+from wsgiref.util import setup_testing_defaults
+
+import pytest
+
+from benchmarks.codesign_scale import Sweep, faults
+from codesign.config import StudyConfig
+from codesign.folder import StudyFolder
+from codesign.ledger import Ledger
+from codesign.processes import run_workers
+from codesign.study import run_study
+from codesign.worker import _give_up, run_trials
+from softgym_envs.errors import ConfigError
+
+SMALL = {"count": 2, "unseen_count": 2, "training_count": 2}
+
+
+def test_sweep_with_killed_workers(study):
+    """Ten trials on the journal, by two workers that are killed three times."""
+    folder = study(trials=10, goals=SMALL)
+    with Sweep([folder, folder], seed=1) as sweep:
+        for _ in range(3):
+            sweep.run_for(trials=2)
+            sweep.kill()
+        sweep.run_for(trials=10)
+    assert len(sweep.seen) == 10
+    assert faults(folder, sweep.seen) == []
+
+
+def test_faults_are_seen(study):
+    folder = study(trials=3, goals=SMALL)
+    run_trials(folder)
+    seen = {record["number"]: record for record in folder.results()}
+    assert faults(folder, seen) == []
+    assert faults(folder, {**seen, 7: seen[0]}) == ["trial 7 was lost or changed"]
+    record = folder.trial(1) / "result.json"
+    record.write_text(json.dumps({**seen[1], "scores": [0.0]}))
+    assert faults(folder, seen) == ["trial 1 was lost or changed", "trial 1 has the result of another one"]
+    record.unlink()
+    assert faults(folder, seen) == ["trial 1 was lost or changed", "trial 1 and its result are not both there"]
+
+
+def test_worker_that_is_killed_is_replaced(study, monkeypatch, tmp_path):
+    """The first two workers end by a signal as soon as they start."""
+    marks = tmp_path / "deaths"
+    marks.mkdir()
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, signal, sys\n"
+        f"if len(os.listdir({str(marks)!r})) < 2:\n"
+        f"    open(os.path.join({str(marks)!r}, str(os.getpid())), 'w').close()\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    folder = study(trials=1, goals=SMALL, attempts=2)
+    assert run_workers(folder, "trials", 1) is None
+    assert len(folder.results()) == 1
+    for mark in marks.iterdir():
+        mark.unlink()
+    assert run_workers(study(trials=2, goals=SMALL, attempts=1), "trials", 1) == "killed by signal 9"
+
+
+def test_given_up_body_has_the_record_of_a_trial(study):
+    folder = study(trials=2, goals=SMALL)
+    with Ledger(folder) as ledger:
+        given_up = _give_up(folder, ledger.claim())
+        ledger.finish(given_up)
+    run_trials(folder)
+    (whole,) = folder.results()
+    assert given_up.keys() == whole.keys()
+
+
+def test_attempts_count_only_without_progress(study):
+    folder = study(trials=1)
+    attempts = []
+    with Ledger(folder) as ledger:
+        for step in (0, 0, 100, 0):
+            with Ledger(folder) as victim:
+                trial = victim.claim()
+                attempts.append(trial.user_attrs.get("attempt", 1))
+                if step:
+                    trial.report(0.5, step)
+        attempts.append(ledger.claim().user_attrs["attempt"])
+    assert attempts == [1, 2, 3, 1, 2]
+
+
+def test_ray_that_is_not_installed(study, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ConfigError, match=r"executor = 'ray' needs Ray \(.*\): pip install 'softgym-envs\[ray\]'"):
+        run_workers(study(executor="ray"), "trials", 1)
+
+
+# Ray leaves files and sockets of its cluster to the garbage collector.
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_ray(tmp_path, tiny):
+    ray = pytest.importorskip("ray")
+    config = StudyConfig.model_validate(tiny(trials=4, goals=SMALL, executor="ray", workers=2))
+    results = run_study(config, tmp_path / "study", progress=False)
+    assert results["trials"]["complete"] == 4
+    assert not ray.is_initialized()
+    folder = StudyFolder(tmp_path / "study")
+    assert faults(folder, {}) == []
+
+
+@pytest.mark.parametrize(
+    "storage, message",
+    [
+        ("sqlite:///study.db", "allowed: journal, postgresql://"),
+        ("postgresql://host", "allowed: journal, postgresql://"),
+        ("somewhere", "allowed: journal, postgresql://"),
+        ("postgresql://me:secret@host/studies", "must hold no password"),
+    ],
+)
+def test_storages_that_are_none(storage, message, tiny):
+    with pytest.raises(ValueError, match=message):
+        StudyConfig.model_validate(tiny(storage=storage))
+
+
+def test_dashboard(study):
+    """It opens the journal and tells what people look for."""
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+    from optuna_dashboard import wsgi
+
+    folder = study(trials=2, goals=SMALL)
+    run_trials(folder)
+    app = wsgi(JournalStorage(JournalFileBackend(str(folder.path / "journal.log"))))
+
+    def get(path):
+        environment = {"PATH_INFO": path}
+        setup_testing_defaults(environment)
+        status = []
+        body = b"".join(app(environment, lambda line, headers, error=None: status.append(line)))
+        assert status == ["200 OK"]
+        return json.loads(body)
+
+    (summary,) = get("/api/studies")["study_summaries"]
+    trials = get(f"/api/studies/{summary['study_id']}")["trials"]
+    assert [trial["values"] for trial in trials] == [record["scores"] for record in folder.results()]
+    told = {attribute["key"]: attribute["value"] for attribute in trials[0]["user_attrs"]}
+    assert float(told["mean_distance"]) == folder.result(0)["evaluation"]["mean_distance"]
+    assert {"origin", "process", "success_rate"} <= told.keys()
