@@ -88,10 +88,12 @@ class ModelQPAgent(InverseQPAgent):
         self._closed = closed
         self._models: WeakKeyDictionary[Any, Backend | None] = WeakKeyDictionary()
         self._corrections: WeakKeyDictionary[Any, PICorrection] = WeakKeyDictionary()
+        self._asked: WeakKeyDictionary[Any, np.ndarray] = WeakKeyDictionary()
 
     def _begin(self, env: Any) -> None:
         super()._begin(env)
         self._corrections[env] = PICorrection(*PI_GAINS)
+        self._asked[env] = env.goal
         if env not in self._models:
             try:
                 self._models[env] = SurrogateBackend(env.robot, env.design)
@@ -110,9 +112,10 @@ class ModelQPAgent(InverseQPAgent):
         if not self._closed:
             return controller.solve(expected.condensed, env.goal, present, expected.slack)
         axes, correction = env.task.axes, self._corrections[env]
-        # Coordinates that do not count are left out of the error.
-        measured = np.where(axes > 0.0, env.state.effector[0], env.goal)
-        aim = correction.correct(env.goal, measured)
+        # The effector is where the last goal sent it: a goal that has moved on since is no error of the model.
+        error = axes * (self._asked[env] - env.state.effector[0])
+        self._asked[env] = env.goal
+        aim = correction.correct(env.goal, env.goal - error)
         command = controller.solve(expected.condensed, aim, present, expected.slack)
         model = expected.condensed
         reached = model.delta.e + model.W.ea @ (controller.effort - model.lambda_.a)

@@ -66,6 +66,12 @@ class Policy:
     Args:
         path: ``policy.safetensors``, with its card beside it, or the name of a shipped policy.
 
+    Attributes:
+        card: its JSON card.
+        hidden: weights (d, w) and biases (w,) of the hidden layers.
+        mean: those of the last layer.
+        observation_size: d of the first one.
+
     Raises:
         WeightsError: if a file is missing, damaged or of another version.
     """
@@ -81,15 +87,15 @@ class Policy:
         if not isinstance(self.card, dict) or self.card.get("format") != FORMAT:
             raise WeightsError(f"policy card '{card}' is not of format {FORMAT}")
         try:
-            self._hidden = []
+            self.hidden = []
             k = 0
             while f"actor.latent_pi.{k}.weight" in tensors:
-                self._hidden.append((tensors[f"actor.latent_pi.{k}.weight"].T, tensors[f"actor.latent_pi.{k}.bias"]))
+                self.hidden.append((tensors[f"actor.latent_pi.{k}.weight"].T, tensors[f"actor.latent_pi.{k}.bias"]))
                 k += 2  # activations sit between the linear layers
-            self._mean = tensors["actor.mu.weight"].T, tensors["actor.mu.bias"]
+            self.mean = tensors["actor.mu.weight"].T, tensors["actor.mu.bias"]
         except KeyError as error:
             raise WeightsError(f"policy '{self.path}' lacks tensor {error}") from None
-        self.observation_size = int((self._hidden[0][0] if self._hidden else self._mean[0]).shape[0])
+        self.observation_size = int((self.hidden[0][0] if self.hidden else self.mean[0]).shape[0])
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return actions (..., n_a) in [-1, 1] for observations (..., d).
@@ -103,6 +109,6 @@ class Policy:
                 f"policy '{self.path.name}' takes observations of size {self.observation_size}, got {x.shape[-1]}: "
                 "was it trained with another design_in_observation or number of cables?"
             )
-        for weight, bias in self._hidden:
+        for weight, bias in self.hidden:
             x = np.maximum(x @ weight + bias, 0.0)
-        return np.tanh(x @ self._mean[0] + self._mean[1])
+        return np.tanh(x @ self.mean[0] + self.mean[1])

@@ -32,7 +32,7 @@ QUESTION = Path(__file__).parent.parent / "configs" / "codesign" / "finger_reach
 VARIABLES = ("length", "height", "joint_height")
 LEVELS = (-0.9, -0.3, 0.3, 0.9)
 """Of each variable, in unit coordinates."""
-TRUTH_STEPS = 16_000
+TRUTH_STEPS = 8_000
 REPEATS = 3
 PRETRAINING = 80_000
 """Environment steps behind the policy ``finger_reach_designs``."""
@@ -47,33 +47,33 @@ PLAIN = {
 STRATEGIES: dict[str, dict[str, Any]] = {
     "plain nesting": {
         "strategy": "scratch",
-        "trials": 16,
-        "training": {"steps": 16_000, "report_every": 16_000, "num_envs": 16},
+        "trials": 12,
+        "training": {"steps": 12_000, "report_every": 12_000, "num_envs": 16},
     },
     "plain nesting, Hyperband": {
         "strategy": "scratch",
-        "trials": 16,
-        "training": {"steps": 16_000, "report_every": 2_000, "num_envs": 16},
+        "trials": 12,
+        "training": {"steps": 12_000, "report_every": 1_500, "num_envs": 16},
         "pruner": {"name": "hyperband"},
     },
-    "warm start": {"strategy": "warm_start", "policy": "finger_reach_designs", "trials": 16},
+    "warm start": {"strategy": "warm_start", "policy": "finger_reach_designs", "trials": 12},
     "warm start, screen (default)": {
         "strategy": "warm_start",
         "policy": "finger_reach_designs",
-        "trials": 16,
+        "trials": 12,
         "screen": {"enabled": True, "candidates": 40, "keep": 0.1, "goals": 10},
         "pruner": {"name": "percentile", "options": {"percentile": 60.0, "n_startup_trials": 5}},
     },
-    "inverse QP": {"strategy": "qp", "trials": 40},
-    "policy as judge": {"strategy": "policy", "policy": "finger_reach_designs", "trials": 40},
+    "inverse QP": {"strategy": "qp", "trials": 30},
+    "policy as judge": {"strategy": "policy", "policy": "finger_reach_designs", "trials": 30},
     "policy as judge, Wilcoxon": {
         "strategy": "policy",
         "policy": "finger_reach_designs",
-        "trials": 40,
+        "trials": 30,
         "pruner": {"name": "wilcoxon"},
     },
-    "critic": {"strategy": "critic", "trials": 16, "joint": {"steps": 80_000, "report_every": 8_000}},
-    "distribution": {"strategy": "distribution", "trials": 16, "joint": {"steps": 80_000, "report_every": 8_000}},
+    "critic": {"strategy": "critic", "trials": 12, "joint": {"steps": 60_000, "report_every": 6_000}},
+    "distribution": {"strategy": "distribution", "trials": 12, "joint": {"steps": 60_000, "report_every": 6_000}},
 }
 
 
@@ -111,7 +111,7 @@ def _truth(path: Path, values: tuple[float, ...], folder: Path) -> Path:
     config, space = study.config, study.config.space
     design = config.baseline | {n: float(space[n].from_unit(v)) for n, v in zip(VARIABLES, values, strict=True)}
     training = training_config(study, design).model_copy(
-        update={"steps": TRUTH_STEPS, "report_every": 2_000, "evaluation_episodes": 40}
+        update={"steps": TRUTH_STEPS, "report_every": 1_000, "evaluation_episodes": 40}
     )
     run = path.with_suffix("")
     policy = train(training, run, initial="finger_reach_designs", progress=False)

@@ -34,6 +34,9 @@ T = TypeVar("T")
 ATTEMPTS = 20
 """Times that one action is begun; a server that is away is one of them, however long it is."""
 
+IDLE_LIMIT = 60.0
+"""A machine that stops inside a transaction keeps the others out no longer than this [s]."""
+
 # A lost peer is told by either side within half a minute, and clocks read alike everywhere.
 CONNECTION = {
     "connect_timeout": 10,
@@ -91,6 +94,7 @@ class PostgresStorage(StudyStorage):
         self, address: str, study: str, *, grace: float = 60.0, patience: float = 600.0, wait: bool = False
     ) -> None:
         import sqlalchemy as sql
+        from optuna.exceptions import OptunaError
 
         try:
             import psycopg  # noqa: F401 - asked for here to name the extra that has it
@@ -109,7 +113,7 @@ class PostgresStorage(StudyStorage):
         self._cache: optuna.storages.BaseStorage | None = None
         try:
             self._storage = self.patiently(self._open) if wait else self._open()
-        except (sql.exc.SQLAlchemyError, RuntimeError) as error:
+        except (sql.exc.SQLAlchemyError, OptunaError, RuntimeError) as error:
             raise ConfigError(f"storage '{address}' cannot be opened: {_reason(error)}") from None
 
     def _open(self) -> optuna.storages.RDBStorage:
@@ -143,9 +147,7 @@ class PostgresStorage(StudyStorage):
         sessions = self._storage.scoped_session
         try:
             with self._engine.begin() as connection:
-                # A machine that stopped inside would keep all others out.
-                limit = f"SET LOCAL idle_in_transaction_session_timeout = {round(1e3 * self.grace)}"
-                connection.execute(text(limit))
+                connection.execute(text(f"SET LOCAL idle_in_transaction_session_timeout = '{IDLE_LIMIT:g}s'"))
                 self._lock(connection, f"study {self.study}")
                 # What Optuna commits in here are parts of this transaction.
                 factory = orm.sessionmaker(bind=connection, join_transaction_mode="create_savepoint")
@@ -236,7 +238,7 @@ class PostgresStorage(StudyStorage):
                 study, old = None, None
             new = accept(old)
             if study is None:
-                directions = ["maximize"] * objectives
+                directions = [optuna.study.StudyDirection.MAXIMIZE] * objectives
                 study = optuna.create_study(study_name=self.study, storage=self.optuna, directions=directions)
             new["id"] = uuid.uuid4().hex if old is None else old["id"]
             for key, value in new.items():

@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 
 from codesign import plots
+from codesign.exports import write_exports
 from codesign.folder import StudyFolder
 from codesign.objectives import OBJECTIVES
 from codesign.plots import place, present, shown_unit
@@ -47,11 +48,18 @@ def write_report(folder: str | Path) -> Path:
 
     study = StudyFolder(folder)
     results = write_results(study)
+    files, no_files = [], ""
+    try:
+        files = write_exports(study)
+    except Exception as error:  # a report is worth having without them
+        no_files = f"Not written: {type(error).__name__}: {error}"
     templates = FileSystemLoader(Path(__file__).parent / "templates")
     environment = Environment(
         loader=templates, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    text = environment.get_template("report.html.j2").render(_context(study, results))
+    text = environment.get_template("report.html.j2").render(
+        {**_context(study, results), "files": files, "no_files": no_files}
+    )
     path = study.path / "report.html"
     with atomic_write(path, "w") as stream:
         stream.write(text)

@@ -30,11 +30,17 @@ __all__ = ["PHASES", "run_trials"]
 
 def run_trials(folder: StudyFolder) -> None:
     """Run trials until the study has as many as were asked for."""
+    from optuna.exceptions import UpdateFinishedTrialError
+
     with Ledger(folder) as ledger:
         while (trial := ledger.claim()) is not None:
             run = _give_up if trial.user_attrs.get("attempt", 1) > folder.config.attempts else run_trial
             # Where the storage goes away in the middle, training goes on from its last checkpoint.
-            ledger.finish(ledger.storage.patiently(partial(run, folder, trial)))
+            try:
+                result = ledger.storage.patiently(partial(run, folder, trial))
+            except UpdateFinishedTrialError:  # it was given away: this worker was out of reach, and counted as dead
+                continue
+            ledger.finish(result)
 
 
 def _give_up(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:

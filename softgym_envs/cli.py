@@ -200,9 +200,19 @@ def deploy(
         click.echo(f"wrote {file}")
 
 
+@cli.command("deploy-policy")
+@click.argument("policy")
+@click.argument("file", type=click.Path(path_type=Path))
+def deploy_policy(policy: str, file: Path) -> None:
+    """Write POLICY, a file or the name of a shipped one, to FILE (.onnx): sensor values in SI in, commands out."""
+    from agents.export import export_policy_onnx
+
+    click.echo(f"wrote {export_policy_onnx(policy, file)}")
+
+
 @cli.command()
 @click.argument("environment")
-@click.option("--agent", default="qp", show_default=True, help="qp, qp_static, random or a policy file.")
+@click.option("--agent", default="qp", show_default=True, help="qp, qp_static, qp_model, qp_pi, random or a policy.")
 @click.option("--backend", help="surrogate or fem; default that of the environment.")
 @click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
 @click.option("--seed", default=0, show_default=True)
@@ -307,7 +317,7 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
     multiple=True,
     default=("qp", "random"),
     show_default=True,
-    help="qp, qp_static, random or a policy file (repeat).",
+    help="qp, qp_static, qp_model, qp_pi, random or a policy (repeat).",
 )
 @click.option("--backend", "backends", multiple=True, help="Default that of the environment; repeat for several.")
 @click.option("--design", "design", multiple=True, help="Design variable, name=value in SI (repeat).")
@@ -351,6 +361,27 @@ def evaluate(
         asked = {"environment": environment.model_dump(mode="json"), "goals": goals, "seed": seed, "design": chosen}
         write_json(output, {**asked, **provenance(), "results": results})
         click.echo(f"wrote {output}")
+
+
+@cli.command()
+@click.option("--folder", type=click.Path(path_type=Path), help="Stored runs (default: those that ship).")
+@click.option("--output", type=click.Path(path_type=Path), help="Write the table here (.md) instead of showing it.")
+@click.option("--curves", type=click.Path(path_type=Path), help="Draw the learning curves here (.png, .svg, .pdf).")
+def results(folder: Path | None, output: Path | None, curves: Path | None) -> None:
+    """Make the table of agents, and their learning curves, from stored runs; see python -m agents.sweep."""
+    from agents.results import RESULTS, draw_curves, load_runs, table
+    from softgym_envs.storage import atomic_write
+
+    runs = load_runs(folder or RESULTS)
+    text = table(runs)
+    if output is None:
+        click.echo(text)
+    else:
+        with atomic_write(output, "w") as stream:
+            stream.write(text)
+        click.echo(f"wrote {output}")
+    if curves is not None:
+        click.echo(f"wrote {draw_curves(runs, curves)}")
 
 
 @cli.command()

@@ -462,5 +462,5 @@ def calibrate(
         folder = Path(folder)
         save_resolved(folder, config)
         write_json(folder / "result.json", {**provenance(), **result})
-        draw_calibration(folder / "calibration.png", box, fits, interval)
+        draw_calibration(folder / "calibration.png", box, fits, interval, refined)
     return result

@@ -48,9 +48,13 @@ def figure(path: str | Path, columns: int = 1, width: float = 5.2, height: float
 
 
 def draw_calibration(
-    path: str | Path, box: Box, fits: Sequence[Fit], interval: Mapping[str, Sequence[float]] | None
+    path: str | Path,
+    box: Box,
+    fits: Sequence[Fit],
+    interval: Mapping[str, Sequence[float]] | None,
+    refined: Fit | None = None,
 ) -> None:
-    """Draw the cost and each fitted variable against the evaluations, a line a start, with the interval."""
+    """Draw the cost and each fitted variable against the evaluations, a line a start, with interval and refined fit."""
     with figure(path, 1 + len(box)) as axes:
         for number, fit in enumerate(fits, start=1):
             steps = np.arange(1, len(fit.history) + 1)
@@ -63,6 +67,9 @@ def draw_calibration(
         for axis, name in zip(axes[1:], box.names, strict=True):
             unit, scale, _ = shown_unit(box.space[name].unit)
             axis.set_ylabel(name.replace("_", " ") + (f" [{unit}]" if unit else ""))
+            if refined is not None:
+                axis.axhline(scale * refined.found[name], color=BASELINE, ls="--", label="refined on FEM")
+                axis.legend()
             if interval is not None:
                 axis.axhspan(*(scale * end for end in interval[name]), color=OTHER, alpha=0.6, lw=0, zorder=0)
         for axis in axes:

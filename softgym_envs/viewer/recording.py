@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -19,7 +19,7 @@ from softgym_envs.robots.robot import Robot
 from softgym_envs.viewer.scene import COLORS, STUB, tension_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
-__all__ = ["RolloutRecorder", "record_rollout"]
+__all__ = ["RolloutRecorder", "record_comparison", "record_rollout"]
 
 Agent = Callable[[np.ndarray, SoftRobotEnv], np.ndarray]
 """Maps an observation and the environment, unwrapped, to an action."""
@@ -45,13 +45,23 @@ class RolloutRecorder:
         robot: the family of bodies.
         path: file to write; folders are made.
         name: name of the recording in the viewer.
+        roles: names of several rollouts to be seen side by side; all entities of one then lie under its name. `log`
+            writes to the rollout that `begin` named last.
     """
 
-    def __init__(self, robot: Robot, path: str | Path, *, name: str | None = None) -> None:
+    def __init__(
+        self, robot: Robot, path: str | Path, *, name: str | None = None, roles: Sequence[str] = ("",)
+    ) -> None:
         self.robot = robot
         self.path = Path(path)
         self.name = name or self.path.stem
+        self.roles = tuple(roles)
         self._shapes = ShapeFinder(robot)
+        self.begin(self.roles[0])
+
+    def begin(self, role: str) -> None:
+        """Write to the rollout of this role from now on."""
+        self._root = f"{role}/" if role else ""
         self._model: MechanicalModel | None = None
         self._goals: np.ndarray | None = None
 
@@ -63,16 +73,19 @@ class RolloutRecorder:
         # Only the timeline of the control steps: wall-clock time means nothing here.
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
+        roots = [f"{role}/" if role else "" for role in self.roles]
         plots = [
-            blueprint.TimeSeriesView(origin=f"plots/{kind}", name=kind.capitalize())
+            blueprint.TimeSeriesView(
+                origin="/", contents=[f"+ /{root}plots/{kind}/**" for root in roots], name=kind.capitalize()
+            )
             for kind in ("distance", "reward", "displacement", "effort")
         ]
+        views = [
+            blueprint.Spatial3DView(origin=f"{root}world", name=role or self.name, background=COLORS["background"])
+            for role, root in zip(self.roles, roots, strict=True)
+        ]
         layout = blueprint.Blueprint(
-            blueprint.Horizontal(
-                blueprint.Spatial3DView(origin="world", name=self.name, background=COLORS["background"]),
-                blueprint.Vertical(*plots),
-                column_shares=[3, 2],
-            ),
+            blueprint.Horizontal(*views, blueprint.Vertical(*plots), column_shares=[3] * len(views) + [2]),
             collapse_panels=True,
         )
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -80,7 +93,10 @@ class RolloutRecorder:
         os.close(handle)
         self._stream.save(self._temporary, default_blueprint=layout)
         self._stream.send_recording_name(self.name)
-        self._log_names()
+        for role in self.roles:
+            self.begin(role)
+            self._log_names()
+        self.begin(self.roles[0])
         return self
 
     def __exit__(
@@ -128,13 +144,14 @@ class RolloutRecorder:
             share = state.effort[row] / self.robot.effort_scale[row]
             color = COLORS["cable slack"] if state.slack[row] else tension_color(share)
             strip = rerun.LineStrips3D([line], radii=0.008 * size, colors=color)
-            self._stream.log(f"world/cables/{self.robot.actuators[row].name}", strip)
+            self._stream.log(f"{self._root}world/cables/{self.robot.actuators[row].name}", strip)
         effectors = rerun.Points3D(state.effector, radii=0.026 * size, colors=COLORS["effector"])
-        self._stream.log("world/effectors", effectors)
-        self._stream.log("world/goal", rerun.Points3D(goal, radii=0.034 * size, colors=COLORS["goal"]))
+        self._stream.log(f"{self._root}world/effectors", effectors)
+        self._stream.log(f"{self._root}world/goal", rerun.Points3D(goal, radii=0.034 * size, colors=COLORS["goal"]))
         if path is not None and len(path) > 1 and (self._goals is None or not np.array_equal(path, self._goals)):
             self._goals = np.array(path)
-            self._stream.log("world/path", rerun.LineStrips3D([path], radii=0.005 * size, colors=COLORS["goal"]))
+            goals = rerun.LineStrips3D([path], radii=0.005 * size, colors=COLORS["goal"])
+            self._stream.log(f"{self._root}world/path", goals)
 
         if distance is None:
             distance = float(np.linalg.norm(state.effector[0] - goal))
@@ -149,14 +166,15 @@ class RolloutRecorder:
     def _log_names(self) -> None:
         import rerun
 
-        self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._stream.log(f"{self._root}world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         names = {"distance": "distance [mm]", "reward": "reward"}
         for actuator in self.robot.actuators:
             unit, _, effort = _PLOTTED.get(actuator.unit, (actuator.unit, 1.0, "SI"))
             names[f"displacement/{actuator.name}"] = f"{actuator.name} [{unit}]"
             names[f"effort/{actuator.name}"] = f"{actuator.name} [{effort}]"
         for entity, name in names.items():
-            self._stream.log(f"plots/{entity}", rerun.SeriesLines(names=name), static=True)
+            label = f"{self._root.rstrip('/')} {name}".strip()
+            self._stream.log(f"{self._root}plots/{entity}", rerun.SeriesLines(names=label), static=True)
 
     def _log_body(self, model: MechanicalModel, x: np.ndarray) -> None:
         import rerun
@@ -179,12 +197,12 @@ class RolloutRecorder:
         else:
             # The viewer keeps the triangles and colours of the step that logged them last.
             mesh = rerun.Mesh3D.from_fields(vertex_positions=points, vertex_normals=normals)
-        self._stream.log("world/body", mesh)
+        self._stream.log(f"{self._root}world/body", mesh)
 
     def _plot(self, entity: str, value: float) -> None:
         import rerun
 
-        self._stream.log(f"plots/{entity}", rerun.Scalars(float(value)))
+        self._stream.log(f"{self._root}plots/{entity}", rerun.Scalars(float(value)))
 
 
 def record_rollout(
@@ -212,30 +230,83 @@ def record_rollout(
     Raises:
         ValueError: if the environment is no `SoftRobotEnv`, or has no time limit and ``steps`` is missing.
     """
+    name = Path(path).stem if env.spec is None else env.spec.id
+    with RolloutRecorder(_body_of(env).robot, path, name=name) as recorder:
+        return _roll_out(recorder, env, agent, seed, options, _limit(env, steps))
+
+
+def record_comparison(
+    env: gymnasium.Env,
+    rollouts: Mapping[str, tuple[Agent, Mapping[str, Any] | None]],
+    path: str | Path,
+    *,
+    seed: int | None = 0,
+    steps: int | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Run one episode for each of several agents, bodies or goals, and write them side by side to one ``.rrd`` file.
+
+    Args:
+        env: as for `record_rollout`.
+        rollouts: agent and options of the reset, by the name shown.
+        path: file to write.
+        seed: seed of every reset.
+        steps: largest number of steps; default the time limit of the environment.
+
+    Returns:
+        What `record_rollout` returns, by name.
+
+    Raises:
+        ValueError: as `record_rollout`, and if there are no rollouts.
+    """
+    if not rollouts:
+        raise ValueError("rollouts must hold at least one, got none")
+    with RolloutRecorder(_body_of(env).robot, path, roles=tuple(rollouts)) as recorder:
+        found = {}
+        for role, (agent, options) in rollouts.items():
+            recorder.begin(role)
+            found[role] = _roll_out(recorder, env, agent, seed, options, _limit(env, steps))
+        return found
+
+
+def _body_of(env: gymnasium.Env) -> SoftRobotEnv:
     body = env.unwrapped
     if not isinstance(body, SoftRobotEnv):
         raise ValueError(f"only rollouts of SoftRobotEnv can be recorded, got {type(body).__name__}")
-    if steps is None:
-        steps = None if env.spec is None else env.spec.max_episode_steps
-        if steps is None:
-            raise ValueError("the environment has no time limit: pass the number of steps as 'steps'")
-    name = Path(path).stem if env.spec is None else env.spec.id
-    with RolloutRecorder(body.robot, path, name=name) as recorder:
-        observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
-        recorder.log(0, body.design, body.state, body.goal, path=body.path, distance=float(info["distance"]))
-        total, step, over = 0.0, 0, False
-        while step < steps and not over:
-            observation, reward, terminated, truncated, info = env.step(agent(observation, body))
-            step, total, over = step + 1, total + float(reward), terminated or truncated
-            recorder.log(
-                step,
-                body.design,
-                body.state,
-                body.goal,
-                path=body.path,
-                reward=float(reward),
-                distance=float(info["distance"]),
-            )
+    return body
+
+
+def _limit(env: gymnasium.Env, steps: int | None) -> int:
+    limit = env.spec.max_episode_steps if steps is None and env.spec is not None else steps
+    if limit is None:
+        raise ValueError("the environment has no time limit: pass the number of steps as 'steps'")
+    return limit
+
+
+def _roll_out(
+    recorder: RolloutRecorder,
+    env: gymnasium.Env,
+    agent: Agent,
+    seed: int | None,
+    options: Mapping[str, Any] | None,
+    steps: int,
+) -> dict[str, Any]:
+    """Run one episode into an open recording."""
+    body = _body_of(env)
+    observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
+    recorder.log(0, body.design, body.state, body.goal, path=body.path, distance=float(info["distance"]))
+    total, step, over = 0.0, 0, False
+    while step < steps and not over:
+        observation, reward, terminated, truncated, info = env.step(agent(observation, body))
+        step, total, over = step + 1, total + float(reward), terminated or truncated
+        recorder.log(
+            step,
+            body.design,
+            body.state,
+            body.goal,
+            path=body.path,
+            reward=float(reward),
+            distance=float(info["distance"]),
+        )
     return {
         "return": total,
         "final_distance": float(info["distance"]),

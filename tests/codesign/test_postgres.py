@@ -7,6 +7,7 @@ import re
 import threading
 import time
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import optuna
 import pytest
@@ -14,13 +15,13 @@ import sqlalchemy as sql
 
 from benchmarks.codesign_scale import Sweep, faults
 from benchmarks.postgres_server import find_programs, temporary_server
+from codesign import worker
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
 from codesign.jobs import Job, missing_jobs, run_jobs
 from codesign.ledger import Ledger
 from codesign.postgres import SIGN, PostgresStorage
 from codesign.study import run_study
-from codesign.worker import run_trials
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 
 GRACE = 1.0
@@ -114,11 +115,11 @@ def test_body_of_a_dead_worker_runs_again_on_another_machine(machine):
 
 def test_signs_of_life_keep_a_trial(machine):
     folder = machine(trials=1)
-    with Ledger(folder) as worker, Ledger(folder) as other:
-        trial = worker.claim()
+    with Ledger(folder) as busy, Ledger(folder) as other:
+        trial = busy.claim()
         time.sleep(2.5 * GRACE)
         assert not other.claimable()
-        assert worker.finish(result(trial))
+        assert busy.finish(result(trial))
 
 
 def test_time_without_the_server_does_not_count(machine, server):
@@ -176,7 +177,7 @@ def test_body_that_kills_its_workers_is_given_up(machine):
             with doomed(folder) as victim:
                 assert victim.claim().number == number
         wait_for(watcher.claimable)
-        run_trials(folder)
+        worker.run_trials(folder)
         watcher.mirror()
         (found,) = folder.results()
     assert (found["number"], found["state"], found["reason"]) == (2, "infeasible", "2 workers died of it")
@@ -208,6 +209,27 @@ def test_files_do_not_change(machine):
     storage.publish({"trials/0000/policy.safetensors": b"\x00\xff"})
     storage.publish({"trials/0000/policy.safetensors": b"other"})
     assert storage.fetch("trials/0000/policy.safetensors") == b"\x00\xff"
+
+
+def test_policies_come_from_the_machine_that_trained_them(machine, monkeypatch):
+    a, b = machine("a", trials=1), machine("b", trials=1)
+    name = "trials/0000/policy.safetensors"
+    a.trial(0).mkdir(parents=True)
+    (a.path / name).write_bytes(b"weights")
+    (a.path / name).with_suffix(".json").write_bytes(b"{}")
+    tested = []
+    monkeypatch.setattr(worker, "run_jobs", lambda folder, jobs: tested.append(folder))
+    monkeypatch.setattr(worker, "finalists", lambda folder: [SimpleNamespace(policy=name)])
+    monkeypatch.setattr(worker, "finalist_jobs", lambda folder: [])
+    with Ledger(a) as ledger:
+        trial = ledger.claim()
+        with pytest.raises(DataError, match=f"policy '{name}' is neither in folder .* nor in storage"):
+            worker.PHASES["finalists"](b)
+        assert ledger.finish({**result(trial), "agent": name})
+    worker.PHASES["finalists"](b)
+    assert tested == [b]
+    assert (b.path / name).read_bytes() == b"weights"
+    assert (b.path / name).with_suffix(".json").read_bytes() == b"{}"
 
 
 def test_other_studies_are_refused(machine, server, tmp_path, tiny):

@@ -7,14 +7,16 @@ import sys
 from wsgiref.util import setup_testing_defaults
 
 import pytest
+from optuna.trial import TrialState
 
 from benchmarks.codesign_scale import Sweep, faults
+from codesign import worker
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
-from codesign.ledger import Ledger
+from codesign.ledger import Ledger, open_study
 from codesign.processes import run_workers
 from codesign.study import run_study
-from codesign.worker import _give_up, run_trials
+from codesign.worker import run_trials
 from softgym_envs.errors import ConfigError
 
 SMALL = {"count": 2, "unseen_count": 2, "training_count": 2}
@@ -67,7 +69,7 @@ def test_worker_that_is_killed_is_replaced(study, monkeypatch, tmp_path):
 def test_given_up_body_has_the_record_of_a_trial(study):
     folder = study(trials=2, goals=SMALL)
     with Ledger(folder) as ledger:
-        given_up = _give_up(folder, ledger.claim())
+        given_up = worker._give_up(folder, ledger.claim())
         ledger.finish(given_up)
     run_trials(folder)
     (whole,) = folder.results()
@@ -86,6 +88,22 @@ def test_attempts_count_only_without_progress(study):
                     trial.report(0.5, step)
         attempts.append(ledger.claim().user_attrs["attempt"])
     assert attempts == [1, 2, 3, 1, 2]
+
+
+def test_worker_goes_on_when_its_trial_was_given_away(study, monkeypatch):
+    folder = study(trials=2, goals=SMALL)
+    original = worker.run_trial
+
+    def run_trial(folder, trial):
+        if trial.number == 0:
+            open_study(folder).tell(0, state=TrialState.FAIL)
+            trial.report(0.5, 1)
+        return original(folder, trial)
+
+    monkeypatch.setattr(worker, "run_trial", run_trial)
+    worker.run_trials(folder)
+    assert [trial.state.name for trial in open_study(folder).trials] == ["FAIL", "COMPLETE", "COMPLETE"]
+    assert [record["number"] for record in folder.results()] == [1, 2]
 
 
 def test_ray_that_is_not_installed(study, monkeypatch):

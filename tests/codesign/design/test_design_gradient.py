@@ -55,7 +55,9 @@ def test_target_and_weights(tmp_path):
     found = []
     for weight in (0.1, 0.9):
         config = configured(
-            {"metric": "bending_angle", "weight": weight}, {"metric": "contact_force", "weight": 1 - weight}, check=False
+            {"metric": "bending_angle", "weight": weight},
+            {"metric": "contact_force", "weight": 1 - weight},
+            check=False,
         )
         found.append(optimise(config, tmp_path / str(weight))["best"]["surrogate"])
     assert found[0]["contact_force"] > found[1]["contact_force"] + 0.5

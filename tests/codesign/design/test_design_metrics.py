@@ -79,7 +79,9 @@ def test_gradients_are_derivatives(finger, name):
             h = torch.zeros(1, 5, dtype=torch.float64)
             h[0, k] = 1e-5
             difference = (learned(box.values(point + h)) - learned(box.values(point - h)))[0, 0] / 2e-5
-            assert float(gradient[0, k]) == pytest.approx(float(difference), rel=1e-5, abs=1e-7 * float(gradient.norm()))
+            assert float(gradient[0, k]) == pytest.approx(
+                float(difference), rel=1e-5, abs=1e-7 * float(gradient.norm())
+            )
 
 
 def test_sensorized_finger_reads_what_the_robot_reads():

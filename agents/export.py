@@ -1,0 +1,163 @@
+"""Trained policies outside Python: ONNX graphs that take what sensors give, in SI units."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agents.config import EnvironmentConfig
+from agents.policy import Policy
+from softgym_envs.storage import atomic_write
+from softgym_envs.version import __version__
+
+if TYPE_CHECKING:
+    from softgym_envs.envs.interface import Interface
+
+__all__ = ["export_policy_onnx"]
+
+OPSET, IR_VERSION = 17, 8
+"""What the graph is written in: that of the surrogates' graphs."""
+
+
+def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
+    """Write a policy as an ONNX graph with the scaling of its observations inside, atomically.
+
+    Inputs, all float32 and in SI units, for any number B of states at once: ``command``, ``displacement`` and ``effort`` of
+    the actuators (B, n_a), ``effector`` and ``goal`` [m] (B, 3), in dynamics the effector's ``velocity`` [m/s] (B, 3), and
+    ``design`` (B, k) for a policy that sees its body. Outputs are the ``action`` (B, n_a) in [-1, 1], and the
+    ``next_command`` (B, n_a) it stands for, within rates and ranges. A policy that acts on top of the inverse QP has no
+    ``next_command``: its action is to be added to that of a QP. The metadata name environment, actuators, design
+    variables and the policy's training.
+
+    Args:
+        policy: a policy, its file, or the name of a shipped one.
+        path: where to, ending with ``.onnx``.
+
+    Returns:
+        The path.
+
+    Raises:
+        WeightsError: if the policy cannot be read.
+        ValueError: for another ending, or where ``onnx`` is not installed.
+    """
+    path = Path(path)
+    if path.suffix != ".onnx":
+        raise ValueError(f"'{path}' must end with .onnx")
+    try:
+        import onnx
+    except ImportError:
+        raise ValueError("ONNX files need the package onnx: pip install 'softgym-envs[onnx]'") from None
+    policy = policy if isinstance(policy, Policy) else Policy(policy)
+    config = EnvironmentConfig.model_validate(policy.card["config"]["environment"])
+    env = config.make()
+    interface: Interface = env.unwrapped.interface  # type: ignore[attr-defined]
+    env.close()
+    data = _graph(policy, interface, config, onnx).SerializeToString()
+    with atomic_write(path) as stream:
+        stream.write(data)
+    return path
+
+
+class _Nodes:
+    """Writes nodes and constants of a graph."""
+
+    def __init__(self, onnx: Any) -> None:
+        self.onnx = onnx
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def __call__(self, operator: str, *inputs: str | np.ndarray | float, output: str = "", **attributes: Any) -> str:
+        names = [value if isinstance(value, str) else self._constant(value) for value in inputs]
+        name = output or f"v{len(self.nodes)}"
+        self.nodes.append(self.onnx.helper.make_node(operator, names, [name], **attributes))
+        return name
+
+    def _constant(self, value: np.ndarray | float) -> str:
+        name = f"c{len(self.constants)}"
+        self.constants.append(self.onnx.numpy_helper.from_array(np.asarray(value, dtype=np.float32), name))
+        return name
+
+    def squashed(self, value: str) -> str:
+        """x / (1 + |x|)."""
+        return self("Div", value, self("Add", self("Abs", value), 1.0))
+
+
+def _graph(policy: Policy, interface: Interface, config: EnvironmentConfig, onnx: Any) -> Any:
+    robot, n = interface.robot, len(interface.robot.actuators)
+    sizes = {"command": n, "displacement": n, "effort": n, "effector": 3, "goal": 3}
+    if interface.moving:
+        sizes["velocity"] = 3
+    if interface.design_names:
+        sizes["design"] = len(interface.design_names)
+
+    g = _Nodes(onnx)
+    middle, half = 0.5 * (interface.lower + interface.upper), 0.5 * (interface.upper - interface.lower)
+    parts = [g("Div", g("Sub", name, middle), half) for name in ("command", "displacement")]
+    parts.append(g.squashed(g("Div", "effort", robot.effort_scale)))
+    parts += [g("Div", name, interface.reach) for name in ("effector", "goal")]
+    parts.append(g.squashed(g("Mul", g("Sub", "goal", "effector"), interface.axes / interface.error_scale)))
+    if interface.moving:
+        parts.append(g.squashed(g("Div", "velocity", robot.size)))
+    if interface.design_names:
+        parts.append(_unit_design(interface, g))
+    h = g("Clip", g("Concat", *parts, axis=-1), -1.0, 1.0)
+    for weight, bias in policy.hidden:
+        h = g("Relu", g("Add", g("MatMul", h, weight), bias))
+    weight, bias = policy.mean
+    action = g("Tanh", g("Add", g("MatMul", h, weight), bias), output="action")
+    outputs = ["action"]
+    if not config.on_qp:
+        outputs.append("next_command")
+        if interface.action_mode == "increment":
+            target = g("Add", "command", g("Mul", action, interface.rates))
+        else:
+            step = g("Sub", g("Add", g("Mul", action, half), middle), "command")
+            step = g("Min", g("Max", step, -interface.rates), interface.rates)
+            target = g("Add", "command", step)
+        g("Min", g("Max", target, interface.lower), interface.upper, output="next_command")
+
+    def value(name: str, size: int) -> Any:
+        return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["B", size])
+
+    graph = onnx.helper.make_graph(
+        g.nodes,
+        "policy",
+        [value(name, size) for name, size in sizes.items()],
+        [value(name, n) for name in outputs],
+        g.constants,
+    )
+    model = onnx.helper.make_model(
+        graph,
+        opset_imports=[onnx.helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        producer_name="softgym-envs",
+        producer_version=__version__,
+    )
+    space = robot.design_space
+    described = {
+        "environment": json.dumps(config.model_dump(mode="json")),
+        "actuators": json.dumps([{"name": a.name, "low": a.low, "high": a.high, "unit": a.unit} for a in robot.actuators]),
+        "design": json.dumps([{"name": name, "unit": space[name].unit} for name in interface.design_names]),
+        "steps": str(policy.card.get("steps")),
+    }
+    onnx.helper.set_model_props(model, described)
+    onnx.checker.check_model(model)
+    return model
+
+
+def _unit_design(interface: Interface, g: _Nodes) -> str:
+    """Design variables in [-1, 1], as the observation shows them."""
+    variables = [interface.robot.design_space[name] for name in interface.design_names]
+    is_log = np.array([variable.log for variable in variables])
+    low, high = (np.array([getattr(variable, end) for variable in variables]) for end in ("low", "high"))
+    low, high = (np.where(is_log, np.log(np.where(is_log, end, 1.0)), end) for end in (low, high))
+    shown = "design"
+    if is_log.any():
+        # Both branches are evaluated; the logarithm only ever sees positive numbers.
+        inside = g("Log", g("Max", "design", np.float32(1e-30)))
+        mixed = g("Mul", inside, is_log.astype(float))
+        shown = g("Add", mixed, g("Mul", "design", (~is_log).astype(float)))
+    return g("Sub", g("Mul", g("Sub", shown, low), 2.0 / (high - low)), 1.0)

@@ -1,0 +1,210 @@
+"""Tables and learning curves from stored runs (`agents.sweep` makes them)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.config import EnvironmentConfig
+from agents.statistics import Estimate, crossed_estimate, stratified_estimate
+from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.errors import DataError
+
+__all__ = ["StoredRuns", "draw_curves", "load_runs", "table"]
+
+RESULTS = Path(__file__).parent / "results"
+"""Stored runs of the configurations that ship."""
+
+AGENTS = {
+    "sac": "SAC",
+    "qp": "QP",
+    "qp_model": "QP, model",
+    "qp_pi": "QP, model, PI",
+    "random": "random",
+}
+
+
+@dataclass(frozen=True)
+class StoredRuns:
+    """All seeds of one configuration, and the agents that need no training on the same goals.
+
+    Attributes:
+        name: of the configuration.
+        environment: what was trained on.
+        runs: contents of ``seed<k>.json``, by seed.
+        baselines: contents of ``baselines.json``, empty where it is missing.
+    """
+
+    name: str
+    environment: EnvironmentConfig
+    runs: list[dict[str, Any]]
+    baselines: dict[str, Any]
+
+    def scores(self, agent: str, backend: str, column: str) -> np.ndarray | None:
+        """One column of the final evaluation, shape (seeds, goals), or None where it was not made.
+
+        Args:
+            agent: ``"sac"`` or the name of a baseline, of which there is one row.
+            backend: ``"own"`` for that of the environment, or ``"fem"``.
+            column: ``"distances"``, ``"mean_distances"``, ``"returns"`` or ``"successes"``; `table` shows the mean
+                distance along a path, and the last one to a goal that stays.
+        """
+        backend = self.environment.backend if backend == "own" else backend
+        sources = self.runs if agent == "sac" else [self.baselines]
+        rows = [source.get("evaluations", {}).get(backend, {}).get(agent) for source in sources]
+        found = [row[column] for row in rows if row is not None]
+        return np.array(found, dtype=float) if found else None
+
+    @property
+    def follows(self) -> bool:
+        """The task is a path."""
+        return ENVIRONMENTS[self.environment.id].task == "track"
+
+    @property
+    def horizon(self) -> int:
+        """Steps of an episode, so that a return divided by it is at most 1."""
+        return ENVIRONMENTS[self.environment.id].max_episode_steps
+
+
+def load_runs(folder: str | Path = RESULTS) -> list[StoredRuns]:
+    """Read ``<config>/seed<k>.json`` and ``<config>/baselines.json`` of a folder.
+
+    Raises:
+        DataError: if there are none, or a file cannot be read.
+    """
+    folder = Path(folder)
+    found = []
+    for place in sorted(path for path in folder.glob("*") if path.is_dir()):
+        runs = sorted((_read(path) for path in place.glob("seed*.json")), key=lambda run: run["seed"])
+        if runs:
+            path = place / "baselines.json"
+            environment = EnvironmentConfig.model_validate(runs[0]["config"]["environment"])
+            found.append(StoredRuns(place.name, environment, runs, _read(path) if path.exists() else {}))
+    if not found:
+        raise DataError(f"'{folder}' holds no results (<config>/seed<k>.json); make them with python -m agents.sweep")
+    return found
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise DataError(f"result '{path}' cannot be read: {error}") from None
+
+
+def table(runs: list[StoredRuns]) -> str:
+    """Markdown: distances and success on the environment's own backend and on FEM, and all environments together."""
+    seeds = sorted({len(entry.runs) for entry in runs})
+    text = [
+        f"Interquartile means over all seeds ({' or '.join(map(str, seeds))}) and goals, with 95 % bootstrap intervals over "
+        "both. Distances in mm: to the goal at the end of an episode, or the mean along a path (track tasks, marked *). The "
+        "step of the policy was chosen on other goals.\n"
+    ]
+    for backend, title in (("own", "On the backend of the training"), ("fem", "The same policies on FEM")):
+        shown = [entry for entry in runs if backend == "own" or entry.environment.backend != "fem"]
+        if any(entry.scores("sac", backend, "distances") is not None for entry in shown):
+            text += [f"\n## {title}\n", _grid(shown, lambda entry, agent, b=backend: _distance(entry, agent, b))]
+            text += ["\nGoals reached [%]:\n", _grid(shown, lambda entry, agent, b=backend: _success(entry, agent, b))]
+    text += ["\n## All environments\n", _together(runs)]
+    return "\n".join(text) + "\n"
+
+
+def _grid(runs: Iterable[StoredRuns], cell: Callable[[StoredRuns, str], str]) -> str:
+    lines = ["| configuration | " + " | ".join(AGENTS.values()) + " |", "|---" * (len(AGENTS) + 1) + "|"]
+    for entry in runs:
+        name = f"{entry.name}*" if entry.follows else entry.name
+        lines.append(f"| {name} | " + " | ".join(cell(entry, agent) for agent in AGENTS) + " |")
+    return "\n".join(lines)
+
+
+def _distance(entry: StoredRuns, agent: str, backend: str) -> str:
+    scores = entry.scores(agent, backend, "mean_distances" if entry.follows else "distances")
+    return "" if scores is None else _present(crossed_estimate(1e3 * scores))
+
+
+def _success(entry: StoredRuns, agent: str, backend: str) -> str:
+    scores = entry.scores(agent, backend, "successes")
+    return "" if scores is None else f"{100.0 * scores.mean():.0f}"
+
+
+def _present(estimate: Estimate, digits: int = 3) -> str:
+    def number(value: float) -> str:
+        return "0" if value == 0.0 else f"{float(f'{value:.{digits}g}'):g}" if abs(value) >= 1e-3 else f"{value:.0e}"
+
+    if np.isnan(estimate.low):
+        return number(estimate.value)
+    return f"{number(estimate.value)} [{number(estimate.low)}, {number(estimate.high)}]"
+
+
+def _together(runs: list[StoredRuns]) -> str:
+    """Returns as a share of the largest, over environments: one task each, its plain configuration."""
+    plain = [entry for entry in runs if not entry.environment.on_qp and not entry.environment.sample_design]
+    lines = [
+        "Return as a share of the largest possible one; interquartile mean over seeds and the plain configurations "
+        "(intervals: seeds resampled within each).\n",
+        "| backend | " + " | ".join(AGENTS.values()) + " |",
+        "|---" * (len(AGENTS) + 1) + "|",
+    ]
+    for backend, word in (("own", "of the training"), ("fem", "FEM")):
+        cells = []
+        for agent in AGENTS:
+            found = [(entry, entry.scores(agent, backend, "returns")) for entry in plain]
+            means = [scores.mean(axis=1) / entry.horizon for entry, scores in found if scores is not None]
+            count = min(map(len, means), default=0)
+            if not count:
+                cells.append("")
+                continue
+            shares = np.stack([mean[:count] for mean in means], axis=1)
+            cells.append(f"{_present(stratified_estimate(shares))} ({len(means)})")
+        lines.append(f"| {word} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n\nIn parentheses: how many environments."
+
+
+def draw_curves(runs: list[StoredRuns], path: str | Path, columns: int = 4) -> Path:
+    """Draw the mean return of the evaluations during training, a panel for each configuration: every seed and the mean.
+
+    The dashed line is the inverse QP on the goals of the final evaluation.
+
+    Args:
+        runs: what to draw.
+        path: picture, its ending names the format.
+        columns: of panels.
+
+    Returns:
+        The path.
+    """
+    from matplotlib.figure import Figure
+
+    rows = -(-len(runs) // columns)
+    figure = Figure(figsize=(3.0 * columns, 2.1 * rows), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
+    for panel in panels[len(runs) :]:
+        panel.remove()
+    for panel, entry in zip(panels, runs, strict=False):
+        curves = [
+            ([row["step"] for row in run["curve"]], [row["mean_return"] / entry.horizon for row in run["curve"]])
+            for run in entry.runs
+        ]
+        for steps, returns in curves:
+            panel.plot(steps, returns, color="#99d0ca", linewidth=1.0)
+        common = min(len(steps) for steps, _ in curves)
+        mean = np.mean([returns[:common] for _, returns in curves], axis=0)
+        panel.plot(curves[0][0][:common], mean, color="#0f766e", linewidth=2.0)
+        qp = entry.scores("qp", "own", "returns")
+        if qp is not None:
+            panel.axhline(qp.mean() / entry.horizon, color="#64748b", linestyle="--", linewidth=1.0)
+        panel.set_title(entry.name, fontsize=9)
+        panel.set_ylim(0.0, 1.0)
+        panel.tick_params(labelsize=7)
+        panel.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
+    figure.supxlabel("environment steps", fontsize=9)
+    figure.supylabel("return, share of the largest", fontsize=9)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    return path

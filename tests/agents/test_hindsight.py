@@ -1,0 +1,150 @@
+"""Hindsight goals: what is stored is relabelled as the environment itself would have shown and rewarded it."""
+
+import numpy as np
+import pytest
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from agents.config import EnvironmentConfig
+from agents.hindsight import HindsightBuffer
+
+REACH = EnvironmentConfig(id="SoftGym/DiamondReach-v0")
+
+
+def make_buffer(env, share, size=400):
+    return HindsightBuffer(
+        size * env.num_envs,
+        env.single_observation_space,
+        env.single_action_space,
+        "cpu",
+        n_envs=env.num_envs,
+        interface=env.interface,
+        task=env.task,
+        share=share,
+    )
+
+
+def fill(buffer, env, steps, seed=0):
+    """Random actions; returns effectors [m] after each step (steps, num_envs, 3), and which steps ended an episode."""
+    rng = np.random.default_rng(seed)
+    observation, _ = env.reset(seed=seed)
+    effectors, ends = [], []
+    for _ in range(steps):
+        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        following, reward, _, done, info = env.step(action)
+        last = info.get("final_info", info)
+        true = np.stack(
+            [o if f is None else f for o, f in zip(following, info.get("final_obs", [None] * 9), strict=False)]
+        )
+        buffer.add(observation, true, action, reward, done, [{"TimeLimit.truncated": bool(d)} for d in done])
+        effectors.append(last["effector"].copy())
+        ends.append(done.copy())
+        observation = following
+    return np.array(effectors), np.array(ends)
+
+
+def test_a_relabelled_transition_is_what_the_environment_gives_for_that_goal():
+    env = REACH.make_vec(3)
+    buffer = make_buffer(env, share=1.0)
+    rng = np.random.default_rng(5)
+    actions = rng.uniform(-1, 1, (20, 3, 4)).astype(np.float32)
+
+    def run(goals):
+        observation, _ = env.reset(seed=0, options={"goal": goals})
+        rows = []
+        for action in actions:
+            following, reward, _, _, info = env.step(action)
+            rows.append((observation, following, reward, info["effector"]))
+            observation = following
+        return rows
+
+    first = run(np.full((3, 1, 3), 0.1))
+    reached = first[12][3]
+    again = run(reached[:, None, :])
+    for k in range(13):
+        for part in (0, 1):
+            shown = env.interface.with_goal(first[k][part], reached)
+            assert np.abs(shown - again[k][part]).max() < 2e-6
+        distance = env.task.distance(env.interface.effector(first[k][1]), reached)
+        terms = env.task.reward_terms(distance, env.interface.effort_share(first[k][1]))
+        assert np.abs(np.prod(list(terms.values()), axis=0) - again[k][2]).max() < 1e-4
+    assert buffer.share == 1.0
+
+
+def test_new_goals_were_reached_at_or_after_the_transition_in_its_episode():
+    env = REACH.make_vec(4)
+    buffer = make_buffer(env, share=1.0)
+    effectors, ends = fill(buffer, env, 130)
+    np.random.seed(3)
+    rows = np.random.randint(0, 130, 300)
+    np.random.seed(4)
+    samples = buffer._get_samples(rows)
+    np.random.seed(4)
+    columns = np.random.randint(0, 4, 300)
+    goals = samples.next_observations.numpy()[:, buffer.interface.slices["goal"]] * buffer.interface.reach
+    episodes = np.cumsum(np.vstack([np.zeros((1, 4), bool), ends[:-1]]), axis=0)
+    ahead = []
+    for goal, row, column in zip(goals, rows, columns, strict=True):
+        k = int(np.argmin(np.linalg.norm(effectors[row:, column] - goal, axis=1))) + row
+        assert np.linalg.norm(effectors[k, column] - goal) < 1e-7
+        assert episodes[k, column] == episodes[row, column]
+        ahead.append(k - row)
+    assert 10 < np.mean(ahead) < 15  # uniform over what is left: a quarter of 50 steps on average
+
+
+def test_the_share_and_the_unchanged_rest():
+    env = REACH.make_vec(4)
+    buffer = make_buffer(env, share=0.8)
+    fill(buffer, env, 100)
+    plain = {}
+    for row in range(100):
+        for column in range(4):
+            plain[buffer.observations[row, column].tobytes()] = buffer.rewards[row, column]
+    np.random.seed(0)
+    samples = buffer.sample(4000)
+    kept = [observation.tobytes() in plain for observation in samples.observations.numpy()]
+    assert 0.18 < np.mean(kept) < 0.22
+    for observation, reward, same in zip(samples.observations.numpy(), samples.rewards.numpy(), kept, strict=True):
+        if same:
+            assert reward[0] == plain[observation.tobytes()]
+    assert samples.rewards[~np.array(kept)].mean() > 5 * samples.rewards[np.array(kept)].mean()
+    assert (samples.dones == 0).all()  # a time limit does not end what could be earned
+
+
+def test_without_hindsight_it_is_the_plain_buffer():
+    env = REACH.make_vec(2)
+    buffer = make_buffer(env, share=0.0)
+    plain = ReplayBuffer(800, env.single_observation_space, env.single_action_space, "cpu", n_envs=2)
+    fill(buffer, env, 60)
+    fill(plain, env, 60)
+    for a in (buffer, plain):
+        np.random.seed(0)
+        a.drawn = a._get_samples(np.arange(60))
+    for one, other in zip(buffer.drawn[:5], plain.drawn[:5], strict=True):
+        assert (one == other).all()
+
+
+def test_a_ring_that_overwrites_and_a_cut():
+    env = REACH.make_vec(2)
+    buffer = make_buffer(env, share=1.0, size=70)
+    fill(buffer, env, 120)  # episodes end at 49 and 99; positions 0 to 49 hold steps 70 to 119
+    assert buffer.full and buffer.pos == 50
+    steps = np.concatenate([np.arange(70, 120), np.arange(50, 70)])
+    expected = np.where(steps < 100, 99 % 70, -1)
+    assert (buffer.ends == expected[:, None]).all()
+    buffer.cut()
+    assert (buffer.ends[30:50] == 49).all() and (buffer.ends[:30] == 29).all() and (buffer.ends[50:] == 29).all()
+
+
+def test_a_step_that_was_not_found_earns_nothing_whatever_the_goal():
+    env = REACH.make_vec(2)
+    buffer = make_buffer(env, share=1.0)
+    fill(buffer, env, 10)
+    buffer.rewards[3] = 0.0
+    samples = buffer._get_samples(np.full(50, 3))
+    assert (samples.rewards == 0.0).all()
+
+
+def test_a_moving_goal_is_refused():
+    env = EnvironmentConfig(id="SoftGym/DiamondTrack-v0").make_vec(2)
+    with pytest.raises(ValueError, match=r"hindsight = 0\.5 needs a goal that stays; task 'track'"):
+        make_buffer(env, share=0.5)

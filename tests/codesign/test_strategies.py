@@ -1,0 +1,141 @@
+"""Whole tiny studies of the strategies whose trials train nothing, of several objectives and of retrained finalists."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from codesign.config import StudyConfig
+from codesign.finalists import evaluations, pareto_trials
+from codesign.folder import StudyFolder
+from codesign.judge import JUDGE, joint_config
+from codesign.ledger import open_study
+from codesign.report import write_report
+from codesign.study import run_study
+
+SHOWN = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
+LIMIT = 3.5e-5  # m3; bodies of the test lie on both sides
+QUICK = {"net_arch": [16], "learning_starts": 100, "batch_size": 32, "gradient_steps": 1}
+
+
+@pytest.fixture
+def run(tmp_path, tiny):
+    """Function ``run(**changes) -> (StudyFolder, results)``."""
+
+    def start(**changes):
+        folder = tmp_path / "study"
+        results = run_study(StudyConfig.model_validate(tiny(**changes)), folder, progress=False)
+        return StudyFolder(folder), results
+
+    return start
+
+
+def test_policy_as_judge_with_pruning_by_goals(run):
+    folder, results = run(
+        strategy="policy",
+        policy="finger_reach_designs",
+        environment=SHOWN,
+        trials=8,
+        goals={"count": 24, "unseen_count": 2, "training_count": 4},
+        pruner={"name": "wilcoxon", "options": {"p_threshold": 0.3}},
+    )
+    assert results["trials"]["infeasible"] == 0 and results["cost"]["training_steps"] == 0
+    assert (folder.path / JUDGE).exists()
+    for trial in folder.results():
+        seen = len(trial["evaluation"]["distances"])
+        assert trial["agent"] == JUDGE
+        assert seen == 24 if trial["state"] == "complete" else seen in (8, 16)
+    states = [trial["state"] for trial in folder.results()]
+    assert states[0] == "complete"  # the baseline is never pruned
+    # Each goal was reported once, under its own number.
+    for trial in open_study(folder).get_trials():
+        record = folder.result(trial.number)["evaluation"]["distances"]
+        np.testing.assert_allclose([-trial.intermediate_values[k] for k in range(len(record))], record)
+
+
+@pytest.mark.parametrize("strategy", ["critic", "distribution"])
+def test_joint_training_gives_the_judge_and_the_first_bodies(strategy, run):
+    joint = {"steps": 320, "report_every": 160, "evaluation_episodes": 2, "keep": 2, "sac": QUICK}
+    folder, results = run(strategy=strategy, environment=SHOWN, trials=4, joint=joint)
+    trials = folder.results()
+    assert [trial["origin"] for trial in trials] == ["baseline", "joint 0", "joint 1", "sampler 3"]
+    told = json.loads((folder.path / "judge" / "judge.json").read_text())
+    for trial, body in zip(trials[1:3], told["bodies"], strict=False):
+        assert {name: trial["design"][name] for name in body} == pytest.approx(body)
+        assert set(body) == set(folder.config.variables)
+    config = joint_config(folder)
+    assert config.environment.sample_design == list(folder.config.variables)
+    assert config.environment.task_options["goals"] == folder.goals["training"].tolist()
+    assert results["cost"]["joint_steps"] == 320 and results["cost"]["cpu_seconds"]["judge"] > 0.0
+    assert "trained together" in write_report(folder.path).read_text()
+
+
+def test_several_objectives_and_limits(run):
+    folder, results = run(
+        also=["material_volume"], limits={"material_volume": LIMIT}, sampler={"name": "nsgaii"}, trials=10
+    )
+    trials = folder.results()
+    study = open_study(folder)
+    assert len(study.directions) == 2
+    for trial in trials:
+        record = trial["evaluation"]
+        assert trial["scores"] == [-record["mean_distance"], -record["material_volume"]]
+        assert trial["violations"] == pytest.approx([record["material_volume"] - LIMIT])
+        assert study.get_trials()[trial["number"]].values == trial["scores"]
+        assert study.get_trials()[trial["number"]].constraints == {"material_volume": trial["violations"][0]}
+        volume = folder.config.robot.build(trial["design"]).volume
+        assert record["material_volume"] == pytest.approx(volume, rel=1e-12)
+    allowed = [trial for trial in trials if trial["violations"][0] <= 0.0]
+    assert 0 < len(allowed) < len(trials)
+    front = pareto_trials(folder)
+    assert results["pareto"] == [trial["number"] for trial in front]
+    for trial in allowed:
+        beaten = any(
+            all(a >= b for a, b in zip(other["scores"], trial["scores"], strict=True))
+            and other["scores"] != trial["scores"]
+            for other in allowed
+        )
+        assert beaten != (trial["number"] in results["pareto"])
+    assert "Pareto" in write_report(folder.path).read_text()
+
+
+def test_finalists_are_trained_anew_with_several_seeds(run):
+    folder, results = run(
+        strategy="scratch",
+        trials=2,
+        training={"steps": 160, "report_every": 80, "evaluation_episodes": 2, "sac": QUICK},
+        finalists={"count": 1, "seeds": 2, "steps": 240},
+    )
+    names = {path.name for path in (folder.path / "finalists").iterdir()}
+    for body in (0, 1):
+        for seed in (1, 2):
+            card = json.loads((folder.path / "finalists" / f"trial000{body}-seed{seed}" / "policy.json").read_text())
+            assert card["config"]["seed"] == seed and card["steps"] == 240
+            assert f"trial000{body}-sac-seed{seed}-fem-unseen.json" in names
+    both = [r for r in evaluations(folder) if (r["agent"], r["backend"]) == ("sac", "surrogate")]
+    assert len(both) == 2
+    for record in both:
+        parts = [
+            json.loads(
+                (
+                    folder.path / "finalists" / f"trial{record['trial']:04d}-sac-seed{s}-surrogate-unseen.json"
+                ).read_text()
+            )
+            for s in (1, 2)
+        ]
+        np.testing.assert_allclose(record["distances"], np.mean([part["distances"] for part in parts], axis=0))
+        assert record["of_seeds"]["mean_distance"] == [part["mean_distance"] for part in parts]
+    assert {row["agent"] for row in results["comparison"]} == {"sac", "qp"}
+    write_report(folder.path)
+    winner = f"winner-trial{results['winner']['trial']:04d}"
+    assert (folder.path / f"{winner}.stl").stat().st_size > 10_000
+    assert (folder.path / f"{winner}.rrd").read_bytes()[:3] == b"RRF"
+
+
+def test_every_strategy_is_described():
+    from codesign.config import STRATEGIES
+    from codesign.report import CONTROLLERS
+
+    assert set(CONTROLLERS) == set(STRATEGIES)
