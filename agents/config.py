@@ -31,7 +31,9 @@ class EnvironmentConfig(Config):
     robot_options: dict[str, Any] = {}
     task_options: dict[str, Any] = {}
     backend_options: dict[str, Any] = {}
-    on_qp: float = Field(default=0.0, ge=0, le=2, description="share of the agent's action on top of the QP's; 0: no QP")
+    on_qp: float = Field(
+        default=0.0, ge=0, le=2, description="share of the agent's action on top of the QP's; 0: no QP"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -64,7 +66,7 @@ class EnvironmentConfig(Config):
         env = gymnasium.make(self.id, **self._options(overrides))
         return self._wrapped(env) if self.on_qp else env
 
-    def _wrapped(self, env: gymnasium.Env) -> gymnasium.Env:
+    def _wrapped(self, env: gymnasium.Env) -> gymnasium.Wrapper:
         from agents.on_qp import OnQP
 
         return OnQP(env, self.on_qp)

@@ -25,12 +25,12 @@ OPSET, IR_VERSION = 17, 8
 def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
     """Write a policy as an ONNX graph with the scaling of its observations inside, atomically.
 
-    Inputs, all float32 and in SI units, for any number B of states at once: ``command``, ``displacement`` and ``effort`` of
-    the actuators (B, n_a), ``effector`` and ``goal`` [m] (B, 3), in dynamics the effector's ``velocity`` [m/s] (B, 3), and
-    ``design`` (B, k) for a policy that sees its body. Outputs are the ``action`` (B, n_a) in [-1, 1], and the
-    ``next_command`` (B, n_a) it stands for, within rates and ranges. A policy that acts on top of the inverse QP has no
-    ``next_command``: its action is to be added to that of a QP. The metadata name environment, actuators, design
-    variables and the policy's training.
+    Inputs, all float32 and in SI units, for any number B of states at once: ``command``, ``displacement`` and
+    ``effort`` of the actuators (B, n_a), ``effector`` and ``goal`` [m] (B, 3), in dynamics the effector's ``velocity``
+    [m/s] (B, 3), and ``design`` (B, k) for a policy that sees its body. Outputs are the ``action`` (B, n_a) in [-1, 1]
+    and the ``next_command`` (B, n_a) it stands for, within rates and ranges. A policy that acts on top of the inverse
+    QP has no ``next_command``: its action is to be added to that of a QP. The metadata name environment, actuators,
+    design variables and the steps of the training.
 
     Args:
         policy: a policy, its file, or the name of a shipped one.
@@ -81,7 +81,7 @@ class _Nodes:
         return name
 
     def squashed(self, value: str) -> str:
-        """x / (1 + |x|)."""
+        """Return x / (1 + |x|)."""
         return self("Div", value, self("Add", self("Abs", value), 1.0))
 
 
@@ -139,7 +139,9 @@ def _graph(policy: Policy, interface: Interface, config: EnvironmentConfig, onnx
     space = robot.design_space
     described = {
         "environment": json.dumps(config.model_dump(mode="json")),
-        "actuators": json.dumps([{"name": a.name, "low": a.low, "high": a.high, "unit": a.unit} for a in robot.actuators]),
+        "actuators": json.dumps(
+            [{"name": a.name, "low": a.low, "high": a.high, "unit": a.unit} for a in robot.actuators]
+        ),
         "design": json.dumps([{"name": name, "unit": space[name].unit} for name in interface.design_names]),
         "steps": str(policy.card.get("steps")),
     }
@@ -157,7 +159,7 @@ def _unit_design(interface: Interface, g: _Nodes) -> str:
     shown = "design"
     if is_log.any():
         # Both branches are evaluated; the logarithm only ever sees positive numbers.
-        inside = g("Log", g("Max", "design", np.float32(1e-30)))
+        inside = g("Log", g("Max", "design", 1e-30))
         mixed = g("Mul", inside, is_log.astype(float))
         shown = g("Add", mixed, g("Mul", "design", (~is_log).astype(float)))
     return g("Sub", g("Mul", g("Sub", shown, low), 2.0 / (high - low)), 1.0)

@@ -47,10 +47,9 @@ class VectorOnQP(gymnasium.vector.VectorActionWrapper):
     def __init__(self, env: gymnasium.vector.VectorEnv, share: float) -> None:
         super().__init__(env)
         self.share = share
-        self._batch: Any = env.unwrapped
-        self._controllers: list[InverseQP] = [
-            make_controller(self._batch.robot, self._batch.task) for _ in range(env.num_envs)
-        ]
+        batch: Any = env.unwrapped
+        self._batch = batch
+        self._controllers: list[InverseQP] = [make_controller(batch.robot, batch.task) for _ in range(env.num_envs)]
 
     def actions(self, actions: np.ndarray) -> np.ndarray:
         """Return the actions that are done, shape (num_envs, n_a)."""

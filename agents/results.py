@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,7 @@ class StoredRuns:
         Args:
             agent: ``"sac"`` or the name of a baseline, of which there is one row.
             backend: ``"own"`` for that of the environment, or ``"fem"``.
-            column: ``"distances"``, ``"mean_distances"``, ``"returns"`` or ``"successes"``; `table` shows the mean
-                distance along a path, and the last one to a goal that stays.
+            column: ``"distances"``, ``"mean_distances"``, ``"returns"`` or ``"successes"``.
         """
         backend = self.environment.backend if backend == "own" else backend
         sources = self.runs if agent == "sac" else [self.baselines]
@@ -101,15 +101,15 @@ def table(runs: list[StoredRuns]) -> str:
     """Markdown: distances and success on the environment's own backend and on FEM, and all environments together."""
     seeds = sorted({len(entry.runs) for entry in runs})
     text = [
-        f"Interquartile means over all seeds ({' or '.join(map(str, seeds))}) and goals, with 95 % bootstrap intervals over "
-        "both. Distances in mm: to the goal at the end of an episode, or the mean along a path (track tasks, marked *). The "
-        "step of the policy was chosen on other goals.\n"
+        f"Interquartile means over all seeds ({' or '.join(map(str, seeds))}) and goals, with 95 % bootstrap intervals "
+        "over both. Distances in mm: to the goal at the end of an episode, or the mean along a path (track tasks, "
+        "marked *). The step of the policy was chosen on other goals.\n"
     ]
     for backend, title in (("own", "On the backend of the training"), ("fem", "The same policies on FEM")):
         shown = [entry for entry in runs if backend == "own" or entry.environment.backend != "fem"]
         if any(entry.scores("sac", backend, "distances") is not None for entry in shown):
-            text += [f"\n## {title}\n", _grid(shown, lambda entry, agent, b=backend: _distance(entry, agent, b))]
-            text += ["\nGoals reached [%]:\n", _grid(shown, lambda entry, agent, b=backend: _success(entry, agent, b))]
+            text += [f"\n## {title}\n", _grid(shown, partial(_distance, backend=backend))]
+            text += ["\nGoals reached [%]:\n", _grid(shown, partial(_success, backend=backend))]
     text += ["\n## All environments\n", _together(runs)]
     return "\n".join(text) + "\n"
 

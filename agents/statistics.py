@@ -90,7 +90,9 @@ def _checked(scores: np.ndarray) -> np.ndarray:
     return scores
 
 
-def _interval(samples: tuple[np.ndarray, ...], statistic: object, confidence: float, resamples: int, seed: int) -> Estimate:
+def _interval(
+    samples: tuple[np.ndarray, ...], statistic: object, confidence: float, resamples: int, seed: int
+) -> Estimate:
     result = stats.bootstrap(
         samples,
         statistic,

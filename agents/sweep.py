@@ -34,7 +34,7 @@ TEST_SEED = 2_000_003
 
 
 def unseen_goals(environment: EnvironmentConfig, count: int) -> tuple[list[dict[str, float]] | None, np.ndarray]:
-    """Bodies (None: the one body) and goals [m] (n, p, 3) of the final evaluation; n = 1 where the goal is always the same."""
+    """Bodies (None: the one body) and goals [m] (n, p, 3) of the final evaluation; n = 1 where all are the same."""
     from agents.evaluation import evaluation_set
 
     designs, goals = evaluation_set(environment, count, TEST_SEED)
@@ -148,7 +148,13 @@ def _cost(config: TrainConfig) -> float:
 
 
 def sweep(
-    configs: Sequence[Path], seeds: Sequence[int], processes: int, folder: Path, *, goals: int = 100, fem_goals: int = 10
+    configs: Sequence[Path],
+    seeds: Sequence[int],
+    processes: int,
+    folder: Path,
+    *,
+    goals: int = 100,
+    fem_goals: int = 10,
 ) -> int:
     """Run every configuration with every seed, and the baselines of each; returns how many jobs failed.
 

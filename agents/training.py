@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["train"]
 
-_EVALUATION_SEED = 1_000_003
+EVALUATION_SEED = 1_000_003
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "ends")
 _CURVE = ("step", "seconds", "success_rate", "mean_distance", "worst_distance", "mean_return")
 
@@ -42,10 +42,10 @@ def train(
 ) -> Path:
     """Train a SAC policy, or go on with an interrupted training in ``folder``.
 
-    Writes ``policy.safetensors`` (actor and critics) with its card, ``curve.csv``, TensorBoard logs where TensorBoard is
-    installed, and a ``checkpoint.safetensors`` from which an interrupted run resumes as if it had not been (weights,
-    optimiser moments, replay buffer and random states; all episodes start anew after each evaluation). The policy is
-    the one with the largest mean return among those that were evaluated; the card names its step.
+    Writes ``policy.safetensors`` (actor and critics) with its card, ``curve.csv``, TensorBoard logs where TensorBoard
+    is installed, and a ``checkpoint.safetensors`` from which a run that was stopped resumes as if it had not been
+    (weights, optimiser moments, replay buffer and random states; all episodes start anew after each evaluation). The
+    policy is the one with the largest mean return among those that were evaluated; the card names its step.
 
     Args:
         config: what to train.
@@ -93,7 +93,7 @@ def train(
         _load_weights(model, read_tensors(start_from), start_from)
     if proposer is not None:
         proposer.attach(model, config, folder)
-    designs, goals = evaluation_set(config.environment, config.evaluation_episodes, _EVALUATION_SEED)
+    designs, goals = evaluation_set(config.environment, config.evaluation_episodes, EVALUATION_SEED)
 
     start = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
     bar = tqdm(total=config.steps, initial=model.num_timesteps, unit="step", desc=folder.name, disable=not progress)
@@ -208,8 +208,9 @@ def _learn(model: SAC, target: int, bar: Any) -> None:
     if model.num_timesteps:
         seeds = np.random.SeedSequence([model.seed or 0, model.num_timesteps])
         model.get_env().seed(int(seeds.generate_state(1)[0]))  # type: ignore[union-attr]
-    if hasattr(model.replay_buffer, "cut"):
-        model.replay_buffer.cut()
+    buffer: Any = model.replay_buffer
+    if hasattr(buffer, "cut"):
+        buffer.cut()
     model.learn(target - model.num_timesteps, callback=Tick(), reset_num_timesteps=False, log_interval=20)
 
 
@@ -246,9 +247,7 @@ def _optimisers(model: SAC) -> dict[str, Any]:
     return found
 
 
-def _save_checkpoint(
-    model: SAC, path: Path, curve: list[dict[str, float]], best: dict[str, np.ndarray]
-) -> None:
+def _save_checkpoint(model: SAC, path: Path, curve: list[dict[str, float]], best: dict[str, np.ndarray]) -> None:
     import torch
     from safetensors.numpy import save
 

