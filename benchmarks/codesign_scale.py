@@ -181,6 +181,8 @@ def _killed_sweep(storage: str, seed: int) -> dict[str, object]:
                         moments.append(len(seen))
             seen |= finished(folder, trials)
         found = faults(folder, seen)
+        if process.returncode:
+            found.append(f"the last run ended with status {process.returncode}")
         states = Counter(trial.state.name for trial in open_study(folder).get_trials(deepcopy=False))
     if found or len(moments) < KILLS:
         raise AssertionError(f"sweep with storage '{storage}', {len(moments)} kills: {'; '.join(found)}")

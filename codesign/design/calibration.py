@@ -375,20 +375,25 @@ def profile_interval(misfit: Misfit, design: dict[str, float], name: str, level:
     width = max(float(np.sqrt(allowed * covariance[k, k])), 1e-5)  # residuals may be zero
     follow = covariance[:, k] / covariance[k, k]
 
+    known = {best[k]: -np.sqrt(allowed)}
+
     def excess(x: float) -> float:
-        point = np.clip(best + follow * (x - best[k]), -1.0, 1.0)
-        if not free.any():
-            return float(np.sum(misfit.residuals(point) ** 2)) - least - allowed
-        return float(2.0 * _solve(misfit, misfit.residuals, point, free, tolerance=1e-4).cost) - least - allowed
+        """Root of the loss of fit, which grows about in proportion to the distance, over what is allowed."""
+        if x not in known:
+            point = np.clip(best + follow * (x - best[k]), -1.0, 1.0)
+            if free.any():
+                point[free] = _solve(misfit, misfit.residuals, point, free, tolerance=1e-4).x
+            known[x] = np.sqrt(max(float(np.sum(misfit.residuals(point) ** 2)) - least, 0.0)) - np.sqrt(allowed)
+        return known[x]
 
     ends = []
     for bound in (-1.0, 1.0):
         inside = outside = best[k]
-        reach = 1.5 * width
+        reach = 1.1 * width
         while outside != bound:
             outside = float(np.clip(best[k] + bound * reach, -1.0, 1.0))
             if excess(outside) > 0.0:
-                outside = brentq(excess, inside, outside, xtol=1e-2 * width)
+                outside = brentq(excess, inside, outside, xtol=2e-2 * width)
                 break
             inside, reach = outside, 2.0 * reach
         end = best.copy()

@@ -77,7 +77,7 @@ def test_pi_corrects_a_model_that_is_not_the_plant():
     plant = on("TrunkReach", backend="fem")
     goals = sample_goals(on("TrunkReach"), 3, seed=11)
     distances = {name: evaluate(name, plant, goals).distances for name in ("qp", "qp_model", "qp_pi")}
-    assert (distances["qp_model"] > 1e-4).all()  # the surrogate's own error
+    assert (distances["qp_model"] > 2e-5).all()  # the surrogate's own error
     assert (distances["qp_pi"] < 0.2 * distances["qp_model"]).all()
     # Where the model is the plant there is nothing to correct.
     own = on("TrunkReach")

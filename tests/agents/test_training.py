@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -211,3 +212,32 @@ def test_each_goal_may_have_its_own_body(trained):
     for i, design in enumerate(designs):
         one = evaluate(trained, environment, goals[i : i + 1], design=design)
         assert both.distances[i] == pytest.approx(one.distances[0], abs=1e-6)
+
+
+def test_the_best_policy_is_kept_also_over_an_interruption(tmp_path, monkeypatch):
+    seen = []
+
+    def worse_and_worse(policy, *arguments, **options):
+        outcome = evaluate(policy, *arguments, **options)
+        seen.append(training.read_tensors(policy))
+        return replace(outcome, returns=np.full_like(outcome.returns, [10.0, 1.0, 2.0][len(seen) - 1]))
+
+    monkeypatch.setattr(training, "evaluate", worse_and_worse)
+    config = CONFIG.model_copy(update={"steps": 600})
+    original = training._learn
+
+    def learn(model, target, bar):
+        if len(seen) == 2 and learn.whole:
+            learn.whole = False
+            raise KeyboardInterrupt
+        original(model, target, bar)
+
+    learn.whole = True
+    monkeypatch.setattr(training, "_learn", learn)
+    with pytest.raises(KeyboardInterrupt):
+        train(config, tmp_path, progress=False)
+    policy = train(config, tmp_path, progress=False)
+    kept, card = training.read_tensors(policy), Policy(policy).card
+    assert card["best_step"] == 200 and card["steps"] == 600 and len(seen) == 3
+    assert all((kept[name] == value).all() for name, value in seen[0].items())
+    assert any((kept[name] != value).any() for name, value in seen[2].items())

@@ -1,0 +1,248 @@
+"""Statistics, sweeps, tables and exported policies."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents import sweep
+from agents.config import EnvironmentConfig, TrainConfig
+from agents.export import export_policy_onnx
+from agents.policy import Policy
+from agents.results import draw_curves, load_runs, table
+from agents.statistics import crossed_estimate, interquartile_mean, stratified_estimate
+from agents.training import train
+from softgym_envs.config import load_config
+from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.errors import ConfigError, DataError
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIGS = sorted((ROOT / "configs" / "agents").glob("*.yaml"))
+
+TINY = """
+environment: {id: SoftGym/FingerReach-v0}
+sac: {net_arch: [8, 8], batch_size: 16, learning_starts: 32, gradient_steps: 1, hindsight: 0.8}
+steps: 400
+num_envs: 8
+evaluation_episodes: 4
+report_every: 200
+"""
+
+
+def test_every_environment_has_a_configuration():
+    found = {load_config(path, TrainConfig).environment.id for path in CONFIGS}
+    assert found == set(ENVIRONMENTS)
+    names = {path.stem for path in CONFIGS}
+    assert {
+        f"{name}_designs" for name in ("diamond_reach", "trunk_reach", "cable_trunk_reach", "gripper_pinch")
+    } <= names
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_configurations_fit_their_environment(path):
+    config = load_config(path, TrainConfig)
+    row = ENVIRONMENTS[config.environment.id]
+    # A leg of the training that ends within an episode would cut it off.
+    assert config.report_every % (config.num_envs * row.max_episode_steps) == 0 or row.backend == "fem"
+    assert config.steps % config.report_every == 0
+    assert config.environment.sample_design == config.environment.design_in_observation
+    if config.sac.hindsight:
+        assert row.task == "reach"
+
+
+def test_interquartile_mean():
+    assert interquartile_mean(np.arange(8.0)) == 3.5
+    assert interquartile_mean(np.array([[0.0, 1.0, 2.0, 1000.0]])) == 1.5
+    assert interquartile_mean(np.array([3.0])) == 3.0
+
+
+def test_intervals_cover_the_truth_about_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    stratified = crossed = 0
+    for _ in range(60):
+        tasks = rng.normal(size=(10, 6))
+        estimate = stratified_estimate(tasks, resamples=300)
+        stratified += estimate.low <= 0.0 <= estimate.high
+        seeds = rng.normal(size=(10, 1)) + rng.normal(size=(1, 30)) + rng.normal(size=(10, 30))
+        estimate = crossed_estimate(seeds, resamples=300)
+        assert estimate.value == pytest.approx(interquartile_mean(seeds))
+        crossed += estimate.low <= 0.0 <= estimate.high
+    assert 51 <= stratified and 51 <= crossed  # 57 expected of 60
+
+
+def test_crossed_intervals_know_that_a_seed_shares_its_policy():
+    rng = np.random.default_rng(1)
+    seeds = rng.normal(size=(4, 1)) + 0.01 * rng.normal(size=(4, 200))
+    one = crossed_estimate(seeds)
+    assert one.high - one.low > 0.5  # four policies, not 800 samples
+    entries = stratified_estimate(seeds)
+    assert entries.high - entries.low < 0.3
+
+
+def test_what_cannot_be_resampled_has_no_interval():
+    assert np.isnan(crossed_estimate(np.ones((1, 1))).low)
+    assert np.isnan(stratified_estimate(np.ones((1, 5))).low)
+    assert crossed_estimate(np.array([[1.0, 2.0, 3.0, 4.0]])).low < 2.0
+    assert crossed_estimate(np.array([[1.0], [2.0]])) != crossed_estimate(np.array([[1.0], [1.0]]))
+    with pytest.raises(ValueError, match="finite table"):
+        crossed_estimate(np.array([[1.0, np.nan]]))
+    with pytest.raises(ValueError, match="finite table"):
+        stratified_estimate(np.ones(3))
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sweep")
+    (folder / "tiny.yaml").write_text(TINY)
+    command = [sys.executable, "-m", "agents.sweep", "--configs", "tiny.yaml", "--seeds", "0", "3", "--processes", "2"]
+    command += ["--folder", "out", "--goals", "5", "--fem-goals", "2"]
+    done = subprocess.run(command, cwd=folder, env=_environment(), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def _environment():
+    import os
+
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+def test_a_sweep_leaves_results_of_every_seed_and_the_baselines(swept):
+    place = swept / "out" / "results" / "tiny"
+    assert {path.name for path in place.iterdir()} == {"seed0.json", "seed3.json", "baselines.json"}
+    run = json.loads((place / "seed3.json").read_text())
+    assert run["config"]["seed"] == 3 and [row["step"] for row in run["curve"]] == [200, 400]
+    assert {backend: len(found["sac"]["distances"]) for backend, found in run["evaluations"].items()} == {
+        "surrogate": 5,
+        "fem": 2,
+    }
+    baselines = json.loads((place / "baselines.json").read_text())["evaluations"]
+    assert set(baselines["fem"]) == {"qp", "qp_model", "qp_pi", "random"}
+    assert max(baselines["surrogate"]["qp"]["distances"]) < 1e-4 < min(baselines["surrogate"]["random"]["distances"])
+
+
+def test_a_finished_sweep_runs_nothing_and_a_lost_result_is_made_again(swept, monkeypatch):
+    place = swept / "out" / "results" / "tiny"
+    before = (place / "seed0.json").read_text()
+    monkeypatch.setattr("agents.training._make_model", lambda *_: pytest.fail("trained again"))
+    assert sweep.sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0
+    (place / "seed0.json").unlink()
+    assert sweep.sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0
+    again, first = json.loads((place / "seed0.json").read_text()), json.loads(before)
+    assert (
+        again["evaluations"]["surrogate"]["sac"]["distances"] == first["evaluations"]["surrogate"]["sac"]["distances"]
+    )
+
+
+def test_an_error_of_one_job_does_not_end_the_others(swept, tmp_path, capsys):
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    broken = tmp_path / "out" / "runs" / "tiny" / "seed1"
+    broken.mkdir(parents=True)
+    (broken / "config.yaml").write_text((swept / "out/runs/tiny/seed0/config.yaml").read_text())  # of seed 0
+    assert sweep.sweep([tmp_path / "tiny.yaml"], [1], 1, tmp_path / "out", goals=2, fem_goals=0) == 1
+    assert "another configuration" in capsys.readouterr().out
+    assert (tmp_path / "out/results/tiny/baselines.json").exists()
+    (tmp_path / "bad.yaml").write_text("environment: {id: SoftGym/Octopus-v0}")
+    with pytest.raises(ConfigError, match="Octopus"):
+        sweep.sweep([tmp_path / "bad.yaml"], [1], 1, tmp_path / "out")
+
+
+def test_goals_of_the_final_evaluation_are_unseen_and_single_where_they_are_all_the_same():
+    from agents.evaluation import evaluation_set
+    from agents.training import EVALUATION_SEED
+
+    reach = EnvironmentConfig(id="SoftGym/FingerReach-v0")
+    _, goals = sweep.unseen_goals(reach, 6)
+    _, chosen = evaluation_set(reach, 6, EVALUATION_SEED)
+    assert goals.shape == (6, 1, 3) and not np.isin(goals, chosen).any()
+    assert sweep.unseen_goals(EnvironmentConfig(id="SoftGym/DiamondTrack-v0"), 6)[1].shape[0] == 1
+    designs, goals = sweep.unseen_goals(reach.model_copy(update={"sample_design": ["length"]}), 3)
+    assert len({design["length"] for design in designs}) == len(goals) == 3
+
+
+def test_the_table_and_the_curves(swept, tmp_path):
+    runs = load_runs(swept / "out" / "results")
+    text = table(runs)
+    assert text.count("| tiny |") == 4
+    qp = next(line for line in text.splitlines() if line.startswith("| tiny |")).split("|")[3]
+    scores = 1e3 * runs[0].scores("qp", "own", "distances")
+    assert float(qp.split("[")[0]) == pytest.approx(interquartile_mean(scores), rel=0.5)
+    assert "seeds (2)" in text
+    picture = draw_curves(runs, tmp_path / "curves.png")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(DataError, match="holds no results"):
+        load_runs(tmp_path)
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "seed0.json").write_text("{")
+    with pytest.raises(DataError, match=r"seed0\.json' cannot be read"):
+        load_runs(tmp_path)
+
+
+POLICIES = {
+    "increment": {"environment": {"id": "SoftGym/FingerReach-v0"}},
+    "absolute, bodies shown": {
+        "environment": {
+            "id": "SoftGym/DiamondReach-v0",
+            "action_mode": "absolute",
+            "design_in_observation": ["young_modulus", "top_height"],
+        }
+    },
+    "one axis": {"environment": {"id": "SoftGym/FingerPress-v0"}},
+    "moving": {"environment": {"id": "SoftGym/TetrapodReach-v0"}, "num_envs": 1},
+    "on the QP": {"environment": {"id": "SoftGym/TrunkReach-v0", "on_qp": 0.3}},
+}
+
+
+@pytest.mark.parametrize("case", POLICIES)
+def test_the_graph_of_a_policy_is_the_policy(case, tmp_path):
+    pytest.importorskip("onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    small = {"sac": {"net_arch": [16, 16], "learning_starts": 100}, "steps": 10, "num_envs": 2, "report_every": 10}
+    config = TrainConfig.model_validate({**small, "evaluation_episodes": 1, **POLICIES[case]})
+    policy = Policy(train(config, tmp_path / "run", progress=False))
+    session = runtime.InferenceSession(
+        str(export_policy_onnx(policy, tmp_path / "policy.onnx")), providers=["CPUExecutionProvider"]
+    )
+    env = config.environment.make().unwrapped
+    interface, robot = env.interface, env.robot
+    rng = np.random.default_rng(0)
+    count = 40
+    n = len(robot.actuators)
+    state = {
+        "command": rng.uniform(robot.lower, robot.upper, (count, n)),
+        "displacement": rng.uniform(robot.lower, robot.upper, (count, n)),
+        "effort": robot.effort_scale * rng.normal(size=(count, n)),
+        "effector": robot.size * rng.normal(size=(count, 3)),
+        "goal": robot.size * rng.normal(size=(count, 3)),
+        "velocity": robot.size * rng.normal(size=(count, 3)),
+    }
+    units = rng.uniform(-1, 1, (count, len(interface.design_names)))
+    design = (
+        np.stack(
+            [robot.design_space[name].from_unit(units[:, k]) for k, name in enumerate(interface.design_names)], axis=1
+        )
+        if interface.design_names
+        else np.zeros((count, 0))
+    )
+    expected = policy(interface.observe(*(state[name] for name in list(state)[:5]), units, state["velocity"]))
+    given = {**state, "design": design}
+    feed = {entry.name: given[entry.name].astype(np.float32) for entry in session.get_inputs()}
+    assert ("velocity" in feed) == (case == "moving") and ("design" in feed) == ("bodies" in case)
+    found = dict(zip([entry.name for entry in session.get_outputs()], session.run(None, feed), strict=True))
+    assert np.abs(found["action"] - expected).max() < 2e-5
+    if case == "on the QP":
+        assert set(found) == {"action"}
+    else:
+        command = interface.command(expected.astype(float), state["command"])
+        assert (np.abs(found["next_command"] - command) / (robot.upper - robot.lower)).max() < 1e-5
+
+
+def test_exports_name_what_is_wrong(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match=r"must end with \.onnx"):
+        export_policy_onnx("finger_reach", tmp_path / "policy.h")
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ValueError, match="pip install"):
+        export_policy_onnx("finger_reach", tmp_path / "policy.onnx")
