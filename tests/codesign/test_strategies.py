@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from codesign.config import StudyConfig
 from codesign.finalists import evaluations, pareto_trials
@@ -17,6 +20,7 @@ from codesign.study import run_study
 
 SHOWN = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
 LIMIT = 3.5e-5  # m3; bodies of the test lie on both sides
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 QUICK = {"net_arch": [16], "learning_starts": 100, "batch_size": 32, "gradient_steps": 1}
 
 
@@ -132,6 +136,26 @@ def test_finalists_are_trained_anew_with_several_seeds(run):
     winner = f"winner-trial{results['winner']['trial']:04d}"
     assert (folder.path / f"{winner}.stl").stat().st_size > 10_000
     assert (folder.path / f"{winner}.rrd").read_bytes()[:3] == b"RRF"
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+def test_report_opens_in_a_browser(run, tmp_path):
+    folder, results = run(finalists={"count": 1})
+    page = write_report(folder.path)
+    picture = tmp_path / "report.png"
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
+    wide = [*options, "--window-size=1100,2400", f"--screenshot={picture}", page.as_uri()]
+    subprocess.run([CHROMIUM, *wide], check=True, capture_output=True, timeout=120)
+    shown = np.asarray(Image.open(picture).convert("L"), dtype=float)
+    assert shown.shape == (2400, 1100)
+    # Bodies, tables and plots all the way down: no stretch of half a screen is empty.
+    assert all(part.std() > 3.0 for part in np.array_split(shown, 6))
+    dumped = subprocess.run(
+        [CHROMIUM, *options, "--dump-dom", page.as_uri()], check=True, capture_output=True, timeout=120, text=True
+    ).stdout
+    assert f"winner-trial{results['winner']['trial']:04d}.stl" in dumped
+    assert dumped.count("data:image/png") >= 4 and dumped.count("data:image/svg") >= 4
+    assert 'src="http' not in dumped and 'href="http' not in dumped  # self-contained
 
 
 def test_every_strategy_is_described():
