@@ -177,17 +177,22 @@ class LearnedMisfit(Misfit):
         self._reached = settled.displacement
         displacement = torch.as_tensor(settled.displacement)
         if free.any():
-            # One Newton step from the solution: what is driven in effort then moves with the design as it must.
-            loose = torch.as_tensor(free)
-            effort, _, W = self.net(values, displacement)
-            n = effort.shape[1]
-            K = torch.linalg.inv(W[:, :n, :n]).detach()
-            both = loose[:, :, None] & loose[:, None, :]
-            A = torch.where(both, K, torch.eye(n, dtype=torch.float64))
-            gap = torch.where(loose, effort - torch.as_tensor(target), 0.0)
-            displacement = displacement - torch.linalg.solve(A, gap)
+            # Newton's method once more in double precision, then a step that carries the derivatives: what is driven
+            # in effort moves with the design as it must.
+            with torch.no_grad():
+                displacement = self._step(values, displacement, free, target)
+            displacement = self._step(values, displacement, free, target)
         effort, effector, _ = self.net(values, displacement)
         return torch.cat([effort, effector], dim=1)
+
+    def _step(self, values: Tensor, displacement: Tensor, free: np.ndarray, target: np.ndarray) -> Tensor:
+        """One Newton step of the ``free`` displacements (N, n_a) towards their efforts ``target``."""
+        loose = torch.as_tensor(free)
+        effort, _, W = self.net(values, displacement)
+        n = effort.shape[1]
+        K = torch.linalg.inv(W[:, :n, :n]).detach()
+        A = torch.where(loose[:, :, None] & loose[:, None, :], K, torch.eye(n, dtype=torch.float64))
+        return displacement - torch.linalg.solve(A, torch.where(loose, effort - torch.as_tensor(target), 0.0))
 
 
 class FEMMisfit(Misfit):
