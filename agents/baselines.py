@@ -26,15 +26,13 @@ alone leaves 0.7^k of an error after k steps; the gains of the thesis (0.01 and 
 
 
 def make_controller(robot: Robot, task: Task) -> InverseQP:
-    """Return the inverse QP of a robot for the goals of a task: those of the first effector, along the task's axes."""
-    weights = np.resize(task.axes, 3 * len(robot.effectors))
-    weights[3:] = 0.0
+    """Return the inverse QP of a robot with one effector for the goals of a task, along the task's axes."""
     return InverseQP(
         robot.lower,
         robot.upper,
         robot.rates,
         np.array([actuator.unilateral for actuator in robot.actuators]),
-        goal_weights=None if weights.all() else weights,
+        goal_weights=None if task.axes.all() else task.axes,
     )
 
 

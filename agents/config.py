@@ -148,3 +148,13 @@ class TrainConfig(Config):
     initial: str | None = Field(default=None, description="policy to start from: a file or the name of a shipped one")
     evaluation_episodes: int = Field(default=64, gt=0)
     report_every: int = Field(default=4_000, gt=0, description="environment steps between evaluations")
+
+    @model_validator(mode="after")
+    def _relabelled(self) -> TrainConfig:
+        # What was done held the QP's action for the goal of then; it says nothing about another goal.
+        if self.sac.hindsight and self.environment.on_qp:
+            raise ValueError(
+                f"sac.hindsight = {self.sac.hindsight:g} cannot be had on top of the QP "
+                f"(environment.on_qp = {self.environment.on_qp:g}), whose action depends on the goal; allowed: 0"
+            )
+        return self

@@ -226,7 +226,12 @@ class DistributionProposer(DesignProposer):
         self.logits = self.logits + rate_spread * (utility @ (share - weights))
 
     def best(self, model: SAC, count: int) -> np.ndarray:
-        return self.means[np.argsort(-self.weights)][:count]
+        """The means, heaviest first, then draws."""
+        means = self.means[np.argsort(-self.weights)]
+        rng = np.random.default_rng([self.config.seed, int(model.num_timesteps)])
+        component = rng.choice(self.components, size=max(0, count - len(means)), p=self.weights)
+        drawn = np.clip(rng.normal(self.means[component], self.spreads[component]), -1.0, 1.0)
+        return np.concatenate([means, drawn])[:count]
 
 
 PROPOSERS: dict[str, type[DesignProposer]] = {"critic": CriticProposer, "distribution": DistributionProposer}

@@ -24,6 +24,7 @@ import numpy as np
 from agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.config import load_config, provenance
 from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.errors import ConfigError
 from softgym_envs.executors import run_jobs
 from softgym_envs.storage import write_json
 
@@ -49,8 +50,8 @@ def _evaluations(
     """Evaluate agents on the environment's backend and on FEM: ``{backend: {agent: columns}}``, SI."""
     from agents.evaluation import evaluate
 
-    designs, paths = unseen_goals(environment, max(goals, fem_goals))
-    counts = {environment.backend: goals, "fem": fem_goals}
+    counts = {"fem": fem_goals} if environment.backend == "fem" else {environment.backend: goals, "fem": fem_goals}
+    designs, paths = unseen_goals(environment, max(counts.values()))
     found: dict[str, dict[str, Any]] = {}
     for backend, count in counts.items():
         if count < 1:
@@ -163,13 +164,17 @@ def sweep(
         seeds: of the trainings.
         processes: at a time.
         folder: where everything goes.
-        goals: unseen goals on the environment's own backend.
-        fem_goals: unseen goals on FEM, 0 for none.
+        goals: unseen goals on surrogates.
+        fem_goals: unseen goals on FEM: of environments that are on FEM themselves the only ones, of others beside
+            those on the surrogate, where 0 is none.
 
     Raises:
-        ConfigError: if a file is not valid, before anything runs.
+        ConfigError: before anything runs, if a file is not valid or an environment would be evaluated on no goal.
     """
     loaded = {path: load_config(path, TrainConfig) for path in configs}
+    for path, config in loaded.items():
+        if config.environment.backend == "fem" and fem_goals < 1:
+            raise ConfigError(f"fem_goals = {fem_goals}, but the environment of '{path}' is on FEM; allowed: 1 or more")
     jobs: list[tuple[float, Callable[..., Path], tuple[Any, ...]]] = []
     for path, config in loaded.items():
         jobs += [(_cost(config), train_and_evaluate, (path, seed, folder, goals, fem_goals)) for seed in seeds]
@@ -190,8 +195,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--goals", type=int, default=100, help="unseen goals on the environment's own backend")
-    parser.add_argument("--fem-goals", type=int, default=10, help="unseen goals on FEM; 0 for none")
+    parser.add_argument("--goals", type=int, default=100, help="unseen goals on surrogates")
+    parser.add_argument(
+        "--fem-goals",
+        type=int,
+        default=10,
+        help="unseen goals on FEM, also of environments trained there; 0 for none, where all are on surrogates",
+    )
     given = parser.parse_args(arguments)
     # Read by the worker processes, which are started afterwards.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):

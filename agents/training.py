@@ -6,6 +6,7 @@ import csv
 import json
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,7 +53,8 @@ def train(
         folder: where the results go.
         initial: policy to start from (actor and critics): a file or the name of a shipped one; overrides that of the
             configuration.
-        report: called after each evaluation with its step and outcome; True stops the training early.
+        report: called after each evaluation with its step and outcome, and when a training goes on with those of the
+            last, as it may have ended before that call; True stops the training early.
         proposer: draws the sampled bodies, and learns along with the policy; default: evenly over their box.
         progress: show a progress bar.
 
@@ -86,8 +88,9 @@ def train(
     checkpoint = folder / "checkpoint.safetensors"
     curve: list[dict[str, float]] = []
     best: dict[str, np.ndarray] = {}
+    outcome: Evaluation | None = None
     if checkpoint.exists():
-        curve, best = _restore(model, checkpoint)
+        curve, best, outcome = _restore(model, checkpoint)
     elif config.initial is not None:
         start_from = policy_path(config.initial)
         _load_weights(model, read_tensors(start_from), start_from)
@@ -97,7 +100,7 @@ def train(
 
     start = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
     bar = tqdm(total=config.steps, initial=model.num_timesteps, unit="step", desc=folder.name, disable=not progress)
-    stopped = False
+    stopped = outcome is not None and report is not None and bool(report(model.num_timesteps, outcome))
     with bar:
         while model.num_timesteps < config.steps and not stopped:
             if proposer is not None:
@@ -127,7 +130,7 @@ def train(
             _write_curve(folder / "curve.csv", curve)
             if proposer is not None:
                 proposer.save(model.num_timesteps)
-            _save_checkpoint(model, checkpoint, curve, best)
+            _save_checkpoint(model, checkpoint, curve, best, outcome)
             stopped = report is not None and bool(report(model.num_timesteps, outcome))
     card = {
         "config": config.model_dump(mode="json"),
@@ -247,7 +250,9 @@ def _optimisers(model: SAC) -> dict[str, Any]:
     return found
 
 
-def _save_checkpoint(model: SAC, path: Path, curve: list[dict[str, float]], best: dict[str, np.ndarray]) -> None:
+def _save_checkpoint(
+    model: SAC, path: Path, curve: list[dict[str, float]], best: dict[str, np.ndarray], outcome: Evaluation
+) -> None:
     import torch
     from safetensors.numpy import save
 
@@ -273,14 +278,15 @@ def _save_checkpoint(model: SAC, path: Path, curve: list[dict[str, float]], best
         "numpy": [int(position[0]), int(position[1]), float(position[2])],
         "actions": model.action_space.np_random.bit_generator.state,
         "curve": curve,
+        "outcome": {name: np.asarray(value).tolist() for name, value in asdict(outcome).items()},
     }
     with atomic_write(path) as stream:
         arrays = {k: np.ascontiguousarray(v) for k, v in tensors.items()}
         stream.write(save(arrays, metadata={"state": json.dumps(meta)}))
 
 
-def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, np.ndarray]]:
-    """Take up a checkpoint; returns the learning curve and the weights of the best policy so far."""
+def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, np.ndarray], Evaluation]:
+    """Take up a checkpoint; returns the learning curve, the weights of the best policy so far, the last evaluation."""
     import torch
     from safetensors import safe_open
 
@@ -308,7 +314,9 @@ def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, 
     torch.set_rng_state(torch.as_tensor(tensors["random/torch"]))
     np.random.set_state(("MT19937", tensors["random/numpy"], *meta["numpy"]))  # noqa: NPY002 - as above
     model.action_space.np_random.bit_generator.state = meta["actions"]
-    return meta["curve"], {k.removeprefix("best/"): v for k, v in tensors.items() if k.startswith("best/")}
+    best = {k.removeprefix("best/"): v for k, v in tensors.items() if k.startswith("best/")}
+    columns = {name: np.asarray(value) for name, value in meta["outcome"].items() if name != "steps"}
+    return meta["curve"], best, Evaluation(**columns, steps=meta["outcome"]["steps"])
 
 
 def _write_curve(path: Path, curve: list[dict[str, float]]) -> None:

@@ -23,6 +23,7 @@ from benchmarks import (
     robots,
     sensor_finger,
     speed,
+    strategies,
     validation,
 )
 from softgym_envs.config import provenance
@@ -60,6 +61,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "sensor_front": design_tools.sensor_front,
     "validation": validation.validation,
     "dynamics": dynamics.dynamics,
+    "strategies": strategies.strategies,
     "codesign_kills": codesign_scale.kills,
     "codesign_profile": codesign_scale.profile,
 }

@@ -34,8 +34,8 @@ LEVELS = (-0.9, -0.3, 0.3, 0.9)
 """Of each variable, in unit coordinates."""
 TRUTH_STEPS = 8_000
 REPEATS = 3
-PRETRAINING = 80_000
-"""Environment steps behind the policy ``finger_reach_designs``."""
+PRETRAINING = 80_000 + 10 * 200 * 50
+"""Environment steps behind the policy ``finger_reach_designs``: training, and the points of its learning curve."""
 
 PLAIN = {
     "policy": None,
@@ -138,7 +138,7 @@ def _run_study(path: Path, name: str, repeat: int) -> Path:
     folder = StudyFolder(path.parent)
     results = json.loads((path.parent / "results.json").read_text())
     cost = results["cost"]
-    before = cost["joint_steps"] + cost["screen_steps"]
+    before = cost["joint_steps"] + cost["joint_report_steps"] + cost["screen_steps"]
     cpu = cost["cpu_seconds"]["judge"] + cost["cpu_seconds"]["screen"]
     rows = []
     for trial in sorted(folder.results(), key=lambda trial: trial["finished_at"]):
@@ -153,7 +153,9 @@ def _run_study(path: Path, name: str, repeat: int) -> Path:
                 "cpu_seconds": trial["cpu_seconds"] - (0.0 if trial["agent"] == "qp" else trial["qp"]["cpu_seconds"]),
             }
         )
-    write_json(path, {"name": name, "repeat": repeat, "steps": before, "cpu_seconds": cpu, "trials": rows})
+    pretraining = PRETRAINING if folder.config.policy else 0
+    found = {"name": name, "repeat": repeat, "pretraining": pretraining, "steps": before, "cpu_seconds": cpu}
+    write_json(path, {**found, "trials": rows})
     return path
 
 
@@ -259,7 +261,7 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
 
 
 def strategies() -> dict[str, object]:
-    """Regret of the co-design strategies by environment steps: median of three repeats (smallest to largest)."""
+    """Regret of the co-design strategies by environment steps: median of the repeats (smallest to largest)."""
     kept = json.loads(KEPT.read_text())
     result: dict[str, object] = {
         "bodies of the ground truth": len(kept["truth"]),
@@ -275,10 +277,13 @@ def strategies() -> dict[str, object]:
 
         def spread(values: list[float], form: str) -> str:
             values = sorted(values)
+            if len(values) == 1:
+                return f"{values[0]:{form}} (one repeat)"
             return f"{np.median(values):{form}} ({values[0]:{form}} to {values[-1]:{form}})"
 
         result[f"{name}: regret at the end [%]"] = spread([100 * row[2] for row in last], ".2f")
         result[f"{name}: environment steps"] = spread([row[0] for row in last], ",.0f")
+        result[f"{name}: steps behind the policy it is given"] = runs[0]["pretraining"]
         result[f"{name}: CPU minutes"] = spread([row[1] / 60 for row in last], ".1f")
         for limit in (0.1, 0.01):
             reached = [next((row[0] for row in run["regret"] if row[2] <= limit), np.inf) for run in runs]

@@ -239,7 +239,7 @@ class JointConfig(Config):
     num_envs: int = Field(default=16, ge=1)
     seed: int = Field(default=0, ge=0)
     keep: int = Field(default=4, ge=1, le=32)
-    options: dict[str, float] = Field(default_factory=dict)
+    options: dict[str, int | float] = Field(default_factory=dict)
     sac: SACConfig = Field(default_factory=SACConfig)
 
 
@@ -395,6 +395,12 @@ class StudyConfig(Config):
         for name in named:
             if name not in OBJECTIVES:
                 raise ValueError(f"unknown objective '{name}'; allowed: {', '.join(OBJECTIVES)}")
+        if OBJECTIVES[self.objective].of_body:
+            allowed = ", ".join(name for name, objective in OBJECTIVES.items() if not objective.of_body)
+            raise ValueError(
+                f"objective '{self.objective}' asks nothing of the controller: name it in 'also' or 'limits'; allowed: "
+                f"{allowed}"
+            )
         objectives = (self.objective, *self.also)
         repeated = [name for name in objectives if objectives.count(name) > 1]
         if repeated:
@@ -413,6 +419,16 @@ class StudyConfig(Config):
         if self.strategy != "qp" and self.environment.backend != "surrogate" and plan.proposer:
             raise ValueError(
                 f"environment.backend = '{self.environment.backend}' has no joint training; allowed: surrogate"
+            )
+        row = ENVIRONMENTS[self.environment.id]
+        if self.goals.source == "family" and row.backend != "surrogate":
+            raise ValueError(
+                f"goals.source = 'family' needs a surrogate, which robot '{row.robot}' has not; allowed: task, zone"
+            )
+        if self.goals.source != "task" and self.strategy not in ("qp", "policy") and row.task != "reach":
+            raise ValueError(
+                f"goals.source = '{self.goals.source}' gives points to train on, task '{row.task}' takes paths; "
+                "allowed: task"
             )
         shown = self.environment.design_in_observation
         if plan.proposer and shown is not True and not set(self.variables) <= set(shown or ()):
@@ -434,9 +450,6 @@ class StudyConfig(Config):
             raise ValueError(
                 f"pruner '{pruner}' has no training to stop in strategy '{self.strategy}'; allowed: none, wilcoxon"
             )
-        if pruner == "wilcoxon" and not OBJECTIVES[self.objective].per_goal:
-            allowed = ", ".join(name for name, objective in OBJECTIVES.items() if objective.per_goal)
-            raise ValueError(f"pruner 'wilcoxon' compares goals, '{self.objective}' has none; allowed: {allowed}")
         if plan.trains and pruner == "wilcoxon":
             raise ValueError(
                 f"pruner 'wilcoxon' compares goals, strategy '{self.strategy}' reports its training; "

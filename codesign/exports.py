@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from codesign.finalists import Finalist, choose_winner, evaluations, finalists
+from codesign.finalists import Finalist, choose_winner, evaluations, fetch_policies, finalists
 from codesign.folder import StudyFolder
 
 __all__ = ["write_exports"]
@@ -41,11 +41,15 @@ def _record(folder: StudyFolder, bodies: dict[str, Finalist], path: Path) -> Non
     from agents.evaluation import make_agent
     from softgym_envs.viewer.recording import record_comparison
 
+    fetch_policies(folder)
     rollouts: dict[str, Any] = {}
     for role, body in bodies.items():
         agent = make_agent(folder.path / body.policy if body.policy else "qp")
         rollouts[role] = (agent, {"design": body.design, "goal": folder.goals["unseen"][0]})
-    env = folder.config.environment.make(sample_design=False)
+    own = folder.config.environment
+    if bodies["winner"].policy is None:  # the QP itself, not on top of another
+        own = own.model_copy(update={"on_qp": 0.0})
+    env = own.make(sample_design=False)
     try:
         record_comparison(env, rollouts, path)
     finally:

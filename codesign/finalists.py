@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,12 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from agents.policy import policy_path
 from codesign.folder import StudyFolder
 from codesign.jobs import Job
 from codesign.judge import JUDGE
-from codesign.objectives import OBJECTIVES, rank_key
+from codesign.objectives import OBJECTIVES, rank_key, violations
 from codesign.trial import assess, training_config
 from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.errors import DataError
+from softgym_envs.storage import atomic_write, write_json
 
 __all__ = [
     "BACKENDS",
@@ -61,7 +65,8 @@ def best_trials(folder: StudyFolder) -> list[dict[str, Any]]:
     complete = [result for result in folder.results() if result["state"] == "complete"]
 
     def key(result: dict[str, Any]) -> tuple[float, ...]:
-        excess = sum(max(0.0, value) for value in result["violations"] or ())
+        broken = zip(folder.config.limits.values(), result["violations"] or (), strict=False)
+        excess = sum(max(0.0, value) / (abs(limit) or 1.0) for limit, value in broken)
         return (-excess, *rank_key(result["score"], result["evaluation"]), -result["number"])
 
     return sorted(complete, key=key, reverse=True)
@@ -114,20 +119,56 @@ def trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
     config = folder.config
     training = training_config(folder, finalist.design)
     steps = config.finalists.steps or training.steps
-    training = training.model_copy(
-        update={"seed": training.seed + seed, "steps": steps, "report_every": min(training.report_every, steps)}
-    )
     initial = config.policy if config.plan.trains else str(folder.path / JUDGE)
+    sac = training.sac
+    if initial is not None:  # its networks decide
+        card = json.loads(policy_path(initial).with_suffix(".json").read_text())
+        sac = sac.model_copy(update={"net_arch": card["config"]["sac"]["net_arch"]})
+    training = training.model_copy(
+        update={
+            "sac": sac,
+            "seed": training.seed + seed,
+            "steps": steps,
+            "report_every": min(training.report_every, steps),
+        }
+    )
     name = f"trial{finalist.number:04d}-seed{seed}"
+    place = folder.path / "finalists" / name
     with folder.lock(f"training-{name}"):
-        return train(training, folder.path / "finalists" / name, initial=initial, progress=False)
+        cpu = time.process_time()
+        policy = train(training, place, initial=initial, progress=False)
+        if not (place / "cost.json").exists():
+            write_json(place / "cost.json", {"steps": steps, "cpu_seconds": time.process_time() - cpu})
+        return policy
+
+
+def fetch_policies(folder: StudyFolder) -> None:
+    """Copy the policies of finalists that were trained on other machines into the folder.
+
+    Raises:
+        DataError: if one is nowhere.
+    """
+    storage = folder.open_storage()
+    policies = [Path(body.policy) for body in finalists(folder) if body.policy is not None]
+    for path in (folder.path / name for policy in policies for name in (policy, policy.with_suffix(".json"))):
+        if path.exists():
+            continue
+        name = path.relative_to(folder.path).as_posix()
+        content = storage.fetch(name)
+        if content is None:
+            raise DataError(
+                f"policy '{name}' is neither in folder '{folder.path}' nor in storage '{folder.config.storage}'"
+            )
+        with atomic_write(path) as stream:
+            stream.write(content)
 
 
 def finalist_jobs(folder: StudyFolder) -> list[Job]:
     """One job per body, controller and backend, the slow ones first."""
     config = folder.config
     own = config.environment
-    options = {"surrogate": {}, "fem": config.finalists.fem_options, own.backend: own.backend_options}
+    options: dict[str, dict[str, Any]] = {"surrogate": {}, "fem": {}, own.backend: own.backend_options}
+    options["fem"] = {**options["fem"], **config.finalists.fem_options}
     backends = BACKENDS if ENVIRONMENTS[own.id].backend == "surrogate" else ("fem",)
     environments = {
         backend: own.model_copy(update={"backend": backend, "backend_options": options[backend]})
@@ -187,25 +228,27 @@ def _mean(records: list[dict[str, Any]]) -> dict[str, Any]:
             merged[key] = float(values.max())
         else:
             merged[key] = values.mean(axis=0).tolist()
-    merged["of_seeds"] = {key: [record[key] for record in records] for key in ("success_rate", "mean_distance")}
+    # Seeds and goals, for intervals over both.
+    merged["of_seeds"] = {k: [record[k] for record in records] for k in records[0] if isinstance(records[0][k], list)}
     return merged
 
 
 def choose_winner(folder: StudyFolder, records: list[dict[str, Any]]) -> Finalist | None:
-    """Name the winner without a look at the unseen goals; it may be the baseline.
+    """Name the winner without a look at the unseen goals; it may be the baseline. None if no body keeps the limits.
 
     Args:
         folder: the study.
         records: what `evaluations` returns.
     """
-    bodies = {finalist.number: finalist for finalist in finalists(folder)}
-    if not bodies:
-        return None
-    if folder.config.finalists.choose == "fem":
-        objective = OBJECTIVES[folder.config.objective]
+    config = folder.config
+    ranked = [r["number"] for r in best_trials(folder) if all(value <= 0.0 for value in r["violations"] or ())]
+    bodies = {finalist.number: finalist for finalist in finalists(folder) if finalist.number in ranked}
+    if config.finalists.choose == "fem":
+        objective = OBJECTIVES[config.objective]
         chosen = [r for r in records if r["goals"] == "selection" and "error" not in r and r["trial"] in bodies]
+        measured = {name: limit for name, limit in config.limits.items() if not OBJECTIVES[name].of_body}
+        kept = [r for r in chosen if all(value <= 0.0 for value in violations(measured, r))]
         if chosen:
-            best = max(chosen, key=lambda r: (*rank_key(objective.score(r), r), -r["trial"]))
-            return bodies[best["trial"]]
-    ranked = [result["number"] for result in best_trials(folder)]
-    return bodies[next(number for number in ranked if number in bodies)]
+            best = max(kept, key=lambda r: (*rank_key(objective.score(r), r), -r["trial"]), default=None)
+            return None if best is None else bodies[best["trial"]]
+    return next((bodies[number] for number in ranked if number in bodies), None)

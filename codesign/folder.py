@@ -167,6 +167,10 @@ def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str) -> None:
     extensible = EXTENSIBLE if new.storage == JOURNAL else (*(key for key in EXTENSIBLE if key != "name"), "storage")
     if (old.storage == JOURNAL) != (new.storage == JOURNAL):
         raise ConfigError(f"{where} holds a study with storage '{old.storage}', got '{new.storage}'; use another {use}")
+    if before["finalists"]["count"]:  # there are tests of finalists; how they were made must stay
+        for part in (before, after):
+            part["finalists.steps"] = part["finalists"]["steps"]
+            part["finalists.fem_options"] = part["finalists"]["fem_options"]
     for key in after:
         if key not in extensible and before[key] != after[key]:
             raise ConfigError(

@@ -48,7 +48,8 @@ def draw_goals(config: StudyConfig) -> dict[str, Any]:
     """Draw the three disjoint sets of goals of a study [m], as plain data.
 
     Returns:
-        ``training`` (k, 3), empty where the task draws its own; ``selection`` and ``unseen`` (k, p, 3).
+        ``training`` (k, 3), empty where the task draws its own; ``selection`` and ``unseen`` (k, p, 3), both the one
+        path of a task that has no other.
     """
     goals = config.goals
     count = goals.count + goals.unseen_count
@@ -61,4 +62,6 @@ def draw_goals(config: StudyConfig) -> dict[str, Any]:
         points = draw(config, count + goals.training_count)
         paths, training = points[:count, None], points[count:]
     drawn = {"training": training, "selection": paths[: goals.count], "unseen": paths[goals.count :]}
+    if (paths == paths[0]).all():  # a published path: once is enough, and there is no other to test on
+        drawn |= {"selection": paths[:1], "unseen": paths[:1]}
     return {"unit": "m", **{name: array.tolist() for name, array in drawn.items()}}

@@ -14,8 +14,10 @@ from typing import Any
 from agents.config import TrainConfig
 from agents.joint import PROPOSERS
 from agents.policy import policy_path
+from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
 from codesign.jobs import Job
+from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import DataError
 from softgym_envs.storage import atomic_write
 
@@ -71,6 +73,13 @@ def joint_config(folder: StudyFolder) -> TrainConfig:
     return TrainConfig(environment=config.environment.model_copy(update=update), **joint)
 
 
+def _report_steps(config: StudyConfig) -> int:
+    """Environment steps of the points of the learning curve of joint training."""
+    joint = config.joint
+    points = -(-joint.steps // joint.report_every)
+    return points * joint.evaluation_episodes * ENVIRONMENTS[config.environment.id].max_episode_steps
+
+
 def _make(folder: StudyFolder) -> dict[str, Any]:
     """Train or copy the judge; what is told of it is a job's result."""
     config = folder.config
@@ -110,6 +119,7 @@ def _make(folder: StudyFolder) -> dict[str, Any]:
         "policy": JUDGE,
         "bodies": bodies,
         "training_steps": steps,
+        "report_steps": _report_steps(config) if steps else 0,
         "seconds": time.perf_counter() - started,
         "cpu_seconds": time.process_time() - cpu,
     }

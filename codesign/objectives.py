@@ -20,6 +20,7 @@ class Objective:
         scale: from SI to ``unit``.
         sign: 1 if more is better, -1 if less is.
         per_goal: field that has its value for each goal, where there is one.
+        of_body: whether it is a property of the body alone.
     """
 
     key: str
@@ -28,6 +29,7 @@ class Objective:
     scale: float
     sign: int
     per_goal: str = ""
+    of_body: bool = False
 
     def score(self, record: Mapping[str, Any]) -> float:
         """Score of a stored evaluation, larger is better [SI]."""
@@ -50,9 +52,9 @@ OBJECTIVES: dict[str, Objective] = {
         Objective("success_rate", "Success rate", "%", 100.0, 1, "successes"),
         Objective("mean_distance", "Mean final distance", "mm", 1e3, -1, "distances"),
         Objective("mean_return", "Mean return", "", 1.0, 1, "returns"),
-        Objective("mean_tracking_distance", "Mean tracking distance", "mm", 1e3, -1),
-        Objective("mean_effort", "Mean actuator effort", "", 1.0, -1),
-        Objective("material_volume", "Material volume", "cm3", 1e6, -1),
+        Objective("mean_tracking_distance", "Mean tracking distance", "mm", 1e3, -1, "mean_distances"),
+        Objective("mean_effort", "Mean actuator effort", "", 1.0, -1, "efforts"),
+        Objective("material_volume", "Material volume", "cm3", 1e6, -1, of_body=True),
     )
 }
 """Registry: name to objective."""

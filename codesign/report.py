@@ -101,7 +101,9 @@ def _headline(results: Mapping[str, Any]) -> str:
     """The finding in a sentence or two."""
     baseline, winner = results["baseline"], results["winner"]
     if winner is None:
-        return "The study has no winner yet: no trial is complete, or no finalists were asked for."
+        return (
+            "The study has no winner: no trial is complete, no body keeps the limits, or no finalists were asked for."
+        )
     if baseline is None:
         return "The baseline body is infeasible, so there is nothing to compare the winner with."
     if winner["trial"] == baseline["trial"]:
@@ -109,13 +111,23 @@ def _headline(results: Mapping[str, Any]) -> str:
     if not results["comparison"]:
         return f"Trial {winner['trial']} scored best; it was not tested on FEM yet."
     row = results["comparison"][0]
-    low, high = row["distance_change_interval"]
-    if high < 0.0:
+    objective = OBJECTIVES[results["objective"]]
+    low, high = sorted(objective.sign * value for value in row["objective_change_interval"])
+    if low > 0.0:
         finding = "The optimised body is better than the baseline"
-    elif low > 0.0:
+    elif high < 0.0:
         finding = "The optimised body is worse than the baseline"
     else:
         finding = "No difference between the optimised body and the baseline is certain"
+    if objective.key != "mean_distance":
+        before, after = (objective.text(objective.sign * value) for value in row["objective"])
+        ends = (objective.sign * objective.shown(value) for value in row["objective_change_interval"])
+        finding += (
+            f" in its {objective.label.lower()}, {after} instead of {before} (95 % interval of the change "
+            f"{' to '.join(f'{value:+.3g}' for value in ends)} {objective.unit}".rstrip()
+            + ")"
+        )
+    low, high = row["distance_change_interval"]
     return (
         f"{finding}: on {BACKENDS[row['backend']]}, with its own {AGENTS[row['agent']]}, it ends "
         f"{_mm(row['winner']['mean_distance'])} from {row['goals']} unseen goals on average instead of "
@@ -176,17 +188,21 @@ def _question(study: StudyFolder, results: Mapping[str, Any]) -> list[tuple[str,
         origin = f"spread over a work zone about ({center}) mm, half size ({half}) mm, the same for every body"
     else:
         origin = "drawn as the task draws them for the baseline body, the same for every body"
+    count, unseen = len(study.goals["selection"]), study.goals["unseen"]
+    others = f"{len(unseen)} others for the final test"
+    if np.array_equal(unseen, study.goals["selection"]):
+        others = "it has one path and no other, so the final test is on the same"
     done = ", ".join(f"{results['trials'][s]} {s}" for s in ("complete", "pruned", "infeasible"))
     rows = [
         ("Task", f"{config.environment.id}, success within {1e3 * results['success_distance']:g} mm at the end"),
         ("Body", f"{len(optimised)} variables: {ranges}"),
-        ("Objective", f"{OBJECTIVES[config.objective].label.lower()} on {goals.count} goals, {direction}"),
+        ("Objective", f"{OBJECTIVES[config.objective].label.lower()} on {count} goals, {direction}"),
         (
             "Physics",
             f"{BACKENDS.get(config.environment.backend, config.environment.backend)} in the search, FEM in the test",
         ),
         ("Controller", CONTROLLERS[config.strategy]),
-        ("Goals", f"{origin}; {goals.unseen_count} others for the final test"),
+        ("Goals", f"{origin}; {others}"),
         ("Budget", f"{config.trials} bodies ({done})"),
         ("Search", f"sampler {config.sampler.name}, pruner {config.pruner.name}" + _screen_text(study)),
     ]
@@ -222,10 +238,10 @@ def _screen_text(study: StudyFolder) -> str:
 def _poses(study: StudyFolder) -> list[tuple[str, np.ndarray | None]]:
     """Captions and commands (n_a,) of the pictures."""
     robot = study.config.robot
-    half = robot.lower + 0.5 * (robot.upper - robot.lower)
+    half = 0.5 * robot.upper
     poses: list[tuple[str, np.ndarray | None]] = [("at rest", None), ("all actuators at 50 %", half)]
     if len(half) > 1:
-        first = robot.lower.copy()
+        first = np.zeros_like(half)
         first[0] = half[0]
         poses.append(("first actuator at 50 %", first))
     return poses
@@ -430,10 +446,11 @@ def _trial_table(trials: list[dict[str, Any]], results: Mapping[str, Any]) -> di
 def _cost_rows(cost: Mapping[str, Any]) -> list[dict[str, str]]:
     steps = {
         "screen": f"{cost['screen_steps']:,}",
-        "judge": f"{cost['joint_steps']:,}",
+        "judge": f"{cost['joint_steps']:,} of training, {cost['joint_report_steps']:,} of its reports",
         "trials": f"{cost['training_steps']:,} of training, {cost['report_steps']:,} of its reports, "
         f"{cost['selection_steps']:,} of scores",
-        "finalists": f"{cost['test_steps_fem']:,} on FEM, {cost['test_steps_surrogate']:,} on the surrogate",
+        "finalists": (f"{cost['retraining_steps']:,} of training, " if cost["retraining_steps"] else "")
+        + f"{cost['test_steps_fem']:,} on FEM, {cost['test_steps_surrogate']:,} on the surrogate",
     }
     titles = {
         "screen": "Screen by the inverse QP",

@@ -14,7 +14,7 @@ import numpy as np
 from codesign.finalists import BACKENDS, Finalist, choose_winner, evaluations, finalists, pareto_trials
 from codesign.folder import StudyFolder
 from codesign.ledger import open_study
-from codesign.objectives import OBJECTIVES
+from codesign.objectives import OBJECTIVES, Objective
 from codesign.screen import screen_records
 from softgym_envs.config import provenance
 from softgym_envs.envs.registration import ENVIRONMENTS
@@ -65,11 +65,43 @@ def success_distance(folder: StudyFolder) -> float:
     return task.success_distance
 
 
-def _compare(baseline: Mapping[str, Any], winner: Mapping[str, Any]) -> dict[str, Any]:
+def difference_interval(baseline: np.ndarray, winner: np.ndarray, *, resamples: int = 2000) -> tuple[float, float]:
+    """95 % interval of a mean difference over goals and, where there are several, training seeds.
+
+    Goals are the same for both and drawn together; the seeds of either are drawn on their own (Owen's pigeonhole
+    bootstrap, 2007).
+
+    Args:
+        baseline: shape (seeds, goals).
+        winner: shape (seeds, goals).
+        resamples: of the bootstrap.
+    """
+    if len(baseline) == len(winner) == 1:
+        return bootstrap_interval((winner - baseline)[0])
+    rng = np.random.default_rng(0)
+    means = []
+    for _ in range(resamples):
+        goals = rng.integers(baseline.shape[1], size=baseline.shape[1])
+        drawn = [table[rng.integers(len(table), size=len(table))][:, goals].mean() for table in (baseline, winner)]
+        means.append(drawn[1] - drawn[0])
+    low, high = np.quantile(means, [(1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0])
+    return float(low), float(high)
+
+
+def _table(record: Mapping[str, Any], key: str) -> np.ndarray:
+    """Values by seed and goal, shape (seeds, goals)."""
+    return np.atleast_2d(np.array(record.get("of_seeds", record)[key], dtype=float))
+
+
+def _compare(baseline: Mapping[str, Any], winner: Mapping[str, Any], objective: Objective) -> dict[str, Any]:
     """Winner minus baseline, goal by goal."""
     distances = {"baseline": np.array(baseline["distances"]), "winner": np.array(winner["distances"])}
     change = distances["winner"] - distances["baseline"]
     gained = np.array(winner["successes"], dtype=float) - np.array(baseline["successes"], dtype=float)
+    tables = {
+        key: (_table(baseline, key), _table(winner, key)) for key in {"distances", "successes", objective.per_goal}
+    }
+    own = tables[objective.per_goal]
     return {
         "backend": winner["backend"],
         "agent": winner["agent"],
@@ -87,9 +119,12 @@ def _compare(baseline: Mapping[str, Any], winner: Mapping[str, Any]) -> dict[str
             for role, record in (("baseline", baseline), ("winner", winner))
         },
         "success_change": float(gained.mean()),
-        "success_change_interval": bootstrap_interval(gained),
+        "success_change_interval": difference_interval(*tables["successes"]),
         "distance_change": float(change.mean()),
-        "distance_change_interval": bootstrap_interval(change),
+        "distance_change_interval": difference_interval(*tables["distances"]),
+        "objective": [float(table.mean()) for table in own],
+        "objective_change": float(own[1].mean() - own[0].mean()),
+        "objective_change_interval": difference_interval(*own),
         "goals_closer": int((change < 0.0).sum()),
         "goals_farther": int((change > 0.0).sum()),
     }
@@ -148,9 +183,14 @@ def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[st
     judged = [trial[key] for trial in trials for key in ("qp", "evaluation") if trial[key] and trial["agent"] != key]
     config, row = folder.config, ENVIRONMENTS[folder.config.environment.id]
     path = folder.path / "judge" / "judge.json"
-    judge = json.loads(path.read_text()) if path.exists() else {"training_steps": 0, "cpu_seconds": 0.0}
+    judge = {"training_steps": 0, "report_steps": 0, "cpu_seconds": 0.0}
+    if path.exists():
+        judge = json.loads(path.read_text())
+    retrained = [json.loads(path.read_text()) for path in sorted(folder.path.glob("finalists/*/cost.json"))]
     return {
         "joint_steps": judge["training_steps"],
+        "joint_report_steps": judge["report_steps"],
+        "retraining_steps": sum(row["steps"] for row in retrained),
         "training_steps": sum(trial["training_steps"] for trial in trials),
         "report_steps": sum(len(trial["curve"]) for trial in trials)
         * config.training.evaluation_episodes
@@ -165,7 +205,8 @@ def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[st
             "screen": sum(record.get("cpu_seconds", 0.0) for record in screened),
             "judge": judge["cpu_seconds"],
             "trials": sum(trial["cpu_seconds"] for trial in trials),
-            "finalists": sum(record.get("cpu_seconds", 0.0) for record in tests),
+            "finalists": sum(record.get("cpu_seconds", 0.0) for record in tests)
+            + sum(row["cpu_seconds"] for row in retrained),
         },
         "wall_seconds": folder.account()["wall_seconds"],
     }
@@ -198,7 +239,7 @@ def collect(folder: StudyFolder) -> dict[str, Any]:
             for agent in winner.agents:
                 pair = [found.get((body.number, agent, backend)) for body in (baseline, winner)]
                 if pair[0] and pair[1]:
-                    comparison.append(_compare(pair[0], pair[1]))
+                    comparison.append(_compare(pair[0], pair[1], OBJECTIVES[config.objective]))
     states = [trial["state"] for trial in trials]
     space = config.space
     return {

@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 
 __all__ = ["assess", "merge", "run_trial", "training_config"]
 
-PIECE = 8
-"""Goals between two questions to the pruner, for strategies that train nothing in a trial."""
+PIECES = 4
+"""Into so many parts, of at most eight goals, the goals of a trial that trains nothing are divided; after each the
+pruner is asked."""
 
 
 def assess(
@@ -60,6 +61,8 @@ def assess(
         "mean_return": float(evaluation.mean_return),
         "distances": np.asarray(evaluation.distances, dtype=float).tolist(),
         "returns": np.asarray(evaluation.returns, dtype=float).tolist(),
+        "mean_distances": np.asarray(evaluation.mean_distances, dtype=float).tolist(),
+        "efforts": np.asarray(evaluation.efforts, dtype=float).tolist(),
         "successes": np.asarray(evaluation.successes, dtype=bool).tolist(),
         "mean_tracking_distance": float(evaluation.mean_distances.mean()),
         "mean_effort": float(evaluation.efforts.mean()),
@@ -117,16 +120,17 @@ def _assess_by_goals(
         return assess(agent, config.environment, goals, design), False
     objective = OBJECTIVES[config.objective]
     parts: list[dict[str, Any]] = []
+    piece = min(8, max(1, len(goals) // PIECES))
     known = set(trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values)
-    for start in range(0, len(goals), PIECE):
-        part = assess(agent, config.environment, goals[start : start + PIECE], design)
+    for start in range(0, len(goals), piece):
+        part = assess(agent, config.environment, goals[start : start + piece], design)
         if "error" in part:
             return part, False
         parts.append(part)
         for k, value in enumerate(part[objective.per_goal]):
             if start + k not in known:
                 trial.report(objective.sign * float(value), start + k)
-        if trial.user_attrs.get("origin") != "baseline" and start + PIECE < len(goals) and trial.should_prune():
+        if trial.user_attrs.get("origin") != "baseline" and start + piece < len(goals) and trial.should_prune():
             return merge(parts), True
     return merge(parts), False
 

@@ -12,15 +12,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from codesign.finalists import finalist_jobs, finalists
+from codesign.finalists import fetch_policies, finalist_jobs
 from codesign.folder import StudyFolder
 from codesign.jobs import run_jobs
 from codesign.judge import judge_jobs
 from codesign.ledger import Ledger
 from codesign.screen import screen_jobs
 from codesign.trial import run_trial
-from softgym_envs.errors import DataError, SoftGymError
-from softgym_envs.storage import atomic_write
+from softgym_envs.errors import SoftGymError
 
 if TYPE_CHECKING:
     import optuna
@@ -70,19 +69,7 @@ def _give_up(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
 
 def _test_finalists(folder: StudyFolder) -> None:
     """Run the check on FEM, with the policies of trials that ran elsewhere."""
-    storage = folder.open_storage()
-    policies = [Path(body.policy) for body in finalists(folder) if body.policy is not None]
-    for path in (folder.path / name for policy in policies for name in (policy, policy.with_suffix(".json"))):
-        if path.exists():
-            continue
-        name = path.relative_to(folder.path).as_posix()
-        content = storage.fetch(name)
-        if content is None:
-            raise DataError(
-                f"policy '{name}' is neither in folder '{folder.path}' nor in storage '{folder.config.storage}'"
-            )
-        with atomic_write(path) as stream:
-            stream.write(content)
+    fetch_policies(folder)
     run_jobs(folder, finalist_jobs(folder))
 
 

@@ -95,12 +95,12 @@ class Box:
 
 
 def full_command(robot: Robot, actuation: Sequence[float] | None) -> np.ndarray:
-    """Check an actuation (n_a,), by default half of every actuator's range.
+    """Check an actuation (n_a,), by default half of every actuator's upper limit.
 
     Raises:
         ConfigError: for a wrong length, or a displacement out of range.
     """
-    command = np.array(0.5 * (robot.lower + robot.upper) if actuation is None else actuation, dtype=float)
+    command = np.array(0.5 * robot.upper if actuation is None else actuation, dtype=float)
     if command.shape != robot.lower.shape or not ((command >= robot.lower) & (command <= robot.upper)).all():
         allowed = ", ".join(f"{a.name} {a.low:g} to {a.high:g} {a.unit}" for a in robot.actuators)
         raise ConfigError(f"actuation {command.tolist()} is not allowed; allowed: {allowed}")
@@ -131,7 +131,7 @@ class Evaluator:
         robot: the family of bodies.
         metrics: names in `METRICS`.
         backend: ``"fem"`` or ``"surrogate"``.
-        actuation: full command: displacements of the actuators, shape (n_a,); default half of their range.
+        actuation: full command: displacements of the actuators, shape (n_a,); default half of their upper limits.
         steps: states beyond rest along the actuation, evenly spaced.
         weights: folder of the surrogate's weights; default the shipped ones.
 
@@ -207,7 +207,7 @@ class LearnedBodies:
     Args:
         robot: the family of bodies.
         metrics: names in `METRICS`.
-        actuation: full command: displacements of the actuators, shape (n_a,); default half of their range.
+        actuation: full command: displacements of the actuators, shape (n_a,); default half of their upper limits.
         steps: states beyond rest along the actuation, evenly spaced.
         weights: folder of the surrogate's weights; default the shipped ones.
 

@@ -35,7 +35,7 @@ class BodiesConfig(Config):
         design: values of the others, and the reference of the free ones; the rest is the robot's baseline.
         backend: ``"fem"`` or ``"surrogate"``.
         weights: folder of the surrogate's weights; default the shipped ones.
-        actuation: full command, a displacement for each actuator; default half of their ranges.
+        actuation: full command, a displacement for each actuator; default half of their upper limits.
         steps: states beyond rest along the actuation.
     """
 

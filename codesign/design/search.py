@@ -56,7 +56,7 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
 
     Designs are proposed in batches and told to Optuna's journal one by one. A batch is filled up until as many designs
     of it are feasible as it is large. The result is the same however often the search was stopped, and with any number
-    of workers.
+    of workers; only ``qmc`` skips the points of a batch that it was stopped in the middle of proposing.
 
     Args:
         config: with solver ``"search"``.
@@ -96,12 +96,12 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
     def key(trial: optuna.trial.FrozenTrial | optuna.Trial) -> tuple[float, ...]:
         return tuple(trial.params[name] for name in box.names)
 
-    for trial in study.get_trials(deepcopy=False):
+    for trial in _trials(study):
         if trial.state.is_finished():
             known.setdefault(key(trial), trial.user_attrs["found"])
     with click.progressbar(length=solver.trials, label="designs", hidden=not progress) as bar:
         while True:
-            trials = study.get_trials(deepcopy=False)
+            trials = _trials(study)
             finished = sum(trial.state.is_finished() for trial in trials)
             bar.update(finished - bar.pos)
             asked: list[Any] = [t for t in trials if t.state == optuna.trial.TrialState.RUNNING]
@@ -112,7 +112,11 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
                 missing = min(solver.batch - complete % solver.batch, solver.trials - len(trials))
                 for number in range(len(trials), len(trials) + missing):
                     study.sampler = _sampler(solver.sampler, number)
+                    if number < len(solver.starts):
+                        values = {**box.reference, **solver.starts[number]}
+                        study.enqueue_trial({name: values[name] for name in box.names})
                     asked.append(study.ask(_distributions(config)))
+                study.set_user_attr("asked", asked[-1].number + 1)
             new = {key(trial): trial for trial in asked if key(trial) not in known}
             for trial in asked:
                 if new.get(key(trial)) is not trial and key(trial) in known:
@@ -154,7 +158,6 @@ def _open(folder: Path, config: OptimiseConfig) -> optuna.Study:
         with path.open("rb+") as stream:
             stream.truncate(data.rfind(b"\n") + 1)
     storage = optuna.storages.JournalStorage(JournalFileBackend(str(path)))
-    fresh = not optuna.get_all_study_names(storage)
     study = optuna.create_study(
         study_name="search",
         storage=storage,
@@ -162,12 +165,27 @@ def _open(folder: Path, config: OptimiseConfig) -> optuna.Study:
         directions=["minimize"] * len(config.objectives),
         sampler=_sampler(config.solver.sampler, 0),
     )
-    if fresh:
-        box = config.bodies.box()
-        for start in config.solver.starts:
-            values = {**box.reference, **start}
-            study.enqueue_trial({name: values[name] for name in box.names})
+    _take_back(study)
     return study
+
+
+def _take_back(study: optuna.Study) -> None:
+    """Fail the trials of a batch that was cut off while it was proposed, so that all of it is proposed again.
+
+    The journal has a trial before its parameters, so some may lack theirs.
+    """
+    import optuna
+
+    asked = study.user_attrs.get("asked", 0)
+    for trial in study.get_trials(deepcopy=False)[asked:]:
+        if not trial.state.is_finished():
+            study._storage.set_trial_state_values(trial._trial_id, optuna.trial.TrialState.FAIL)
+
+
+def _trials(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+    """All trials but those that were taken back."""
+    trials = study.get_trials(deepcopy=False)
+    return [trial for trial in trials if "found" in trial.user_attrs or not trial.state.is_finished()]
 
 
 def _sampler(sampler: SamplerConfig, number: int) -> Any:
@@ -192,7 +210,7 @@ def _distributions(config: OptimiseConfig) -> dict[str, optuna.distributions.Bas
 def _result(config: OptimiseConfig, folder: Path, study: optuna.Study) -> dict[str, Any]:
     from codesign.design.plots import draw_front
 
-    trials = study.get_trials(deepcopy=False)
+    trials = _trials(study)
     feasible = [trial for trial in trials if trial.values is not None]
     if not feasible:
         reason = trials[0].user_attrs["found"]["infeasible"]

@@ -459,7 +459,7 @@ class TorchVectorEnv:
             self._take_bodies(index, designs)
             self._changed[index] = True
         elif self._sampled:
-            designs = self.designs[index]
+            designs = self._fixed.expand(len(index), -1).clone()
             low, high = self._ends[:, self._sampled]
             drawn = low + (high - low) * self._uniform(0.0, 1.0, len(index), len(self._sampled), dtype=torch.float64)
             bounds = torch.where(self._log, torch.exp(self._ends), self._ends)[:, self._sampled]

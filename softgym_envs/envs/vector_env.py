@@ -160,6 +160,7 @@ class SoftRobotVectorEnv(VectorEnv):
             self._changed[index] = True
         elif self._sampled:
             names = self.design_space.names
+            self.designs[index] = list(self._fixed_design.values())
             for column, draws in enumerate(self.design_sampler(self.np_random, index).T):
                 name = self._sampled[column]
                 self.designs[index, names.index(name)] = self.design_space[name].from_unit(draws)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from agents.config import EnvironmentConfig
+from agents.config import EnvironmentConfig, TrainConfig
 from agents.hindsight import HindsightBuffer
 
 REACH = EnvironmentConfig(id="SoftGym/DiamondReach-v0")
@@ -142,6 +142,14 @@ def test_a_step_that_was_not_found_earns_nothing_whatever_the_goal():
     buffer.rewards[3] = 0.0
     samples = buffer._get_samples(np.full(50, 3))
     assert (samples.rewards == 0.0).all()
+
+
+def test_hindsight_on_top_of_the_qp_is_refused():
+    config = {"environment": {"id": REACH.id, "on_qp": 0.3}, "sac": {"hindsight": 0.8}}
+    with pytest.raises(ValueError, match=r"sac\.hindsight = 0\.8 .*environment\.on_qp = 0\.3.* allowed: 0"):
+        TrainConfig.model_validate(config)
+    assert TrainConfig.model_validate({**config, "sac": {}}).environment.on_qp == 0.3
+    assert TrainConfig.model_validate({**config, "environment": {"id": REACH.id}}).sac.hindsight == 0.8
 
 
 def test_a_moving_goal_is_refused():

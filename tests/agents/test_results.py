@@ -150,6 +150,17 @@ def test_an_error_of_one_job_does_not_end_the_others(swept, tmp_path, capsys):
         sweep.sweep([tmp_path / "bad.yaml"], [1], 1, tmp_path / "out")
 
 
+def test_environments_on_fem_are_evaluated_on_the_goals_for_fem(tmp_path):
+    on_fem = EnvironmentConfig(id="SoftGym/FingerReach-v0", backend="fem")
+    found = sweep._evaluations(on_fem, {"random": "random"}, 5, 2)
+    assert {backend: len(agents["random"]["distances"]) for backend, agents in found.items()} == {"fem": 2}
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY.replace("v0}", "v0, backend: fem}"))
+    with pytest.raises(ConfigError, match=r"fem_goals = 0, but the environment of '.*tiny\.yaml' is on FEM"):
+        sweep.sweep([path], [0], 1, tmp_path / "out", goals=5, fem_goals=0)
+    assert not (tmp_path / "out").exists()
+
+
 def test_goals_of_the_final_evaluation_are_unseen_and_single_where_they_are_all_the_same():
     from agents.evaluation import evaluation_set
     from agents.training import EVALUATION_SEED

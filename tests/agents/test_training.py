@@ -100,6 +100,33 @@ def test_interrupted_training_resumes_as_if_it_had_not_been(hindsight, tmp_path,
     assert (folder / "policy.safetensors").stat().st_mtime_ns == before  # done is done
 
 
+def test_a_report_that_was_lost_with_its_process_is_made_again(trained, tmp_path):
+    seen = []
+
+    def report(step, outcome):
+        seen.append((step, outcome.to_json()))
+        if len(seen) == 1:
+            raise KeyboardInterrupt
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        train(CONFIG, tmp_path, progress=False, report=report)
+    policy = train(CONFIG, tmp_path, progress=False, report=report)
+    assert [step for step, _ in seen] == [200, 200, 400] and seen[0] == seen[1] != seen[2]
+    assert policy.read_bytes() == trained.read_bytes()
+
+
+def test_a_training_that_was_to_stop_stops_when_it_goes_on(tmp_path, monkeypatch):
+    def lost(step, outcome):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(CONFIG, tmp_path, progress=False, report=lost)
+    monkeypatch.setattr(training, "_learn", lambda *_: pytest.fail("went on"))
+    card = Policy(train(CONFIG, tmp_path, progress=False, report=lambda step, outcome: True)).card
+    assert card["stopped_early"] and card["steps"] == 200
+
+
 def test_damaged_checkpoint_is_named(tmp_path, monkeypatch):
     original = training._learn
 

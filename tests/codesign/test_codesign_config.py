@@ -46,10 +46,16 @@ BAD = {
         "tpe",
     ),
     "pruner of several objectives": ({"also": ["mean_effort"], "pruner": {"name": "wilcoxon"}}, "wilcoxon", "none"),
-    "goals of an objective that has none": (
-        {"objective": "mean_effort", "pruner": {"name": "wilcoxon"}},
-        "mean_effort",
-        "mean_distance",
+    "body alone as objective": ({"objective": "material_volume"}, "material_volume", "also"),
+    "points for a task of paths": (
+        {"strategy": "scratch", "environment": {"id": "SoftGym/FingerTrack-v0"}},
+        "goals.source",
+        "task",
+    ),
+    "family without a surrogate": (
+        {"environment": {"id": "SoftGym/TetrapodReach-v0"}, "variables": ["leg_length"]},
+        "family",
+        "zone",
     ),
     "judge that does not see the body": ({"strategy": "critic"}, "critic", "design_in_observation"),
     "unknown option of joint training": (

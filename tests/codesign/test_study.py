@@ -18,7 +18,7 @@ from codesign.finalists import choose_winner, evaluations, finalist_jobs
 from codesign.folder import StudyFolder
 from codesign.ledger import open_study
 from codesign.report import write_report
-from codesign.results import bootstrap_interval, rank_correlation, rate_interval
+from codesign.results import bootstrap_interval, difference_interval, rank_correlation, rate_interval
 from codesign.study import run_study
 from softgym_envs.errors import WeightsError
 from softgym_envs.storage import write_json
@@ -140,7 +140,9 @@ def test_report(finished):
     page.feed(path.read_text())
     assert page.open == []
     assert len(page.sources) > 8
-    assert all(source.startswith("data:image/") for source in page.sources)
+    beside = {path.name for path in finished.folder.path.glob("winner-trial*")}
+    assert len(beside) == 2
+    assert all(source.startswith("data:image/") or source in beside for source in page.sources)
     text = " ".join(page.text)
     row = finished.results["comparison"][0]
     for role in ("baseline", "winner"):
@@ -215,3 +217,41 @@ def test_statistics(rng):
     assert rate_interval([0.5, 1.0, 0.0])[0] >= 0.0  # shares of several seeds
     assert rank_correlation([1, 2, 3], [10, 20, 15]) == pytest.approx(0.5)
     assert rank_correlation([1, 1, 1], [1, 2, 3]) is None
+
+
+def test_interval_of_a_difference_heeds_the_seeds(rng):
+    """With one seed each it is the bootstrap over goals; a lucky seed of several widens it."""
+    goals = rng.normal(0.0, 1.0, 40)
+    baseline, winner = goals[None], goals[None] - 0.1
+    assert difference_interval(baseline, winner) == pytest.approx((-0.1, -0.1))
+    lucky = np.array([goals - 0.5, goals + 0.2, goals + 0.2])  # better by 0.03 on average
+    low, high = difference_interval(np.tile(goals, (3, 1)), lucky)
+    assert low < -0.3 and high > 0.1
+    steady = np.tile(goals - 0.1, (3, 1))
+    assert difference_interval(np.tile(goals, (3, 1)), steady) == pytest.approx((-0.1, -0.1))
+
+
+def test_limits_decide_before_scores(study):
+    folder = study(finalists={"count": 2, "choose": "fem"}, limits={"mean_effort": 1.0})
+
+    def record(distance, effort):
+        return {"success_rate": 0.5, "mean_distance": distance, "mean_return": 1.0, "mean_effort": effort}
+
+    found = [(3e-3, 0.5, 0.5), (2e-3, 0.9, 1.2), (1e-3, 1.5, 1.5)]  # distance, effort in search, effort on FEM
+    for number, (distance, effort, tested) in enumerate(found):
+        result = {
+            "number": number,
+            "origin": "baseline" if number == 0 else f"sampler {number}",
+            "state": "complete",
+            "design": folder.config.baseline,
+            "agent": "qp",
+            "score": -distance,
+            "violations": [effort - 1.0],
+            "evaluation": record(distance, effort),
+        }
+        write_json(folder.trial(number) / "result.json", result)
+        path = folder.path / "finalists" / f"trial{number:04d}-qp-fem-selection.json"
+        test = {"trial": number, "agent": "qp", "backend": "fem", "goals": "selection", **record(distance, tested)}
+        write_json(path, test)
+    assert choose_winner(folder, evaluations(folder)).number == 0  # trial 1 breaks it on FEM, trial 2 in the search
+    assert choose_winner(folder, []).number == 1

@@ -212,6 +212,18 @@ def test_given_bodies_hold_one_episode():
     assert (env.designs[:, 0] == 0.040).all()
 
 
+def test_given_bodies_do_not_stay_where_others_are_sampled():
+    env = TorchVectorEnv(FINGER, 3, device="cpu", design={"height": 0.021}, sample_design=["joint_height"], seed=0)
+    length, height, joint = (env.design_space.names.index(name) for name in ("length", "height", "joint_height"))
+    env.reset(options={"design": {"length": 0.0385, "height": 0.0205}})
+    given = env.designs.clone()
+    env._state["steps"][1] = 49
+    env.step(torch.zeros(3, 2))
+    assert env.designs[:, length].tolist() == [0.0385, 0.040, 0.0385]
+    assert env.designs[:, height].tolist() == [0.0205, 0.021, 0.0205]
+    assert (env.designs[:, joint] != given[:, joint]).tolist() == [False, True, False]
+
+
 def test_single_precision_is_enough():
     walks = []
     for dtype in (torch.float32, torch.float64):

@@ -68,6 +68,19 @@ def test_given_designs_hold_one_episode_at_least():
     assert (env.unwrapped.designs[:, 0] == 0.040).all()
 
 
+def test_given_designs_do_not_stay_where_others_are_sampled():
+    env = gymnasium.make_vec(
+        "SoftGym/FingerReach-v0", num_envs=2, design={"height": 0.021}, sample_design=["joint_height"]
+    )
+    names = env.unwrapped.design_space.names
+    length, height, joint = (names.index(name) for name in ("length", "height", "joint_height"))
+    env.reset(seed=0, options={"design": {"length": 0.0385, "height": 0.0205}})
+    given = env.unwrapped.designs.copy()
+    env.reset()
+    assert (env.unwrapped.designs[:, length] == 0.040).all() and (env.unwrapped.designs[:, height] == 0.021).all()
+    assert (env.unwrapped.designs[:, joint] != given[:, joint]).all()
+
+
 def test_bad_input():
     with pytest.raises(ValueError, match="fem.*surrogate"):
         gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2, backend="fem")

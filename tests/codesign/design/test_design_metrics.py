@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.design.bodies import Box, Evaluator, LearnedBodies
+from codesign.design.bodies import Box, Evaluator, LearnedBodies, full_command
 from codesign.design.metrics import METRICS
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConfigError, DesignError
@@ -104,6 +104,13 @@ def test_what_cannot_be_asked_for(finger):
     ):
         with pytest.raises(ConfigError, match=words):
             Evaluator(finger, metrics, **options)
+
+
+@pytest.mark.parametrize("name", ["finger", "diamond", "tetrapod"])
+def test_the_default_actuation_is_not_rest(name):
+    robot = make_robot(name)
+    command = full_command(robot, None)
+    assert (command > 0.0).all() and command == pytest.approx(0.5 * robot.upper)
 
 
 def test_box(finger):

@@ -90,6 +90,41 @@ def test_a_stopped_search_ends_as_one_that_was_not(some, monkeypatch, tmp_path):
         search(configured(objectives=[{"metric": "travel"}]), tmp_path / "parts", progress=False)
 
 
+@pytest.mark.parametrize("sampler", [SAMPLER, {"name": "tpe", "seed": 3}])
+@pytest.mark.parametrize("parameters", [1, 15, 26, 27])  # of which the first 18 are those of the first batch
+def test_a_search_that_was_stopped_while_it_proposed(sampler, parameters, some, monkeypatch, tmp_path):
+    import optuna
+
+    starts = [{"length": 0.039}, {"length": 0.0415}]
+    solver = {"method": "search", "sampler": sampler, "trials": 14, "batch": 6, "starts": starts}
+    config = configured(objectives=[{"metric": "bending_angle"}], solver=solver)
+
+    def designs(folder):
+        rows = (folder / "trials.csv").read_text().splitlines()[1:]
+        return [row.split(",")[1:-1] for row in rows]  # without number and seconds
+
+    whole = search(config, tmp_path / "whole", progress=False)
+    suggest, count = optuna.Trial._suggest, 0
+
+    def stop(self, *arguments):
+        nonlocal count
+        count += 1
+        if count == parameters:
+            raise KeyboardInterrupt
+        return suggest(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(optuna.Trial, "_suggest", stop)
+        with pytest.raises(KeyboardInterrupt):
+            search(config, tmp_path / "parts", progress=False)
+    parts = search(config, tmp_path / "parts", progress=False)
+    assert designs(tmp_path / "parts") == designs(tmp_path / "whole") and len(designs(tmp_path / "parts")) == 14
+    for name in ("feasible", "infeasible", "repeated"):
+        assert parts[name] == whole[name]
+    assert parts["front"][0]["design"] == whole["front"][0]["design"]
+    assert some.count == 2 * (14 - whole["repeated"])  # nothing was evaluated again
+
+
 def test_generations_of_nsga_are_full(some, tmp_path):
     import optuna
 
