@@ -177,12 +177,17 @@ def main(folder: Path, workers: int = 1) -> None:
         for done, path in enumerate(run_jobs(missing, workers), 1):
             print(f"[{done}/{len(missing)}] {path.relative_to(folder)}", flush=True)
     finally:
-        truth = [json.loads(path.read_text()) for path in sorted((folder / "truth").glob("*.json"))]
-        runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*/*/regret.json"))]
-        kept = {**provenance(), "truth": [_short(point) for point in truth], "runs": runs}
-        if len(truth) == len(LEVELS) ** len(VARIABLES):
-            kept |= _judge(truth, runs)
-        write_json(KEPT, kept)
+        collect(folder)
+
+
+def collect(folder: Path) -> None:
+    """Write what is there to ``benchmarks/data/strategies.json``."""
+    truth = [json.loads(path.read_text()) for path in sorted((folder / "truth").glob("*.json"))]
+    runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*/*/regret.json"))]
+    kept = {**provenance(), "truth": [_short(point) for point in truth], "runs": runs}
+    if len(truth) == len(LEVELS) ** len(VARIABLES):
+        kept |= _judge(truth, runs)
+    write_json(KEPT, kept)
 
 
 def _short(point: dict[str, Any]) -> dict[str, Any]:
