@@ -265,6 +265,16 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
     }
 
 
+def _steps_to(curve: list[list[float]], limit: float) -> float:
+    """Environment steps from which on the regret keeps a limit: a noisy score may lead away from a good body again."""
+    reached = float("inf")
+    for steps, _, regret in reversed(curve):
+        if regret > limit:
+            break
+        reached = steps
+    return reached
+
+
 def strategies() -> dict[str, object]:
     """Regret of the co-design strategies by environment steps: median of the repeats (smallest to largest)."""
     kept = json.loads(KEPT.read_text())
@@ -291,8 +301,9 @@ def strategies() -> dict[str, object]:
         result[f"{name}: steps behind the policy it is given"] = runs[0]["pretraining"]
         result[f"{name}: CPU minutes"] = spread([row[1] / 60 for row in last], ".1f")
         for limit in (0.1, 0.01):
-            reached = [next((row[0] for row in run["regret"] if row[2] <= limit), np.inf) for run in runs]
-            result[f"{name}: environment steps to {limit:.0%} regret"] = spread(reached, ",.0f")
+            result[f"{name}: environment steps to {limit:.0%} regret"] = spread(
+                [_steps_to(run["regret"], limit) for run in runs], ",.0f"
+            )
     return result
 
 

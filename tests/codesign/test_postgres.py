@@ -15,7 +15,7 @@ import sqlalchemy as sql
 
 from benchmarks.codesign_scale import Sweep, faults
 from benchmarks.postgres_server import find_programs, temporary_server
-from codesign import worker
+from codesign import finalists, worker
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
 from codesign.jobs import Job, missing_jobs, run_jobs
@@ -227,7 +227,7 @@ def test_policies_come_from_the_machine_that_trained_them(machine, monkeypatch):
     (a.path / name).with_suffix(".json").write_bytes(b"{}")
     tested = []
     monkeypatch.setattr(worker, "run_jobs", lambda folder, jobs: tested.append(folder))
-    monkeypatch.setattr(worker, "finalists", lambda folder: [SimpleNamespace(policy=name)])
+    monkeypatch.setattr(finalists, "finalists", lambda folder: [SimpleNamespace(policy=name)])
     monkeypatch.setattr(worker, "finalist_jobs", lambda folder: [])
     with Ledger(a) as ledger:
         trial = ledger.claim()
