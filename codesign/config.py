@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import warnings
 from dataclasses import dataclass
@@ -132,9 +131,6 @@ class SamplerConfig(Config):
     def _known_options(self) -> SamplerConfig:
         import optuna
 
-        if self.name == "cmaes" and importlib.util.find_spec("cmaes") is None:
-            others = ", ".join(name for name in SAMPLERS if name != "cmaes")
-            raise ValueError(f"sampler 'cmaes' needs the package cmaes (pip install cmaes); allowed without: {others}")
         _check_options("sampler", self.name, getattr(optuna.samplers, SAMPLERS[self.name]), self.options)
         return self
 
