@@ -215,28 +215,20 @@ class TrainingConfig(Config):
     sac: SACConfig = Field(default_factory=SACConfig)
 
 
-class JointConfig(Config):
+class JointConfig(TrainingConfig):
     """Training of bodies and policy together, before the trials; for the strategies ``"critic"``, ``"distribution"``.
 
     Attributes:
         steps: environment steps.
         report_every: environment steps between two checkpoints, and two questions to the critic.
-        evaluation_episodes: episodes behind each point of the learning curve.
-        num_envs: environments in parallel.
-        seed: of everything in it.
         keep: number of its most promising bodies that become trials.
         options: arguments of the proposer, see `agents.joint`.
-        sac: hyper-parameters.
     """
 
     steps: int = Field(default=40_000, ge=1)
     report_every: int = Field(default=4_000, ge=1)
-    evaluation_episodes: int = Field(default=32, ge=1)
-    num_envs: int = Field(default=16, ge=1)
-    seed: int = Field(default=0, ge=0)
     keep: int = Field(default=4, ge=1, le=32)
     options: dict[str, int | float] = Field(default_factory=dict)
-    sac: SACConfig = Field(default_factory=SACConfig)
 
 
 class ScreenConfig(Config):

@@ -12,9 +12,9 @@ __all__ = ["write_exports"]
 
 
 def write_exports(folder: StudyFolder) -> list[tuple[str, str]]:
-    """Write ``winner.stl`` and ``rollouts.rrd`` (baseline and winner side by side on the first unseen goal).
+    """Write ``winner-trialNNNN.stl`` and ``.rrd`` (baseline and winner side by side on the first unseen goal).
 
-    What is there already is kept, as long as the winner is the same.
+    What is there already is kept; another winner gets files of its own.
 
     Returns:
         Name and description of each file there is; none without a winner.

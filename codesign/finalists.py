@@ -18,8 +18,7 @@ from codesign.judge import JUDGE
 from codesign.objectives import OBJECTIVES, rank_key, violations
 from codesign.trial import assess, training_config
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.errors import DataError
-from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.storage import write_json
 
 __all__ = [
     "BACKENDS",
@@ -148,19 +147,9 @@ def fetch_policies(folder: StudyFolder) -> None:
     Raises:
         DataError: if one is nowhere.
     """
-    storage = folder.open_storage()
-    policies = [Path(body.policy) for body in finalists(folder) if body.policy is not None]
-    for path in (folder.path / name for policy in policies for name in (policy, policy.with_suffix(".json"))):
-        if path.exists():
-            continue
-        name = path.relative_to(folder.path).as_posix()
-        content = storage.fetch(name)
-        if content is None:
-            raise DataError(
-                f"policy '{name}' is neither in folder '{folder.path}' nor in storage '{folder.config.storage}'"
-            )
-        with atomic_write(path) as stream:
-            stream.write(content)
+    for body in finalists(folder):
+        if body.policy is not None:
+            folder.policy(body.policy)
 
 
 def finalist_jobs(folder: StudyFolder) -> list[Job]:

@@ -14,7 +14,7 @@ from codesign.goals import draw_goals
 from codesign.storages import StudyStorage, file_lock, open_storage
 from softgym_envs.config import check_config, load_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
-from softgym_envs.storage import write_json
+from softgym_envs.storage import atomic_write, write_json
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -138,6 +138,29 @@ class StudyFolder:
     def lock(self, name: str) -> BaseFileLock:
         """Return a lock shared by all processes of the folder; see `codesign.storages.file_lock`."""
         return file_lock(self.path, name)
+
+    def policy(self, name: str) -> Path:
+        """Return the file of a policy; it and its card are copied from the storage where another machine made them.
+
+        Args:
+            name: its path in the folder.
+
+        Raises:
+            DataError: if it is in neither.
+        """
+        path = self.path / name
+        missing = [file for file in (path, path.with_suffix(".json")) if not file.exists()]
+        storage = self.open_storage() if missing else None
+        for file in missing:
+            known = file.relative_to(self.path).as_posix()
+            content = storage.fetch(known) if storage is not None else None
+            if content is None:
+                raise DataError(
+                    f"policy '{known}' is neither in folder '{self.path}' nor in storage '{self.config.storage}'"
+                )
+            with atomic_write(file) as stream:
+                stream.write(content)
+        return path
 
     def trial(self, number: int) -> Path:
         """Folder of a trial."""

@@ -18,7 +18,6 @@ from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
 from codesign.jobs import Job
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.errors import DataError
 from softgym_envs.storage import atomic_write
 
 __all__ = ["JUDGE", "joint_config", "judge_jobs", "judge_policy", "promising_bodies"]
@@ -36,22 +35,12 @@ def judge_jobs(folder: StudyFolder) -> list[Job]:
 
 
 def judge_policy(folder: StudyFolder) -> Path:
-    """The file of the judge, copied from the storage of the study where another machine made it.
+    """The file of the judge, wherever it was made.
 
     Raises:
         DataError: if there is none.
     """
-    storage = folder.open_storage()
-    for name in (JUDGE, Path(JUDGE).with_suffix(".json").as_posix()):
-        path = folder.path / name
-        if path.exists():
-            continue
-        content = storage.fetch(name)
-        if content is None:
-            raise DataError(f"study '{folder.path}' has no '{name}'")
-        with atomic_write(path) as stream:
-            stream.write(content)
-    return folder.path / JUDGE
+    return folder.policy(JUDGE)
 
 
 def promising_bodies(folder: StudyFolder) -> list[tuple[str, dict[str, float]]]:
