@@ -24,7 +24,7 @@ import numpy as np
 from agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.config import load_config, provenance
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.errors import ConfigError
+from softgym_envs.errors import ConfigError, SoftGymError
 from softgym_envs.executors import run_jobs
 from softgym_envs.storage import write_json
 
@@ -208,9 +208,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ[variable] = "1"
     if find_spec("platformdirs") is None:
         os.environ.setdefault("SOFTGYM_CACHE", str(given.folder / "cache"))
-    failed = sweep(
-        given.configs, given.seeds, given.processes, given.folder, goals=given.goals, fem_goals=given.fem_goals
-    )
+    try:
+        failed = sweep(
+            given.configs, given.seeds, given.processes, given.folder, goals=given.goals, fem_goals=given.fem_goals
+        )
+    except SoftGymError as error:
+        parser.error(str(error))
     return 1 if failed else 0
 
 

@@ -196,7 +196,7 @@ class GoalsConfig(Config):
 
 
 class TrainingConfig(Config):
-    """Training inside one trial; see `agents.config.TrainConfig`. Only for strategies whose trials train.
+    """Training for one body, in a trial or as a finalist; see `agents.config.TrainConfig`.
 
     Attributes:
         steps: environment steps of one trial.
@@ -285,9 +285,10 @@ class StudyConfig(Config):
         also: further objectives: the study then looks for the Pareto front of all of them.
         limits: largest allowed values of objectives that are better when smaller, smallest of the others [SI]; a body
             that breaks one cannot win.
-        strategy: ``"scratch"`` trains a policy in each trial (plain nesting), ``"warm_start"`` fine-tunes a
-            design-conditioned one, ``"policy"`` lets it judge bodies as it is, ``"critic"`` and ``"distribution"``
-            train bodies and a policy together and then let it judge, ``"qp"`` trains none and asks the inverse QP.
+        strategy: ``"policy"`` lets one design-conditioned policy judge all bodies as it is, ``"warm_start"`` fine-tunes
+            it in each trial, ``"scratch"`` trains a policy in each trial (plain nesting), ``"critic"`` and
+            ``"distribution"`` train bodies and a policy together and then let it judge, ``"qp"`` trains none and asks
+            the inverse QP.
         policy: design-conditioned policy, for ``"warm_start"`` and ``"policy"``: a file or the name of a shipped one.
         joint: training of bodies and policy together, for ``"critic"`` and ``"distribution"``.
         trials: number of bodies, the baseline and those of the screen included.
@@ -314,7 +315,7 @@ class StudyConfig(Config):
     objective: str = "mean_distance"
     also: tuple[str, ...] = ()
     limits: dict[str, float] = Field(default_factory=dict)
-    strategy: Literal["warm_start", "scratch", "policy", "critic", "distribution", "qp"] = "warm_start"
+    strategy: Literal["policy", "warm_start", "scratch", "critic", "distribution", "qp"] = "policy"
     policy: str | None = None
     joint: JointConfig = Field(default_factory=JointConfig)
     trials: int = Field(ge=1)
@@ -413,10 +414,15 @@ class StudyConfig(Config):
             raise ValueError(
                 f"goals.source = 'family' needs a surrogate, which robot '{row.robot}' has not; allowed: task, zone"
             )
-        if self.goals.source != "task" and self.strategy not in ("qp", "policy") and row.task != "reach":
+        trains = plan.trains or plan.proposer or self.finalists.seeds
+        if self.goals.source != "task" and trains and row.task != "reach":
             raise ValueError(
                 f"goals.source = '{self.goals.source}' gives points to train on, task '{row.task}' takes paths; "
                 "allowed: task"
+            )
+        if self.finalists.seeds and self.strategy == "qp":
+            raise ValueError(
+                f"finalists.seeds = {self.finalists.seeds} trains policies, strategy 'qp' has none; allowed: 0"
             )
         shown = self.environment.design_in_observation
         if plan.proposer and shown is not True and not set(self.variables) <= set(shown or ()):
@@ -443,7 +449,7 @@ class StudyConfig(Config):
                 f"pruner 'wilcoxon' compares goals, strategy '{self.strategy}' reports its training; "
                 f"allowed: {', '.join(name for name in PRUNERS if name != 'wilcoxon')}"
             )
-        if plan.trains and training.report_every > training.steps:
+        if (plan.trains or self.finalists.seeds) and training.report_every > training.steps:
             raise ValueError(
                 f"training.report_every = {training.report_every} exceeds training.steps = {training.steps}"
             )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from agents.policy import policy_path
+from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
 from codesign.jobs import Job
 from codesign.judge import JUDGE
@@ -29,6 +30,7 @@ __all__ = [
     "finalist_jobs",
     "finalists",
     "pareto_trials",
+    "trainings",
 ]
 
 BACKENDS = ("surrogate", "fem")
@@ -136,9 +138,33 @@ def trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
     with folder.lock(f"training-{name}"):
         cpu = time.process_time()
         policy = train(training, place, initial=initial, progress=False)
-        if not (place / "cost.json").exists():
-            write_json(place / "cost.json", {"steps": steps, "cpu_seconds": time.process_time() - cpu})
+        if not (place / "training.json").exists():
+            objective = OBJECTIVES[config.objective]
+            curve = json.loads(policy.with_suffix(".json").read_text())["curve"]
+            write_json(
+                place / "training.json",
+                {
+                    "trial": finalist.number,
+                    "seed": training.seed,
+                    "steps": steps,
+                    "report_steps": len(curve) * training.evaluation_episodes * _episode_steps(config),
+                    "cpu_seconds": time.process_time() - cpu,
+                    # Not every objective is followed during a training.
+                    "curve": [[row["step"], objective.score(row)] for row in curve if objective.key in row],
+                },
+            )
         return policy
+
+
+def trainings(folder: StudyFolder) -> list[dict[str, Any]]:
+    """What is told of the policies that were trained anew for the present finalists."""
+    numbers = [body.number for body in finalists(folder)]
+    told = [json.loads(path.read_text()) for path in sorted(folder.path.glob("finalists/*/training.json"))]
+    return [row for row in told if row["trial"] in numbers]
+
+
+def _episode_steps(config: StudyConfig) -> int:
+    return ENVIRONMENTS[config.environment.id].max_episode_steps
 
 
 def fetch_policies(folder: StudyFolder) -> None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "curves",
+    "finalist_curves",
     "history",
     "importance",
     "overlay",
@@ -193,6 +194,34 @@ def curves(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> s
         ax.set(xlabel="environment steps of training", ylabel=f"{_axis(objective)} in training")
         if roles:
             ax.legend(fontsize=8)
+    return out[0]
+
+
+def finalist_curves(results: Mapping[str, Any]) -> str | None:
+    """Progress of the policies that were trained anew for the finalists, one line each, or None without them."""
+    trained = [row for row in results["trainings"] if row["curve"]]
+    if not trained:
+        return None
+    objective, roles = OBJECTIVES[results["objective"]], _roles(results)
+    colours = {"winner": WINNER, "baseline": BASELINE}
+    told: set[str] = set()
+    with _figure(6.2, 3.2) as (_, (ax,), out):
+        for row in sorted(trained, key=lambda row: row["trial"] in roles):
+            steps, scores = np.array(row["curve"], dtype=float).T
+            role = roles.get(row["trial"], "")
+            label = role or "other finalists"
+            ax.plot(
+                steps,
+                objective.shown(scores),
+                color=colours.get(role, OTHER),
+                label=None if label in told else label,
+                linewidth=1.8 if role else 1.1,
+                marker=".",
+                markersize=4,
+            )
+            told.add(label)
+        ax.set(xlabel="environment steps of training", ylabel=f"{_axis(objective)} in training")
+        ax.legend(fontsize=8)
     return out[0]
 
 

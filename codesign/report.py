@@ -77,6 +77,7 @@ def _context(study: StudyFolder, results: dict[str, Any]) -> dict[str, Any]:
         **_pictures(study, results),
         "design": [_design_row(variable) for variable in results["variables"]],
         "comparison": [_comparison_row(row) for row in results["comparison"]],
+        "interval_note": _interval_note(study),
         "figures": {"reached": plots.reached(results), "transfer": plots.transfer(results)},
         "search": _search(trials, results) if complete else [],
         "search_notes": _search_notes(trials, results),
@@ -346,11 +347,22 @@ def _comparison_row(row: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _interval_note(study: StudyFolder) -> str:
+    seeds = study.config.finalists.seeds
+    if seeds > 1:
+        return f"The intervals of SAC are over goals and over {seeds} trainings for each body, with other seeds."
+    return (
+        "The intervals are over goals, for the controllers as trained: they do not contain the chance of another "
+        "training seed."
+    )
+
+
 def _search(trials: list[dict[str, Any]], results: Mapping[str, Any]) -> list[tuple[str, str]]:
     figures = (
         ("Every trial, and the best so far", plots.history(trials, results)),
         ("Several objectives", plots.pareto(trials, results)),
         ("Learning inside the trials", plots.curves(trials, results)),
+        ("Learning of the finalists, each with several seeds", plots.finalist_curves(results)),
         ("Bodies and their objective", plots.parallel(trials, results)),
         ("Which variables matter", plots.importance(results)),
         ("The inverse QP as a predictor of the trained controller", plots.screen(trials, results)),
@@ -449,7 +461,11 @@ def _cost_rows(cost: Mapping[str, Any]) -> list[dict[str, str]]:
         "judge": f"{cost['joint_steps']:,} of training, {cost['joint_report_steps']:,} of its reports",
         "trials": f"{cost['training_steps']:,} of training, {cost['report_steps']:,} of its reports, "
         f"{cost['selection_steps']:,} of scores",
-        "finalists": (f"{cost['retraining_steps']:,} of training, " if cost["retraining_steps"] else "")
+        "finalists": (
+            f"{cost['retraining_steps']:,} of training, {cost['retraining_report_steps']:,} of its reports, "
+            if cost["retraining_steps"]
+            else ""
+        )
         + f"{cost['test_steps_fem']:,} on FEM, {cost['test_steps_surrogate']:,} on the surrogate",
     }
     titles = {

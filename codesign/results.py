@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign.finalists import BACKENDS, Finalist, choose_winner, evaluations, finalists, pareto_trials
+from codesign.finalists import BACKENDS, Finalist, choose_winner, evaluations, finalists, pareto_trials, trainings
 from codesign.folder import StudyFolder
 from codesign.ledger import open_study
 from codesign.objectives import OBJECTIVES, Objective
@@ -186,11 +186,12 @@ def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[st
     judge = {"training_steps": 0, "report_steps": 0, "cpu_seconds": 0.0}
     if path.exists():
         judge = json.loads(path.read_text())
-    retrained = [json.loads(path.read_text()) for path in sorted(folder.path.glob("finalists/*/cost.json"))]
+    retrained = [json.loads(path.read_text()) for path in sorted(folder.path.glob("finalists/*/training.json"))]
     return {
         "joint_steps": judge["training_steps"],
         "joint_report_steps": judge["report_steps"],
         "retraining_steps": sum(row["steps"] for row in retrained),
+        "retraining_report_steps": sum(row["report_steps"] for row in retrained),
         "training_steps": sum(trial["training_steps"] for trial in trials),
         "report_steps": sum(len(trial["curve"]) for trial in trials)
         * config.training.evaluation_episodes
@@ -274,6 +275,7 @@ def collect(folder: StudyFolder) -> dict[str, Any]:
         "finalists": [
             {"trial": body.number, "role": body.role, "design": body.design, "score": body.score} for body in bodies
         ],
+        "trainings": trainings(folder),
         "evaluations": tests,
         "importance": importance(folder),
         "cost": _cost(folder, trials, tests),

@@ -215,7 +215,8 @@ class _Printer:
             found = record.get("error") or (
                 f"success {100 * record['success_rate']:.1f} %, mean distance {1e3 * record['mean_distance']:.2f} mm"
             )
-            which = f"{record['agent']} on {record['backend']}, {record['goals']} goals"
+            seed = f" (seed {record['seed']})" if record["seed"] else ""
+            which = f"{record['agent']}{seed} on {record['backend']}, {record['goals']} goals"
             self.say(f"test: trial {record['trial']}, {which}: {found}")
 
     def verdict(self, results: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -479,9 +480,13 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
     folder = Path("results") / study.name if folder is None else folder
     result = run(study, folder)
     for name in study.fit:
-        text = f"{name} = {result['design'][name]:.6g}"
-        if result["interval"] is not None:
-            text += ", {:g} % interval {:.6g} to {:.6g}".format(100 * result["level"], *result["interval"][name])
+        value, ends = result["design"][name], (result["interval"] or {}).get(name)
+        digits = 6
+        if ends is not None and ends[1] > ends[0]:  # as many as tell the ends apart
+            digits = max(digits, 2 - math.floor(math.log10((ends[1] - ends[0]) / abs(value))))
+        text = f"{name} = {value:.{digits}g}"
+        if ends is not None:
+            text += f", {100 * result['level']:g} % interval {ends[0]:.{digits}g} to {ends[1]:.{digits}g}"
         click.echo(text)
     errors = ", ".join(f"{name} {value:.3g}" for name, value in result["errors"].items())
     click.echo(f"root mean square errors: {errors} [SI]; {result['seconds']:.1f} s; wrote {folder}")

@@ -22,9 +22,9 @@ __all__ = ["Config", "check_config", "load_config", "read_value", "provenance", 
 
 
 class Config(BaseModel):
-    """Base of all configurations: unknown keys are errors, values do not change."""
+    """Base of all configurations: unknown keys are errors, numbers are finite, values do not change."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=False, allow_inf_nan=False)
 
 
 class _Loader(yaml.SafeLoader):
@@ -42,6 +42,9 @@ def read_value(text: str) -> Any:
     """Read YAML text; raises `yaml.YAMLError`."""
     return yaml.load(text, Loader=_Loader)
 
+
+_PASSWORD = re.compile(r"(?<=[^/]):[^/@:\s]*@")
+"""The password of an address, which must not end up in a log."""
 
 ModelT = TypeVar("ModelT", bound=Config)
 
@@ -100,7 +103,7 @@ def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> Model
             allowed = _allowed(model, [part for part in first["loc"][:-1] if isinstance(part, str)])
             message = f"unknown key; allowed: {allowed}" if allowed else "unknown key"
         elif first["type"] != "missing" and not isinstance(first["input"], dict):
-            message += f", got {first['input']!r}"
+            message += f", got {_PASSWORD.sub(r':***@', repr(first['input']))}"
         others = error.error_count() - 1
         more = f" (and {others} more)" if others else ""
         raise ConfigError(f"{where}: {key}: {message}{more}") from None

@@ -218,7 +218,7 @@ def _result(config: OptimiseConfig, folder: Path, study: optuna.Study) -> dict[s
     box, names = config.bodies.box(), config.metrics
     values = np.array([[trial.user_attrs["found"]["metrics"][name] for name in names] for trial in feasible])
     costs = np.array([trial.values for trial in feasible])
-    front = non_dominated(costs)
+    front = np.array([k for k in non_dominated(costs) if "repeated" not in feasible[k].user_attrs["found"]], dtype=int)
     if len(names) == 1:
         front = front[:1]
     rows = [

@@ -39,6 +39,7 @@ BAD = {
     "unknown objective": ({"objective": "beauty"}, "beauty", "success_rate"),
     "unknown second objective": ({"also": ["beauty"]}, "beauty", "success_rate"),
     "unknown limit": ({"limits": {"beauty": 1.0}}, "beauty", "success_rate"),
+    "limit that is no number": ({"limits": {"mean_effort": float("nan")}}, "limits.mean_effort", "finite"),
     "an objective twice": ({"also": ["mean_distance"]}, "mean_distance", "twice"),
     "limits for a sampler that knows none": (
         {"limits": {"mean_effort": 1.0}, "sampler": {"name": "cmaes"}},
@@ -83,6 +84,17 @@ BAD = {
         {"strategy": "scratch", "training": {"steps": 100, "report_every": 200}},
         "report_every = 200",
         "steps = 100",
+    ),
+    "finalists of a strategy without policies": ({"finalists": {"count": 1, "seeds": 2}}, "finalists.seeds = 2", "qp"),
+    "finalists trained on points for a task of paths": (
+        {
+            "strategy": "policy",
+            "policy": "finger_reach_designs",
+            "environment": {"id": "SoftGym/FingerTrack-v0"},
+            "finalists": {"count": 1, "seeds": 1},
+        },
+        "goals.source",
+        "task",
     ),
     "joint training on FEM": (
         {

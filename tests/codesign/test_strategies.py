@@ -134,7 +134,13 @@ def test_finalists_are_trained_anew_with_several_seeds(run):
         assert record["of_seeds"]["distances"] == [part["distances"] for part in parts]
     assert {row["agent"] for row in results["comparison"]} == {"sac", "qp"}
     assert results["cost"]["retraining_steps"] == 2 * 2 * 240
-    write_report(folder.path)
+    assert results["cost"]["retraining_report_steps"] == 2 * 2 * 3 * 2 * 50
+    told = {(row["trial"], row["seed"]): row["curve"] for row in results["trainings"]}
+    assert sorted(told) == [(0, 1), (0, 2), (1, 1), (1, 2)]
+    for (number, seed), curve in told.items():
+        card = json.loads((folder.path / "finalists" / f"trial{number:04d}-seed{seed}" / "policy.json").read_text())
+        assert curve == [[row["step"], -row["mean_distance"]] for row in card["curve"]]
+    assert "Learning of the finalists" in write_report(folder.path).read_text()
     winner = f"winner-trial{results['winner']['trial']:04d}"
     assert (folder.path / f"{winner}.stl").stat().st_size > 10_000
     assert (folder.path / f"{winner}.rrd").read_bytes()[:3] == b"RRF"
