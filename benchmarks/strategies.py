@@ -57,7 +57,7 @@ STRATEGIES: dict[str, dict[str, Any]] = {
         "pruner": {"name": "hyperband"},
     },
     "warm start": {"strategy": "warm_start", "policy": "finger_reach_designs", "trials": 12},
-    "warm start, screen (default)": {
+    "warm start, screen": {
         "strategy": "warm_start",
         "policy": "finger_reach_designs",
         "trials": 12,
@@ -65,8 +65,16 @@ STRATEGIES: dict[str, dict[str, Any]] = {
         "pruner": {"name": "percentile", "options": {"percentile": 60.0, "n_startup_trials": 5}},
     },
     "inverse QP": {"strategy": "qp", "trials": 30},
+    "inverse QP, Wilcoxon": {"strategy": "qp", "trials": 30, "pruner": {"name": "wilcoxon"}},
+    "inverse QP, Gaussian process": {"strategy": "qp", "trials": 30, "sampler": {"name": "gp"}},
     "policy as judge": {"strategy": "policy", "policy": "finger_reach_designs", "trials": 30},
-    "policy as judge, Wilcoxon": {
+    "policy as judge, Gaussian process": {
+        "strategy": "policy",
+        "policy": "finger_reach_designs",
+        "trials": 30,
+        "sampler": {"name": "gp"},
+    },
+    "policy as judge, Wilcoxon (default)": {
         "strategy": "policy",
         "policy": "finger_reach_designs",
         "trials": 30,
@@ -92,7 +100,7 @@ def _study(name: str, repeat: int) -> Any:
         given[part] = {**base[part], "seed": repeat, **given.get(part, {})}
     if given["strategy"] == "scratch":
         given["training"] = {**given["training"], "sac": {**given["training"]["sac"], "learning_starts": 1_000}}
-    given["sampler"] = {"name": "tpe", "seed": repeat, "options": {"n_startup_trials": 6}}
+    given["sampler"] = {"name": "tpe", "seed": repeat, "options": {"n_startup_trials": 6}, **given.get("sampler", {})}
     if not given["screen"]["enabled"]:
         given["screen"] = {"enabled": False}
     return _question(name=f"repeat{repeat}", **given)
