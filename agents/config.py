@@ -12,7 +12,7 @@ from softgym_envs.envs.registration import ENVIRONMENTS
 if TYPE_CHECKING:
     import gymnasium
 
-__all__ = ["EnvironmentConfig", "SACConfig", "TrainConfig"]
+__all__ = ["EnvironmentConfig", "SACConfig", "TrainConfig", "check_hindsight"]
 
 
 class EnvironmentConfig(Config):
@@ -151,10 +151,15 @@ class TrainConfig(Config):
 
     @model_validator(mode="after")
     def _relabelled(self) -> TrainConfig:
-        # What was done held the QP's action for the goal of then; it says nothing about another goal.
-        if self.sac.hindsight and self.environment.on_qp:
-            raise ValueError(
-                f"sac.hindsight = {self.sac.hindsight:g} cannot be had on top of the QP "
-                f"(environment.on_qp = {self.environment.on_qp:g}), whose action depends on the goal; allowed: 0"
-            )
+        check_hindsight(self.sac, self.environment)
         return self
+
+
+def check_hindsight(sac: SACConfig, environment: EnvironmentConfig) -> None:
+    """Raise ValueError for hindsight goals on top of the QP."""
+    # What was done held the QP's action for the goal of then; it says nothing about another goal.
+    if sac.hindsight and environment.on_qp:
+        raise ValueError(
+            f"sac.hindsight = {sac.hindsight:g} cannot be had on top of the QP "
+            f"(environment.on_qp = {environment.on_qp:g}), whose action depends on the goal; allowed: 0"
+        )

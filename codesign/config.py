@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from agents.config import EnvironmentConfig, SACConfig
+from agents.config import EnvironmentConfig, SACConfig, check_hindsight
 from agents.joint import PROPOSERS
 from codesign.objectives import OBJECTIVES
 from softgym_envs.config import Config
@@ -449,6 +449,10 @@ class StudyConfig(Config):
                 f"pruner 'wilcoxon' compares goals, strategy '{self.strategy}' reports its training; "
                 f"allowed: {', '.join(name for name in PRUNERS if name != 'wilcoxon')}"
             )
+        if plan.trains or self.finalists.seeds:
+            check_hindsight(training.sac, self.environment)
+        if plan.proposer:
+            check_hindsight(self.joint.sac, self.environment)
         if (plan.trains or self.finalists.seeds) and training.report_every > training.steps:
             raise ValueError(
                 f"training.report_every = {training.report_every} exceeds training.steps = {training.steps}"

@@ -96,6 +96,15 @@ BAD = {
         "goals.source",
         "task",
     ),
+    "hindsight on top of the QP": (
+        {
+            "strategy": "scratch",
+            "environment": {"id": "SoftGym/FingerReach-v0", "on_qp": 0.5},
+            "training": {"sac": {"hindsight": 0.8}},
+        },
+        "hindsight = 0.8",
+        "allowed: 0",
+    ),
     "joint training on FEM": (
         {
             "strategy": "critic",
