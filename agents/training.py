@@ -46,7 +46,8 @@ def train(
     Writes ``policy.safetensors`` (actor and critics) with its card, ``curve.csv``, TensorBoard logs where TensorBoard
     is installed, and a ``checkpoint.safetensors`` from which a run that was stopped resumes as if it had not been
     (weights, optimiser moments, replay buffer and random states; all episodes start anew after each evaluation). The
-    policy is the one with the largest mean return among those that were evaluated; the card names its step.
+    policy is the one with the largest mean return among those that were evaluated; the card names its step, and the CPU
+    time of all processes that the training took.
 
     Args:
         config: what to train.
@@ -84,13 +85,15 @@ def train(
     else:
         save_resolved(folder, config)
 
+    began = time.process_time()
     model = _make_model(config, folder)
     checkpoint = folder / "checkpoint.safetensors"
     curve: list[dict[str, float]] = []
     best: dict[str, np.ndarray] = {}
     outcome: Evaluation | None = None
     if checkpoint.exists():
-        curve, best, outcome = _restore(model, checkpoint)
+        curve, best, outcome, spent = _restore(model, checkpoint)
+        began -= spent
     elif config.initial is not None:
         start_from = policy_path(config.initial)
         _load_weights(model, read_tensors(start_from), start_from)
@@ -130,13 +133,14 @@ def train(
             _write_curve(folder / "curve.csv", curve)
             if proposer is not None:
                 proposer.save(model.num_timesteps)
-            _save_checkpoint(model, checkpoint, curve, best, outcome)
+            _save_checkpoint(model, checkpoint, curve, best, outcome, time.process_time() - began)
             stopped = report is not None and bool(report(model.num_timesteps, outcome))
     card = {
         "config": config.model_dump(mode="json"),
         "steps": int(model.num_timesteps),
         "best_step": _best_step(curve) if proposer is None else int(model.num_timesteps),
         "stopped_early": stopped,
+        "cpu_seconds": round(time.process_time() - began, 2),
         "curve": curve,
         "provenance": provenance(),
     }
@@ -251,7 +255,12 @@ def _optimisers(model: SAC) -> dict[str, Any]:
 
 
 def _save_checkpoint(
-    model: SAC, path: Path, curve: list[dict[str, float]], best: dict[str, np.ndarray], outcome: Evaluation
+    model: SAC,
+    path: Path,
+    curve: list[dict[str, float]],
+    best: dict[str, np.ndarray],
+    outcome: Evaluation,
+    cpu_seconds: float,
 ) -> None:
     import torch
     from safetensors.numpy import save
@@ -278,6 +287,7 @@ def _save_checkpoint(
         "numpy": [int(position[0]), int(position[1]), float(position[2])],
         "actions": model.action_space.np_random.bit_generator.state,
         "curve": curve,
+        "cpu_seconds": cpu_seconds,
         "outcome": {name: np.asarray(value).tolist() for name, value in asdict(outcome).items()},
     }
     with atomic_write(path) as stream:
@@ -285,8 +295,12 @@ def _save_checkpoint(
         stream.write(save(arrays, metadata={"state": json.dumps(meta)}))
 
 
-def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, np.ndarray], Evaluation]:
-    """Take up a checkpoint; returns the learning curve, the weights of the best policy so far, the last evaluation."""
+def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, np.ndarray], Evaluation, float]:
+    """Take up a checkpoint.
+
+    Returns:
+        The learning curve, the weights of the best policy so far, the last evaluation, and the CPU time spent [s].
+    """
     import torch
     from safetensors import safe_open
 
@@ -316,7 +330,8 @@ def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, 
     model.action_space.np_random.bit_generator.state = meta["actions"]
     best = {k.removeprefix("best/"): v for k, v in tensors.items() if k.startswith("best/")}
     columns = {name: np.asarray(value) for name, value in meta["outcome"].items() if name != "steps"}
-    return meta["curve"], best, Evaluation(**columns, steps=meta["outcome"]["steps"])
+    outcome = Evaluation(**columns, steps=meta["outcome"]["steps"])
+    return meta["curve"], best, outcome, float(meta["cpu_seconds"])
 
 
 def _write_curve(path: Path, curve: list[dict[str, float]]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -136,11 +135,11 @@ def trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
     name = f"trial{finalist.number:04d}-seed{seed}"
     place = folder.path / "finalists" / name
     with folder.lock(f"training-{name}"):
-        cpu = time.process_time()
         policy = train(training, place, initial=initial, progress=False)
         if not (place / "training.json").exists():
             objective = OBJECTIVES[config.objective]
-            curve = json.loads(policy.with_suffix(".json").read_text())["curve"]
+            trained = json.loads(policy.with_suffix(".json").read_text())
+            curve = trained["curve"]
             write_json(
                 place / "training.json",
                 {
@@ -148,7 +147,7 @@ def trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
                     "seed": training.seed,
                     "steps": steps,
                     "report_steps": len(curve) * training.evaluation_episodes * _episode_steps(config),
-                    "cpu_seconds": time.process_time() - cpu,
+                    "cpu_seconds": trained["cpu_seconds"],
                     # Not every objective is followed during a training.
                     "curve": [[row["step"], objective.score(row)] for row in curve if objective.key in row],
                 },

@@ -74,7 +74,7 @@ def _make(folder: StudyFolder) -> dict[str, Any]:
     config = folder.config
     started, cpu = time.perf_counter(), time.process_time()
     bodies: list[dict[str, float]] = []
-    steps = 0
+    steps, before = 0, 0.0
     if config.plan.proposer is None:
         assert config.policy is not None  # the configuration was checked
         source = policy_path(config.policy)
@@ -86,6 +86,9 @@ def _make(folder: StudyFolder) -> dict[str, Any]:
         source = train(
             joint_config(folder), training, proposer=PROPOSERS[config.plan.proposer](**options), progress=False
         )
+        # A training that goes on after its worker died has cost more than this process.
+        card = json.loads(source.with_suffix(".json").read_text())
+        before = max(0.0, card["cpu_seconds"] - (time.process_time() - cpu))
         found = json.loads((training / "bodies.json").read_text())
         space = config.space
         bodies = [
@@ -110,5 +113,5 @@ def _make(folder: StudyFolder) -> dict[str, Any]:
         "training_steps": steps,
         "report_steps": _report_steps(config) if steps else 0,
         "seconds": time.perf_counter() - started,
-        "cpu_seconds": time.process_time() - cpu,
+        "cpu_seconds": before + time.process_time() - cpu,
     }

@@ -182,6 +182,7 @@ def run_trial(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
         "qp": None,
         "curve": [],
         "training_steps": 0,
+        "cpu_seconds": 0.0,  # of earlier processes
     }
     evaluation: dict[str, Any] | None
     try:
@@ -205,7 +206,8 @@ def run_trial(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
         result["qp"] = result["qp"] or {"error": str(error)}
     if result["scores"] is not None and not np.isfinite(result["scores"]).all():
         result.update(state="infeasible", reason=f"the scores are {result['scores']}", score=None, scores=None)
-    result.update(seconds=time.perf_counter() - started, cpu_seconds=time.process_time() - cpu, finished_at=time.time())
+    result["cpu_seconds"] += time.process_time() - cpu
+    result.update(seconds=time.perf_counter() - started, finished_at=time.time())
     write_json(folder.trial(trial.number) / "result.json", result)
     return result
 
@@ -237,6 +239,7 @@ def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str
 
     config = folder.config
     reporter = _Reporter(trial, OBJECTIVES[config.objective])
+    cpu = time.process_time()
     policy = train(
         training_config(folder, result["design"]),
         folder.trial(trial.number),
@@ -244,13 +247,16 @@ def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str
         report=reporter,
         progress=False,
     )
-    # A trial that goes on after its worker died may have been stopped before.
-    pruned = reporter.pruned or bool(json.loads(policy.with_suffix(".json").read_text()).get("stopped_early"))
+    card = json.loads(policy.with_suffix(".json").read_text())
+    # A trial that goes on after its worker died may have been stopped before, and has cost more than this process.
+    pruned = reporter.pruned or card["stopped_early"]
+    before = max(0.0, card["cpu_seconds"] - (time.process_time() - cpu))
     steps = max(reporter.curve, default=0) if pruned else config.training.steps
     result.update(
         agent=Path(policy).resolve().relative_to(folder.path).as_posix(),
         curve=[[step, value] for step, value in sorted(reporter.curve.items())],
         training_steps=steps,
+        cpu_seconds=before,
     )
     if pruned:
         result.update(state="pruned", reason=f"stopped by the pruner after {steps} steps")

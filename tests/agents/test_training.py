@@ -2,11 +2,13 @@
 
 import csv
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 
 from agents import training
 from agents.config import EnvironmentConfig, TrainConfig
@@ -86,12 +88,18 @@ def test_interrupted_training_resumes_as_if_it_had_not_been(hindsight, tmp_path,
     with pytest.raises(KeyboardInterrupt):
         train(config, folder, progress=False)
     assert (folder / "checkpoint.safetensors").exists() and not (folder / "policy.safetensors").exists()
+    with safe_open(folder / "checkpoint.safetensors", framework="numpy") as opened:
+        spent = json.loads(opened.metadata()["state"])["cpu_seconds"]
     steps = []
+    began = time.process_time()
     monkeypatch.setattr(
         training, "_learn", lambda model, target, bar: (steps.append(model.num_timesteps), original(model, target, bar))
     )
     train(config, folder, progress=False)
+    own = time.process_time() - began
     assert steps == [200]  # went on where it was
+    card = json.loads((folder / "policy.json").read_text())
+    assert spent < card["cpu_seconds"] <= spent + own + 0.01  # of both processes
     with open(folder / "curve.csv") as stream:
         assert [int(r["step"]) for r in csv.DictReader(stream)] == [200, 400]
     assert (folder / "policy.safetensors").read_bytes() == uninterrupted

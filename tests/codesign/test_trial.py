@@ -35,7 +35,7 @@ def pretend(monkeypatch):
             stopped = stopped or report((k + 1) * config.report_every, outcome_of(value))
         policy = folder / "policy.safetensors"
         policy.write_bytes(b"")
-        policy.with_suffix(".json").write_text(json.dumps({"stopped_early": stopped}))
+        policy.with_suffix(".json").write_text(json.dumps({"stopped_early": stopped, "cpu_seconds": 0.0}))
         return policy
 
     def evaluate(agent, environment, goals, *, design=None, seed=0):
