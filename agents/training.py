@@ -331,7 +331,7 @@ def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, 
     best = {k.removeprefix("best/"): v for k, v in tensors.items() if k.startswith("best/")}
     columns = {name: np.asarray(value) for name, value in meta["outcome"].items() if name != "steps"}
     outcome = Evaluation(**columns, steps=meta["outcome"]["steps"])
-    return meta["curve"], best, outcome, float(meta["cpu_seconds"])
+    return meta["curve"], best, outcome, float(meta.get("cpu_seconds", 0.0))
 
 
 def _write_curve(path: Path, curve: list[dict[str, float]]) -> None:
