@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import pytest
 import yaml
 
+from agents.policy import policy_path
 from codesign.config import StudyConfig
 from codesign.study import run_study
 from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError, WeightsError
 
+ROOT = Path(__file__).resolve().parents[2]
 BAD = {
     "name that is no folder": ({"name": "../x"}, "name", "pattern"),
     "unknown key": ({"colour": "red"}, "colour", "variables"),
@@ -129,10 +134,18 @@ def test_malformed(name, tmp_path, tiny):
     assert allowed in message
 
 
-def test_demo_configs_are_well_formed():
-    for name in ("finger_reach", "finger_reach_scratch"):
-        config = load_config(f"configs/codesign/{name}.yaml", StudyConfig)
-        assert config.variables == ("length", "height", "joint_height")
+@pytest.mark.parametrize("path", sorted((ROOT / "configs" / "codesign").glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_configs_and_their_policies(path):
+    config = load_config(path, StudyConfig)
+    assert config.name == path.stem
+    if config.policy is not None:
+        card = json.loads(policy_path(config.policy).with_suffix(".json").read_text())["config"]
+        assert card["environment"]["id"] == config.environment.id
+        assert card["environment"]["design_in_observation"] == list(config.variables)
+        # Finalists go on from its networks under their own settings, which must not differ by oversight.
+        own = config.training.sac.model_dump()
+        for key in ("gamma", "gradient_steps", "target_entropy", "hindsight"):
+            assert own[key] == card["sac"][key], key
 
 
 def test_missing_policy(tmp_path, tiny):
