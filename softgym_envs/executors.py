@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -36,6 +37,8 @@ def run_jobs(jobs: Sequence[tuple[Callable, tuple]], workers: int, executor: str
     else:
         from joblib import Parallel, delayed, parallel_config
 
+        # loky ends workers that were idle for minutes or grew large, and starts others: nothing to act on.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         with parallel_config("loky", n_jobs=workers, initializer=_follow, initargs=(os.getpid(),)):
             yield from Parallel(return_as="generator_unordered", batch_size=1)(
                 delayed(function)(*arguments) for function, arguments in jobs
