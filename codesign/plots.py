@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -263,7 +264,8 @@ def parallel(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) ->
         ax.axvline(len(variables), color="#94a3b8", linewidth=1.0, zorder=1)
         for height, end in zip((-0.05, 1.05), ends, strict=True):
             ax.text(len(variables), height, f"{end:.2f}", ha="center", va="center", fontsize=8, color="#475569")
-        ax.set_xticks(range(len(variables) + 1), [v["name"].replace("_", " ") for v in variables] + [_axis(objective)])
+        names = [v["name"].replace("_", " ") for v in variables] + [_axis(objective)]
+        ax.set_xticks(range(len(names)), [textwrap.fill(name, 13) for name in names])
         ax.set(yticks=[], ylim=(-0.12, 1.12))
         for side in ("left", "bottom"):
             ax.spines[side].set_visible(False)
