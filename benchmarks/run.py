@@ -1,11 +1,13 @@
-"""``softgym bench`` (or ``make bench``): run benchmarks, print them, and write one JSON file."""
+"""``softgym bench`` (or ``make bench``): run benchmarks, print them, and keep the results in one JSON file."""
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -69,14 +71,17 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
 
 
 def run(names: Sequence[str], output: str | Path) -> dict[str, dict[str, object]]:
-    """Run the named benchmarks (default: all) and write their results.
+    """Run the named benchmarks (default: all) and write each result, with what made it, to a JSON file.
+
+    Results of other benchmarks that the file holds already stay, with the commit that made them.
 
     Raises:
-        ConfigError: for an unknown name.
+        ConfigError: for an unknown name, or a file that is something else.
     """
     for name in names:
         if name not in BENCHMARKS:
             raise ConfigError(f"unknown benchmark '{name}'; allowed: {', '.join(BENCHMARKS)}")
+    kept = _read(Path(output))
     results: dict[str, dict[str, object]] = {}
     for name in names or BENCHMARKS:
         click.echo(f"\n{name}: {(BENCHMARKS[name].__doc__ or '').splitlines()[0]}")
@@ -84,6 +89,20 @@ def run(names: Sequence[str], output: str | Path) -> dict[str, dict[str, object]
         for key, value in results[name].items():
             click.echo(f"  {key:58s} {value:.6g}" if isinstance(value, float) else f"  {key:58s} {value}")
         machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
-        write_json(output, {"machine": machine, **provenance(), "results": results})
+        kept[name] = {"results": results[name], "machine": machine, **provenance()}
+        write_json(output, kept)
     click.echo(f"\nwrote {output}")
     return results
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Results of earlier runs, by benchmark."""
+    if not path.exists():
+        return {}
+    try:
+        kept = json.loads(path.read_text())
+    except ValueError:
+        kept = None
+    if not isinstance(kept, dict) or not all(isinstance(e, dict) and "results" in e for e in kept.values()):
+        raise ConfigError(f"'{path}' does not hold results of benchmarks; name another --output")
+    return kept
