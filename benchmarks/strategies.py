@@ -67,14 +67,27 @@ STRATEGIES: dict[str, dict[str, Any]] = {
     "inverse QP": {"strategy": "qp", "trials": 30},
     "inverse QP, Wilcoxon": {"strategy": "qp", "trials": 30, "pruner": {"name": "wilcoxon"}},
     "inverse QP, Gaussian process": {"strategy": "qp", "trials": 30, "sampler": {"name": "gp"}},
+    "inverse QP, Gaussian process, 12 goals": {
+        "strategy": "qp",
+        "trials": 30,
+        "sampler": {"name": "gp"},
+        "goals": {"count": 12},
+    },
     "policy as judge": {"strategy": "policy", "policy": "finger_reach_designs", "trials": 30},
-    "policy as judge, Gaussian process": {
+    "policy as judge, Gaussian process (default)": {
         "strategy": "policy",
         "policy": "finger_reach_designs",
         "trials": 30,
         "sampler": {"name": "gp"},
     },
-    "policy as judge, Wilcoxon (default)": {
+    "policy as judge, Gaussian process, 12 goals": {
+        "strategy": "policy",
+        "policy": "finger_reach_designs",
+        "trials": 30,
+        "sampler": {"name": "gp"},
+        "goals": {"count": 12},
+    },
+    "policy as judge, Wilcoxon": {
         "strategy": "policy",
         "policy": "finger_reach_designs",
         "trials": 30,
@@ -98,6 +111,7 @@ def _study(name: str, repeat: int) -> Any:
     base = _question().model_dump(mode="json")
     for part in ("training", "joint"):
         given[part] = {**base[part], "seed": repeat, **given.get(part, {})}
+    given["goals"] = {**base["goals"], **given.get("goals", {})}
     if given["strategy"] == "scratch":
         given["training"] = {**given["training"], "sac": {**given["training"]["sac"], "learning_starts": 1_000}}
     given["sampler"] = {"name": "tpe", "seed": repeat, "options": {"n_startup_trials": 6}, **given.get("sampler", {})}
