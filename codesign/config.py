@@ -300,7 +300,7 @@ class StudyConfig(Config):
             again [s].
         patience: how long a database that does not answer is waited for [s].
         attempts: workers that a body may cost without any progress of its training, before it counts as infeasible.
-        sampler: who proposes bodies.
+        sampler: who proposes bodies; Gaussian processes need the fewest, but learn nothing from trials that were pruned.
         pruner: who stops hopeless trials.
         goals: what the body has to reach.
         training: training inside one trial.
@@ -325,7 +325,7 @@ class StudyConfig(Config):
     heartbeat: float = Field(default=60.0, ge=1.0)
     patience: float = Field(default=600.0, ge=0.0)
     attempts: int = Field(default=5, ge=1)
-    sampler: SamplerConfig = Field(default_factory=SamplerConfig)
+    sampler: SamplerConfig = Field(default_factory=lambda: SamplerConfig(name="gp"))
     pruner: PrunerConfig = Field(default_factory=PrunerConfig)
     goals: GoalsConfig = Field(default_factory=GoalsConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
