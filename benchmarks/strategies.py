@@ -33,6 +33,8 @@ VARIABLES = ("length", "height", "joint_height")
 LEVELS = (-0.9, -0.3, 0.3, 0.9)
 """Of each variable, in unit coordinates."""
 TRUTH_STEPS = 8_000
+GOALS = 40
+"""That the true score of a body is over; strategies may look at fewer."""
 REPEATS = 3
 PRETRAINING = 80_000 + 10 * 200 * 50
 """Environment steps behind the policy ``finger_reach_designs``: training, and the points of its learning curve."""
@@ -56,6 +58,12 @@ STRATEGIES: dict[str, dict[str, Any]] = {
         "training": {"steps": 12_000, "report_every": 1_500, "num_envs": 16},
         "pruner": {"name": "hyperband"},
     },
+    "plain nesting, Gaussian process": {
+        "strategy": "scratch",
+        "trials": 12,
+        "training": {"steps": 12_000, "report_every": 12_000, "num_envs": 16},
+        "sampler": {"name": "gp"},
+    },
     "warm start": {"strategy": "warm_start", "policy": "finger_reach_designs", "trials": 12},
     "warm start, screen": {
         "strategy": "warm_start",
@@ -74,13 +82,13 @@ STRATEGIES: dict[str, dict[str, Any]] = {
         "goals": {"count": 12},
     },
     "policy as judge": {"strategy": "policy", "policy": "finger_reach_designs", "trials": 30},
-    "policy as judge, Gaussian process (default)": {
+    "policy as judge, Gaussian process": {
         "strategy": "policy",
         "policy": "finger_reach_designs",
         "trials": 30,
         "sampler": {"name": "gp"},
     },
-    "policy as judge, Gaussian process, 12 goals": {
+    "policy as judge, Gaussian process, 12 goals (default)": {
         "strategy": "policy",
         "policy": "finger_reach_designs",
         "trials": 30,
@@ -103,6 +111,7 @@ def _question(**changes: Any) -> Any:
     from codesign.config import StudyConfig
 
     base = load_config(QUESTION, StudyConfig).model_dump(mode="json")
+    base["goals"]["count"] = GOALS
     return StudyConfig.model_validate({**base, **changes})
 
 
@@ -209,7 +218,16 @@ def collect(folder: Path) -> None:
     kept = {**provenance(), "truth": [_short(point) for point in truth], "runs": runs}
     if len(truth) == len(LEVELS) ** len(VARIABLES):
         kept |= _judge(truth, runs)
-    write_json(KEPT, kept)
+    write_json(KEPT, _rounded(kept))
+
+
+def _rounded(value: Any) -> Any:
+    """Plain data with seven digits: more would only fill the repository."""
+    if isinstance(value, float):
+        return float(f"{value:.7g}")
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return {key: _rounded(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
 def _short(point: dict[str, Any]) -> dict[str, Any]:
@@ -255,11 +273,18 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
         method="Nelder-Mead",
         options={"maxfev": 120, "initial_simplex": start + 0.2 * np.vstack([np.zeros(3), -np.sign(start) * np.eye(3)])},
     )
-    known = {}
+
+    def key_of(design: dict[str, float]) -> tuple[float, ...]:
+        return tuple(np.round(unit_of(design), 5).tolist())
+
+    # The truth does not change, so that scores which were kept need no second look.
+    kept = json.loads(KEPT.read_text()) if KEPT.exists() else {"truth": [], "runs": []}
+    same = kept["truth"] == _rounded([_short(point) for point in truth])
+    known = {key_of(t["design"]): t["true_score"] for run in kept["runs"] for t in run["trials"]} if same else {}
     candidates = [float(found.fun)]
     for run in runs:
         for trial in run["trials"]:
-            key = tuple(np.round(unit_of(trial["design"]), 9))
+            key = key_of(trial["design"])
             if key not in known:
                 known[key] = score(np.array(key))
             trial["true_score"] = known[key]

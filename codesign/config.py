@@ -300,7 +300,7 @@ class StudyConfig(Config):
             again [s].
         patience: how long a database that does not answer is waited for [s].
         attempts: workers that a body may cost without any progress of its training, before it counts as infeasible.
-        sampler: who proposes bodies; Gaussian processes need the fewest, but learn nothing from trials that were pruned.
+        sampler: who proposes bodies; Gaussian processes need the fewest, but learn nothing from pruned trials.
         pruner: who stops hopeless trials.
         goals: what the body has to reach.
         training: training inside one trial.
