@@ -69,7 +69,6 @@ postgres:
 
 demo: setup
 	$(BIN)/softgym codesign --config configs/codesign/finger_reach.yaml --folder $(DEMO)
-	@echo "report: $(CURDIR)/$(DEMO)/report.html"
 
 # One thread in each process: the matrices are small, and the test workers fill the cores.
 test bench docs docs-images: export OMP_NUM_THREADS = 1

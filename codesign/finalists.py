@@ -84,9 +84,17 @@ def pareto_trials(folder: StudyFolder) -> list[dict[str, Any]]:
 
 
 def finalists(folder: StudyFolder) -> list[Finalist]:
-    """The baseline and the best other bodies, best first; without the baseline if it is infeasible."""
+    """The baseline and the best other bodies, best first; without the baseline if it is infeasible.
+
+    A body that samplers proposed again and again is one body: its first trial.
+    """
     config = folder.config
-    ranked = best_trials(folder)
+    bodies: dict[tuple[float, ...], dict[str, Any]] = {}
+    for result in best_trials(folder):
+        key = tuple(result["design"].values())
+        if key not in bodies or result["origin"] == "baseline":
+            bodies[key] = result
+    ranked = list(bodies.values())
     baseline = [result for result in ranked if result["origin"] == "baseline"]
     others = [result for result in ranked if result["origin"] != "baseline"][: config.finalists.count]
     return [

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from codesign.config import StudyConfig
-from codesign.finalists import evaluations, pareto_trials
+from codesign.finalists import evaluations, finalists, pareto_trials
 from codesign.folder import StudyFolder
 from codesign.judge import JUDGE, joint_config
 from codesign.ledger import open_study
@@ -171,3 +171,16 @@ def test_every_strategy_is_described():
     from codesign.report import CONTROLLERS
 
     assert set(CONTROLLERS) == set(STRATEGIES)
+
+
+def test_a_body_that_was_proposed_twice_is_one_finalist(run):
+    folder, _ = run(trials=5, finalists={"count": 3})
+    before = finalists(folder)
+    assert len({tuple(body.design.values()) for body in before}) == len(before) == 4
+    best = folder.result(before[1].number)
+    again = folder.trial(before[3].number) / "result.json"
+    again.write_text(json.dumps({**best, "number": before[3].number}))
+    after = finalists(folder)
+    assert len({tuple(body.design.values()) for body in after}) == len(after) == 4
+    first = min(before[1].number, before[3].number)
+    assert [body.number for body in after[:2]] == [0, first]
