@@ -100,7 +100,7 @@ def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goal
             "seed": seed,
             "steps": card["steps"],
             "best_step": card["best_step"],
-            "cpu_seconds": card["cpu_seconds"],
+            "cpu_seconds": card.get("cpu_seconds"),
             "horizon": ENVIRONMENTS[config.environment.id].max_episode_steps,
             "curve": card["curve"],
             "evaluations": _evaluations(config.environment, {"sac": policy}, goals, fem_goals),

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from agents.joint import DesignProposer
 
-__all__ = ["train"]
+__all__ = ["cpu_before", "train"]
 
 EVALUATION_SEED = 1_000_003
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "ends")
@@ -151,6 +151,17 @@ def train(
         leftover.unlink(missing_ok=True)
     model.get_env().close()  # type: ignore[union-attr]
     return result
+
+
+def cpu_before(policy: Path, began: float) -> float:
+    """CPU time [s] that earlier processes spent on a training which this one took up.
+
+    Args:
+        policy: what `train` returned.
+        began: ``time.process_time()`` before that call.
+    """
+    card = json.loads(policy.with_suffix(".json").read_text())
+    return max(0.0, card.get("cpu_seconds", 0.0) - (time.process_time() - began))
 
 
 def _best_step(curve: list[dict[str, float]]) -> int:

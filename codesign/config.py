@@ -474,6 +474,11 @@ class StudyConfig(Config):
         return self.robot.design_space
 
     @property
+    def episode_steps(self) -> int:
+        """Environment steps of an episode."""
+        return ENVIRONMENTS[self.environment.id].max_episode_steps
+
+    @property
     def baseline(self) -> dict[str, float]:
         """The complete baseline design [SI]."""
         return self.space.complete(self.environment.design)

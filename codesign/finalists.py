@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from agents.policy import policy_path
-from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
 from codesign.jobs import Job
 from codesign.judge import JUDGE
@@ -154,7 +153,7 @@ def trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
                     "trial": finalist.number,
                     "seed": training.seed,
                     "steps": steps,
-                    "report_steps": len(curve) * training.evaluation_episodes * _episode_steps(config),
+                    "report_steps": len(curve) * training.evaluation_episodes * config.episode_steps,
                     "cpu_seconds": trained["cpu_seconds"],
                     # Not every objective is followed during a training.
                     "curve": [[row["step"], objective.score(row)] for row in curve if objective.key in row],
@@ -168,10 +167,6 @@ def trainings(folder: StudyFolder) -> list[dict[str, Any]]:
     numbers = [body.number for body in finalists(folder)]
     told = [json.loads(path.read_text()) for path in sorted(folder.path.glob("finalists/*/training.json"))]
     return [row for row in told if row["trial"] in numbers]
-
-
-def _episode_steps(config: StudyConfig) -> int:
-    return ENVIRONMENTS[config.environment.id].max_episode_steps
 
 
 def fetch_policies(folder: StudyFolder) -> None:

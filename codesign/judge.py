@@ -17,7 +17,6 @@ from agents.policy import policy_path
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
 from codesign.jobs import Job
-from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.storage import atomic_write
 
 __all__ = ["JUDGE", "joint_config", "judge_jobs", "judge_policy", "promising_bodies"]
@@ -66,7 +65,7 @@ def _report_steps(config: StudyConfig) -> int:
     """Environment steps of the points of the learning curve of joint training."""
     joint = config.joint
     points = -(-joint.steps // joint.report_every)
-    return points * joint.evaluation_episodes * ENVIRONMENTS[config.environment.id].max_episode_steps
+    return points * joint.evaluation_episodes * config.episode_steps
 
 
 def _make(folder: StudyFolder) -> dict[str, Any]:
@@ -79,16 +78,14 @@ def _make(folder: StudyFolder) -> dict[str, Any]:
         assert config.policy is not None  # the configuration was checked
         source = policy_path(config.policy)
     else:
-        from agents.training import train
+        from agents.training import cpu_before, train
 
         training = folder.path / "judge" / "training"
         options: dict[str, Any] = dict(config.joint.options)
         source = train(
             joint_config(folder), training, proposer=PROPOSERS[config.plan.proposer](**options), progress=False
         )
-        # A training that goes on after its worker died has cost more than this process.
-        card = json.loads(source.with_suffix(".json").read_text())
-        before = max(0.0, card["cpu_seconds"] - (time.process_time() - cpu))
+        before = cpu_before(source, cpu)
         found = json.loads((training / "bodies.json").read_text())
         space = config.space
         bodies = [

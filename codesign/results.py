@@ -181,7 +181,7 @@ def importance(folder: StudyFolder) -> dict[str, float]:
 def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[str, Any]]) -> dict[str, Any]:
     screened = [record["qp"] for record in screen_records(folder)]
     judged = [trial[key] for trial in trials for key in ("qp", "evaluation") if trial[key] and trial["agent"] != key]
-    config, row = folder.config, ENVIRONMENTS[folder.config.environment.id]
+    config = folder.config
     path = folder.path / "judge" / "judge.json"
     judge = {"training_steps": 0, "report_steps": 0, "cpu_seconds": 0.0}
     if path.exists():
@@ -195,7 +195,7 @@ def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[st
         "training_steps": sum(trial["training_steps"] for trial in trials),
         "report_steps": sum(len(trial["curve"]) for trial in trials)
         * config.training.evaluation_episodes
-        * row.max_episode_steps,
+        * config.episode_steps,
         "selection_steps": sum(record.get("steps", 0) for record in judged),
         "screen_steps": sum(record.get("steps", 0) for record in screened),
         **{

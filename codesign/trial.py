@@ -235,7 +235,7 @@ def _score(config: StudyConfig, evaluation: dict[str, Any], result: dict[str, An
 
 def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str, Any]) -> dict[str, Any] | None:
     """Train the controller of a body and evaluate it; None if the pruner stopped it."""
-    from agents.training import train
+    from agents.training import cpu_before, train
 
     config = folder.config
     reporter = _Reporter(trial, OBJECTIVES[config.objective])
@@ -247,10 +247,9 @@ def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str
         report=reporter,
         progress=False,
     )
-    card = json.loads(policy.with_suffix(".json").read_text())
-    # A trial that goes on after its worker died may have been stopped before, and has cost more than this process.
-    pruned = reporter.pruned or card["stopped_early"]
-    before = max(0.0, card["cpu_seconds"] - (time.process_time() - cpu))
+    before = cpu_before(policy, cpu)
+    # A trial that goes on after its worker died may have been stopped before.
+    pruned = reporter.pruned or json.loads(policy.with_suffix(".json").read_text())["stopped_early"]
     steps = max(reporter.curve, default=0) if pruned else config.training.steps
     result.update(
         agent=Path(policy).resolve().relative_to(folder.path).as_posix(),

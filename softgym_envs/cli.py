@@ -483,7 +483,7 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
         value, ends = result["design"][name], (result["interval"] or {}).get(name)
         digits = 6
         if ends is not None and ends[1] > ends[0]:  # as many as tell the ends apart
-            digits = max(digits, 2 - math.floor(math.log10((ends[1] - ends[0]) / abs(value))))
+            digits = max(digits, 2 - math.floor(math.log10((ends[1] - ends[0]) / (abs(value) or 1.0))))
         text = f"{name} = {value:.{digits}g}"
         if ends is not None:
             text += f", {100 * result['level']:g} % interval {ends[0]:.{digits}g} to {ends[1]:.{digits}g}"

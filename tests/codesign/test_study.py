@@ -169,6 +169,21 @@ def test_tables(finished):
         }
 
 
+def write_trial(folder, number, evaluation, violations):
+    """Leave the result of a finished trial, each of another body."""
+    result = {
+        "number": number,
+        "origin": "baseline" if number == 0 else f"sampler {number}",
+        "state": "complete",
+        "design": {**folder.config.baseline, "height": 0.020 + 1e-4 * number},
+        "agent": "qp",
+        "score": -evaluation["mean_distance"],
+        "violations": violations,
+        "evaluation": evaluation,
+    }
+    write_json(folder.trial(number) / "result.json", result)
+
+
 @pytest.mark.parametrize("choose, winner", [("surrogate", 2), ("fem", 1)])
 def test_who_names_the_winner(choose, winner, study):
     folder = study(finalists={"count": 2, "choose": choose})
@@ -177,19 +192,7 @@ def test_who_names_the_winner(choose, winner, study):
         return {"success_rate": 0.5, "mean_distance": distance, "mean_return": 1.0}
 
     for number, (searched, tested) in enumerate([(3e-3, 3e-3), (2e-3, 1e-3), (1e-3, 2e-3)]):
-        write_json(
-            folder.trial(number) / "result.json",
-            {
-                "number": number,
-                "origin": "baseline" if number == 0 else f"sampler {number}",
-                "state": "complete",
-                "design": {**folder.config.baseline, "height": 0.020 + 1e-4 * number},
-                "agent": "qp",
-                "score": -searched,
-                "violations": [],
-                "evaluation": record(searched),
-            },
-        )
+        write_trial(folder, number, record(searched), [])
         path = folder.path / "finalists" / f"trial{number:04d}-qp-fem-selection.json"
         write_json(path, {"trial": number, "agent": "qp", "backend": "fem", "goals": "selection", **record(tested)})
     assert choose_winner(folder, evaluations(folder)).number == winner
@@ -239,17 +242,7 @@ def test_limits_decide_before_scores(study):
 
     found = [(3e-3, 0.5, 0.5), (2e-3, 0.9, 1.2), (1e-3, 1.5, 1.5)]  # distance, effort in search, effort on FEM
     for number, (distance, effort, tested) in enumerate(found):
-        result = {
-            "number": number,
-            "origin": "baseline" if number == 0 else f"sampler {number}",
-            "state": "complete",
-            "design": {**folder.config.baseline, "height": 0.020 + 1e-4 * number},
-            "agent": "qp",
-            "score": -distance,
-            "violations": [effort - 1.0],
-            "evaluation": record(distance, effort),
-        }
-        write_json(folder.trial(number) / "result.json", result)
+        write_trial(folder, number, record(distance, effort), [effort - 1.0])
         path = folder.path / "finalists" / f"trial{number:04d}-qp-fem-selection.json"
         test = {"trial": number, "agent": "qp", "backend": "fem", "goals": "selection", **record(distance, tested)}
         write_json(path, test)
