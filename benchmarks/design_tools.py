@@ -113,6 +113,10 @@ def calibration() -> dict[str, object]:
         result[f"nu 0.47, 3 positions, {name}: from each start"] = ends
         result[f"nu 0.47, 3 positions, {name}: found"] = round(found["design"]["poisson_ratio"], 6)
         result[f"nu 0.47, 3 positions, {name}: all starts [s]"] = round(found["seconds"], 2)
+    tensions = measure(robot, {"poisson_ratio": 0.47}, np.linspace(0.0, 0.010, 3)[:, None])
+    found = calibrate(configured(["poisson_ratio"], starts=starts, level=None), data=tensions)
+    result["nu 0.47, 3 positions and tensions, surrogate: found"] = round(found["design"]["poisson_ratio"], 6)
+    result["nu 0.47, 3 positions and tensions, surrogate: all starts [s]"] = round(found["seconds"], 2)
     pulled = measure(robot, {"young_modulus": 2.2e6}, [[2.0], [5.0], [10.0], [15.0]], driven="effort")
     found = calibrate(configured(["young_modulus"]), data=pulled)
     result["E 2.2 MPa, 4 efforts, surrogate: error [%]"] = 100.0 * (found["design"]["young_modulus"] / 2.2e6 - 1.0)

@@ -481,12 +481,13 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
     result = run(study, folder)
     for name in study.fit:
         value, ends = result["design"][name], (result["interval"] or {}).get(name)
-        digits = 6
-        if ends is not None and ends[1] > ends[0]:  # as many as tell the ends apart
-            digits = max(digits, 2 - math.floor(math.log10((ends[1] - ends[0]) / (abs(value) or 1.0))))
-        text = f"{name} = {value:.{digits}g}"
-        if ends is not None:
+        text = f"{name} = {value:.6g}"
+        if ends is not None and ends[1] > ends[0]:
+            # As many digits as tell the ends apart.
+            digits = max(6, 2 - math.floor(math.log10((ends[1] - ends[0]) / (abs(value) or 1.0))))
             text += f", {100 * result['level']:g} % interval {ends[0]:.{digits}g} to {ends[1]:.{digits}g}"
+        elif ends is not None:
+            text += ", no interval: the model fits the data exactly"
         click.echo(text)
     errors = ", ".join(f"{name} {value:.3g}" for name, value in result["errors"].items())
     click.echo(f"root mean square errors: {errors} [SI]; {result['seconds']:.1f} s; wrote {folder}")
