@@ -63,6 +63,8 @@ class Robot(ABC):
         rest_mode: how actuators are held at rest: ``"effort"`` (without effort) or ``"displacement"`` (at zero).
         stiffness_variable: design variable that scales all efforts and nothing else (Young's modulus without dead
             loads), or None. Surrogates use it exactly instead of learning it.
+        convex: the elastic energy is convex in the displacements of the actuators: the body keeps its state also when
+            they are driven by efforts. Surrogates are built so; where it is False they learn unstable states too.
     """
 
     name: str
@@ -77,6 +79,7 @@ class Robot(ABC):
     motion: float
     rest_mode: str = "effort"
     stiffness_variable: str | None = None
+    convex: bool = True
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -120,6 +123,13 @@ class Robot(ABC):
             ValueError: if the robot has none.
         """
         raise ValueError(f"robot '{self.name}' has no reference path: give a path of your own")
+
+    def displacements(self, fractions: np.ndarray) -> np.ndarray:
+        """Commands that points of the unit cube (N, n_a) stand for when states are sampled, shape (N, n_a).
+
+        A robot whose actuators never move independently keeps to what occurs.
+        """
+        return self.lower + fractions * (self.upper - self.lower)
 
     # -- what follows from it ---------------------------------------------------------------------------------------
 

@@ -33,7 +33,8 @@ class TorchModel(nn.Module):
         members = []
         for state in potential.unstack_members(model.tensors)[0]:
             body_width = state["body.0.weight"].shape[0]
-            net = PotentialNet(n, e, self.features.design_size, model.width, body_width, rest)
+            sizes = (n, e, self.features.design_size, model.width, body_width)
+            net = PotentialNet(*sizes, rest, convex=model.robot.convex)
             net.load_state_dict({k: torch.as_tensor(np.array(v)) for k, v in state.items()})
             members.append(net.double())
         self.members = nn.ModuleList(members)

@@ -145,12 +145,12 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str
         return None, plan.states
     rows: list[Equilibrium] = [rest]
     span = robot.upper - robot.lower
-    fractions = plan.unit_points(count, group * plan.states, plan.states, plan.groups * plan.states, 1)
-    order = path_order(fractions, -robot.lower / span)
+    points = plan.unit_points(count, group * plan.states, plan.states, plan.groups * plan.states, 1)
+    commands = robot.displacements(points)
+    order = path_order((commands - robot.lower) / span, -robot.lower / span)
     rng = np.random.default_rng([plan.seed, 2, group])
     failed = 0
-    for fraction in fractions[order]:
-        command = robot.lower + fraction * span
+    for command in commands[order]:
         try:
             equilibrium = statics.solve(command)
         except ConvergenceError:

@@ -83,6 +83,7 @@ def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
     Those whose W is not positive definite are unstable even with their actuators held (volume-driven chambers can
     buckle). Those whose actuators' compliance has grown `GROWTH` times over that at rest, in any direction, are about
     to buckle: W is singular there, which no smooth model follows. Bodies that are unstable at rest teach nothing.
+    Where the energy is not convex (`Robot.convex`) states are kept whose actuators must be held.
 
     Raises:
         DataError: if the dataset does not begin with a rest state.
@@ -94,13 +95,16 @@ def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
     W = full_compliance(data["compliance"], count + data["effector"].shape[1]) * _stiffness(robot, data)[:, None, None]
     a, e = slice(0, count), slice(count, None)
     scale = np.sqrt(np.abs(np.einsum("bii->bi", W)).mean(axis=0))
-    stable = np.linalg.eigvalsh((W / scale[:, None] / scale)[:, a, a])[:, 0] > 1e-9
+    rest_of = np.flatnonzero(rest)[np.cumsum(rest) - 1]
+    convex = np.linalg.eigvalsh((W / scale[:, None] / scale)[:, a, a])[:, 0] > 1e-9
+    stable = convex if robot.convex else convex[rest_of]
     # What is left once the actuators are held may vanish (a chain of rigid directions) but not be negative.
     held = W[:, e, e] - W[:, e, a] @ np.linalg.solve(W[:, a, a], W[:, a, e])
     least = np.linalg.eigvalsh(0.5 * (held + held.swapaxes(1, 2)))[:, 0]
     stable &= least > -1e-6 * np.einsum("bii->b", W[:, e, e])
-    rest_of = np.flatnonzero(rest)[np.cumsum(rest) - 1]
     stable &= stable[rest_of]
+    if not robot.convex:
+        return stable
     C = np.linalg.cholesky(W[rest_of][stable][:, a, a])
     half = np.linalg.solve(C, W[stable][:, a, a])
     growth = np.linalg.eigvalsh(np.linalg.solve(C, half.swapaxes(1, 2)))[:, -1]

@@ -17,6 +17,10 @@ arXiv:1609.07152), ``x`` a plain one, ``C = L L^T``. Hence, whatever the weights
 * d delta / d effort of the surrogate is its own W: control and design work with exact derivatives;
 * cables that cannot push have one solution, ``min U`` over the displacements beyond their commands.
 
+A robot whose energy is not convex (`Robot.convex`) has a quadratic part of any sign instead of a convex one: what a
+convex function and a quadratic one of the body can be together is every smooth function on its box. ``W`` is then the
+exact derivative still, but positive definite only where the body is stable.
+
 Every FEM state teaches values and first derivatives of both (efforts, W_aa, W_ea), which is why few are needed.
 Layers of the design are apart from those of the actuation and evaluated once per body. An ensemble is the mean of its
 members' ``Phi``, and so a potential again; their spread is the uncertainty.
@@ -421,9 +425,13 @@ class Model(SurrogateModel):
         for name in ("a", "b"):
             body[name] = np.logaddexp(np.float32(0.0), body[name] - np.float32(4.0))
         lower = np.tril_indices(n)
-        factor = np.zeros((rows, M, n, n), dtype=np.float32)
-        factor[:, :, lower[0], lower[1]] = np.where(lower[0] == lower[1], np.exp(body["quadratic"]), body["quadratic"])
-        body["quadratic"] = (factor @ factor.swapaxes(2, 3)).mean(axis=1)
+        factor, entries = np.zeros((rows, M, n, n), dtype=np.float32), body["quadratic"]
+        if self.robot.convex:
+            factor[:, :, lower[0], lower[1]] = np.where(lower[0] == lower[1], np.exp(entries), entries)
+            body["quadratic"] = (factor @ factor.swapaxes(2, 3)).mean(axis=1)
+        else:
+            factor[:, :, lower[0], lower[1]] = entries
+            body["quadratic"] = (factor + factor.swapaxes(2, 3)).mean(axis=1)
         body["slope"] = body["slope"].reshape(rows, M, e, n)
         body["linear"] = np.ascontiguousarray(body["linear"].mean(axis=1))
         if self._rest is not None:
@@ -516,13 +524,13 @@ def train(
     if training.unloaded:
         middle = 0.5 * (robot.upper + robot.lower)
         rest = (0.0 - middle) / (robot.upper - middle)
-    jobs = [(_train_member, (trainer, member, data, rest)) for member in range(options.members)]
+    jobs = [(_train_member, (trainer, member, data, rest, robot.convex)) for member in range(options.members)]
     found = sorted(run_jobs(jobs, trainer.workers), key=lambda result: result[0])
     return stack_members([state for _, state, _ in found], scales), {f"member {k}": rows for k, _, rows in found}
 
 
 def _train_member(
-    trainer: Any, member: int, data: dict[str, list], rest: np.ndarray | None
+    trainer: Any, member: int, data: dict[str, list], rest: np.ndarray | None, convex: bool
 ) -> tuple[int, dict[str, np.ndarray], list[dict[str, float]]]:
     """Number, state and history of one member."""
     import torch
@@ -534,7 +542,8 @@ def _train_member(
     seed = trainer.seed + 1000 * member
     torch.manual_seed(seed)
     design, _, effort, effector, S = data["t"][:5]
-    net = PotentialNet(effort.shape[1], effector.shape[1], design.shape[1], options.width, options.body_width, rest)
+    sizes = (effort.shape[1], effector.shape[1], design.shape[1], options.width, options.body_width)
+    net = PotentialNet(*sizes, rest, convex=convex)
     effort_spread = float(((S.mT @ effort[:, :, None]) ** 2).mean())
 
     def loss(rows):
@@ -588,17 +597,24 @@ def _scales(robot: Robot, states: States) -> dict[str, np.ndarray]:
 
 
 def _targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) -> list:
-    """Scaled targets: design, actuation, effort, effector, factor of W_aa, Jacobian, whitening of C, and C."""
+    """Scaled targets: design, actuation, effort, effector, metric, Hessian in it, Jacobian, whitening of C, and C.
+
+    The metric is a factor of W_aa, where W_aa may have any sign that of the body's rest.
+    """
     import torch
 
     n = states.effort.shape[1]
     a, c = slice(0, n), slice(n, None)
     half = 0.5 * (robot.upper - robot.lower)
     W_aa = states.W[:, a, a] / half[:, None] / half * scales["energy"]
+    metric_of = np.arange(len(states)) if robot.convex else states.rest_of
+    S = np.linalg.cholesky(0.5 * (W_aa + W_aa.swapaxes(1, 2))[metric_of])
+    hessian = np.broadcast_to(np.eye(n), W_aa.shape) if robot.convex else S.swapaxes(1, 2) @ np.linalg.inv(W_aa) @ S
     J = np.linalg.solve(states.W[:, a, a], states.W[:, a, c]).swapaxes(1, 2)
     W_ee = states.W[:, c, c] / scales["held"]
     size = W_ee.shape[1]
     C = W_ee - J @ states.W[:, a, c] / scales["held"]
+    W_ee = W_ee[metric_of]
     # A body without freedom left (a rigid direction) has C = 0 up to rounding: a factor needs a little more.
     floor = 1e-6 * np.einsum("bii->b", W_ee)[:, None, None] / size
     C = 0.5 * (C + C.swapaxes(1, 2)) + 2.0 * size * floor * np.eye(size)
@@ -608,7 +624,8 @@ def _targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) -> lis
         states.actuation,
         states.effort * half / scales["energy"],
         (states.effector - scales["effector_mean"]) / scales["effector"],
-        np.linalg.cholesky(0.5 * (W_aa + W_aa.swapaxes(1, 2))),
+        S,
+        hessian,
         J * half / scales["effector"],
         whitening,
         C,
@@ -617,14 +634,12 @@ def _targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) -> lis
 
 
 def potential_loss(net, batch: list, effort_spread: float):
-    """Sum of mean squared errors: efforts and W_aa in the metric of W_aa, C in its own, effector and Jacobian plain."""
-    import torch
-
-    design, u, effort, effector, S, J, whitening, C = batch
+    """Sum of mean squared errors: efforts and Hessian in their metric, C in its own, effector and Jacobian plain."""
+    design, u, effort, effector, S, K, J, whitening, C = batch
     gradient, hessian, x, jacobian, L = net(design, u)
     terms = (
         ((S.mT @ (gradient - effort)[:, :, None]) ** 2).mean() / effort_spread,
-        ((S.mT @ hessian @ S - torch.eye(S.shape[1])) ** 2).mean(),
+        ((S.mT @ hessian @ S - K) ** 2).mean(),
         ((x - effector) ** 2).mean(),
         ((jacobian - J) ** 2).mean(),
         ((whitening @ (L @ L.mT - C) @ whitening.mT) ** 2).mean(),

@@ -39,14 +39,19 @@ class PotentialNet(nn.Module):
         width: hidden units w of the actuation layers.
         body_width: hidden units of the design layers.
         rest: scaled actuation at which the effort is zero, shape (n,), or None where it is learned.
+        convex: the energy is convex; otherwise its quadratic part has any sign.
     """
 
     rest: torch.Tensor | None
+    lower_a: torch.Tensor
+    lower_e: torch.Tensor
 
-    def __init__(self, count: int, effectors: int, design: int, width: int, body_width: int, rest=None) -> None:
+    def __init__(
+        self, count: int, effectors: int, design: int, width: int, body_width: int, rest=None, convex: bool = True
+    ) -> None:
         super().__init__()
         n, e, w = count, effectors, width
-        self.n, self.e, self.w = n, e, w
+        self.n, self.e, self.w, self.convex = n, e, w, convex
         self.sizes = list(body_parts(n, e, w).values())
         self.body = nn.Sequential(
             nn.Linear(max(design, 1), body_width),
@@ -77,18 +82,25 @@ class PotentialNet(nn.Module):
         matrix[:, index[0], index[1]] = torch.where(index[0] == index[1], torch.exp(entries), entries)
         return matrix
 
+    def _quadratic(self, entries):
+        if self.convex:
+            factor = self._triangular(entries, self.lower_a, self.n)
+            return factor @ factor.mT
+        half = torch.zeros(len(entries), self.n, self.n, dtype=entries.dtype)
+        half[:, self.lower_a[0], self.lower_a[1]] = entries
+        return half + half.mT
+
     def coefficients(self, design) -> dict:
         """What the body gives to the layers, from design features (B, d)."""
         if design.shape[1] == 0:
             design = torch.zeros(len(design), 1, dtype=design.dtype)
         c1, c2, a, b, quadratic, linear, x0, slope, held, d1, d2 = torch.split(self.body(design), self.sizes, dim=1)
-        factor = self._triangular(quadratic, self.lower_a, self.n)
         return {
             "c1": c1,
             "c2": c2,
             "a": nn.functional.softplus(a - 4.0),
             "b": nn.functional.softplus(b - 4.0),
-            "quadratic": factor @ factor.mT,
+            "quadratic": self._quadratic(quadratic),
             "linear": linear,
             "x0": x0,
             "slope": slope.reshape(-1, self.e, self.n),
