@@ -52,9 +52,10 @@ class Options(Config):
     width: int = Field(default=64, gt=0)
     body_width: int = Field(default=64, gt=0)
     members: int = Field(default=5, gt=0)
-    steps: int = Field(default=12_000, gt=0)
-    batch_size: int = Field(default=256, gt=0)
-    learning_rate: float = Field(default=3e-3, gt=0)
+    optimiser: Literal["soap", "adam"] = "soap"
+    steps: int = Field(default=4000, gt=0)
+    batch_size: int = Field(default=128, gt=0)
+    learning_rate: float = Field(default=1e-2, gt=0)
 
 
 def body_parts(n: int, e: int, w: int) -> dict[str, int]:

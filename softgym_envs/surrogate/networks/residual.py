@@ -25,8 +25,9 @@ class Options(Config):
     kind: Literal["residual"] = "residual"
     width: int = Field(default=128, gt=0)
     depth: int = Field(default=3, gt=0)
-    steps: int = Field(default=20000, gt=0)
-    batch_size: int = Field(default=512, gt=0)
+    optimiser: Literal["soap", "adam"] = "soap"
+    steps: int = Field(default=4000, gt=0)
+    batch_size: int = Field(default=128, gt=0)
     learning_rate: float = Field(default=3e-3, gt=0)
 
 

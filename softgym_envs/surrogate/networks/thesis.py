@@ -24,6 +24,7 @@ class Options(Config):
     kind: Literal["thesis"] = "thesis"
     width: int = Field(default=450, gt=0)
     depth: int = Field(default=3, gt=0)
+    optimiser: Literal["soap", "adam"] = "adam"
     steps: int = Field(default=20000, gt=0)
     batch_size: int = Field(default=512, gt=0)
     learning_rate: float = Field(default=1e-3, gt=0)
