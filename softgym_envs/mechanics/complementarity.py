@@ -9,72 +9,76 @@ __all__ = ["solve_complementarity"]
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(W, gap, unilateral, y):
-    """Row by row: the consistent taut set, starting from the most likely ones. Returns the first unsolved row or -1."""
-    count, m = gap.shape
-    a = np.empty((m, m + 1))
-    index = np.empty(m, dtype=np.int64)
-    candidate = np.empty(m)
-    for b in range(count):
-        solved = False
-        scale = 0.0
+def _solve_row(W, gap, unilateral, y, a, index):
+    """Fill y (m,) with the consistent taut set, starting from the most likely ones; False if there is none.
+
+    ``a`` (m, m + 1) and ``index`` (m,), of integers, are room to work in.
+    """
+    m = len(gap)
+    scale = 0.0
+    for i in range(m):
+        scale = max(scale, abs(gap[i]))
+    tolerance = 1e-12 * scale
+    for code in range(1 << m):
+        # Bit i set: actuator i is slack. Code 0, all taut, comes first.
+        k = 0
+        allowed = True
         for i in range(m):
-            scale = max(scale, abs(gap[b, i]))
-        tolerance = 1e-12 * scale
-        for code in range(1 << m):
-            # Bit i set: actuator i is slack. Code 0, all taut, comes first.
-            k = 0
-            allowed = True
-            for i in range(m):
-                if code >> i & 1:
-                    if not unilateral[i]:
-                        allowed = False
-                        break
-                else:
-                    index[k] = i
-                    k += 1
-            if not allowed:
-                continue
-            for r in range(k):
-                for c in range(k):
-                    a[r, c] = W[b, index[r], index[c]]
-                a[r, k] = -gap[b, index[r]]
-            # Gaussian elimination without pivoting: fine for positive definite blocks.
-            for p in range(k):
-                if not a[p, p] > 0.0:
+            if code >> i & 1:
+                if not unilateral[i]:
                     allowed = False
                     break
-                for r in range(p + 1, k):
-                    factor = a[r, p] / a[p, p]
-                    for c in range(p, k + 1):
-                        a[r, c] -= factor * a[p, c]
-            if not allowed:
-                continue
-            for i in range(m):
-                candidate[i] = 0.0
-            for r in range(k - 1, -1, -1):
-                value = a[r, k]
-                for c in range(r + 1, k):
-                    value -= a[r, c] * candidate[index[c]]
-                candidate[index[r]] = value / a[r, r]
-            consistent = True
-            for i in range(m):
-                if code >> i & 1:
-                    value = gap[b, i]
-                    for j in range(m):
-                        value += W[b, i, j] * candidate[j]
-                    if value < -tolerance:
-                        consistent = False
-                        break
-                elif unilateral[i] and candidate[i] < 0.0:
+            else:
+                index[k] = i
+                k += 1
+        if not allowed:
+            continue
+        for r in range(k):
+            for c in range(k):
+                a[r, c] = W[index[r], index[c]]
+            a[r, k] = -gap[index[r]]
+        # Gaussian elimination without pivoting: fine for positive definite blocks.
+        for p in range(k):
+            if not a[p, p] > 0.0:
+                allowed = False
+                break
+            for r in range(p + 1, k):
+                factor = a[r, p] / a[p, p]
+                for c in range(p, k + 1):
+                    a[r, c] -= factor * a[p, c]
+        if not allowed:
+            continue
+        for i in range(m):
+            y[i] = 0.0
+        for r in range(k - 1, -1, -1):
+            value = a[r, k]
+            for c in range(r + 1, k):
+                value -= a[r, c] * y[index[c]]
+            y[index[r]] = value / a[r, r]
+        consistent = True
+        for i in range(m):
+            if code >> i & 1:
+                value = gap[i]
+                for j in range(m):
+                    value += W[i, j] * y[j]
+                if value < -tolerance:
                     consistent = False
                     break
-            if consistent:
-                for i in range(m):
-                    y[b, i] = candidate[i]
-                solved = True
+            elif unilateral[i] and y[i] < 0.0:
+                consistent = False
                 break
-        if not solved:
+        if consistent:
+            return True
+    return False
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(W, gap, unilateral, y):
+    """Row by row. Returns the first unsolved row or -1."""
+    count, m = gap.shape
+    a, index = np.empty((m, m + 1)), np.empty(m, dtype=np.int64)
+    for b in range(count):
+        if not _solve_row(W[b], gap[b], unilateral, y[b], a, index):
             return b
     return -1
 

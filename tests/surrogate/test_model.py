@@ -11,7 +11,7 @@ import torch
 from softgym_envs.config import load_config
 from softgym_envs.errors import WeightsError
 from softgym_envs.robots import make_robot
-from softgym_envs.surrogate.model import Context, Features, load_model
+from softgym_envs.surrogate.model import Context, Features, SurrogateModel, load_model
 from softgym_envs.surrogate.networks import NETWORKS, potential, residual
 from softgym_envs.surrogate.networks.potential_torch import PotentialNet
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
@@ -144,6 +144,36 @@ def test_compiled_potential_agrees_with_torch(name):
     positions = np.stack([0.03 * part[2] for part in parts])
     deviation = np.linalg.norm(positions - positions.mean(axis=0), axis=2)
     assert np.allclose(spread, np.sqrt((deviation**2).mean(axis=0)), rtol=1e-3, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["finger", "diamond", "trunk"])
+def test_search_of_a_batch_is_that_of_its_rows(name):
+    """Rows of a batch do not touch each other: not those that end early, not those without a state."""
+    robot = make_robot(name)
+    model = pretrained_model(robot)
+    count, lost = 2 * potential._ROWS + 5, [3, potential._ROWS + 1]
+    designs, target = random_bodies(robot, count)
+    context = model.context(designs)
+    guess = target + 0.1 * (random_bodies(robot, count, seed=1)[1] - target)
+    target[0] = guess[0] = robot.upper  # taut
+    guess[lost, 0] = np.nan
+    unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
+    for iterations in (0, 1, 12):
+        found = model.search(context, target, guess, unilateral, 2e-4, iterations)
+        assert not found[2][lost].any()
+        for row in range(count):
+            rows = slice(row, row + 1)
+            alone = model.search(context.rows(np.array([row])), target[rows], guess[rows], unilateral, 2e-4, iterations)
+            assert found[2][row] == alone[2][0]
+            if found[2][row]:
+                assert np.abs(found[0][row] - alone[0][0]).max() < 1e-4 * model.span.max()
+    well = np.setdiff1d(np.arange(count), lost)
+    assert found[2][well].all()
+    # the same search in plain numpy
+    expected = SurrogateModel.search(model, context.rows(well), target[well], guess[well], unilateral, 2e-4, 12)
+    assert expected[2].all()
+    assert np.abs(found[0][well] - expected[0]).max() < 1e-4 * model.span.max()
+    assert np.abs(found[1][well] - expected[1]).max() < 1e-3 * np.abs(expected[1]).max()
 
 
 def test_members_of_an_ensemble():
