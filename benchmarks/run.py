@@ -55,6 +55,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "deployed": export.deployed,
     "tracking": robots.tracking,
     "predicted_tracking": robots.predicted_tracking,
+    "shared_finger": robots.shared_finger,
     "stiff_flop": robots.stiff_flop,
     "carry": carry.carry,
     "sensor_finger": sensor_finger.published,

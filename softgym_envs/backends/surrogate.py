@@ -120,6 +120,11 @@ class SurrogateBackend(Backend):
         weights: str | Path | None = None,
         members: int | None = None,
     ) -> None:
+        if not robot.convex:
+            raise ValueError(
+                f"robot '{robot.name}' alone has no state that a search finds by its commands; its learned model is a "
+                "part of grippers (softgym_envs.control.CoupledFingers), or use backend='fem'"
+            )
         self.robot = robot
         self.model = pretrained_model(robot, weights, members)
         self._unilateral = np.array([actuator.unilateral for actuator in robot.actuators])

@@ -115,6 +115,8 @@ def _potential(model: SurrogateModel, members: int | None) -> Model:
 
     if not isinstance(model, Model):
         raise ValueError(f"a model of network '{model.network}' cannot be exported; allowed: 'potential'")
+    if not model.robot.convex:
+        raise ValueError(f"the energy of robot '{model.robot.name}' is not convex, which exported models rely on")
     return model if members is None else Model(model.robot, model.tensors, model.card, members)
 
 

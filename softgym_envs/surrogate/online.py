@@ -61,6 +61,8 @@ def check_ensemble(model: SurrogateModel) -> Model:
     """
     if not isinstance(model, Model):
         raise WeightsError(f"online learning needs a network of kind 'potential'; these weights are '{model.network}'")
+    if not model.robot.convex:
+        raise WeightsError(f"online learning needs a convex energy; that of robot '{model.robot.name}' is not")
     if model.members < 2:
         raise WeightsError(
             "online learning needs an ensemble of 2 or more members: their spread decides what is trusted"
