@@ -92,7 +92,8 @@ def generate_dataset(
     """Generate a dataset, or finish an interrupted one, and return it.
 
     Finished shards are kept, however the process that made them ended; a shard that cannot be read is renamed to
-    ``*.corrupt`` and made again. A finished dataset is only read.
+    ``*.corrupt`` and made again. A finished dataset is only read. One of fewer groups of the same plan grows: a
+    sequence goes on where it was (but not a Latin hypercube, which is laid out for its number of points).
 
     Args:
         folder: where shards, ``manifest.json`` and the card ``README.md`` live.
@@ -134,17 +135,16 @@ def generate_dataset(
     path = folder / "manifest.json"
     card = folder / "README.md"
     if path.exists():
-        _check_manifest(folder, manifest)
-        if card.exists():
+        grows = _check_manifest(folder, manifest)
+        if card.exists() and not grows:
             try:
                 return load_dataset(folder)
             except DataError:
                 pass  # unfinished or damaged
     with _hold(folder):
-        if path.exists():
-            _check_manifest(folder, manifest)
-        else:
-            write_json(path, manifest)
+        if path.exists() and _check_manifest(folder, manifest):
+            card.unlink(missing_ok=True)
+        write_json(path, manifest)
         for name in (path.name, card.name, "shard_"):  # what writers left that were killed
             for left in folder.glob(f".{name}*"):
                 left.unlink(missing_ok=True)
@@ -218,12 +218,18 @@ def _shards(folder: Path, manifest: dict[str, Any]) -> list[Path]:
     return [folder / f"shard_{number:05d}.npz" for number in range(count)]
 
 
-def _check_manifest(folder: Path, manifest: dict[str, Any]) -> None:
-    """Raise `DataError` if a folder holds a dataset of another manifest."""
+def _check_manifest(folder: Path, manifest: dict[str, Any]) -> bool:
+    """Tell whether a folder holds the first groups only; raise `DataError` if it holds another dataset."""
     kept = _read_manifest(folder / "manifest.json")
-    if kept != manifest:
+    if kept == manifest:
+        return False
+    groups, whole = kept["plan"]["groups"], kept["groups_per_shard"]
+    begun = {**manifest, "plan": {**manifest["plan"], "groups": groups}}
+    grows = groups < manifest["plan"]["groups"] and groups % whole == 0 and kept["plan"]["sequence"] != "latin"
+    if kept != begun or not grows:
         changed = sorted(k for k in manifest.keys() | kept.keys() if kept.get(k) != manifest.get(k))
         raise DataError(f"'{folder}' holds another dataset (different: {', '.join(changed)}); use a new folder")
+    return True
 
 
 def _read_manifest(path: Path) -> dict:

@@ -432,6 +432,37 @@ def test_another_plan_does_not_mix(copied):
         generate_dataset(copied, "finger", PLAN, groups_per_shard=2, progress=False)
 
 
+@pytest.mark.parametrize("sequence", ["halton", "sobol", "random"])
+def test_a_dataset_grows(tmp_path, sequence):
+    """More groups keep those there are, and are what they would have been at once."""
+
+    def plan(groups):
+        return SamplingPlan(groups, 2, sequence, 3)
+
+    small = generate_dataset(tmp_path / "grown", "trunk", plan(2), groups_per_shard=1, progress=False)
+    stamps = [path.stat().st_mtime_ns for path in sorted((tmp_path / "grown").glob("shard*"))]
+    grown = generate_dataset(tmp_path / "grown", "trunk", plan(5), groups_per_shard=1, progress=False)
+    shards = sorted((tmp_path / "grown").glob("shard*"))
+    assert len(shards) == 5 and [path.stat().st_mtime_ns for path in shards[:2]] == stamps
+    assert all((grown[name][: len(small[name])] == small[name]).all() for name in COLUMNS)
+    assert equal(grown, generate_dataset(tmp_path / "whole", "trunk", plan(5), groups_per_shard=1, progress=False))
+    assert "of 5 bodies" in (tmp_path / "grown" / "README.md").read_text()
+    with pytest.raises(DataError, match=r"different: plan\)"):  # it does not shrink
+        generate_dataset(tmp_path / "grown", "trunk", plan(4), groups_per_shard=1, progress=False)
+
+
+def test_a_dataset_that_cannot_grow(tmp_path):
+    """A Latin hypercube is laid out for its number of points; a shard that is not full would have to be."""
+    for sequence, first in (("latin", 2), ("halton", 1)):
+        for groups in (first, 4):
+            plan = SamplingPlan(groups, 2, sequence, 3)
+            if groups == first:
+                generate_dataset(tmp_path / sequence, "trunk", plan, groups_per_shard=2, progress=False)
+                continue
+            with pytest.raises(DataError, match=r"different: plan\)"):
+                generate_dataset(tmp_path / sequence, "trunk", plan, groups_per_shard=2, progress=False)
+
+
 @pytest.mark.parametrize("text", ['{"format": 2, "pl', "[]", '{"format": 1}', '{"format": 2, "plan": {}}'])
 def test_broken_manifest(copied, text):
     (copied / "manifest.json").write_text(text)
