@@ -22,6 +22,16 @@ TIP_FRACTION = 0.4  # radius of the long cables at the tip over the half-width t
 LONG_GUIDES, SHORT_GUIDES = 20, 10
 
 
+def stretched(share: np.ndarray, short_fraction: float) -> np.ndarray:
+    """Heights, as shares of the length, of equal steps along the trunk; the first half ends with the short cables.
+
+    Sections and guides move with that end. Were the mesh to stay, the force there would pass from one element to the
+    next as the design changes, and strains jump between elements: the derivative of the tip changed its sign within
+    2 % of the range.
+    """
+    return np.interp(share, [0.0, 0.5, 1.0], [0.0, short_fraction, 1.0])
+
+
 def octagonal_bar(layers: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
     """Mesh a bar of octagonal section, half-width 1 and length 1, that stands on z = 0, in prisms cut in three.
 
@@ -69,7 +79,8 @@ def octagonal_bar(layers: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
 class CableTrunk(Robot):
     """Tapered arm with four cables along its whole length and four to its middle.
 
-    The mesh is regular, so it follows the design exactly and is as symmetric as the body.
+    The mesh is regular on either side of the short cables' end, so it follows the design exactly and is as symmetric
+    as the body.
 
     Args:
         layers: number of elements along the trunk; the defaults give 825 nodes and 3456 tetrahedra.
@@ -156,6 +167,7 @@ class CableTrunk(Robot):
     def mesh(self, design: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
         """Nodes [m] (n, 3) and tetrahedra (m, 4) of a complete design: the bar, stretched and tapered."""
         nodes, tetrahedra = octagonal_bar(self.layers, self.rings)
+        nodes[:, 2] = stretched(nodes[:, 2], design["short_fraction"])
         half_width = np.interp(nodes[:, 2], [0.0, 1.0], [design["base_half_width"], design["tip_half_width"]])
         return nodes * np.column_stack([half_width, half_width, np.full(len(nodes), design["length"])]), tetrahedra
 
@@ -175,8 +187,8 @@ class CableTrunk(Robot):
         base = design["cable_fraction"] * design["base_half_width"]
         tip = TIP_FRACTION * design["tip_half_width"]
         actuators = iter(self.actuators)
-        for reach, count in ((1.0, LONG_GUIDES), (design["short_fraction"], SHORT_GUIDES)):
-            share = np.linspace(0.0, reach, count + 1)
+        for reach, count in ((1.0, LONG_GUIDES), (0.5, SHORT_GUIDES)):
+            share = stretched(np.linspace(0.0, reach, count + 1), design["short_fraction"])
             radius, height = base + share * (tip - base), share * design["length"]
             for x, y in ((0, 1), (-1, 0), (0, -1), (1, 0)):
                 points = np.column_stack([x * radius, y * radius, height])
