@@ -224,7 +224,7 @@ def main(folder: Path, workers: int = 1) -> None:
                         continue
                     if name in ONCE and (seed or size != given["sizes"][-1]):
                         continue
-                    if "times" in name and case != "finger":  # minutes each
+                    if "5" in name and case != "finger":  # minutes each
                         continue
                     path = runs / f"{stem}_{name.replace(' ', '').replace(',', '_')}_{size}_{seed}.json"
                     jobs.append((_run, (path, case, name, data, size, seed)))
