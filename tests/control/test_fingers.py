@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.control import InverseQP
 from softgym_envs.control.fingers import CoupledFingers, FEMFingers, SurrogateFingers
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.statics import Statics
 from softgym_envs.robots import make_robot
+from softgym_envs.surrogate.export import export_c
 from softgym_envs.surrogate.model import SurrogateModel
+from softgym_envs.surrogate.pretrained import pretrained_model
 
 MESH_SIZE = 12e-3
 # Cables [m]. The second command of each leaves cables slack, or bends the finger by 30 degrees.
@@ -128,6 +131,28 @@ def test_the_inverse_controller_moves_the_object(parts):
     np.testing.assert_allclose(state.position, goal, atol=1e-5)
     whole = Statics(robot.build()).solve(command)
     np.testing.assert_allclose(whole.condensed.delta.e, goal, atol=1e-5)
+
+
+def test_one_learned_finger_makes_the_gripper():
+    """Shipped weights, on commands and bodies that were in no dataset, against the gripper in one model."""
+    robot, model = make_robot("three_finger_gripper"), pretrained_model(make_robot("contact_finger"))
+    rng = np.random.default_rng(3)
+    for design in (robot.design_space.baseline, robot.design_space.sample(rng)):
+        whole = Statics(robot.build(design))
+        learned = CoupledFingers.like(robot, SurrogateFingers(model, design), design)
+        for _ in range(2):
+            command = rng.uniform(robot.lower, robot.upper)
+            expected, found = whole.solve(command), learned.solve(command)
+            assert np.linalg.norm(found.position - expected.condensed.delta.e) < 1e-3
+            assert np.abs(found.effort - expected.effort[:6]).max() < 0.05 * expected.effort.max()
+            np.testing.assert_array_equal(found.slack, expected.slack)
+
+
+def test_a_contact_finger_alone_is_no_environment():
+    with pytest.raises(ValueError, match="'contact_finger' alone has no state that a search finds"):
+        SurrogateBackend(make_robot("contact_finger"))
+    with pytest.raises(ValueError, match="energy of robot 'contact_finger' is not convex"):
+        export_c(pretrained_model(make_robot("contact_finger")), {}, "finger.h")
 
 
 # -- algebra on a finger that is a formula --------------------------------------------------------------------------
