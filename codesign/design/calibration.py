@@ -176,6 +176,9 @@ class LearnedMisfit(Misfit):
             raise ConvergenceError("the surrogate finds no state for some of the measured commands")
         self._reached = settled.displacement
         displacement = torch.as_tensor(settled.displacement)
+        if self.data.driven == "displacement":
+            # What is taut is where it was commanded to be; the search only ends near it.
+            displacement = torch.where(torch.as_tensor(free), displacement, torch.as_tensor(self.data.displacement))
         if free.any():
             # Newton's method once more in double precision, then a step that carries the derivatives: what is driven
             # in effort moves with the design as it must.
