@@ -1,4 +1,4 @@
-"""Networks compared on the same data: error against the number of FEM states, three seeds each.
+"""Networks compared on the same data: error against the number of FEM states.
 
     python -m benchmarks.networks results/networks 2
 
@@ -12,8 +12,9 @@ from __future__ import annotations
 import json
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -31,7 +32,6 @@ CASES: dict[str, dict[str, Any]] = {
         "groups": 130,
         "margin": 0.1,
         "sizes": (50, 200, 800, 6400),
-        "seeds": (0, 1, 2),
         "tracking": 500,
     },
     "diamond": {
@@ -40,7 +40,6 @@ CASES: dict[str, dict[str, Any]] = {
         "groups": 32,
         "margin": 1.0,
         "sizes": (50, 200, 1600),
-        "seeds": (0, 1, 2),
         "tracking": 200,
     },
     "diamond that is only pulled": {
@@ -49,28 +48,49 @@ CASES: dict[str, dict[str, Any]] = {
         "groups": 135,
         "margin": 0.0,
         "sizes": (200, 6500),
-        "seeds": (0,),
         "tracking": None,
     },
 }
 """Bodies; 50 states in each group. The Diamond's circle needs cables that push, so they are in its data. The third is
 the thesis' own set: as many states, and cables that are pulled by 0 to 30 mm."""
 
-NETWORKS: dict[str, dict[str, Any]] = {
-    "potential": {"kind": "potential", "members": 1},
-    "residual": {"kind": "residual"},
-    "thesis": {"kind": "thesis", "steps": 4000, "batch_size": 128},
-    "rbf": {"kind": "rbf"},
-    "potential, Adam": {"kind": "potential", "members": 1, "optimiser": "adam", "learning_rate": 3e-3},
-    "thesis, SOAP": {"kind": "thesis", "optimiser": "soap", "steps": 4000, "batch_size": 128},
-    "thesis, 5 times the steps": {"kind": "thesis", "steps": 20_000, "batch_size": 256},
-    "potential x 5": {"kind": "potential", "members": 5},
+
+@dataclass(frozen=True)
+class Row:
+    """A network of the table.
+
+    Attributes:
+        options: of its training; 4000 steps of 128 states unless they say otherwise.
+        sizes: which of a case's numbers of states it learns from.
+        seeds: how many of a case's seeds.
+        cases: the bodies it learns; some take minutes for each.
+    """
+
+    options: dict[str, Any]
+    sizes: Literal["every", "200 and all", "all"] = "every"
+    seeds: int = 3
+    cases: tuple[str, ...] = tuple(CASES)
+
+    def runs(self, case: str) -> list[tuple[int, int]]:
+        """Numbers of states and seeds."""
+        sizes = CASES[case]["sizes"]
+        chosen = {"every": sizes, "200 and all": (200, sizes[-1]), "all": sizes[-1:]}[self.sizes]
+        return [(size, seed) for seed in range(self.seeds) for size in chosen] if case in self.cases else []
+
+
+NETWORKS: dict[str, Row] = {
+    "potential": Row({"kind": "potential", "members": 1}),
+    "residual": Row({"kind": "residual"}, "200 and all"),
+    "thesis": Row({"kind": "thesis", "steps": 4000, "batch_size": 128}),
+    "rbf": Row({"kind": "rbf"}, "200 and all"),
+    "potential, Adam": Row(
+        {"kind": "potential", "members": 1, "optimiser": "adam", "learning_rate": 3e-3}, "all", seeds=1
+    ),
+    "thesis, SOAP": Row({"kind": "thesis", "optimiser": "soap", "steps": 4000, "batch_size": 128}, "all"),
+    "thesis, 5 times the steps": Row({"kind": "thesis", "steps": 20_000, "batch_size": 256}, "all", 1, ("finger",)),
+    "potential x 5": Row({"kind": "potential", "members": 5}, "all", 1, ("finger",)),
 }
-"""4000 steps of 128 states for all but one. The thesis' network is trained by Adam as published, and by SOAP too."""
-#: Networks that are trained on every number of states; the others on 200 and on all, or ...
-CURVES = ("potential", "thesis")
-#: ... on all, with one seed.
-ONCE = ("potential, Adam", "thesis, SOAP", "thesis, 5 times the steps", "potential x 5")
+"""The thesis' network is trained by Adam as published, and by SOAP as ours are."""
 
 
 def standardised_loss(model: Any, training: dict[str, np.ndarray], test: dict[str, np.ndarray]) -> float:
@@ -140,13 +160,14 @@ def _run(path: Path, case: str, name: str, data: dict[str, dict[str, np.ndarray]
     others = np.flatnonzero(~data["train"]["rest"].astype(bool))
     chosen = np.concatenate([[0], np.random.default_rng(seed).permutation(others)[:size]])
     part = {k: v[chosen] for k, v in data["train"].items()}
-    module = network_module(NETWORKS[name]["kind"])
+    options = NETWORKS[name].options
+    module = network_module(options["kind"])
     start = time.process_time()
     tensors, _ = module.train(
         robot,
         training_states(robot, part, features),
         training_states(robot, data["validation"], features),
-        Trainer(module.Options(**NETWORKS[name]), seed),
+        Trainer(module.Options(**options), seed),
     )
     seconds = time.process_time() - start
     model = module.Model(robot, tensors, {})
@@ -217,17 +238,10 @@ def main(folder: Path, workers: int = 1) -> None:
         if given["tracking"]:
             path = runs / f"{stem}_tracking.json"
             jobs.append((_track, (path, case, data, given["tracking"], folder / "models" / case)))
-        for seed in given["seeds"]:
-            for name in NETWORKS:
-                for size in given["sizes"]:
-                    if name not in CURVES and size not in (200, given["sizes"][-1]):
-                        continue
-                    if name in ONCE and (seed or size != given["sizes"][-1]):
-                        continue
-                    if "5" in name and case != "finger":  # minutes each
-                        continue
-                    path = runs / f"{stem}_{name.replace(' ', '').replace(',', '_')}_{size}_{seed}.json"
-                    jobs.append((_run, (path, case, name, data, size, seed)))
+        for name, row in NETWORKS.items():
+            for size, seed in row.runs(case):
+                path = runs / f"{stem}_{name.replace(' ', '').replace(',', '_')}_{size}_{seed}.json"
+                jobs.append((_run, (path, case, name, data, size, seed)))
     try:
         for path in run_jobs([job for job in jobs if not job[1][0].exists()], workers):
             last = json.loads(path.read_text())

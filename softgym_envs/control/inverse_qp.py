@@ -130,7 +130,7 @@ class InverseQP:
         n = len(self.rates)
         # One inequality per actuator (its effort) beside the box of displacements.
         qp = self._proxqp.dense.QP(n, 0, n, True)
-        qp.settings.eps_abs = 1e-9
+        qp.settings.eps_abs = 1e-11  # where many actuators serve one effector, 1e-9 leaves 5e-5 of their ranges open
         qp.settings.eps_rel = 0.0
         qp.settings.max_iter = 1000
         qp.settings.initial_guess = self._proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
