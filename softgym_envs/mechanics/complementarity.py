@@ -9,65 +9,74 @@ __all__ = ["solve_complementarity"]
 
 
 @njit(cache=True, error_model="numpy")
+def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
+    """Fill y (m,) with the efforts where the actuators of ``slack`` carry none.
+
+    Returns the actuators that contradict it, which push though they are unilateral or would fall short beyond their
+    commands; -1 if the others have no definite W. Sets of actuators are bits of an integer.
+    """
+    m = len(gap)
+    k = 0
+    for i in range(m):
+        y[i] = 0.0
+        if not slack >> i & 1:
+            index[k] = i
+            k += 1
+    for r in range(k):
+        for c in range(k):
+            a[r, c] = W[index[r], index[c]]
+        a[r, k] = -gap[index[r]]
+    # Gaussian elimination without pivoting: fine for positive definite blocks.
+    for p in range(k):
+        if not a[p, p] > 0.0:
+            return -1
+        for r in range(p + 1, k):
+            factor = a[r, p] / a[p, p]
+            for c in range(p, k + 1):
+                a[r, c] -= factor * a[p, c]
+    for r in range(k - 1, -1, -1):
+        value = a[r, k]
+        for c in range(r + 1, k):
+            value -= a[r, c] * y[index[c]]
+        y[index[r]] = value / a[r, r]
+    wrong = 0
+    for i in range(m):
+        if slack >> i & 1:
+            value = gap[i]
+            for j in range(m):
+                value += W[i, j] * y[j]
+            if value < -tolerance:
+                wrong |= 1 << i
+        elif unilateral[i] and y[i] < 0.0:
+            wrong |= 1 << i
+    return wrong
+
+
+@njit(cache=True, error_model="numpy")
 def _solve_row(W, gap, unilateral, y, a, index):
-    """Fill y (m,) with the consistent taut set, starting from the most likely ones; False if there is none.
+    """Fill y (m,) with the consistent efforts; False if there are none.
 
     ``a`` (m, m + 1) and ``index`` (m,), of integers, are room to work in.
     """
     m = len(gap)
-    scale = 0.0
+    scale, bilateral = 0.0, 0
     for i in range(m):
         scale = max(scale, abs(gap[i]))
+        if not unilateral[i]:
+            bilateral |= 1 << i
     tolerance = 1e-12 * scale
-    for code in range(1 << m):
-        # Bit i set: actuator i is slack. Code 0, all taut, comes first.
-        k = 0
-        allowed = True
-        for i in range(m):
-            if code >> i & 1:
-                if not unilateral[i]:
-                    allowed = False
-                    break
-            else:
-                index[k] = i
-                k += 1
-        if not allowed:
-            continue
-        for r in range(k):
-            for c in range(k):
-                a[r, c] = W[index[r], index[c]]
-            a[r, k] = -gap[index[r]]
-        # Gaussian elimination without pivoting: fine for positive definite blocks.
-        for p in range(k):
-            if not a[p, p] > 0.0:
-                allowed = False
-                break
-            for r in range(p + 1, k):
-                factor = a[r, p] / a[p, p]
-                for c in range(p, k + 1):
-                    a[r, c] -= factor * a[p, c]
-        if not allowed:
-            continue
-        for i in range(m):
-            y[i] = 0.0
-        for r in range(k - 1, -1, -1):
-            value = a[r, k]
-            for c in range(r + 1, k):
-                value -= a[r, c] * y[index[c]]
-            y[index[r]] = value / a[r, r]
-        consistent = True
-        for i in range(m):
-            if code >> i & 1:
-                value = gap[i]
-                for j in range(m):
-                    value += W[i, j] * y[j]
-                if value < -tolerance:
-                    consistent = False
-                    break
-            elif unilateral[i] and y[i] < 0.0:
-                consistent = False
-                break
-        if consistent:
+    # All taut at first; whoever contradicts it changes sides. Two or three rounds nearly always settle it.
+    slack = 0
+    for _ in range(2 * m):
+        wrong = _with_slack(slack, W, gap, unilateral, tolerance, y, a, index)
+        if wrong == 0:
+            return True
+        if wrong < 0:
+            break
+        slack ^= wrong
+    # These rounds may go in circles, and a W that is not definite breaks them off: then every set is tried.
+    for slack in range(1 << m):
+        if not slack & bilateral and _with_slack(slack, W, gap, unilateral, tolerance, y, a, index) == 0:
             return True
     return False
 
@@ -86,8 +95,8 @@ def _solve(W, gap, unilateral, y):
 def solve_complementarity(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
     """Solve ``W y + gap = 0`` for bilateral rows, ``0 <= y _|_ W y + gap >= 0`` for unilateral ones.
 
-    With W positive definite exactly one set of taut actuators is consistent; it is found by trying them, which for
-    the handful of actuators of a robot is faster than any pivoting.
+    With W positive definite exactly one set of taut actuators is consistent. It is found by block principal pivoting
+    (Kostreva 1978): all rows that contradict a set change sides at once; where that goes in circles, by trying all.
 
     Args:
         W: symmetric positive definite matrices, shape (B, m, m).
