@@ -18,9 +18,9 @@ from softgym_envs.surrogate.pretrained import pretrained_model
 
 __all__ = ["Settled", "SurrogateBackend", "at_rest", "released", "settle"]
 
-#: Largest step left when a search ends [quarter of the actuator range]: 1e-6 m for a cable of 20 mm. Single precision
+#: Largest step left when a search ends [quarter of the actuator range]: 3e-7 m for a cable of 20 mm. Single precision
 #: does not carry much farther.
-TOLERANCE = 2e-4
+TOLERANCE = 5e-5
 
 
 @dataclass(frozen=True)
