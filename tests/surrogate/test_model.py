@@ -1,5 +1,6 @@
 """Learned models: structure that holds by construction, shipped accuracy, damaged files."""
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch
 
 from softgym_envs.config import load_config
 from softgym_envs.errors import WeightsError
+from softgym_envs.mechanics import complementarity
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.model import Context, Features, SurrogateModel, load_model
 from softgym_envs.surrogate.networks import NETWORKS, potential, residual
@@ -176,6 +178,11 @@ def test_search_of_a_batch_is_that_of_its_rows(name):
     assert expected[2].all()
     assert np.abs(found[0][well] - expected[0]).max() < 1e-4 * model.span.max()
     assert np.abs(found[1][well] - expected[1]).max() < 1e-3 * np.abs(expected[1]).max()
+
+
+def test_the_search_is_compiled_anew_when_what_it_inlines_changes():
+    found = hashlib.sha256(Path(complementarity.__file__).read_bytes()).hexdigest()[:16]
+    assert found == potential._INLINED, f"write '{found}' in {potential.__file__}"
 
 
 def test_members_of_an_ensemble():

@@ -67,6 +67,9 @@ def body_parts(n: int, e: int, w: int) -> dict[str, int]:
 
 
 _FAST: Any = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
+#: SHA-256 of the file of `_solve_row`. Numba keeps compiled kernels by the text of their own file: so this file changes
+#: with that one, and `_search` is compiled anew (a test compares).
+_INLINED = "f7e267c7c883d330"
 #: Rows evaluated together: each weight is then fetched once for all of them, and what belongs to one member stays
 #: in the fast caches.
 _ROWS = 48
