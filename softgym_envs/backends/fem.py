@@ -98,6 +98,7 @@ class FEMBackend(Backend):
             self._rest = self._state(rest, zero, still=True)
             self.model, self._statics, self.design = model, statics, dict(complete)
         self.restore(self._rest)
+        self._mode = "displacement"  # of the present state's command
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
@@ -113,6 +114,7 @@ class FEMBackend(Backend):
                 self.state = self._state(found, command)
             else:
                 self.state = self._advance(command, mode, load)
+            self._mode = mode
         except BaseException:
             # Whatever stopped it, the present state stands.
             self._go_back(kept)
@@ -156,7 +158,10 @@ class FEMBackend(Backend):
 
     def _advance(self, command: np.ndarray, mode: str, load: np.ndarray | None) -> State:
         assert self._dynamics is not None
-        start = self.state.command if mode == "displacement" else self.state.effort
+        # From where an actuator was told to be, which one that gave way has not reached.
+        start = self.state.effort
+        if mode == "displacement":
+            start = self.state.command if self._mode == mode else self.state.displacement
         for k in range(self._substeps):
             part = command if k == self._substeps - 1 else start + (k + 1) / self._substeps * (command - start)
             motion = self._drive(self._dynamics, part, mode, load)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 
@@ -78,7 +78,7 @@ def settle(
     unilateral: np.ndarray,
     slack: np.ndarray | None = None,
     *,
-    max_iterations: int = 12,
+    max_iterations: int = 25,
 ) -> Settled:
     """Find the states under commanded displacements, with cables that cannot push.
 
@@ -92,7 +92,7 @@ def settle(
         start: displacements reached before, shape (B, n_a): where the search begins for slack cables.
         unilateral: actuators that cannot push, shape (n_a,).
         slack: actuators slack before, shape (B, n_a).
-        max_iterations: bound on the search; it ends after two or three.
+        max_iterations: bound on the search; it mostly ends after two or three.
     """
     guess = target if slack is None else np.where(slack, np.maximum(start, target), target)
     displacement, effort, converged = model.search(context, target, guess, unilateral, TOLERANCE, max_iterations)
@@ -195,8 +195,13 @@ class _SurrogateState(State):
     def __init__(self, model: SurrogateModel, context: Context, **fields: np.ndarray | float) -> None:
         for name, value in fields.items():
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "nodes", None)
+        object.__setattr__(self, "velocity", np.zeros_like(self.effector))
+        object.__setattr__(self, "bonds", np.zeros(0))
         object.__setattr__(self, "_source", (model, context))
+
+    def __reduce__(self) -> tuple[type[State], tuple]:
+        # A copy is a plain state: the model is not carried along.
+        return State, tuple(getattr(self, field.name) for field in fields(State))
 
     @cached_property
     def condensed(self) -> CondensedModel:

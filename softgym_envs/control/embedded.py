@@ -8,6 +8,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.control.inverse_qp import InverseQP
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 
 __all__ = ["EmbeddedLoop", "PICorrection", "follow"]
@@ -148,8 +149,15 @@ class EmbeddedLoop:
             self.displacement = displacement
         condensed = self._condensed(self.displacement)
         closed = None if measured is None else self.correction
-        aim = goal if closed is None or measured is None else closed.correct(goal, measured)
-        self.effort = self.controller.solve(condensed, aim, self.effort)
+        aim, summed = goal, None if closed is None else closed.correction
+        if closed is not None and measured is not None:
+            aim = closed.correct(goal, measured)
+        try:
+            self.effort = self.controller.solve(condensed, aim, self.effort)
+        except ConvergenceError:
+            if closed is not None and summed is not None:
+                closed.correction = summed  # what is not acted upon must not wind up
+            raise
         change = self.effort - condensed.lambda_.a
         self.displacement = condensed.delta.a + condensed.W.aa @ change
         self.predicted = condensed.delta.e + condensed.W.ea @ change

@@ -13,7 +13,7 @@ from softgym_envs.backends import make_backend
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.designs import DesignSpace
 from softgym_envs.envs.interface import Interface
-from softgym_envs.envs.task import check_goals, make_task
+from softgym_envs.envs.task import make_task
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots import make_robot
 
@@ -183,7 +183,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if goal is None:
             self._path = self.task.sample(self.np_random, 1, self._kinematics)[0]
         else:
-            self._path = check_goals(goal, "goal")
+            self._path = self.task.check_paths(goal)
         self.task.begin(self.np_random)
         self._step = 0
         return self._observe()

@@ -57,7 +57,7 @@ class Task(ABC):
         name: registry name.
         axes: which coordinates of the effector count, 1 or 0, shape (3,).
         success_distance: distance below which a goal counts as reached [m].
-        horizon: control steps a goal path describes; paths hold their last goal beyond it.
+        horizon: control steps a goal path describes; paths hold their last goal beyond it. 1 for a single goal.
     """
 
     #: It pushes the effector, so the backend must know forces.
@@ -87,6 +87,17 @@ class Task(ABC):
             return paths[:, 0]
         index = np.minimum(steps * counts // self.horizon, counts - 1)
         return paths[np.arange(len(paths)), index]
+
+    def check_paths(self, goals: object, leading: tuple[int, ...] = ()) -> np.ndarray:
+        """Return the goals of episodes [m] as paths (*leading, p, 3).
+
+        Raises:
+            ValueError: for another shape, values that are not finite, or a path where the task has one goal.
+        """
+        paths = check_goals(goals, "goal", leading)
+        if self.horizon == 1 and paths.shape[-2] > 1:
+            raise ValueError(f"task '{self.name}' has one goal an episode, got a path of {paths.shape[-2]}")
+        return paths
 
     def begin(self, rng: np.random.Generator) -> None:  # noqa: B027 - a hook, not a duty
         """Draw what else is random in an episode of a single environment; nothing by default."""

@@ -22,7 +22,7 @@ from softgym_envs.envs.interface import Interface
 from softgym_envs.envs.reach import Reach
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.envs.soft_robot_env import design_names
-from softgym_envs.envs.task import check_goals, make_task
+from softgym_envs.envs.task import make_task
 from softgym_envs.envs.track import Track
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots import make_robot
@@ -33,10 +33,11 @@ __all__ = ["TorchVectorEnv"]
 
 #: A quarter of an actuator's range, the unit of steps and tolerances of searches, in scaled displacements.
 SPAN = 0.5
-#: Newton steps of every row, with one Hessian. With random actions no row needs more, but some 2 % of GripperPinch.
+#: Newton steps of every row, with one Hessian. With random actions 7 % of the rows of GripperPinch and 2 % of the cable
+#: trunk's need more, and none of the others'.
 STEPS = 4
-#: Bound on the Newton steps of the others, with a new Hessian every fourth.
-MORE_STEPS = 13
+#: Bound on the Newton steps of those, with a new Hessian every fourth.
+MORE_STEPS = 25
 #: Passes of pivots in a complementarity problem: one to the last known slack set, the others to the right one.
 PASSES = 3
 
@@ -55,6 +56,7 @@ class _Ensemble:
             return torch.as_tensor(np.ascontiguousarray(array, dtype=float), dtype=dtype, device=device)
 
         tensors = {k: np.asarray(v, dtype=float) for k, v in model.tensors.items()}
+        self.trained = model.trained
         self.members, self.width, self.count, self.effectors = model.members, model.width, model.count, model.effectors
         self.unilateral = tuple(actuator.unilateral for actuator in model.robot.actuators)
         M, w, n = self.members, self.width, self.count
@@ -134,14 +136,14 @@ class _Ensemble:
         return gradient, hessian + bodies["quadratic"]
 
     def effector(self, bodies: Bodies, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Effector (B, e) and its spread (B,) over the members, infinite for a single one."""
+        """Effector (B, e) and its spread (B,) over the members, infinite where they are not all."""
         U = u.expand(self.members, *u.shape)
         z = torch.baddbmm(bodies["d1"], U, self._B1)
         z = torch.baddbmm(bodies["d2"], z * torch.rsqrt(1.0 + z * z), self._B2)
         plane = bodies["x0"] + (bodies["slope"] * u[:, None, :]).sum(dim=3)
         x = torch.baddbmm(plane, z * torch.rsqrt(1.0 + z * z), self._V)
         mean = x.mean(dim=0)
-        if self.members == 1:
+        if self.members < self.trained:
             return mean, torch.full_like(mean[:, 0], torch.inf)
         square = ((x - mean) ** 2).mean(dim=0).reshape(len(u), -1, 3).sum(dim=2)
         return mean, torch.sqrt(square.amax(dim=1))
@@ -246,10 +248,10 @@ def _complementarity(
 class TorchVectorEnv:
     """``num_envs`` copies of an environment on the surrogate, stepped together on one device.
 
-    It has the names of `gymnasium.vector.VectorEnv`, whose contract asks for arrays; here everything is a tensor on
-    ``device``. Episodes that end are reset in the same step: the observation is the first of the next episode, and
-    ``info["final_obs"]``, ``info["final_info"]`` hold the end of the last one; ``info["_final_obs"]`` says of which
-    rows. What the step returns stays valid after the next one.
+    `reset` and `step` are those of `gymnasium.vector.VectorEnv`, whose contract asks for arrays; here everything is a
+    tensor on ``device``, so that it is none. Episodes that end are reset in the same step: the observation is the first
+    of the next episode, and ``info["final_obs"]``, ``info["final_info"]`` hold the end of the last one;
+    ``info["_final_obs"]`` says of which rows. What the step returns stays valid after the next one.
 
     Args:
         id: an environment ID whose backend is the surrogate, with the task reach or track.
@@ -532,7 +534,7 @@ class TorchVectorEnv:
         if options.get("goal") is not None:
             goal = _array(options["goal"])
             paths = torch.as_tensor(
-                check_goals(goal, "goal", () if np.ndim(goal) < 3 else (self.num_envs,)),
+                self.task.check_paths(goal, () if np.ndim(goal) < 3 else (self.num_envs,)),
                 dtype=self.dtype,
                 device=self.device,
             )

@@ -12,7 +12,8 @@ from gymnasium.vector.utils import batch_space
 from softgym_envs.backends.surrogate import Settled, at_rest, settle
 from softgym_envs.envs.interface import Interface
 from softgym_envs.envs.soft_robot_env import design_names, merge_defaults
-from softgym_envs.envs.task import check_goals, make_task
+from softgym_envs.envs.task import make_task
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.model import Context
@@ -137,6 +138,10 @@ class SoftRobotVectorEnv(VectorEnv):
         self._take_rest(index, at_rest(self.model, context, self._unilateral))
 
     def _take_rest(self, index: np.ndarray, rest: Settled) -> None:
+        if not rest.converged.all():
+            lost = self.designs[index[np.flatnonzero(~rest.converged)[0]]].tolist()
+            design = dict(zip(self.design_space.names, lost, strict=True))
+            raise ConvergenceError(f"the surrogate finds no rest of design {design}")
         self._rest_displacement[index], self._rest_effort[index] = rest.displacement, rest.effort
         self._rest_effector[index] = rest.effector[:, :3]
         self._rest_uncertainty[index], self._rest_trusted[index] = rest.uncertainty, rest.trusted
@@ -190,7 +195,8 @@ class SoftRobotVectorEnv(VectorEnv):
 
     def _kinematics(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
         context = self._context.rows(index)
-        return settle(self.model, context, commands, np.zeros_like(commands), self._unilateral).effector[:, :3]
+        found = settle(self.model, context, commands, np.zeros_like(commands), self._unilateral)
+        return np.where(found.converged[:, None], found.effector[:, :3], np.nan)
 
     # -- what controllers look at -----------------------------------------------------------------------------------
 
@@ -243,7 +249,7 @@ class SoftRobotVectorEnv(VectorEnv):
         goal = options.get("goal")
         if goal is not None:
             shared = np.ndim(goal) < 3
-            goal = check_goals(goal, "goal", () if shared else (self.num_envs,))
+            goal = self.task.check_paths(goal, () if shared else (self.num_envs,))
             goal = np.broadcast_to(goal, (self.num_envs, *goal.shape[-2:]))
         self._begin_episodes(np.arange(self.num_envs), options.get("design"), goal)
         return self._observe(), self._info()[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["solve_complementarity"]
+__all__ = ["solve_complementarity", "solve_rows"]
 
 
 @njit(cache=True, error_model="numpy")
@@ -45,9 +45,9 @@ def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
             value = gap[i]
             for j in range(m):
                 value += W[i, j] * y[j]
-            if value < -tolerance:
+            if not value >= -tolerance:  # nor where it is NaN
                 wrong |= 1 << i
-        elif unilateral[i] and y[i] < 0.0:
+        elif unilateral[i] and not y[i] >= 0.0:
             wrong |= 1 << i
     return wrong
 
@@ -82,14 +82,25 @@ def _solve_row(W, gap, unilateral, y, a, index):
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(W, gap, unilateral, y):
-    """Row by row. Returns the first unsolved row or -1."""
+def _solve(W, gap, unilateral, y, found):
+    """Row by row."""
     count, m = gap.shape
     a, index = np.empty((m, m + 1)), np.empty(m, dtype=np.int64)
     for b in range(count):
-        if not _solve_row(W[b], gap[b], unilateral, y[b], a, index):
-            return b
-    return -1
+        found[b] = _solve_row(W[b], gap[b], unilateral, y[b], a, index)
+
+
+def solve_rows(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `solve_complementarity`, and return which rows have a solution, shape (B,); the others are not to be used.
+
+    Raises:
+        ValueError: for more than 16 actuators.
+    """
+    if gap.shape[1] > 16:
+        raise ValueError(f"at most 16 actuators can be told taut from slack, got {gap.shape[1]}")
+    y, found = np.empty_like(gap), np.empty(len(gap), dtype=bool)
+    _solve(W, gap, unilateral, y, found)
+    return y, found
 
 
 def solve_complementarity(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
@@ -107,10 +118,8 @@ def solve_complementarity(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray
         numpy.linalg.LinAlgError: if no set is consistent: a W is not positive definite.
         ValueError: for more than 16 actuators.
     """
-    if gap.shape[1] > 16:
-        raise ValueError(f"at most 16 actuators can be told taut from slack, got {gap.shape[1]}")
-    y = np.empty_like(gap)
-    row = _solve(W, gap, unilateral, y)
-    if row >= 0:
+    y, found = solve_rows(W, gap, unilateral)
+    if not found.all():
+        row = np.flatnonzero(~found)[0]
         raise np.linalg.LinAlgError(f"no consistent set of taut actuators in row {row}: W is not positive definite")
     return y

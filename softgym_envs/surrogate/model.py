@@ -18,7 +18,7 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace
 from softgym_envs.errors import WeightsError
-from softgym_envs.mechanics.complementarity import solve_complementarity
+from softgym_envs.mechanics.complementarity import solve_rows
 from softgym_envs.mechanics.condensation import CondensedModel, Roles
 from softgym_envs.robots.robot import Robot
 from softgym_envs.surrogate.networks import network_module
@@ -87,7 +87,7 @@ class Context:
 
     def put(self, index: np.ndarray, other: Context) -> None:
         """Overwrite the bodies of some of the rows. Afterwards no two rows share one."""
-        if len(self.stiffness) != len(self.slot):
+        if not self._own:
             self.stiffness = self.stiffness[self.slot]
             self.arrays = {name: array[self.slot] for name, array in self.arrays.items()}
             self.slot = np.arange(len(self.slot))
@@ -96,9 +96,14 @@ class Context:
         for name, array in self.arrays.items():
             array[target] = other.arrays[name][other.slot]
 
+    @property
+    def _own(self) -> bool:
+        """Every row has a body of its own, in order."""
+        return len(self.stiffness) == len(self.slot) and bool((self.slot == np.arange(len(self.slot))).all())
+
     def gather(self) -> dict[str, np.ndarray]:
         """The arrays of every row, with leading dimension B."""
-        if len(self.stiffness) == len(self.slot) and (self.slot == np.arange(len(self.slot))).all():
+        if self._own:
             return self.arrays
         return {name: array[self.slot] for name, array in self.arrays.items()}
 
@@ -204,11 +209,14 @@ class SurrogateModel(ABC):
                 break
             if iteration % 4 == 0:
                 # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
-                W = np.linalg.inv(self.stiffness(part, d))
-            try:
-                taut = solve_complementarity(W, d - np.matmul(W, e[:, :, None])[:, :, 0] - wanted, unilateral)
-            except np.linalg.LinAlgError:  # a network that does not keep W positive definite
-                break
+                K = self.stiffness(part, d)
+                K[np.linalg.det(K) == 0.0] = np.nan
+                W = np.linalg.inv(K)
+            taut, solved = solve_rows(W, d - np.matmul(W, e[:, :, None])[:, :, 0] - wanted, unilateral)
+            if not solved.all():  # a network that does not keep W positive definite: these rows are lost
+                converged[rows[~solved]] = False
+                rows, d, e, wanted, W, taut = (x[solved] for x in (rows, d, e, wanted, W, taut))
+                part = part.rows(solved)
             # Far steps are cut: the network is only asked where its neighbourhood of known states reaches.
             step = np.clip(np.matmul(W, (taut - e)[:, :, None])[:, :, 0], -self.span, self.span)
             d = d + step

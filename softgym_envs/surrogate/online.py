@@ -24,8 +24,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
+import uuid
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -63,9 +63,10 @@ def check_ensemble(model: SurrogateModel) -> Model:
         raise WeightsError(f"online learning needs a network of kind 'potential'; these weights are '{model.network}'")
     if not model.robot.convex:
         raise WeightsError(f"online learning needs a convex energy; that of robot '{model.robot.name}' is not")
-    if model.members < 2:
+    if model.members < model.trained:
         raise WeightsError(
-            "online learning needs an ensemble of 2 or more members: their spread decides what is trusted"
+            "online learning needs all members of an ensemble of 2 or more: their spread decides what is trusted, and "
+            f"is calibrated for all; got {model.members}"
         )
     if not {"displacement", "design", "limit", "inflation"} <= model.card.get("domain", {}).keys():
         raise WeightsError("the card of the weights does not say where they are trusted; train them with 'softgym fit'")
@@ -101,7 +102,6 @@ class StateStore:
         sizes = (len(robot.design_space.names), len(robot.actuators), len(robot.actuators), 3 * len(robot.effectors))
         self._widths = dict(zip(COLUMNS, (*sizes, n * (n + 1) // 2), strict=False))
         self._parts: list[dict[str, np.ndarray]] = []
-        self._number = 0
         if self.folder is None:
             return
         asked = json.loads(json.dumps({"format": _FORMAT, "robot": robot.name, "signature": robot.signature}))
@@ -116,7 +116,6 @@ class StateStore:
         else:
             write_json(path, asked)
         for shard in sorted(self.folder.glob("states_*.npz")):
-            self._number += 1
             try:
                 self._parts.append(self._checked(read_npz(shard, COLUMNS), f"shard '{shard}'"))
             except DataError as error:
@@ -149,10 +148,9 @@ class StateStore:
         """
         checked = self._checked(part, "new states")
         if self.folder is not None:
-            # The process is in the name: several may collect into one folder.
-            with atomic_write(self.folder / f"states_{self._number:06d}_{os.getpid()}.npz") as stream:
+            # In the order of time, and unique: several stores and processes may collect into one folder.
+            with atomic_write(self.folder / f"states_{time.time_ns():020d}_{uuid.uuid4().hex}.npz") as stream:
                 np.savez(stream, allow_pickle=False, **checked)
-            self._number += 1
         self._parts.append(checked)
 
 

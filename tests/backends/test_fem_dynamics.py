@@ -63,6 +63,22 @@ def test_control_steps_are_divided_and_commands_ramped():
     np.testing.assert_allclose(state.velocity[0], by_hand.effector_velocity()[:3], atol=1e-6)
 
 
+def test_a_displacement_after_an_effort_begins_where_the_actuators_are():
+    backend = FEMBackend(make_robot("tetrapod"), dynamics=True)
+    reached = backend.step(np.full(4, 0.02), "effort").displacement
+    seen = []
+    advance = backend._dynamics.advance
+    backend._dynamics.advance = lambda command, *rest, **named: (
+        seen.append(np.array(command)),
+        advance(command, *rest, **named),
+    )[1]
+    backend.step(np.zeros(4))
+    count = len(seen)
+    assert count > 1
+    expected = [(1.0 - (k + 1) / count) * reached for k in range(count)]
+    np.testing.assert_allclose(seen, expected, atol=1e-12)
+
+
 def test_the_velocity_is_that_of_the_effector():
     backend = FEMBackend(make_robot("tetrapod"), dynamics=True, control_step=0.002, time_step=0.002)
     for k in range(20):

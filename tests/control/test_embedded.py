@@ -9,6 +9,7 @@ import pytest
 
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.control import EmbeddedLoop, InverseQP, PICorrection, follow
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots import make_robot
 
@@ -160,6 +161,23 @@ def test_the_integral_does_not_wind_up():
         assert errors[-1] < 1e-5
     print(f"calls until the error stays below 0.1 mm, by time out of reach: {calls}")
     assert calls[1000] <= calls[60] + 20
+
+
+def test_what_no_answer_was_found_for_is_not_summed_up(monkeypatch):
+    correction = PICorrection(0.05, 0.05)
+    loop, goal = EmbeddedLoop(ChamberRobot(), controller(), correction), ChamberRobot.rest + [0.008, 0.0, 0.004]
+    loop.step(goal, ChamberRobot.rest)
+    before, effort = correction.correction.copy(), loop.effort.copy()
+
+    def fail(*arguments):
+        raise ConvergenceError("no answer")
+
+    monkeypatch.setattr(loop.controller, "solve", fail)
+    for _ in range(10):
+        with pytest.raises(ConvergenceError):
+            loop.step(goal, ChamberRobot.rest)
+    np.testing.assert_array_equal(correction.correction, before)
+    np.testing.assert_array_equal(loop.effort, effort)
 
 
 def test_bad_measurements_are_refused():

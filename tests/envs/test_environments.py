@@ -282,10 +282,25 @@ def test_bad_actions_and_reset_options(backend):
         env.reset(options={"colour": "red"})
     with pytest.raises(ValueError, match="goal"):
         env.reset(options={"goal": [0.0, np.nan, 0.0]})
+    with pytest.raises(ValueError, match="one goal an episode, got a path of 5"):
+        env.reset(options={"goal": np.zeros((5, 3))})
     with pytest.raises(DesignError, match="length"):
         env.reset(options={"design": {"length": 1.0}})
     env.reset()
     assert np.isfinite(env.step(np.array([5.0, -5.0]))[0]).all()  # out of range is clipped
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_every_field_of_a_state_can_be_read_and_copied(backend):
+    env = gymnasium.make("SoftGym/FingerReach-v0", backend=backend).unwrapped
+    env.reset(seed=0)
+    env.step(np.array([1.0, -1.0]))
+    state = env.state
+    assert state.velocity.shape == (1, 3) and not state.velocity.any() and state.bonds.shape == (0,)
+    assert repr(state).startswith(type(state).__name__)
+    for twin in (pickle.loads(pickle.dumps(state)), copy.deepcopy(state)):
+        assert (twin.effector == state.effector).all() and twin.stable == state.stable
+        np.testing.assert_array_equal(twin.condensed.compliance, state.condensed.compliance)
 
 
 def test_unsolvable_step_ends_the_episode(monkeypatch):

@@ -185,12 +185,39 @@ def test_the_search_is_compiled_anew_when_what_it_inlines_changes():
     assert found == potential._INLINED, f"write '{found}' in {potential.__file__}"
 
 
+def test_a_row_without_a_definite_compliance_is_lost_alone(monkeypatch):
+    robot = make_robot("finger")
+    model = untrained_residual(robot)
+    designs, target = random_bodies(robot, 16)
+    context = model.context(designs)
+    unilateral = np.ones(2, dtype=bool)
+    whole = model.search(context, target, target, unilateral, 1e-4, 25)
+    assert whole[2].all() and (whole[1] == 0.0).any()
+    searched = np.flatnonzero((whole[0] != target).any(axis=1))
+    honest = model.stiffness
+    for bad, lost in ((np.zeros((2, 2)), True), (-np.eye(2), False)):  # the second has an answer, all slack
+
+        def broken(part, displacement, bad=bad):
+            K = honest(part, displacement)
+            K[part.slot == searched[0]] = bad
+            return K
+
+        monkeypatch.setattr(model, "stiffness", broken)
+        displacement, effort, found = model.search(context, target, target, unilateral, 1e-4, 25)
+        others = np.arange(16) != searched[0]
+        assert found[searched[0]] != lost and found[others].all()
+        np.testing.assert_array_equal(displacement[others], whole[0][others])
+        np.testing.assert_array_equal(effort[others], whole[1][others])
+
+
 def test_members_of_an_ensemble():
     robot = make_robot("finger")
     model, _ = untrained_potential(robot, members=3)
     designs, displacement = random_bodies(robot, 5)
-    one = potential.Model(robot, model.tensors, {}, members=1)
-    assert one.members == 1 and np.isinf(one.state(one.context(designs), displacement)[2]).all()
+    assert np.isfinite(model.state(model.context(designs), displacement)[2]).all()
+    for members in (1, 2):  # whose spread is smaller than that of all, which was calibrated
+        part = potential.Model(robot, model.tensors, {}, members=members)
+        assert part.members == members and np.isinf(part.state(part.context(designs), displacement)[2]).all()
     with pytest.raises(ValueError, match=r"members = 4.*1 to 3"):
         potential.Model(robot, model.tensors, {}, members=4)
     with pytest.raises(ValueError, match="members = 2"):
@@ -208,6 +235,9 @@ def test_context_rows_share_and_part():
     shared.put(np.arange(6), own)
     for got, wanted in zip(model.state(shared, displacement), model.state(own, displacement), strict=True):
         assert (got == wanted).all()
+    twice = own.rows(np.array([0, 0, 1, 2, 3, 4]))  # as many bodies as rows, and yet two share one
+    twice.put(np.array([0]), own.rows(np.array([5])))
+    assert (model.state(twice, displacement)[1][1] == model.state(own.rows(np.array([0])), displacement[1:2])[1]).all()
     shared.put(np.array([2]), own.rows(np.array([4])))
     index = np.array([5, 2])
     expected = model.state(own.rows(np.array([5, 4])), displacement[index])[1]

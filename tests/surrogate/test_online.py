@@ -148,6 +148,8 @@ def test_weights_are_written_and_read_as_ordinary_ones(model, learned, middle, r
 def test_models_that_cannot_decide_are_refused(robot, weights, middle, model):
     with pytest.raises(WeightsError, match="2 or more"):
         check_ensemble(load_model(weights, robot, members=1))
+    with pytest.raises(WeightsError, match="calibrated for all; got 2"):
+        check_ensemble(load_model(weights, robot, members=2))
     with pytest.raises(WeightsError, match="where they are trusted"):
         check_ensemble(Model(robot, model.tensors, {}))
     unstable = {**middle, "compliance": -middle["compliance"]}
@@ -167,8 +169,9 @@ def test_states_are_read_again(robot, middle, tmp_path):
     assert again.count == store.count == 6
     assert again.data.keys() == set(COLUMNS)
     assert all(np.array_equal(again.data[k], store.data[k]) for k in COLUMNS)
-    again.add({k: v[:2] for k, v in middle.items()})  # under a name of its own
-    assert StateStore(robot, tmp_path).count == 7
+    for both in (again, store):  # names are their own, in one process too
+        both.add({k: v[:2] for k, v in middle.items()})
+    assert StateStore(robot, tmp_path).count == 8
     assert StateStore(robot).count == 0
 
 

@@ -69,7 +69,7 @@ def body_parts(n: int, e: int, w: int) -> dict[str, int]:
 _FAST: Any = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
 #: SHA-256 of the file of `_solve_row`. Numba keeps compiled kernels by the text of their own file: so this file changes
 #: with that one, and `_search` is compiled anew (a test compares).
-_INLINED = "f7e267c7c883d330"
+_INLINED = "1bf3de55b52d1f35"
 #: Rows evaluated together: each weight is then fetched once for all of them, and what belongs to one member stays
 #: in the fast caches.
 _ROWS = 48
@@ -473,6 +473,8 @@ class Model(SurrogateModel):
         available = len(tensors["energy1"])
         if members is not None and not 1 <= members <= available:
             raise ValueError(f"members = {members} is out of bounds; these weights have 1 to {available}")
+        #: Their spread is calibrated for all of an ensemble; that of fewer is smaller, and one has none.
+        self.trained = max(available, 2)
         tensors = {
             k: v[:members] if v.shape and not k.startswith("scale.") and k != "rest" else v for k, v in tensors.items()
         }
@@ -552,7 +554,7 @@ class Model(SurrogateModel):
         spread = np.empty(len(u), dtype=np.float32)
         coefficients = (body["d1"], body["d2"], body["x0"], body["slope"])
         _effectors(u, context.slot, *self._shape, *coefficients, effector, spread)
-        if self.members == 1:
+        if self.members < self.trained:
             spread = np.full(len(u), np.inf)
         return effector * self.effector_scale + self.effector_mean, spread * self.effector_scale
 
