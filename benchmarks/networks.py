@@ -53,9 +53,9 @@ CASES: dict[str, dict[str, Any]] = {
     "gripper": {
         "robot": "three_finger_gripper",
         "robot_options": {},
-        "groups": 65,
+        "groups": 24,
         "margin": 0.1,
-        "sizes": (200, 3200),
+        "sizes": (200, 1100),
         "tracking": None,
     },
 }

@@ -195,19 +195,18 @@ def test_a_row_without_a_definite_compliance_is_lost_alone(monkeypatch):
     assert whole[2].all() and (whole[1] == 0.0).any()
     searched = np.flatnonzero((whole[0] != target).any(axis=1))
     honest = model.stiffness
-    for bad, lost in ((np.zeros((2, 2)), True), (-np.eye(2), False)):  # the second has an answer, all slack
 
-        def broken(part, displacement, bad=bad):
-            K = honest(part, displacement)
-            K[part.slot == searched[0]] = bad
-            return K
+    def broken(part, displacement):
+        K = honest(part, displacement)
+        K[part.slot == searched[0]] = 0.0
+        return K
 
-        monkeypatch.setattr(model, "stiffness", broken)
-        displacement, effort, found = model.search(context, target, target, unilateral, 1e-4, 25)
-        others = np.arange(16) != searched[0]
-        assert found[searched[0]] != lost and found[others].all()
-        np.testing.assert_array_equal(displacement[others], whole[0][others])
-        np.testing.assert_array_equal(effort[others], whole[1][others])
+    monkeypatch.setattr(model, "stiffness", broken)
+    displacement, effort, found = model.search(context, target, target, unilateral, 1e-4, 25)
+    others = np.arange(16) != searched[0]
+    assert not found[searched[0]] and found[others].all()
+    np.testing.assert_array_equal(displacement[others], whole[0][others])
+    np.testing.assert_array_equal(effort[others], whole[1][others])
 
 
 def test_members_of_an_ensemble():
