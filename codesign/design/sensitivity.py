@@ -6,7 +6,7 @@ Samples lie evenly in the unit coordinates of the design space: logarithmic vari
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +84,8 @@ def sobol(values: np.ndarray, box: Box, confidence: float, seed: int) -> Table:
 
     Args:
         values: the metric at Saltelli's samples, shape (n (d + 2),); NaN where a design is infeasible. Blocks with one
-            are left out, and the shares are then those of the remaining region.
+            are left out: the others are no longer independent samples of the variables, so that the shares are biased,
+            by more the fewer blocks are left.
         box: the designs.
         confidence: level of the intervals.
         seed: of their bootstrap.
@@ -107,9 +108,18 @@ def _problem(box: Box) -> dict[str, Any]:
     return {"num_vars": len(box), "names": list(box.names), "bounds": [[0.0, 1.0]] * len(box)}
 
 
+#: Samples that belong together: the levels of a variable, a trajectory, a block of Saltelli's.
+GROUPS: dict[str, Callable[[int], int]] = {"oat": lambda d: 1, "morris": lambda d: d + 1, "sobol": lambda d: d + 2}
+
+
+def _whole(values: np.ndarray, size: int) -> np.ndarray:
+    """Which blocks of ``size`` samples (n,) are feasible throughout, shape (n / size,)."""
+    return ~np.isnan(values.reshape(-1, size)).any(axis=1)
+
+
 def _whole_blocks(values: np.ndarray, size: int) -> np.ndarray:
     """Which samples (n,) belong to blocks of ``size`` samples that are all feasible."""
-    whole = ~np.isnan(values.reshape(-1, size)).any(axis=1)
+    whole = _whole(values, size)
     if whole.sum() < 2:
         raise ConvergenceError(f"only {whole.sum()} of {len(whole)} groups of samples are feasible; narrow the bounds")
     return np.repeat(whole, size)
@@ -185,7 +195,8 @@ def analyse(config: SensitivityConfig, folder: str | Path, *, progress: bool = T
 
     Returns:
         ``indices`` (``{metric: {variable: {index: value}}}``, see `one_at_a_time`, `morris` and `sobol`), ``designs``,
-        ``infeasible`` and ``seconds`` of evaluation over all processes.
+        ``infeasible``, ``groups_kept`` (share of the trajectories or blocks without an infeasible design, of which the
+        indices are) and ``seconds`` of evaluation over all processes.
 
     Raises:
         ConfigError: if SALib is not installed (``morris``, ``sobol``), or the folder holds another study.
@@ -215,6 +226,7 @@ def analyse(config: SensitivityConfig, folder: str | Path, *, progress: bool = T
     )
     if config.method == "oat" and "metrics" not in records[0]:
         raise ConvergenceError(f"the reference design is not feasible: {records[0]['infeasible']}")
+    lost = np.array([0.0 if "metrics" in record else np.nan for record in records])
     tables: dict[str, Table] = {}
     for metric in config.metrics:
         values = np.array([record["metrics"][metric] if "metrics" in record else np.nan for record in records])
@@ -229,6 +241,7 @@ def analyse(config: SensitivityConfig, folder: str | Path, *, progress: bool = T
         "indices": tables,
         "designs": len(records),
         "infeasible": sum("infeasible" in record for record in records),
+        "groups_kept": float(_whole(lost, GROUPS[config.method](len(box))).mean()),
         "seconds": sum(record["seconds"] for record in records),
     }
     write_json(folder / "result.json", {**provenance(), **result})

@@ -18,7 +18,7 @@ from codesign.finalists import choose_winner, evaluations, finalist_jobs
 from codesign.folder import StudyFolder
 from codesign.ledger import open_study
 from codesign.report import write_report
-from codesign.results import bootstrap_interval, difference_interval, rank_correlation, rate_interval
+from codesign.results import bootstrap_interval, mean_interval, rank_correlation, rate_interval
 from codesign.study import run_study
 from softgym_envs.errors import WeightsError
 from softgym_envs.storage import write_json
@@ -216,8 +216,10 @@ def test_statistics(rng):
     assert low < values.mean() < high
     assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(200), rel=0.1)
     assert bootstrap_interval([2.0, 2.0]) == (2.0, 2.0)
-    assert rate_interval([True] * 10)[0] == pytest.approx(0.7225, abs=1e-3)
-    assert rate_interval([0.5, 1.0, 0.0])[0] >= 0.0  # shares of several seeds
+    assert bootstrap_interval([2.0]) is None and mean_interval(np.ones((1, 1))) is None
+    assert rate_interval(np.ones((1, 10)))[0] == pytest.approx(0.7225, abs=1e-3)
+    low, high = rate_interval(np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]]))
+    assert 0.0 <= low < 5.0 / 6.0 < high <= 1.0
     assert rank_correlation([1, 2, 3], [10, 20, 15]) == pytest.approx(0.5)
     assert rank_correlation([1, 1, 1], [1, 2, 3]) is None
 
@@ -226,12 +228,26 @@ def test_interval_of_a_difference_heeds_the_seeds(rng):
     """With one seed each it is the bootstrap over goals; a lucky seed of several widens it."""
     goals = rng.normal(0.0, 1.0, 40)
     baseline, winner = goals[None], goals[None] - 0.1
-    assert difference_interval(baseline, winner) == pytest.approx((-0.1, -0.1))
+    assert mean_interval(winner, baseline) == pytest.approx((-0.1, -0.1))
     lucky = np.array([goals - 0.5, goals + 0.2, goals + 0.2])  # better by 0.03 on average
-    low, high = difference_interval(np.tile(goals, (3, 1)), lucky)
-    assert low < -0.3 and high > 0.1
+    low, high = mean_interval(lucky, np.tile(goals, (3, 1)))
+    half = 4.303 * np.std([-0.5, 0.2, 0.2], ddof=1) / np.sqrt(3.0)  # Student's with 2 degrees of freedom
+    assert (low, high) == pytest.approx((-0.1 / 3.0 - half, -0.1 / 3.0 + half), rel=1e-3)
     steady = np.tile(goals - 0.1, (3, 1))
-    assert difference_interval(np.tile(goals, (3, 1)), steady) == pytest.approx((-0.1, -0.1))
+    assert mean_interval(steady, np.tile(goals, (3, 1))) == pytest.approx((-0.1, -0.1))
+
+
+@pytest.mark.parametrize("seeds", [2, 3])
+@pytest.mark.parametrize("spread", [0.2, 1.0])
+def test_intervals_over_seeds_and_goals_cover(rng, seeds, spread):
+    """The true difference is 0; goals are shared, seeds are each body's own."""
+    covered = 0
+    for _ in range(400):
+        goals = rng.normal(size=40)
+        tables = (goals + rng.normal(size=(seeds, 1)) * spread + rng.normal(size=(seeds, 40)) for _ in range(2))
+        low, high = mean_interval(*tables)
+        covered += low <= 0.0 <= high
+    assert covered / 400 > 0.915  # three standard deviations of the count below 0.95
 
 
 def test_limits_decide_before_scores(study):
