@@ -74,12 +74,15 @@ class Row:
         sizes: which of a case's numbers of states it learns from.
         seeds: how many.
         cases: the bodies it learns; some take minutes for each.
+        validated: its best step is chosen by 200 validation states of the body, beside those it learns from; otherwise
+            by these themselves.
     """
 
     options: dict[str, Any]
     sizes: Literal["every", "200 and all", "all"] = "every"
     seeds: int = 3
     cases: tuple[str, ...] = tuple(CASES)
+    validated: bool = True
 
     def runs(self, case: str) -> list[tuple[int, int]]:
         """Numbers of states and seeds."""
@@ -95,6 +98,9 @@ NETWORKS: dict[str, Row] = {
     "rbf": Row({"kind": "rbf"}, "200 and all"),
     "potential, Adam": Row(
         {"kind": "potential", "members": 1, "optimiser": "adam", "learning_rate": 3e-3}, "all", 1, ("finger", "diamond")
+    ),
+    "potential, no validation": Row(
+        {"kind": "potential", "members": 1}, seeds=1, cases=("finger", "diamond"), validated=False
     ),
     "thesis, 5 times the steps": Row({"kind": "thesis", "steps": 20_000, "batch_size": 256}, "all", 1, ("finger",)),
     "potential x 5": Row({"kind": "potential", "members": 5}, "all", 1, ("finger",)),
@@ -178,7 +184,7 @@ def _run(path: Path, case: str, name: str, data: dict[str, dict[str, np.ndarray]
     tensors, _ = module.train(
         robot,
         training_states(robot, part, features),
-        training_states(robot, data["validation"], features),
+        training_states(robot, data["validation"] if NETWORKS[name].validated else part, features),
         Trainer(module.Options(**options), seed),
     )
     seconds = time.process_time() - start
