@@ -31,7 +31,7 @@ def test_set(folder: str | Path = "results/test_set", workers: int = 2) -> dict[
     for variant, (name, options) in shipped_robots().items():
         robot = make_robot(name, **options)
         model = pretrained_model(robot)
-        plan = load_config(CONFIGS / f"{variant}.yaml", FitConfig).data.test
+        plan = load_config(CONFIGS / f"{variant}.yaml", FitConfig).data.plan("test")
         data = generate_dataset(Path(folder) / variant, name, plan, robot_options=options, workers=workers)
         context = model.context(data["design"])
         _, effector, spread = model.state(context, data["displacement"])

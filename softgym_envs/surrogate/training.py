@@ -52,6 +52,10 @@ class DataConfig(Config):
     design: dict[str, float] = {}
     bounds: dict[str, tuple[float, float]] = {}
 
+    def plan(self, split: str) -> SamplingPlan:
+        """What the dataset ``split`` ("train", "validation" or "test") is drawn by."""
+        return SamplingPlan(**getattr(self, split).model_dump(), **self.model_dump(exclude=set(SPLITS)))
+
 
 if TYPE_CHECKING:
     NetworkOptions = Any
@@ -245,7 +249,7 @@ def generate(config: FitConfig, data_folder: str | Path, *, progress: bool = Tru
         split: generate_dataset(
             Path(data_folder) / split,
             config.robot,
-            SamplingPlan(**getattr(config.data, split).model_dump(), **config.data.model_dump(exclude=set(SPLITS))),
+            config.data.plan(split),
             robot_options=config.robot_options,
             groups_per_shard=10,
             workers=config.workers,
