@@ -8,11 +8,14 @@ from pydantic import Field, field_validator, model_validator
 
 from softgym_envs.config import Config
 from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.robots import make_robot
 
 if TYPE_CHECKING:
     import gymnasium
 
-__all__ = ["EnvironmentConfig", "SACConfig", "TrainConfig", "check_hindsight"]
+    from softgym_envs.robots.robot import Robot
+
+__all__ = ["EnvironmentConfig", "SACConfig", "TrainConfig", "check_hindsight", "check_start"]
 
 
 class EnvironmentConfig(Config):
@@ -52,6 +55,15 @@ class EnvironmentConfig(Config):
         """The same environment on another backend; options of the present backend do not apply there."""
         options = self.backend_options if backend == self.backend else {}
         return self.model_copy(update={"backend": backend, "backend_options": options})
+
+    def robot(self) -> Robot:
+        """Make the family of bodies.
+
+        Raises:
+            ValueError: for a wrong option of the robot.
+        """
+        row = ENVIRONMENTS[self.id]
+        return make_robot(row.robot, **{**row.robot_options, **self.robot_options})
 
     def _options(self, overrides: dict[str, Any]) -> dict[str, Any]:
         options = self.model_dump(exclude={"id", "on_qp"})
@@ -150,8 +162,9 @@ class TrainConfig(Config):
     report_every: int = Field(default=4_000, gt=0, description="environment steps between evaluations")
 
     @model_validator(mode="after")
-    def _relabelled(self) -> TrainConfig:
+    def _consistent(self) -> TrainConfig:
         check_hindsight(self.sac, self.environment)
+        check_start("sac.learning_starts", self.sac, "steps", self.steps)
         return self
 
 
@@ -162,4 +175,20 @@ def check_hindsight(sac: SACConfig, environment: EnvironmentConfig) -> None:
         raise ValueError(
             f"sac.hindsight = {sac.hindsight:g} cannot be had on top of the QP "
             f"(environment.on_qp = {environment.on_qp:g}), whose action depends on the goal; allowed: 0"
+        )
+
+
+def check_start(key: str, sac: SACConfig, end: str, steps: int) -> None:
+    """Raise ValueError for a training that ends before its first update.
+
+    Args:
+        key: of ``learning_starts``, for the message.
+        sac: hyper-parameters.
+        end: key of ``steps``, for the message.
+        steps: environment steps of the training.
+    """
+    if sac.learning_starts >= steps:
+        raise ValueError(
+            f"{key} = {sac.learning_starts} is not below {end} = {steps}: nothing would be learned; "
+            f"allowed: 0 to {steps - 1}"
         )

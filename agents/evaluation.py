@@ -115,7 +115,10 @@ def make_agent(agent: str | Path, seed: int = 0) -> Agent:
     """
     if agent in AGENTS:
         return make_baseline(str(agent), seed)
-    policy = Policy(agent)
+    return _acting(Policy(agent))
+
+
+def _acting(policy: Policy) -> Agent:
     return lambda observation, env: policy(observation)
 
 
@@ -135,15 +138,23 @@ def evaluate(
         goals: goals or paths of goals [m], shape (n, 3) or (n, p, 3).
         design: the body, or one for each goal (default: the environment's).
         seed: seed of the random agent and of the environment.
+
+    Raises:
+        ConfigError: if the policy was trained for another environment, see `Policy.check_environment`.
+        WeightsError: if the policy cannot be read.
     """
     goals = np.asarray(goals, dtype=float)
     goals = goals[:, None, :] if goals.ndim == 2 else goals
-    if agent not in AGENTS and environment.backend == "surrogate":
-        return _evaluate_batch(Policy(agent), environment, goals, design, seed)
     if agent in AGENTS:
+        act = make_baseline(str(agent), seed)
         environment = environment.model_copy(update={"on_qp": 0.0})
+    else:
+        policy = Policy(agent)
+        policy.check_environment(environment)
+        if environment.backend == "surrogate":
+            return _evaluate_batch(policy, environment, goals, design, seed)
+        act = _acting(policy)
     env = environment.make(sample_design=False)
-    act = make_agent(agent, seed)
     rows = []
     steps = 0
     try:

@@ -7,7 +7,6 @@ Gaussians over bodies that moves to those with larger returns (Schaff et al. 201
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.config import EnvironmentConfig, TrainConfig
-from softgym_envs.storage import write_json
+from softgym_envs.storage import read_json, write_json
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
@@ -160,7 +159,7 @@ class DistributionProposer(DesignProposer):
         rng = np.random.default_rng([self.config.seed, self.size])
         path = self._path(model.num_timesteps)
         if path.exists():
-            stored = json.loads(path.read_text())
+            stored = read_json(path)
             self.logits, self.means, self.spreads = (np.array(stored[k]) for k in ("logits", "means", "spreads"))
         else:
             self.logits = np.zeros(self.components)

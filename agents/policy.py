@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from softgym_envs.errors import WeightsError
-from softgym_envs.storage import atomic_write, write_json
+from agents.config import EnvironmentConfig
+from softgym_envs.config import check_config
+from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.envs.soft_robot_env import design_names
+from softgym_envs.errors import ConfigError, DataError, WeightsError
+from softgym_envs.storage import atomic_write, read_json, write_json
 
 __all__ = ["Policy", "policy_path", "read_tensors", "save_policy"]
 
@@ -36,7 +39,7 @@ def policy_path(policy: str | Path) -> Path:
 
 
 def save_policy(path: Path, tensors: dict[str, np.ndarray], card: dict[str, Any]) -> None:
-    """Write ``policy.safetensors`` and its JSON card beside it."""
+    """Write ``policy.safetensors`` and its JSON card beside it, whose ``config`` is that of the training."""
     from safetensors.numpy import save
 
     with atomic_write(path) as stream:
@@ -68,6 +71,7 @@ class Policy:
 
     Attributes:
         card: its JSON card.
+        environment: where it was trained.
         hidden: weights (d, w) and biases (w,) of the hidden layers.
         mean: those of the last layer.
         observation_size: d of the first one.
@@ -81,11 +85,18 @@ class Policy:
         tensors = read_tensors(self.path)
         card = self.path.with_suffix(".json")
         try:
-            self.card = json.loads(card.read_text())
-        except (OSError, ValueError) as error:
-            raise WeightsError(f"policy card '{card}' cannot be read: {error}") from None
+            self.card = read_json(card)
+        except DataError as error:
+            raise WeightsError(f"policy card {error}") from None
         if not isinstance(self.card, dict) or self.card.get("format") != FORMAT:
             raise WeightsError(f"policy card '{card}' is not of format {FORMAT}")
+        config = self.card.get("config")
+        if not isinstance(config, dict) or not isinstance(config.get("environment"), dict):
+            raise WeightsError(f"policy card '{card}' lacks config.environment, where the policy was trained")
+        try:
+            self.environment = check_config(EnvironmentConfig, config["environment"], f"policy card '{card}'")
+        except ConfigError as error:
+            raise WeightsError(str(error)) from None
         try:
             self.hidden = []
             k = 0
@@ -96,6 +107,22 @@ class Policy:
         except KeyError as error:
             raise WeightsError(f"policy '{self.path}' lacks tensor {error}") from None
         self.observation_size = int((self.hidden[0][0] if self.hidden else self.mean[0]).shape[0])
+
+    def check_environment(self, environment: EnvironmentConfig) -> None:
+        """Refuse an environment in which observations or actions mean something else than where it was trained.
+
+        Backend, body, goals and ID may differ, as long as robot and task are the same.
+
+        Raises:
+            ConfigError: naming the key, its value and that of the policy.
+        """
+        own = _meaning(self.environment)
+        for key, (meaning, shown) in _meaning(environment).items():
+            if meaning != own[key][0]:
+                raise ConfigError(
+                    f"environment.{key} = {shown} does not fit policy '{self.path}', which was trained with "
+                    f"{own[key][1]}; allowed: that, or another policy"
+                )
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return actions (..., n_a) in [-1, 1] for observations (..., d).
@@ -112,3 +139,22 @@ class Policy:
         for weight, bias in self.hidden:
             x = np.maximum(x @ weight + bias, 0.0)
         return np.tanh(x @ self.mean[0] + self.mean[1])
+
+
+def _meaning(environment: EnvironmentConfig) -> dict[str, tuple[Any, object]]:
+    """What observations and actions mean: by key, what must be equal, and how a message shows it."""
+    row, robot = ENVIRONMENTS[environment.id], environment.robot()
+    shown = design_names(robot.design_space, environment.design_in_observation)
+    variables = [robot.design_space[name] for name in shown]
+    scales = (
+        [(actuator.name, actuator.low, actuator.high, actuator.rate) for actuator in robot.actuators],
+        (robot.size, robot.motion, robot.effort_scale.tolist()),
+        [(variable.low, variable.high, variable.log) for variable in variables],
+    )
+    return {
+        "id": ((row.robot, row.task), f"{environment.id} (robot {row.robot}, task {row.task})"),
+        "on_qp": (environment.on_qp, environment.on_qp),
+        "action_mode": (environment.action_mode, environment.action_mode),
+        "design_in_observation": (shown, list(shown)),
+        "robot_options": (scales, environment.robot_options),
+    }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -15,6 +14,7 @@ from agents.config import EnvironmentConfig
 from agents.statistics import Estimate, crossed_estimate, stratified_estimate
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import DataError
+from softgym_envs.storage import read_json
 
 __all__ = ["StoredRuns", "draw_curves", "load_runs", "table"]
 
@@ -80,21 +80,22 @@ def load_runs(folder: str | Path = RESULTS) -> list[StoredRuns]:
     folder = Path(folder)
     found = []
     for place in sorted(path for path in folder.glob("*") if path.is_dir()):
-        runs = sorted((_read(path) for path in place.glob("seed*.json")), key=lambda run: run["seed"])
+        runs = sorted((_read_run(path) for path in place.glob("seed*.json")), key=lambda run: run["seed"])
         if runs:
             path = place / "baselines.json"
             environment = EnvironmentConfig.model_validate(runs[0]["config"]["environment"])
-            found.append(StoredRuns(place.name, environment, runs, _read(path) if path.exists() else {}))
+            found.append(StoredRuns(place.name, environment, runs, read_json(path) if path.exists() else {}))
     if not found:
         raise DataError(f"'{folder}' holds no results (<config>/seed<k>.json); make them with python -m agents.sweep")
     return found
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise DataError(f"result '{path}' cannot be read: {error}") from None
+def _read_run(path: Path) -> dict[str, Any]:
+    run = read_json(path)
+    wanted = {"seed", "config", "curve", "evaluations", "horizon"}
+    if not isinstance(run, dict) or not wanted <= run.keys():
+        raise DataError(f"'{path}' is no result of a training: it must hold {', '.join(sorted(wanted))}")
+    return run
 
 
 def table(runs: list[StoredRuns]) -> str:

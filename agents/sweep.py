@@ -4,7 +4,8 @@
 
 Trainings go to ``FOLDER/runs/<config>/seed<k>``, what `agents.results` reads to ``FOLDER/results/<config>``:
 ``seed<k>.json`` for each policy and ``baselines.json`` for the agents that need no training, all on the same unseen
-goals. A finished part is not run again, and a training that was killed goes on from its checkpoint.
+goals. A finished part is not run again, and a training that was killed goes on from its checkpoint; what another
+configuration or another number of goals left in the folder is refused.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from agents.config import EnvironmentConfig, TrainConfig
-from softgym_envs.config import load_config, provenance
+from softgym_envs.config import check_config, difference, load_config, provenance
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.errors import ConfigError, SoftGymError
+from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.executors import run_jobs
-from softgym_envs.storage import write_json
+from softgym_envs.storage import read_json, write_json
 
 __all__ = ["evaluate_baselines", "sweep", "train_and_evaluate", "unseen_goals"]
 
@@ -50,12 +51,10 @@ def _evaluations(
     """Evaluate agents on the environment's backend and on FEM: ``{backend: {agent: columns}}``, SI."""
     from agents.evaluation import evaluate
 
-    counts = {"fem": fem_goals} if environment.backend == "fem" else {environment.backend: goals, "fem": fem_goals}
+    counts = _counts(environment, goals, fem_goals)
     designs, paths = unseen_goals(environment, max(counts.values()))
     found: dict[str, dict[str, Any]] = {}
     for backend, count in counts.items():
-        if count < 1:
-            continue
         found[backend] = {}
         for name, agent in agents.items():
             begun = time.perf_counter()
@@ -77,8 +76,53 @@ def _evaluations(
     return found
 
 
+def _counts(environment: EnvironmentConfig, goals: int, fem_goals: int) -> dict[str, int]:
+    """Number of goals on each backend that agents are evaluated on."""
+    own = environment.backend
+    asked = {"fem": fem_goals} if own == "fem" else {own: goals, "fem": fem_goals}
+    return {backend: count for backend, count in asked.items() if count > 0}
+
+
 def _short(values: np.ndarray) -> list[float]:
     return [float(f"{value:.6g}") for value in values]
+
+
+def _finished(result: Path, config: TrainConfig, goals: int, fem_goals: int) -> bool:
+    """Whether a result is there, of this configuration and on so many goals.
+
+    Args:
+        result: ``seed<k>.json``, or ``baselines.json``, for which only the environment of ``config`` counts.
+        config: what is asked for, with its seed.
+        goals: unseen goals on the environment's backend.
+        fem_goals: unseen goals on FEM.
+
+    Raises:
+        DataError: if there is another result, or it cannot be read.
+    """
+    if not result.exists():
+        return False
+    stored, where = read_json(result), f"result '{result}'"
+    try:
+        if "config" in stored:
+            old = check_config(TrainConfig, stored["config"], where)
+        else:
+            old = check_config(TrainConfig, {**config.model_dump(), "environment": stored["environment"]}, where)
+        found = {
+            backend: len(next(iter(agents.values()))["distances"]) for backend, agents in stored["evaluations"].items()
+        }
+    except (KeyError, TypeError, AttributeError, StopIteration) as error:
+        raise DataError(f"{where} is not one of a sweep: {type(error).__name__} {error}") from None
+    other = difference(old, config)
+    asked = _counts(config.environment, goals, fem_goals)
+    if other is None and found != asked:
+        # A task whose goals are all the same is evaluated on one.
+        if set(found.values()) == {1} and len(unseen_goals(config.environment, 2)[1]) == 1:
+            asked = dict.fromkeys(asked, 1)
+        if found != asked:
+            other = f"goals = {found}, got {asked}"
+    if other is not None:
+        raise DataError(f"{where} is of another sweep: {other}; use another folder")
+    return True
 
 
 def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goals: int) -> Path:
@@ -88,9 +132,9 @@ def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goal
 
     name = path.stem
     result = folder / "results" / name / f"seed{seed}.json"
-    if result.exists():
-        return result
     config = load_config(path, TrainConfig).model_copy(update={"seed": seed})
+    if _finished(result, config, goals, fem_goals):
+        return result
     policy = train(config, folder / "runs" / name / f"seed{seed}", progress=False)
     card = Policy(policy).card
     write_json(
@@ -113,9 +157,10 @@ def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goal
 def evaluate_baselines(path: Path, folder: Path, goals: int, fem_goals: int) -> Path:
     """Evaluate the agents that need no training on the goals of a configuration; returns the file of the result."""
     result = folder / "results" / path.stem / "baselines.json"
-    if result.exists():
+    config = load_config(path, TrainConfig)
+    if _finished(result, config, goals, fem_goals):
         return result
-    environment = load_config(path, TrainConfig).environment
+    environment = config.environment
     agents: dict[str, str | Path] = {name: name for name in ("qp", "qp_model", "qp_pi", "random")}
     write_json(
         result,
@@ -168,6 +213,7 @@ def sweep(
 
     Raises:
         ConfigError: before anything runs, if a file is not valid or an environment would be evaluated on no goal.
+        DataError: before anything runs, if the folder holds results of another configuration or number of goals.
     """
     loaded = {path: load_config(path, TrainConfig) for path in configs}
     for path, config in loaded.items():
@@ -175,8 +221,16 @@ def sweep(
             raise ConfigError(f"fem_goals = {fem_goals}, but the environment of '{path}' is on FEM; allowed: 1 or more")
     jobs: list[tuple[float, Callable[..., Path], tuple[Any, ...]]] = []
     for path, config in loaded.items():
-        jobs += [(_cost(config), train_and_evaluate, (path, seed, folder, goals, fem_goals)) for seed in seeds]
-        jobs.append((0.0, evaluate_baselines, (path, folder, goals, fem_goals)))
+        place = folder / "results" / path.stem
+        for seed in seeds:
+            seeded = config.model_copy(update={"seed": seed})
+            if not _finished(place / f"seed{seed}.json", seeded, goals, fem_goals):
+                jobs.append((_cost(config), train_and_evaluate, (path, seed, folder, goals, fem_goals)))
+        if not _finished(place / "baselines.json", config, goals, fem_goals):
+            jobs.append((0.0, evaluate_baselines, (path, folder, goals, fem_goals)))
+    before = len(loaded) * (len(seeds) + 1) - len(jobs)
+    if before:
+        print(f"{before} jobs were finished before", flush=True)
     jobs.sort(key=lambda job: -job[0])
     begun, failed = time.perf_counter(), 0
     finished = run_jobs([(_attempt, job[1:]) for job in jobs], processes)

@@ -15,10 +15,10 @@ import numpy as np
 
 from agents.config import TrainConfig
 from agents.evaluation import Evaluation, evaluate, evaluation_set
-from agents.policy import policy_path, read_tensors, save_policy
-from softgym_envs.config import provenance, save_resolved
+from agents.policy import Policy, read_tensors, save_policy
+from softgym_envs.config import difference, load_config, provenance, save_resolved
 from softgym_envs.errors import DataError, WeightsError
-from softgym_envs.storage import atomic_write
+from softgym_envs.storage import atomic_write, read_json
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
@@ -63,43 +63,47 @@ def train(
         The path of ``policy.safetensors``.
 
     Raises:
+        ValueError: if the environment cannot be made; a new folder is then not begun.
+        ConfigError: if ``initial`` was trained for another environment, or the folder's configuration cannot be read.
         DataError: if the folder holds the training of another configuration.
         WeightsError: if ``initial`` or a checkpoint is damaged or does not fit.
     """
     import torch
-    import yaml
     from tqdm import tqdm
 
     torch.set_num_threads(1)
     if initial is not None:
         config = config.model_copy(update={"initial": str(initial)})
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     result = folder / "policy.safetensors"
     resolved = folder / "config.yaml"
-    if resolved.exists():
-        if TrainConfig.model_validate(yaml.safe_load(resolved.read_text())) != config:
-            raise DataError(f"'{folder}' holds a training with another configuration; use a new folder")
+    begun = resolved.exists()
+    if begun:
+        other = difference(load_config(resolved, TrainConfig), config)
+        if other is not None:
+            raise DataError(f"'{folder}' holds a training with another configuration: {other}; use a new folder")
         if result.exists():
             return result
-    else:
-        save_resolved(folder, config)
 
     began = time.process_time()
-    model = _make_model(config, folder)
     checkpoint = folder / "checkpoint.safetensors"
     curve: list[dict[str, float]] = []
     best: dict[str, np.ndarray] = {}
     outcome: Evaluation | None = None
+    model = _make_model(config)
     if checkpoint.exists():
         curve, best, outcome, spent = _restore(model, checkpoint)
         began -= spent
     elif config.initial is not None:
-        start_from = policy_path(config.initial)
-        _load_weights(model, read_tensors(start_from), start_from)
+        start_from = Policy(config.initial)
+        start_from.check_environment(config.environment)
+        _load_weights(model, read_tensors(start_from.path), start_from.path)
     if proposer is not None:
         proposer.attach(model, config, folder)
     designs, goals = evaluation_set(config.environment, config.evaluation_episodes, EVALUATION_SEED)
+    if not begun:  # wrong values have shown themselves: only now is the folder taken
+        save_resolved(folder, config)
+    _log_to(model, folder)
 
     start = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
     bar = tqdm(total=config.steps, initial=model.num_timesteps, unit="step", desc=folder.name, disable=not progress)
@@ -111,7 +115,7 @@ def train(
             target = min(config.steps, (model.num_timesteps // config.report_every + 1) * config.report_every)
             _learn(model, target, bar)
             scratch = folder / "latest.safetensors"
-            save_policy(scratch, _weights(model), {})
+            save_policy(scratch, _weights(model), {"config": config.model_dump(mode="json")})
             outcome = evaluate(scratch, config.environment, goals, design=designs)
             curve.append(
                 {
@@ -160,7 +164,7 @@ def cpu_before(policy: Path, began: float) -> float:
         policy: what `train` returned.
         began: ``time.process_time()`` before that call.
     """
-    card = json.loads(policy.with_suffix(".json").read_text())
+    card = read_json(policy.with_suffix(".json"))
     return max(0.0, card.get("cpu_seconds", 0.0) - (time.process_time() - began))
 
 
@@ -169,9 +173,8 @@ def _best_step(curve: list[dict[str, float]]) -> int:
     return int(max(curve, key=lambda row: (row["mean_return"], row["step"]))["step"])
 
 
-def _make_model(config: TrainConfig, folder: Path) -> SAC:
+def _make_model(config: TrainConfig) -> SAC:
     from stable_baselines3 import SAC
-    from stable_baselines3.common.logger import configure
 
     from agents.vec_env import SB3VecEnv
 
@@ -207,9 +210,15 @@ def _make_model(config: TrainConfig, folder: Path) -> SAC:
     # stable-baselines3 counts progress within one call of learn(); ours spans the whole training.
     fall = sac.final_learning_rate - sac.learning_rate
     model.lr_schedule = lambda _: sac.learning_rate + fall * min(model.num_timesteps / config.steps, 1.0)
+    return model
+
+
+def _log_to(model: SAC, folder: Path) -> None:
+    """Write the model's log to a folder, where TensorBoard is installed."""
+    from stable_baselines3.common.logger import configure
+
     formats = ["tensorboard"] if find_spec("tensorboard") else []
     model.set_logger(configure(str(folder / "tensorboard"), formats))
-    return model
 
 
 def _learn(model: SAC, target: int, bar: Any) -> None:

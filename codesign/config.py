@@ -9,13 +9,12 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from agents.config import EnvironmentConfig, SACConfig, check_hindsight
+from agents.config import EnvironmentConfig, SACConfig, check_hindsight, check_start
 from agents.joint import PROPOSERS
 from codesign.objectives import OBJECTIVES
 from softgym_envs.config import Config
 from softgym_envs.designs import DesignSpace
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.robot import Robot
 
 __all__ = [
@@ -34,7 +33,6 @@ __all__ = [
     "TrainingConfig",
     "ZoneConfig",
     "construct",
-    "robot_of",
 ]
 
 JOURNAL = "journal"
@@ -87,16 +85,6 @@ PRUNERS: dict[str, str] = {
 """Registry: name to class of `optuna.pruners`. Their steps are environment steps of training; those of ``"wilcoxon"``,
 for strategies that train nothing in a trial, are goals, each of which is compared with the same goal of the best body.
 """
-
-
-def robot_of(environment: EnvironmentConfig) -> Robot:
-    """Return the family of bodies of an environment.
-
-    Raises:
-        ValueError: for a wrong option of the robot.
-    """
-    row = ENVIRONMENTS[environment.id]
-    return make_robot(row.robot, **{**row.robot_options, **environment.robot_options})
 
 
 def construct(cls: type, options: dict[str, Any]) -> Any:
@@ -355,7 +343,7 @@ class StudyConfig(Config):
     def _comparable(cls, environment: EnvironmentConfig) -> EnvironmentConfig:
         if environment.sample_design:
             raise ValueError("sample_design must be false: a trial has one body; 'variables' names what is optimised")
-        robot_of(environment).design_space.complete(environment.design)
+        environment.robot().design_space.complete(environment.design)
         return environment
 
     @model_validator(mode="after")
@@ -400,7 +388,7 @@ class StudyConfig(Config):
             raise ValueError("sampler 'cmaes' knows neither several objectives nor limits; allowed: tpe, gp, nsgaii")
 
     def _check_strategy(self) -> None:
-        plan, training = self.plan, self.training
+        plan = self.plan
         if plan.policy and not self.policy:
             raise ValueError(f"strategy '{self.strategy}' needs 'policy', a trained design-conditioned policy")
         if not plan.policy and self.policy:
@@ -449,14 +437,23 @@ class StudyConfig(Config):
                 f"pruner 'wilcoxon' compares goals, strategy '{self.strategy}' reports its training; "
                 f"allowed: {', '.join(name for name in PRUNERS if name != 'wilcoxon')}"
             )
-        if plan.trains or self.finalists.seeds:
+        self._check_trainings()
+
+    def _check_trainings(self) -> None:
+        plan, training, finalists = self.plan, self.training, self.finalists
+        if plan.trains or finalists.seeds:
             check_hindsight(training.sac, self.environment)
+            if training.report_every > training.steps:
+                raise ValueError(
+                    f"training.report_every = {training.report_every} exceeds training.steps = {training.steps}"
+                )
+        if plan.trains or (finalists.seeds and finalists.steps is None):
+            check_start("training.sac.learning_starts", training.sac, "training.steps", training.steps)
+        if finalists.seeds and finalists.steps is not None:
+            check_start("training.sac.learning_starts", training.sac, "finalists.steps", finalists.steps)
         if plan.proposer:
             check_hindsight(self.joint.sac, self.environment)
-        if (plan.trains or self.finalists.seeds) and training.report_every > training.steps:
-            raise ValueError(
-                f"training.report_every = {training.report_every} exceeds training.steps = {training.steps}"
-            )
+            check_start("joint.sac.learning_starts", self.joint.sac, "joint.steps", self.joint.steps)
 
     @property
     def plan(self) -> Strategy:
@@ -466,7 +463,7 @@ class StudyConfig(Config):
     @property
     def robot(self) -> Robot:
         """The family of bodies."""
-        return robot_of(self.environment)
+        return self.environment.robot()
 
     @property
     def space(self) -> DesignSpace:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,19 +9,23 @@ from typing import Any
 
 import numpy as np
 
+from agents.config import EnvironmentConfig
 from agents.policy import policy_path
+from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
 from codesign.jobs import Job
 from codesign.judge import JUDGE
 from codesign.objectives import OBJECTIVES, rank_key, violations
 from codesign.trial import assess, training_config
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.storage import write_json
+from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
+from softgym_envs.storage import read_json, write_json
 
 __all__ = [
     "BACKENDS",
     "Finalist",
     "best_trials",
+    "check_tests",
     "choose_winner",
     "evaluations",
     "finalist_jobs",
@@ -129,7 +132,7 @@ def trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
     initial = config.policy if config.plan.trains else str(folder.path / JUDGE)
     sac = training.sac
     if initial is not None:  # its networks decide
-        card = json.loads(policy_path(initial).with_suffix(".json").read_text())
+        card = read_json(policy_path(initial).with_suffix(".json"))
         sac = sac.model_copy(update={"net_arch": card["config"]["sac"]["net_arch"]})
     training = training.model_copy(
         update={
@@ -145,7 +148,7 @@ def trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
         policy = train(training, place, initial=initial, progress=False)
         if not (place / "training.json").exists():
             objective = OBJECTIVES[config.objective]
-            trained = json.loads(policy.with_suffix(".json").read_text())
+            trained = read_json(policy.with_suffix(".json"))
             curve = trained["curve"]
             write_json(
                 place / "training.json",
@@ -165,7 +168,7 @@ def trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
 def trainings(folder: StudyFolder) -> list[dict[str, Any]]:
     """What is told of the policies that were trained anew for the present finalists."""
     numbers = [body.number for body in finalists(folder)]
-    told = [json.loads(path.read_text()) for path in sorted(folder.path.glob("finalists/*/training.json"))]
+    told = [read_json(path) for path in sorted(folder.path.glob("finalists/*/training.json"))]
     return [row for row in told if row["trial"] in numbers]
 
 
@@ -180,17 +183,39 @@ def fetch_policies(folder: StudyFolder) -> None:
             folder.policy(body.policy)
 
 
-def finalist_jobs(folder: StudyFolder) -> list[Job]:
-    """One job per body, controller and backend, the slow ones first."""
-    config = folder.config
+def _environments(config: StudyConfig) -> dict[str, EnvironmentConfig]:
+    """What finalists are tested in, by backend."""
     own = config.environment
     options: dict[str, dict[str, Any]] = {"surrogate": {}, "fem": {}, own.backend: own.backend_options}
     options["fem"] = {**options["fem"], **config.finalists.fem_options}
     backends = BACKENDS if ENVIRONMENTS[own.id].backend == "surrogate" else ("fem",)
-    environments = {
+    return {
         backend: own.model_copy(update={"backend": backend, "backend_options": options[backend]})
         for backend in backends
     }
+
+
+def check_tests(config: StudyConfig) -> None:
+    """Build the baseline on FEM as for the tests of the finalists, where they have options of their own (seconds).
+
+    Raises:
+        ConfigError: for an option that the backend does not take.
+    """
+    options = config.finalists.fem_options
+    if not (options and config.finalists.count):
+        return
+    try:
+        _environments(config)["fem"].make(sample_design=False).close()
+    except ValueError as error:
+        raise ConfigError(f"finalists cannot be tested with finalists.fem_options = {options}: {error}") from None
+    except (InfeasibleDesign, ConvergenceError):  # of the baseline: a result of the test
+        pass
+
+
+def finalist_jobs(folder: StudyFolder) -> list[Job]:
+    """One job per body, controller and backend, the slow ones first."""
+    config = folder.config
+    environments = _environments(config)
 
     def make(finalist: Finalist, agent: str, backend: str, goals: str, seed: int) -> dict[str, Any]:
         controller: str | Path = agent
@@ -206,7 +231,7 @@ def finalist_jobs(folder: StudyFolder) -> list[Job]:
         }
 
     jobs = []
-    for backend in reversed(backends):
+    for backend in reversed(environments):
         for finalist in finalists(folder):
             tests = [(agent, "unseen") for agent in finalist.agents]
             if config.finalists.choose == "fem" and backend == "fem":
@@ -223,7 +248,7 @@ def evaluations(folder: StudyFolder) -> list[dict[str, Any]]:
     paths = [job.path for job in finalist_jobs(folder)]
     groups: dict[tuple, list[dict[str, Any]]] = {}
     for path in sorted(path for path in paths if path.exists()):
-        record = json.loads(path.read_text())
+        record = read_json(path)
         groups.setdefault(tuple(record[key] for key in ("trial", "agent", "backend", "goals")), []).append(record)
     return [_mean(records) for records in groups.values()]
 
@@ -238,13 +263,13 @@ def _mean(records: list[dict[str, Any]]) -> dict[str, Any]:
     for key in records[0]:
         if key in merged or key == "seed":
             continue
-        values = np.array([record[key] for record in records], dtype=float)
+        values = [record[key] for record in records]
         if key in ("steps", "seconds", "cpu_seconds"):
-            merged[key] = float(values.sum())
+            merged[key] = sum(values)
         elif key == "worst_distance":
-            merged[key] = float(values.max())
+            merged[key] = max(values)
         else:
-            merged[key] = values.mean(axis=0).tolist()
+            merged[key] = np.mean(np.array(values, dtype=float), axis=0).tolist()
     # Seeds and goals, for intervals over both.
     merged["of_seeds"] = {k: [record[k] for record in records] for k in records[0] if isinstance(records[0][k], list)}
     return merged

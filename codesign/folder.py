@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ from codesign.goals import draw_goals
 from codesign.storages import StudyStorage, file_lock, open_storage
 from softgym_envs.config import check_config, load_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
-from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.storage import atomic_write, read_json, write_json
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -22,7 +21,16 @@ if TYPE_CHECKING:
 __all__ = ["StudyFolder"]
 
 # What may change between two runs of one study.
-EXTENSIBLE = ("name", "title", "trials", "workers", "executor", "heartbeat", "patience", "attempts", "finalists")
+EXTENSIBLE = (
+    *("name", "title", "trials", "workers", "executor", "heartbeat", "patience", "attempts"),
+    *("finalists.count", "finalists.choose", "finalists.seeds", "finalists.steps", "finalists.fem_options"),
+)
+MADE_BY = ("finalists.steps", "finalists.fem_options")  # how tests of finalists were made
+TESTED = """
+SELECT EXISTS (SELECT FROM codesign_files JOIN studies USING (study_id)
+               WHERE study_name = :study AND path LIKE 'finalists/%')
+"""
+"""Whether a database has tests of finalists of a study."""
 
 
 class StudyFolder:
@@ -59,8 +67,11 @@ class StudyFolder:
             wait: whether to wait for a database that does not answer; by default a wrong address is told at once.
 
         Raises:
-            ConfigError: if the folder, or the study of this name in the database, is of another study.
+            ConfigError: if the folder, or the study of this name in the database, is of another study, or FEM does not
+                take ``finalists.fem_options``.
         """
+        from codesign.finalists import check_tests  # whose module needs this one
+
         folder = cls(path)
         folder.path.mkdir(parents=True, exist_ok=True)
         with folder.lock("study"):
@@ -68,7 +79,9 @@ class StudyFolder:
             if new and (folder.path / "journal.log").exists():
                 raise ConfigError(f"folder '{path}' holds a journal but no config.yaml; use another folder")
             if not new:
-                _accept(folder.config, config, f"folder '{path}'", "folder")
+                _accept(folder.config, config, f"folder '{path}'", "folder", folder._made())
+            if new or folder.config.finalists != config.finalists:
+                check_tests(config)  # now, and not after hours of trials
             goals = folder._agree(config, str(path), wait) if config.storage != JOURNAL else None
             if new or folder.config != config:
                 save_resolved(folder.path, config)
@@ -85,7 +98,7 @@ class StudyFolder:
             config.storage, config.name, grace=config.heartbeat, patience=config.patience, wait=wait
         )
         known = self.path / "study.json"
-        mine = json.loads(known.read_text())["id"] if known.exists() else None
+        mine = read_json(known)["id"] if known.exists() else None
 
         def accept(shared: dict[str, Any] | None) -> dict[str, Any]:
             if shared is None:
@@ -101,13 +114,20 @@ class StudyFolder:
             if mine not in (None, shared["id"]):
                 raise ConfigError(f"{where} holds another study '{config.name}' than folder '{shown}'; use another one")
             old = check_config(StudyConfig, shared["config"], f"study '{config.name}' of {where}")
-            _accept(old, config, where, "name")
+            made = MADE_BY if storage._execute(TESTED, study=config.name) else self._made()
+            _accept(old, config, where, "name", made)
             return {"config": config.model_dump(mode="json"), "goals": shared["goals"]}
 
         shared = storage.agree(accept, 1 + len(config.also))
         if mine is None:
             write_json(known, {"id": shared["id"]})
         return shared["goals"]
+
+    def _made(self) -> tuple[str, ...]:
+        """Keys of the configuration by which tests of finalists, or policies for them, in the folder were made."""
+        if any(self.path.glob("finalists/*.json")):
+            return MADE_BY
+        return MADE_BY[:1] if any(self.path.glob("finalists/*/")) else ()
 
     def open_storage(self) -> StudyStorage:
         """Open the storage of the trials.
@@ -127,13 +147,13 @@ class StudyFolder:
     @cached_property
     def goals(self) -> dict[str, np.ndarray]:
         """Goals [m] by use: ``training`` (k, 3), ``selection`` (k, p, 3), ``unseen`` (k, p, 3)."""
-        stored = json.loads((self.path / "goals.json").read_text())
+        stored = read_json(self.path / "goals.json")
         return {name: np.array(stored[name], dtype=float) for name in ("training", "selection", "unseen")}
 
     def account(self) -> dict[str, Any]:
         """Command that last ran the study, and wall-clock time of each phase so far [s]."""
         path = self.path / "account.json"
-        return json.loads(path.read_text()) if path.exists() else {"command": "", "wall_seconds": {}}
+        return read_json(path) if path.exists() else {"command": "", "wall_seconds": {}}
 
     def lock(self, name: str) -> BaseFileLock:
         """Return a lock shared by all processes of the folder; see `codesign.storages.file_lock`."""
@@ -169,15 +189,22 @@ class StudyFolder:
     def result(self, number: int) -> dict[str, Any] | None:
         """Result of a trial, or None if it is not finished."""
         path = self.trial(number) / "result.json"
-        return json.loads(path.read_text()) if path.exists() else None
+        return read_json(path) if path.exists() else None
 
     def results(self) -> list[dict[str, Any]]:
         """Results of all finished trials, by number."""
         paths = sorted((self.path / "trials").glob("[0-9]*/result.json"))
-        return [json.loads(path.read_text()) for path in paths]
+        return [read_json(path) for path in paths]
 
 
-def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str) -> None:
+def _flat(config: StudyConfig) -> dict[str, Any]:
+    """Plain data of a configuration, its part ``finalists`` by dotted keys."""
+    data = config.model_dump(mode="json")
+    finalists = data.pop("finalists")
+    return {**data, **{f"finalists.{key}": value for key, value in finalists.items()}}
+
+
+def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str, made: tuple[str, ...]) -> None:
     """Raise unless a study can go on with a new configuration.
 
     Args:
@@ -185,15 +212,13 @@ def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str) -> None:
         new: what it is to be now.
         where: that holds the study.
         use: what to change to begin another one.
+        made: keys by which tests of finalists were made, and which must stay therefore.
     """
-    before, after = (config.model_dump(mode="json") for config in (old, new))
-    extensible = EXTENSIBLE if new.storage == JOURNAL else (*(key for key in EXTENSIBLE if key != "name"), "storage")
+    before, after = _flat(old), _flat(new)
+    fixed = made if new.storage == JOURNAL else ("name", *made)
+    extensible = [key for key in EXTENSIBLE if key not in fixed] + ["storage"] * (new.storage != JOURNAL)
     if (old.storage == JOURNAL) != (new.storage == JOURNAL):
         raise ConfigError(f"{where} holds a study with storage '{old.storage}', got '{new.storage}'; use another {use}")
-    if before["finalists"]["count"]:  # there are tests of finalists; how they were made must stay
-        for part in (before, after):
-            part["finalists.steps"] = part["finalists"]["steps"]
-            part["finalists.fem_options"] = part["finalists"]["fem_options"]
     for key in after:
         if key not in extensible and before[key] != after[key]:
             raise ConfigError(

@@ -10,6 +10,9 @@ from codesign.config import StudyConfig
 
 __all__ = ["draw_goals", "family_goals", "zone_goals"]
 
+STREAM = 0x60A15
+"""Sets the seeds of goals that a task draws apart from those of trainings, whose environments it draws for as well."""
+
 
 def family_goals(config: StudyConfig, count: int) -> np.ndarray:
     """Effector positions [m] (count, 3) of random bodies under random commands, on the surrogate.
@@ -47,6 +50,8 @@ def zone_goals(config: StudyConfig, count: int) -> np.ndarray:
 def draw_goals(config: StudyConfig) -> dict[str, Any]:
     """Draw the three disjoint sets of goals of a study [m], as plain data.
 
+    Where trainings draw their own goals as the task does, these are of other seeds than any training has.
+
     Returns:
         ``training`` (k, 3), empty where the task draws its own; ``selection`` and ``unseen`` (k, p, 3), both the one
         path of a task that has no other.
@@ -56,7 +61,9 @@ def draw_goals(config: StudyConfig) -> dict[str, Any]:
     if goals.source == "task":
         from agents.evaluation import sample_goals
 
-        paths, training = sample_goals(config.environment, count, goals.seed), np.zeros((0, 3))
+        # Beyond 32 bits, where no training has a seed.
+        seed = (1 << 64) + int(np.random.SeedSequence([goals.seed, STREAM]).generate_state(1, np.uint64)[0])
+        paths, training = sample_goals(config.environment, count, seed), np.zeros((0, 3))
     else:
         draw = family_goals if goals.source == "family" else zone_goals
         points = draw(config, count + goals.training_count)

@@ -6,7 +6,6 @@ It is given (strategy ``"policy"``), or trained together with the bodies before 
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from agents.policy import policy_path
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
 from codesign.jobs import Job
-from softgym_envs.storage import atomic_write
+from softgym_envs.storage import atomic_write, read_json
 
 __all__ = ["JUDGE", "joint_config", "judge_jobs", "judge_policy", "promising_bodies"]
 
@@ -47,7 +46,7 @@ def promising_bodies(folder: StudyFolder) -> list[tuple[str, dict[str, float]]]:
     path = folder.path / "judge" / "judge.json"
     if folder.config.plan.proposer is None or not path.exists():
         return []
-    bodies = json.loads(path.read_text())["bodies"][: folder.config.joint.keep]
+    bodies = read_json(path)["bodies"][: folder.config.joint.keep]
     return [(f"joint {index}", values) for index, values in enumerate(bodies)]
 
 
@@ -86,7 +85,7 @@ def _make(folder: StudyFolder) -> dict[str, Any]:
             joint_config(folder), training, proposer=PROPOSERS[config.plan.proposer](**options), progress=False
         )
         before = cpu_before(source, cpu)
-        found = json.loads((training / "bodies.json").read_text())
+        found = read_json(training / "bodies.json")
         space = config.space
         bodies = [
             {name: float(space[name].from_unit(value)) for name, value in zip(found["names"], body, strict=True)}

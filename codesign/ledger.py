@@ -3,6 +3,13 @@
 Every change of it happens while no other process is at it, so no trial is lost, run twice or one too many. A trial
 belongs to a worker, and a worker shows that it lives (`codesign.storages`): a trial whose worker does not was left
 behind (``kill -9``, power cut). Its result is taken over if it was already written; else its body is queued again.
+
+A body is blamed for the death of its worker if the call that had started the worker outlived it, or if it was an error
+that is a bug. It is not if the call has ended as well: Ctrl-C, ``kill -9`` of everything and a power cut say nothing
+about a body. One that takes its call down with it (all memory of the machine) cannot be told from these and is not
+blamed either; whoever starts the call again sees it. Blamed wrongly is a body whose worker knows no call (a task on a
+Ray cluster that ran before), or whose call, killed with its worker, still shows as alive in a database, where the signs
+of life of the two differ by up to a sixth of ``heartbeat``.
 """
 
 from __future__ import annotations
@@ -28,6 +35,9 @@ if TYPE_CHECKING:
 __all__ = ["Ledger", "open_study"]
 
 T = TypeVar("T")
+
+CALL = "SOFTGYM_STUDY_CALL"
+"""Environment variable by which workers know the ledger of the call that started them."""
 
 TOLD = ("success_rate", "mean_distance", "mean_return")
 """What Optuna is told of an evaluation beside its score, for people who look there (``optuna-dashboard``)."""
@@ -101,6 +111,8 @@ def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number:
 class Ledger:
     """The trials of a study, as one worker sees them. Use it as a context: the worker lives as long as it is open.
 
+    The call that starts workers has one too, and must have it open as long as they run.
+
     Args:
         folder: the study.
     """
@@ -108,6 +120,7 @@ class Ledger:
     def __init__(self, folder: StudyFolder) -> None:
         self.folder = folder
         self.worker = f"worker-{uuid.uuid4().hex[:12]}"
+        self.call = os.environ.get(CALL)
         self.storage = folder.open_storage()
         self._presence = self.storage.present(self.worker)
         self._claimed: set[int] = set()
@@ -116,9 +129,14 @@ class Ledger:
 
     def __enter__(self) -> Ledger:
         self._presence.__enter__()
+        os.environ[CALL] = self.worker
         return self
 
     def __exit__(self, *exception: Any) -> None:
+        if self.call is None:
+            os.environ.pop(CALL, None)
+        else:
+            os.environ[CALL] = self.call
         self._presence.__exit__(*exception)
 
     @property
@@ -224,6 +242,8 @@ class Ledger:
         number = len(study.get_trials(deepcopy=False))
         trial = open_study(self.folder, self.storage, number).ask(distributions(config))
         trial.set_user_attr("worker", self.worker)
+        if self.call is not None:
+            trial.set_user_attr("call", self.call)
         trial.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
         if "origin" not in trial.user_attrs:
             trial.set_user_attr("origin", f"sampler {trial.number}")
@@ -282,13 +302,19 @@ class Ledger:
                             marks[key] = trial.user_attrs[key]
                     earlier = trials[trial.user_attrs["replaces"]] if "replaces" in trial.user_attrs else None
                     progress = len(trial.intermediate_values) > len(earlier.intermediate_values if earlier else ())
-                    marks["attempt"] = 1 if progress else trial.user_attrs.get("attempt", 1) + 1
+                    blamed = self._blamed(trial)
+                    marks["attempt"] = 1 if progress else trial.user_attrs.get("attempt", 1) + blamed
                     study.enqueue_trial(values, user_attrs=marks)
             study.tell(trial.number, state=TrialState.FAIL)
 
     def _lives(self, worker: str | None) -> bool:
         # Without a worker it was left by one that was killed in here.
         return worker is not None and (worker == self.worker or self.storage.lives(worker))
+
+    def _blamed(self, trial: optuna.trial.FrozenTrial) -> bool:
+        """Tell whether a trial counts as the cause of its worker's death; see the module."""
+        call = trial.user_attrs.get("call")
+        return "raised" in trial.user_attrs or call is None or self._lives(call)
 
     # ---------------------------------------------------------------------------------------------------------------
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +18,7 @@ from codesign.screen import screen_records
 from softgym_envs.config import provenance
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.envs.task import make_task
-from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.storage import atomic_write, read_json, write_json
 
 __all__ = ["collect", "mean_interval", "rank_correlation", "rate_interval", "write_results"]
 
@@ -199,8 +198,8 @@ def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[st
     path = folder.path / "judge" / "judge.json"
     judge = {"training_steps": 0, "report_steps": 0, "cpu_seconds": 0.0}
     if path.exists():
-        judge = json.loads(path.read_text())
-    retrained = [json.loads(path.read_text()) for path in sorted(folder.path.glob("finalists/*/training.json"))]
+        judge = read_json(path)
+    retrained = [read_json(path) for path in sorted(folder.path.glob("finalists/*/training.json"))]
     return {
         "joint_steps": judge["training_steps"],
         "joint_report_steps": judge["report_steps"],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from typing import Any
 
@@ -12,6 +11,7 @@ from codesign.folder import StudyFolder
 from codesign.jobs import Job
 from codesign.objectives import OBJECTIVES, rank_key
 from codesign.trial import assess
+from softgym_envs.storage import read_json
 
 __all__ = ["candidates", "kept_bodies", "screen_jobs", "screen_records"]
 
@@ -51,7 +51,7 @@ def screen_records(folder: StudyFolder) -> list[dict[str, Any]]:
     objective = OBJECTIVES[folder.config.objective]
     records = []
     for path in sorted((folder.path / "screen").glob("[0-9]*.json")):
-        record = json.loads(path.read_text())
+        record = read_json(path)
         score = None if "error" in record["qp"] else objective.score(record["qp"])
         records.append({"index": int(path.stem), "score": score, **record})
     return records

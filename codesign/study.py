@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from agents.policy import policy_path
+import numpy as np
+
+from agents.policy import Policy
 from codesign.config import StudyConfig
 from codesign.finalists import finalist_jobs
 from codesign.folder import StudyFolder
 from codesign.jobs import missing_jobs
 from codesign.judge import judge_jobs, promising_bodies
-from codesign.ledger import Ledger
+from codesign.ledger import Ledger, distributions, make_pruner, make_sampler
 from codesign.objectives import OBJECTIVES
 from codesign.processes import run_workers
 from codesign.results import write_results
 from codesign.screen import kept_bodies, screen_jobs
-from softgym_envs.errors import ConfigError, SoftGymError
-from softgym_envs.storage import write_json
+from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign, SoftGymError
+from softgym_envs.storage import read_json, write_json
 
 __all__ = ["run_study"]
 
@@ -50,16 +51,21 @@ def run_study(
         What is in ``results.json``.
 
     Raises:
-        ConfigError: if the folder or the database holds another study, the database cannot be opened, or the number
-            of workers is not positive.
-        WeightsError: if the policy to start from is missing.
+        ConfigError: if the folder or the database holds another study, the database cannot be opened, the number of
+            workers is not positive, the policy was trained for another environment, or the sampler cannot propose.
+        ValueError: if the environment cannot be made.
+        WeightsError: if the policy to start from is missing or damaged.
         SoftGymError: if a worker was stopped by an error.
     """
     count = config.workers if workers is None else workers
     if count < 1:
         raise ConfigError(f"workers = {count} is out of bounds; allowed: 1 or more")
+    # What cannot go well is told before anything starts, and before the folder is taken.
     if config.policy is not None:
-        policy_path(config.policy)  # a missing one is told before anything starts
+        Policy(config.policy).check_environment(config.environment)
+    if not (Path(folder) / "config.yaml").exists():
+        _try_environment(config)
+        _try_sampler(config)
     study = StudyFolder.create(folder, config)
     printer = _Printer(study, enabled=progress)
     try:
@@ -81,6 +87,40 @@ def run_study(
     results = write_results(study)
     printer.verdict(results)
     return results
+
+
+def _try_environment(config: StudyConfig) -> None:
+    """Make the environment once, so that wrong options of it show themselves."""
+    with suppress(InfeasibleDesign, ConvergenceError):  # whether the baseline can exist is for its trial to tell
+        config.environment.make().close()
+
+
+def _try_sampler(config: StudyConfig) -> None:
+    """Propose a body after as many trials as the sampler wants to see first, so that wrong options show themselves.
+
+    Raises:
+        ConfigError: if it cannot, or the pruner cannot be made.
+    """
+    import optuna
+
+    sampler, pruner = config.sampler, config.pruner
+    space, rng = distributions(config), np.random.default_rng(0)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        study = optuna.create_study(directions=["maximize"] * (1 + len(config.also)), sampler=make_sampler(config, 0))
+        for _ in range(sampler.options.get("n_startup_trials", 10) + 1):
+            params = {key: float(rng.uniform(config.space[key].low, config.space[key].high)) for key in space}
+            values = rng.random(len(study.directions)).tolist()
+            study.add_trial(optuna.create_trial(params=params, distributions=space, values=values))
+        study.ask(space)
+    except Exception as error:  # whatever a wrong value happens to cause
+        raise ConfigError(
+            f"sampler '{sampler.name}' with sampler.options = {sampler.options} cannot propose a body: {error}"
+        ) from error
+    try:
+        make_pruner(config)
+    except ValueError as error:
+        raise ConfigError(f"pruner '{pruner.name}' with pruner.options = {pruner.options}: {error}") from None
 
 
 def _run_screen(study: StudyFolder, workers: int, printer: _Printer) -> None:
@@ -190,7 +230,7 @@ class _Printer:
         fresh = [path for path in self.study.path.glob("trials/[0-9]*/result.json") if str(path) not in self._seen]
         for path in sorted(fresh, key=lambda path: path.stat().st_mtime):
             self._seen.add(str(path))
-            result = json.loads(path.read_text())
+            result = read_json(path)
             if result["score"] is not None and (self._best is None or result["score"] > self._best[0]):
                 self._best = (result["score"], result["number"])
             if quiet:
@@ -209,7 +249,7 @@ class _Printer:
         fresh = [path for path in self.study.path.glob("finalists/trial*.json") if str(path) not in self._seen]
         for path in sorted(fresh, key=lambda path: path.stat().st_mtime):
             self._seen.add(str(path))
-            record = json.loads(path.read_text())
+            record = read_json(path)
             if quiet:
                 continue
             found = record.get("error") or (
@@ -226,10 +266,13 @@ class _Printer:
             return
         self.say(f"winner: trial {results['winner']['trial']}")
         for row in results["comparison"]:
-            low, high = (1e3 * value for value in row["distance_change_interval"])
+            sure = ""
+            if row["distance_change_interval"] is not None:
+                low, high = (1e3 * value for value in row["distance_change_interval"])
+                sure = f", 95 % interval {low:+.2f} to {high:+.2f}"
             self.say(
                 f"  {row['agent']} on {row['backend']}, {row['goals']} unseen goals: success "
                 f"{100 * row['baseline']['success_rate']:.1f} -> {100 * row['winner']['success_rate']:.1f} %, distance "
                 f"{1e3 * row['baseline']['mean_distance']:.2f} -> {1e3 * row['winner']['mean_distance']:.2f} mm "
-                f"(change {1e3 * row['distance_change']:+.2f} mm, 95 % interval {low:+.2f} to {high:+.2f})"
+                f"(change {1e3 * row['distance_change']:+.2f} mm{sure})"
             )

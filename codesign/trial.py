@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +15,7 @@ from codesign.folder import StudyFolder
 from codesign.judge import JUDGE, judge_policy
 from codesign.objectives import OBJECTIVES, Objective, violations
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
-from softgym_envs.storage import write_json
+from softgym_envs.storage import read_json, write_json
 
 if TYPE_CHECKING:
     import optuna
@@ -249,7 +248,7 @@ def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str
     )
     before = cpu_before(policy, cpu)
     # A trial that goes on after its worker died may have been stopped before.
-    pruned = reporter.pruned or json.loads(policy.with_suffix(".json").read_text())["stopped_early"]
+    pruned = reporter.pruned or read_json(policy.with_suffix(".json"))["stopped_early"]
     steps = max(reporter.curve, default=0) if pruned else config.training.steps
     result.update(
         agent=Path(policy).resolve().relative_to(folder.path).as_posix(),

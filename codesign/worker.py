@@ -20,6 +20,7 @@ from codesign.ledger import Ledger
 from codesign.screen import screen_jobs
 from codesign.trial import run_trial
 from softgym_envs.errors import SoftGymError
+from softgym_envs.storage import write_json
 
 if TYPE_CHECKING:
     import optuna
@@ -39,13 +40,18 @@ def run_trials(folder: StudyFolder) -> None:
                 result = ledger.storage.patiently(partial(run, folder, trial))
             except UpdateFinishedTrialError:  # it was given away: this worker was out of reach, and counted as dead
                 continue
+            except SoftGymError:  # of the installation or the storage, not of the body
+                raise
+            except Exception:
+                trial.set_user_attr("raised", True)  # the body is blamed, though the call ends as well
+                raise
             ledger.finish(result)
 
 
 def _give_up(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
-    """Result of a body that cost too many workers; see `codesign.trial.run_trial`."""
+    """Write the ``result.json`` of a body that cost too many workers and return it; see `codesign.trial.run_trial`."""
     reason = f"{folder.config.attempts} workers died of it"
-    return {
+    result: dict[str, Any] = {
         "number": trial.number,
         "origin": trial.user_attrs["origin"],
         "sampler_seed": trial.user_attrs.get("sampler_seed"),
@@ -65,6 +71,8 @@ def _give_up(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
         "cpu_seconds": 0.0,
         "finished_at": time.time(),
     }
+    write_json(folder.trial(trial.number) / "result.json", result)
+    return result
 
 
 def _test_finalists(folder: StudyFolder) -> None:

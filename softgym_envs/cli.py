@@ -6,6 +6,8 @@ import json
 import math
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -25,6 +27,19 @@ def _fail(message: str) -> NoReturn:
     sys.exit(2)
 
 
+class _Resumable(click.Abort):
+    """A verb was stopped that goes on where it was when it is called again."""
+
+
+@contextmanager
+def _resumable() -> Iterator[None]:
+    """Around work that loses nothing when it is stopped by Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise _Resumable from None
+
+
 def main() -> None:
     """Entry point: errors of the user's input end with one line and status 2."""
     import gymnasium
@@ -39,8 +54,9 @@ def main() -> None:
         cli(standalone_mode=False)
     except click.exceptions.Exit as leave:
         sys.exit(leave.exit_code)
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("stopped; the same command goes on where it was", err=True)
+    except (click.Abort, KeyboardInterrupt) as stop:
+        more = "; the same command goes on where it was" if isinstance(stop, _Resumable) else ""
+        click.echo(f"stopped{more}", err=True)
         sys.exit(130)
     except click.ClickException as error:
         _fail(error.format_message())
@@ -226,12 +242,16 @@ def rollout(
     from agents.config import EnvironmentConfig
     from agents.evaluation import AGENTS, make_agent
     from agents.policy import Policy
+    from softgym_envs.config import check_config
 
     act = make_agent(agent, seed)
     chosen = _assignments(design, "design")
     # A policy sees and does what it was trained to see and do.
-    trained = {} if agent in AGENTS else Policy(agent).card["config"]["environment"]
-    config = EnvironmentConfig(**{**trained, "id": environment})
+    policy = None if agent in AGENTS else Policy(agent)
+    trained = {} if policy is None else policy.environment.model_dump()
+    config = check_config(EnvironmentConfig, {**trained, "id": environment}, "rollout")
+    if policy is not None:
+        policy.check_environment(config)
     if backend is not None:
         config = config.on(backend)
     env = config.make(**({"design": chosen} if chosen else {}))
@@ -273,7 +293,8 @@ def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...])
     from softgym_envs.config import load_config
     from softgym_envs.surrogate.training import FitConfig, generate
 
-    data = generate(load_config(config, FitConfig, overrides), folder, progress=not quiet)
+    with _resumable():
+        data = generate(load_config(config, FitConfig, overrides), folder, progress=not quiet)
     for split, columns in data.items():
         click.echo(f"{split}: {len(columns['rest'])} states of {int(columns['rest'].sum())} designs")
 
@@ -290,7 +311,8 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
     from softgym_envs.surrogate.training import FitConfig
     from softgym_envs.surrogate.training import fit as run
 
-    errors = run(load_config(config, FitConfig, overrides), folder, data or folder / "data", progress=not quiet)
+    with _resumable():
+        errors = run(load_config(config, FitConfig, overrides), folder, data or folder / "data", progress=not quiet)
     click.echo(json.dumps(errors, indent=2))
 
 
@@ -306,7 +328,8 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
     from agents.training import train as run
     from softgym_envs.config import load_config
 
-    path = run(load_config(config, TrainConfig, overrides), folder, initial=initial, progress=not quiet)
+    with _resumable():
+        path = run(load_config(config, TrainConfig, overrides), folder, initial=initial, progress=not quiet)
     click.echo(f"wrote {path}")
 
 
@@ -338,8 +361,9 @@ def evaluate(
 ) -> None:
     """Evaluate agents on the same unseen goals; CONFIG is the one they were trained with."""
     from agents.config import TrainConfig
+    from agents.evaluation import AGENTS, sample_goals
     from agents.evaluation import evaluate as run
-    from agents.evaluation import sample_goals
+    from agents.policy import Policy
     from softgym_envs.config import load_config, provenance
     from softgym_envs.storage import write_json
 
@@ -347,6 +371,9 @@ def evaluate(
     chosen = _assignments(design, "design") or None
     if goals < 1:
         raise ConfigError(f"--goals {goals} must be at least 1")
+    for agent in agents:  # before time is spent on the others
+        if agent not in AGENTS:
+            Policy(agent).check_environment(environment)
     points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
     results: list[dict[str, Any]] = []
     click.echo(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean mm':>9s} {'worst mm':>9s} {'return':>8s}")
@@ -408,8 +435,10 @@ def codesign(
 
     study = load_config(config, StudyConfig, (*overrides, *([f"storage={storage}"] if storage else [])))
     folder = Path("results") / study.name if folder is None else folder
-    run_study(study, folder, workers=workers, progress=not quiet)
-    click.echo(f"report: {write_report(folder)}")
+    with _resumable():
+        run_study(study, folder, workers=workers, progress=not quiet)
+        report = write_report(folder)
+    click.echo(f"report: {report}")
 
 
 _results = click.option("--folder", type=click.Path(path_type=Path), help="Where results go (default: results/<name>).")
@@ -428,13 +457,15 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
 
     study = load_config(config, SensitivityConfig, overrides)
     folder = Path("results") / study.name if folder is None else folder
-    result = analyse(study, folder, progress=not quiet)
+    with _resumable():
+        result = analyse(study, folder, progress=not quiet)
     for metric, table in result["indices"].items():
         keys = list(next(iter(table.values())))
         click.echo(f"\n{metric:24s} " + " ".join(f"{key:>16s}" for key in keys))
         for variable, row in table.items():
             click.echo(f"  {variable:22s} " + " ".join(f"{row[key]:16.5g}" for key in keys))
-    click.echo(f"\n{result['designs']} designs, {result['infeasible']} infeasible; wrote {folder}")
+    kept = f" ({100 * result['groups_kept']:.0f} % of the groups of samples are left)" if result["infeasible"] else ""
+    click.echo(f"\n{result['designs']} designs, {result['infeasible']} infeasible{kept}; wrote {folder}")
 
 
 @cli.command()
@@ -456,7 +487,8 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
         click.echo(json.dumps(result["best"], indent=2))
         click.echo(f"{len(result['descents'])} descents, {result['seconds']:.2f} s; wrote {folder}")
         return
-    result = search(study, folder, progress=not quiet)
+    with _resumable():
+        result = search(study, folder, progress=not quiet)
     click.echo(
         json.dumps([result["front"][0], result["front"][-1]] if len(study.objectives) > 1 else result["front"][0])
     )

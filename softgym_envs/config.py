@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import re
+import reprlib
 import subprocess
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -18,7 +19,7 @@ from softgym_envs.errors import ConfigError
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.version import __version__
 
-__all__ = ["Config", "check_config", "load_config", "read_value", "provenance", "save_resolved"]
+__all__ = ["Config", "check_config", "difference", "load_config", "read_value", "provenance", "save_resolved"]
 
 
 class Config(BaseModel):
@@ -107,6 +108,26 @@ def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> Model
         others = error.error_count() - 1
         more = f" (and {others} more)" if others else ""
         raise ConfigError(f"{where}: {key}: {message}{more}") from None
+
+
+def difference(old: Config, new: Config) -> str | None:
+    """Tell the first value in which two configurations of one kind differ: ``"sac.gamma = 0.9, got 0.95"``.
+
+    Args:
+        old: the one that holds so far.
+        new: the one that is asked for.
+
+    Returns:
+        Dotted key and both values, long ones abridged; None if there is no difference.
+    """
+    return _difference(old.model_dump(mode="json"), new.model_dump(mode="json"), "")
+
+
+def _difference(old: Any, new: Any, key: str) -> str | None:
+    if isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys():
+        parts = (_difference(old[name], new[name], f"{key}.{name}" if key else name) for name in old)
+        return next((part for part in parts if part is not None), None)
+    return None if old == new else f"{key} = {reprlib.repr(old)}, got {reprlib.repr(new)}"
 
 
 def _allowed(model: type[BaseModel], path: list[str]) -> str:

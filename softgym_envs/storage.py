@@ -17,7 +17,7 @@ from softgym_envs.errors import DataError
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["atomic_write", "cache_directory", "read_npz", "write_json"]
+__all__ = ["atomic_write", "cache_directory", "read_json", "read_npz", "write_json"]
 
 
 @contextmanager
@@ -54,6 +54,18 @@ def read_npz(path: str | Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
             return {name: data[name] for name in names}
     except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"'{path}' cannot be read: {error}") from error
+
+
+def read_json(path: str | Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        DataError: if the file is missing, truncated or no JSON.
+    """
+    try:
+        return json.loads(Path(path).read_text())
+    except (OSError, ValueError) as error:
+        raise DataError(f"'{path}' cannot be read: {error}") from None
 
 
 def write_json(path: str | Path, value: object) -> None:

@@ -78,6 +78,8 @@ def test_dataset_fit_and_train(monkeypatch, capsys, tmp_path):
 
 
 CONFIG = "configs/agents/finger_reach.yaml"
+FRONT = "configs/design/sensorized_finger_front.yaml"
+STRENGTH = "configs/design/finger_strength.yaml"
 
 
 @pytest.mark.parametrize(
@@ -88,7 +90,11 @@ CONFIG = "configs/agents/finger_reach.yaml"
         (["show", "finger", "--design", "size=1"], ["size", "length"]),
         (["show", "finger", "--design", "length"], ["length", "name=number"]),
         (["show", "finger", "--option", "cables=9"], ["cables", "1, 2"]),
-        (["rollout", "SoftGym/Nothing-v0"], ["Nothing"]),
+        (["rollout", "SoftGym/Nothing-v0"], ["Nothing", "FingerReach"]),
+        (
+            ["rollout", "SoftGym/FingerTrack-v0", "--agent", "finger_reach"],
+            ["SoftGym/FingerTrack-v0", "task reach", "finger_reach"],
+        ),
         (["rollout", "SoftGym/FingerReach-v0", "--backend", "magic"], ["magic", "fem, surrogate"]),
         (["rollout", "SoftGym/FingerReach-v0", "--agent", "nowhere.safetensors"], ["nowhere.safetensors"]),
         (["rollout", "SoftGym/FingerReach-v0", "--design", "height=nan"], ["height", "finite"]),
@@ -99,7 +105,19 @@ CONFIG = "configs/agents/finger_reach.yaml"
         (["train", "--config", CONFIG, "--folder", "x", "steps"], ["steps", "key=value"]),
         (["train", "--config", CONFIG, "--folder", "x", "environment.id=Foo-v0"], ["Foo-v0", "FingerReach"]),
         (["train", "--config", CONFIG, "--folder", "x", "sac.gamma=2"], ["sac.gamma", "2"]),
+        (["train", "--config", CONFIG, "--folder", "x", "steps=900"], ["learning_starts = 1000", "steps = 900"]),
+        (["train", "--config", CONFIG, "--folder", "x", "environment.backend=foo"], ["foo", "fem, surrogate"]),
+        (["train", "--config", CONFIG, "--folder", "x", "environment.action_mode=foo"], ["action_mode", "foo"]),
+        (["train", "--config", CONFIG, "--folder", "x", "environment.task_options={foo: 1}"], ["task 'reach'", "foo"]),
+        (
+            ["train", "--config", CONFIG, "--folder", "x", "initial=finger_reach", "environment.on_qp=0.5"],
+            ["environment.on_qp = 0.5", "finger_reach", "0.0"],
+        ),
         (["evaluate", "--config", CONFIG, "--goals", "0"], ["goals", "0"]),
+        (
+            ["evaluate", "--config", CONFIG, "--agent", "finger_reach", "environment.action_mode=absolute"],
+            ["environment.action_mode = absolute", "finger_reach", "increment"],
+        ),
         (["fit", "--config", CONFIG, "--folder", "x"], ["robot", "required"]),
         (["frobnicate"], ["frobnicate"]),
         (["bench", "nothing"], ["nothing"]),
@@ -123,6 +141,29 @@ def test_malformed_files(monkeypatch, capsys, tmp_path, text):
     path.write_text(text)
     status, _, err = run(monkeypatch, capsys, "train", "--config", path, "--folder", tmp_path / "x")
     assert status == 2 and len(err.strip().splitlines()) == 1 and "config.yaml" in err
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "arguments", "resumes"),
+    [
+        ("agents.training", "train", ["train", "--config", CONFIG, "--folder", "x"], True),
+        ("agents.evaluation", "evaluate", ["evaluate", "--config", CONFIG, "--goals", "1"], False),
+        ("codesign.design.search", "search", ["optimise", "--config", FRONT], True),
+        ("codesign.design.gradient", "optimise", ["optimise", "--config", STRENGTH], False),
+    ],
+)
+def test_a_stopped_verb_says_so_and_goes_on_only_where_it_can(
+    module, name, arguments, resumes, monkeypatch, capsys, tmp_path
+):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"{module}.{name}", stop)
+    monkeypatch.chdir(tmp_path)
+    arguments = [str(ROOT / a) if a.startswith("configs/") else a for a in arguments]
+    status, _, err = run(monkeypatch, capsys, *arguments)
+    assert status == 130 and "stopped" in err
+    assert ("goes on where it was" in err) == resumes
 
 
 def test_console_module_runs():

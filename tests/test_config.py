@@ -1,10 +1,24 @@
-"""Provenance: the commit of a clone and of a source archive."""
+"""Configurations that differ, damaged files, and provenance: the commit of a clone and of a source archive."""
 
 from __future__ import annotations
 
 import subprocess
+from typing import Any
 
-from softgym_envs.config import commit_of
+import pytest
+
+from softgym_envs.config import Config, commit_of, difference
+from softgym_envs.errors import DataError
+from softgym_envs.storage import read_json
+
+
+class Inner(Config):
+    size: int
+
+
+class Outer(Config):
+    inner: Inner
+    table: dict[str, Any]
 
 
 def git(folder, *arguments):
@@ -36,3 +50,24 @@ def test_no_commit_where_none_is_known(tmp_path):
     assert commit_of(tmp_path) is None
     (tmp_path / ".git_archival.txt").write_text("node: $Format:%H$\n")  # copied, not exported
     assert commit_of(tmp_path) is None
+
+
+def test_difference_names_the_first_value_that_differs():
+    old = Outer(inner=Inner(size=1), table={"a": 1})
+    assert difference(old, Outer(inner=Inner(size=1), table={"a": 1})) is None
+    assert difference(old, Outer(inner=Inner(size=2), table={"a": 3})) == "inner.size = 1, got 2"
+    assert difference(old, Outer(inner=Inner(size=1), table={"a": 3})) == "table.a = 1, got 3"
+    assert difference(old, Outer(inner=Inner(size=1), table={"b": 1})) == "table = {'a': 1}, got {'b': 1}"
+    assert len(difference(old, Outer(inner=Inner(size=1), table={"b": [0] * 999}))) < 80
+
+
+@pytest.mark.parametrize("content", [b"{", b"", b"\xff\xfe"])
+def test_damaged_json_names_its_file(content, tmp_path):
+    path = tmp_path / "goals.json"
+    with pytest.raises(DataError, match=r"goals\.json' cannot be read"):
+        read_json(path)
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"goals\.json' cannot be read"):
+        read_json(path)
+    path.write_text('{"a": 1}')
+    assert read_json(path) == {"a": 1}

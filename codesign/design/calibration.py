@@ -16,9 +16,10 @@ from torch import Tensor
 from codesign.design.bodies import Box, learned_model
 from codesign.design.config import CalibrationConfig
 from codesign.design.measurements import Measurements, read_measurements
+from codesign.design.search import claimed
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import released, settle
-from softgym_envs.config import provenance, save_resolved
+from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError, InfeasibleDesign
 from softgym_envs.robots.robot import Robot
 from softgym_envs.storage import write_json
@@ -437,10 +438,25 @@ def calibrate(
         (``{name: [low, high]}``), ``errors`` (root mean square, SI) and ``seconds``.
 
     Raises:
-        ConfigError: for a variable that changes nothing that was measured.
+        ConfigError: for a variable that changes nothing that was measured; if the folder holds something else or
+            another process is at it, see `codesign.design.search.claimed`.
         DataError: for a malformed file of measurements.
         ConvergenceError: if a body on the way has no equilibrium.
     """
+    if folder is None:
+        return _calibrate(config, data)[0]
+    from codesign.design.plots import draw_calibration
+
+    folder = Path(folder)
+    with claimed(folder, config, "calibration"):
+        result, fits, refined = _calibrate(config, data)
+        write_json(folder / "result.json", {**provenance(), **result})
+        draw_calibration(folder / "calibration.png", config.box(), fits, result["interval"], refined)
+    return result
+
+
+def _calibrate(config: CalibrationConfig, data: Measurements | None) -> tuple[dict[str, Any], list[Fit], Fit | None]:
+    """Return what `calibrate` does, the fits and the one on FEM."""
     began = time.perf_counter()
     if data is None:
         data = read_measurements(config.data, config.make_robot())
@@ -469,11 +485,4 @@ def calibrate(
         "measured_states": len(data),
         "seconds": time.perf_counter() - began,
     }
-    if folder is not None:
-        from codesign.design.plots import draw_calibration
-
-        folder = Path(folder)
-        save_resolved(folder, config)
-        write_json(folder / "result.json", {**provenance(), **result})
-        draw_calibration(folder / "calibration.png", box, fits, interval, refined)
-    return result
+    return result, fits, refined

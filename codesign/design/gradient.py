@@ -14,7 +14,8 @@ from torch import Tensor
 
 from codesign.design.bodies import Box
 from codesign.design.config import GradientConfig, ObjectiveConfig, OptimiseConfig
-from softgym_envs.config import provenance, save_resolved
+from codesign.design.search import claimed
+from softgym_envs.config import provenance
 from softgym_envs.storage import write_json
 
 __all__ = ["Descent", "WeightedCost", "descend", "optimise"]
@@ -141,11 +142,26 @@ def optimise(config: OptimiseConfig, folder: str | Path | None = None) -> dict[s
         ``best`` (design, cost and metrics by backend), ``descents`` and ``seconds``; lengths and all else are SI.
 
     Raises:
-        ConfigError: if the weights have no exact gradients.
+        ConfigError: if the weights have no exact gradients, the folder holds something else or another process is at
+            it, see `codesign.design.search.claimed`.
         WeightsError: if there are none.
         InfeasibleDesign: if the best design cannot be built for the check on FEM.
         ConvergenceError: if it has no equilibrium there.
     """
+    if folder is None:
+        return _optimise(config)[0]
+    from codesign.design.plots import draw_descents
+
+    folder = Path(folder)
+    with claimed(folder, config, "optimisation", free=("name", "workers")):
+        result, cost, descents = _optimise(config)
+        write_json(folder / "result.json", {**provenance(), **result})
+        draw_descents(folder / "descents.png", cost, descents)
+    return result
+
+
+def _optimise(config: OptimiseConfig) -> tuple[dict[str, Any], WeightedCost, list[Descent]]:
+    """Return what `optimise` does, the cost and the descents."""
     solver = config.solver
     assert isinstance(solver, GradientConfig)
     bodies, box = config.bodies, config.bodies.box()
@@ -168,11 +184,4 @@ def optimise(config: OptimiseConfig, folder: str | Path | None = None) -> dict[s
         "grid": len(cost.points),
         "seconds": seconds,
     }
-    if folder is not None:
-        from codesign.design.plots import draw_descents
-
-        folder = Path(folder)
-        save_resolved(folder, config)
-        write_json(folder / "result.json", {**provenance(), **result})
-        draw_descents(folder / "descents.png", cost, descents)
-    return result
+    return result, cost, descents

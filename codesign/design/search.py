@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,8 @@ import numpy as np
 from codesign.config import SAMPLERS, SamplerConfig, construct
 from codesign.design.bodies import Evaluator
 from codesign.design.config import OptimiseConfig, SearchConfig
-from softgym_envs.config import load_config, provenance, save_resolved
+from codesign.storages import file_lock
+from softgym_envs.config import Config, load_config, provenance, save_resolved
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 from softgym_envs.executors import run_jobs
 from softgym_envs.storage import atomic_write, write_json
@@ -21,7 +23,7 @@ from softgym_envs.storage import atomic_write, write_json
 if TYPE_CHECKING:
     import optuna
 
-__all__ = ["evaluate", "evaluate_numbered", "non_dominated", "search"]
+__all__ = ["claimed", "evaluate", "evaluate_numbered", "non_dominated", "search"]
 
 
 def evaluate(evaluator: Evaluator, design: Mapping[str, float]) -> dict[str, Any]:
@@ -69,20 +71,23 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
         evaluation time over all processes.
 
     Raises:
-        ConfigError: if the folder holds another search.
+        ConfigError: if the folder holds something else or another process is at it, see `claimed`.
         ConvergenceError: if no design was feasible.
     """
+    with claimed(folder, config, "search", free=("name", "workers", "solver.trials")):
+        return _search(config, Path(folder), progress)
+
+
+def _search(config: OptimiseConfig, folder: Path, progress: bool) -> dict[str, Any]:
     import click
     import optuna
 
     solver = config.solver
     assert isinstance(solver, SearchConfig)
-    folder = Path(folder)
-    _claim(folder, config)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    study = _open(folder, config)
     box = config.bodies.box()
     evaluator = config.bodies.evaluator(config.metrics)
+    study = _open(folder, config)
     known: dict[tuple[float, ...], dict[str, Any]] = {}
 
     def tell(trial: optuna.trial.FrozenTrial | optuna.Trial, found: dict[str, Any]) -> None:
@@ -133,18 +138,69 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
     return _result(config, folder, study)
 
 
-def _claim(folder: Path, config: OptimiseConfig) -> None:
-    """Write the configuration to a new folder, or see that it has the same one but for what may change."""
+@contextmanager
+def claimed(folder: str | Path, config: Config, kind: str, *, free: Sequence[str] = ("name",)) -> Iterator[None]:
+    """Keep a folder for one run of a design tool while the block runs, and write its configuration there.
+
+    Args:
+        folder: new, or of the same configuration.
+        config: of the run.
+        kind: what it is, for messages.
+        free: dotted keys of the configuration that may differ from that of the folder.
+
+    Raises:
+        ConfigError: if the folder holds something else or results of another configuration, or another process is at
+            it.
+    """
+    from filelock import Timeout
+
+    folder = Path(folder)
+    _check(folder, config, kind, free)  # before the lock is written to where it may not belong
+    lock = file_lock(folder, "run")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ConfigError(
+            f"folder '{folder}' is in use by another process; wait for its end, or name another folder"
+        ) from None
+    try:
+        _check(folder, config, kind, free)  # another process may have come first
+        save_resolved(folder, config)
+        yield
+    finally:
+        lock.release()
+
+
+def _check(folder: Path, config: Config, kind: str, free: Sequence[str]) -> None:
+    """Raise ConfigError unless a run may go to a folder; see `claimed`."""
     path = folder / "config.yaml"
-    if path.exists():
-        kept = load_config(path, OptimiseConfig).model_dump(mode="json")
-        asked = config.model_dump(mode="json")
-        for data in (kept, asked):
-            data.pop("workers"), data.pop("name"), data["solver"].pop("trials", None)
-        if kept != asked:
-            changed = next(name for name in asked if asked[name] != kept.get(name))
-            raise ConfigError(f"folder '{folder}' holds another search, with other '{changed}'; name another folder")
-    save_resolved(folder, config)
+    results = [name for name in ("journal.log", "result.json") if (folder / name).exists()]
+    if not path.exists():
+        if results:
+            raise ConfigError(f"folder '{folder}' holds a {results[0]} but no config.yaml; name another folder")
+        return
+    try:
+        kept = _bound(load_config(path, type(config)), free)
+    except ConfigError:
+        raise ConfigError(
+            f"folder '{folder}' holds something else: its config.yaml is of no {kind}; name another folder"
+        ) from None
+    asked = _bound(config, free)
+    if results and kept != asked:
+        changed = next(name for name in asked if asked[name] != kept[name])
+        raise ConfigError(f"folder '{folder}' holds another {kind}, with other '{changed}'; name another folder")
+
+
+def _bound(config: Config, free: Sequence[str]) -> dict[str, Any]:
+    """Plain data of a configuration without some dotted keys."""
+    data = config.model_dump(mode="json")
+    for key in free:
+        *path, last = key.split(".")
+        part = data
+        for name in path:
+            part = part[name]
+        part.pop(last, None)
+    return data
 
 
 def _open(folder: Path, config: OptimiseConfig) -> optuna.Study:

@@ -16,7 +16,7 @@ from codesign.design.bodies import Box, Evaluator
 from codesign.design.config import SensitivityConfig
 from codesign.design.search import evaluate_numbered
 from softgym_envs.config import load_config, provenance, save_resolved
-from softgym_envs.errors import ConfigError, ConvergenceError
+from softgym_envs.errors import ConfigError, ConvergenceError, DataError
 from softgym_envs.executors import run_jobs
 from softgym_envs.storage import write_json
 
@@ -169,9 +169,12 @@ def evaluate_all(
         whole = data[: data.rfind(b"\n") + 1]  # a line without an end was cut off by a crash
         if whole != data:
             path.write_bytes(whole)
-        for line in whole.splitlines():
-            record = json.loads(line)
-            found[record.pop("number")] = record
+        for place, line in enumerate(whole.splitlines(), start=1):
+            try:
+                record = json.loads(line)
+                found[record.pop("number")] = record
+            except (ValueError, KeyError, AttributeError) as error:
+                raise DataError(f"'{path}', line {place} is no evaluation: {error!r}; remove it to repeat it") from None
     jobs = [(evaluate_numbered, (k, evaluator, design)) for k, design in enumerate(designs) if k not in found]
     path.parent.mkdir(parents=True, exist_ok=True)
     with (

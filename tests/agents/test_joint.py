@@ -71,7 +71,7 @@ def test_an_episode_is_told_with_its_own_body(tmp_path):
         def episode(self, body, total):
             told.append((body, total))
 
-    model = _make_model(config(), tmp_path)
+    model = _make_model(config())
     env = model.get_env()
     listener = Listener()
     listener.attach(model, config(), tmp_path)
@@ -118,7 +118,7 @@ def test_a_stopped_training_ends_as_one_that_was_not(kind, tmp_path):
 def test_critic_values_rank_bodies_as_the_critic_does(monkeypatch, tmp_path):
     """A critic that likes length alone: its values must not depend on the height."""
 
-    model = _make_model(config(), tmp_path)
+    model = _make_model(config())
     names, bodies = ("length", "height"), np.array([[-0.5, 0.3], [0.5, 0.3], [0.5, -0.9]])
     monkeypatch.setattr(
         type(model.critic), "forward", lambda self, states, actions: (states[:, -2:-1], states[:, -2:-1] + 1.0)
@@ -130,7 +130,7 @@ def test_critic_values_rank_bodies_as_the_critic_does(monkeypatch, tmp_path):
 
 def test_needs_sampled_bodies(tmp_path):
     plain = config(environment={"id": "SoftGym/FingerReach-v0"})
-    model = _make_model(plain, tmp_path)
+    model = _make_model(plain)
     with pytest.raises(ValueError, match="sample_design"):
         CriticProposer().attach(model, plain, tmp_path)
     assert isinstance(model.get_env(), SB3VecEnv)

@@ -137,6 +137,37 @@ def test_a_finished_sweep_runs_nothing_and_a_lost_result_is_made_again(swept, mo
     )
 
 
+def test_a_sweep_refuses_results_of_another(swept, tmp_path):
+    out = swept / "out"
+    given = {"goals": 5, "fem_goals": 2}
+    other = tmp_path / "tiny.yaml"
+    other.write_text(TINY.replace("gradient_steps: 1", "gradient_steps: 2"))
+    with pytest.raises(DataError, match=r"seed0\.json' is of another sweep: sac\.gradient_steps = 1, got 2"):
+        sweep.sweep([other], [0], 1, out, **given)
+    other.write_text(TINY.replace("v0}", "v0, action_mode: absolute}"))
+    with pytest.raises(DataError, match=r"baselines\.json' .*: environment\.action_mode = 'increment', got 'absolute'"):
+        sweep.sweep([other], [1], 1, out, **given)
+    with pytest.raises(DataError, match=r"goals = \{'surrogate': 5, 'fem': 2\}, got \{'surrogate': 6, 'fem': 2\}"):
+        sweep.sweep([swept / "tiny.yaml"], [0], 1, out, goals=6, fem_goals=2)
+    moved = tmp_path / "moved" / "results" / "tiny"
+    moved.mkdir(parents=True)
+    (moved / "seed1.json").write_text((out / "results" / "tiny" / "seed0.json").read_text())
+    with pytest.raises(DataError, match=r"seed1\.json' .*: seed = 0, got 1"):
+        sweep.sweep([swept / "tiny.yaml"], [1], 1, tmp_path / "moved", **given)
+    for text in ("{", "[]", '{"environment": {"id": "SoftGym/FingerReach-v0"}}'):
+        (moved / "seed1.json").write_text(text)
+        with pytest.raises(DataError, match=r"seed1\.json' (cannot be read|is not one of a sweep)"):
+            sweep.sweep([swept / "tiny.yaml"], [1], 1, tmp_path / "moved", **given)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_stored_results_count_as_finished(path):
+    config = load_config(path, TrainConfig)
+    for stored in sorted((ROOT / "agents" / "results" / path.stem).glob("*.json")):
+        seed = json.loads(stored.read_text()).get("seed", 0)
+        assert sweep._finished(stored, config.model_copy(update={"seed": seed}), goals=100, fem_goals=10)
+
+
 def test_an_error_of_one_job_does_not_end_the_others(swept, tmp_path, capsys):
     (tmp_path / "tiny.yaml").write_text(TINY)
     broken = tmp_path / "out" / "runs" / "tiny" / "seed1"
@@ -211,7 +242,7 @@ POLICIES = {
 def test_the_graph_of_a_policy_is_the_policy(case, tmp_path):
     pytest.importorskip("onnx")
     runtime = pytest.importorskip("onnxruntime")
-    small = {"sac": {"net_arch": [16, 16], "learning_starts": 100}, "steps": 10, "num_envs": 2, "report_every": 10}
+    small = {"sac": {"net_arch": [16, 16], "learning_starts": 4}, "steps": 10, "num_envs": 2, "report_every": 10}
     config = TrainConfig.model_validate({**small, "evaluation_episodes": 1, **POLICIES[case]})
     policy = Policy(train(config, tmp_path / "run", progress=False))
     session = runtime.InferenceSession(

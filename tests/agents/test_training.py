@@ -16,7 +16,7 @@ from agents.evaluation import evaluate, sample_goals
 from agents.policy import Policy
 from agents.training import train
 from softgym_envs.config import load_config
-from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.errors import ConfigError, DataError, WeightsError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -54,7 +54,7 @@ def test_training_leaves_policy_curve_logs_and_provenance(trained):
 def test_policy_is_the_mean_action_of_the_actor(trained, tmp_path):
     import torch
 
-    model = training._make_model(CONFIG, tmp_path)
+    model = training._make_model(CONFIG)
     training._load_weights(model, training.read_tensors(trained), trained)
     observation = np.random.default_rng(0).uniform(-1, 1, (6, 15)).astype(np.float32)
     with torch.no_grad():
@@ -154,8 +154,75 @@ def test_damaged_checkpoint_is_named(tmp_path, monkeypatch):
 
 
 def test_another_configuration_does_not_mix(trained):
-    with pytest.raises(DataError, match="another configuration"):
+    with pytest.raises(DataError, match="another configuration: steps = 400, got 800"):
         train(CONFIG.model_copy(update={"steps": 800}), trained.parent, progress=False)
+    shown = CONFIG.environment.model_copy(update={"robot_options": {"cables": 1}})
+    with pytest.raises(DataError, match=r"environment\.robot_options = \{\}, got \{'cables': 1\}"):
+        train(CONFIG.model_copy(update={"environment": shown}), trained.parent, progress=False)
+
+
+def test_a_damaged_configuration_of_a_folder_is_named(tmp_path):
+    (tmp_path / "config.yaml").write_text("steps: [1, 2")
+    with pytest.raises(ConfigError, match=r"config\.yaml' is not valid YAML"):
+        train(CONFIG, tmp_path, progress=False)
+
+
+@pytest.mark.parametrize("option", [{"backend": "foo"}, {"action_mode": "foo"}, {"task_options": {"foo": 1}}])
+def test_a_wrong_environment_takes_no_folder(option, tmp_path):
+    environment = CONFIG.environment.model_copy(update=option)
+    with pytest.raises(ValueError, match="foo"):
+        train(CONFIG.model_copy(update={"environment": environment}), tmp_path / "run", progress=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_training_that_would_learn_nothing_is_refused():
+    with pytest.raises(ValueError, match=r"sac\.learning_starts = 1000 is not below steps = 1000.*allowed: 0 to 999"):
+        TrainConfig.model_validate({"environment": {"id": "SoftGym/FingerReach-v0"}, "steps": 1000})
+
+
+OTHER = {
+    "on_qp": ({"on_qp": 0.5}, r"environment\.on_qp = 0\.5 .*trained with 0\.0"),
+    "action_mode": ({"action_mode": "absolute"}, r"environment\.action_mode = absolute .*trained with increment"),
+    "order of the body": (
+        {"design_in_observation": ["height", "length", "joint_height"]},
+        r"design_in_observation = \['height', 'length', 'joint_height'\] .*\['length', 'height', 'joint_height'\]",
+    ),
+    "task": ({"id": "SoftGym/FingerTrack-v0"}, r"environment\.id = SoftGym/FingerTrack-v0 .*task track.*task reach"),
+    "robot": (
+        {"id": "SoftGym/DiamondReach-v0", "design_in_observation": False},
+        r"environment\.id = .*robot diamond.*robot finger",
+    ),
+    "cables": ({"robot_options": {"cables": 1}}, r"environment\.robot_options = \{'cables': 1\} .*trained with \{\}"),
+}
+
+
+@pytest.mark.parametrize("name", OTHER)
+def test_a_policy_refuses_an_environment_it_was_not_trained_for(name, tmp_path):
+    changes, message = OTHER[name]
+    bodies = ["length", "height", "joint_height"]
+    known = {"id": "SoftGym/FingerReach-v0", "design_in_observation": bodies}
+    environment = EnvironmentConfig.model_validate({**known, **changes})
+    goals = np.array([[0.0, 0.066, -0.072]])
+    with pytest.raises(ConfigError, match=message):
+        evaluate("finger_reach_designs", environment, goals)
+    with pytest.raises(ConfigError, match=message):
+        wide = CONFIG.sac.model_copy(update={"net_arch": [128, 128]})
+        config = CONFIG.model_copy(update={"environment": environment, "sac": wide})
+        train(config, tmp_path / "run", initial="finger_reach_designs", progress=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_policy_takes_other_backends_bodies_goals_and_physics():
+    policy = Policy("finger_reach_designs")
+    for changes in (
+        {"backend": "fem"},
+        {"design": {"height": 0.021}},
+        {"design_in_observation": ["length", "height", "joint_height"], "sample_design": True},
+        {"task_options": {"goals": [[0.0, 0.066, -0.072]]}},
+    ):
+        policy.check_environment(policy.environment.model_copy(update=changes))
+    carry = Policy("tetrapod_carry")
+    carry.check_environment(carry.environment.model_copy(update={"robot_options": {"payload": 0.5}}))
 
 
 def test_warm_start_and_early_stop(trained, tmp_path):
@@ -188,6 +255,16 @@ def test_damaged_policies(trained, tmp_path):
     broken.write_bytes(trained.read_bytes())
     with pytest.raises(WeightsError, match=r"policy\.json"):
         Policy(broken)
+    card = broken.with_suffix(".json")
+    for text, message in (
+        ("{", "cannot be read"),
+        ('{"format": 2}', "is not of format 1"),
+        ('{"format": 1}', r"lacks config\.environment"),
+        ('{"format": 1, "config": {"environment": {"id": "Foo"}}}', "unknown environment 'Foo'"),
+    ):
+        card.write_text(text)
+        with pytest.raises(WeightsError, match=rf"policy card '.*policy\.json' ?.*{message}"):
+            Policy(broken)
     with pytest.raises(ValueError, match=r"size 15, got 20.*design_in_observation"):
         Policy(trained)(np.zeros(20))
 

@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 import yaml
 
+from agents.evaluation import sample_goals
 from agents.policy import policy_path
 from codesign.config import StudyConfig
 from codesign.study import run_study
 from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError, WeightsError
+from softgym_envs.storage import write_json
 
 ROOT = Path(__file__).resolve().parents[2]
 BAD = {
@@ -110,6 +112,25 @@ BAD = {
         "hindsight = 0.8",
         "allowed: 0",
     ),
+    "trials that learn nothing": (
+        {"strategy": "scratch", "training": {"steps": 1000, "report_every": 500}},
+        "training.sac.learning_starts = 1000",
+        "training.steps = 1000",
+    ),
+    "finalists that learn nothing": (
+        {"strategy": "scratch", "training": {"steps": 2000}, "finalists": {"count": 1, "seeds": 1, "steps": 500}},
+        "training.sac.learning_starts = 1000",
+        "finalists.steps = 500",
+    ),
+    "a judge that learns nothing": (
+        {
+            "strategy": "critic",
+            "environment": {"id": "SoftGym/FingerReach-v0", "design_in_observation": True},
+            "joint": {"keep": 1, "steps": 800, "report_every": 400},
+        },
+        "joint.sac.learning_starts = 1000",
+        "joint.steps = 800",
+    ),
     "joint training on FEM": (
         {
             "strategy": "critic",
@@ -158,12 +179,75 @@ def test_missing_policy(tmp_path, tiny):
     assert not (tmp_path / "study").exists()
 
 
+SHOWN = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
+JUDGED = {"strategy": "policy", "policy": "finger_reach_designs"}
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"environment": {**SHOWN, "backend": "foo"}}, "unknown backend 'foo'.*surrogate"),
+        ({"environment": {**SHOWN, "action_mode": "foo"}}, "action_mode = 'foo'.*'increment'"),
+        ({"environment": {**SHOWN, "task_options": {"foo": 1}}}, "task 'reach'.*foo"),
+        ({"sampler": {"name": "tpe", "options": {"n_startup_trials": "x"}}}, "sampler 'tpe'.*'n_startup_trials': 'x'"),
+        ({"sampler": {"name": "tpe", "options": {"n_ei_candidates": "x"}}}, "sampler 'tpe'.*'n_ei_candidates': 'x'"),
+        ({**JUDGED, "environment": {**SHOWN, "on_qp": 0.3}}, r"environment\.on_qp = 0\.3.*finger_reach_designs"),
+        (
+            {**JUDGED, "environment": {**SHOWN, "design_in_observation": ["height", "length", "joint_height"]}},
+            r"environment\.design_in_observation = \['height'",
+        ),
+    ],
+)
+def test_wrong_values_are_told_before_the_folder_is_taken(changes, words, tmp_path, tiny):
+    with pytest.raises(ValueError, match=words):
+        run_study(StudyConfig.model_validate(tiny(**changes)), tmp_path / "study", progress=False)
+    assert not (tmp_path / "study").exists()
+
+
 def test_folder_keeps_its_study(study):
     first = study()
     with pytest.raises(ConfigError, match="another 'variables'"):
         study(variables=["length"])
     assert study(trials=7).config.trials == 7
+    with pytest.raises(ConfigError, match="or change only: name, title, trials, .*attempts, finalists.count, "):
+        study(sampler={"name": "random"})
     assert (first.goals["selection"].shape, first.goals["unseen"].shape) == ((6, 1, 3), (3, 1, 3))
+
+
+def test_options_of_fem(study):
+    """They are tried before the trials, and stay once there is a test."""
+
+    def asked(**finalists):
+        return study(finalists={"count": 1, **finalists})
+
+    with pytest.raises(ConfigError, match=r"finalists.fem_options = \{'dinamics': True\}: .*argument 'dinamics'"):
+        asked(fem_options={"dinamics": True})
+    folder = asked(fem_options={"dynamics": True})
+    assert asked(fem_options={"dynamics": False}).config.finalists.fem_options == {"dynamics": False}
+    (folder.path / "finalists" / "trial0000-seed1").mkdir(parents=True)
+    asked()
+    with pytest.raises(ConfigError, match="another 'finalists.steps'"):
+        asked(steps=9)
+    write_json(folder.path / "finalists" / "trial0000-qp-fem-unseen.json", {})
+    with pytest.raises(ConfigError) as caught:
+        asked(fem_options={"dynamics": False})
+    message = str(caught.value)
+    assert "another 'finalists.fem_options'; use another folder, or change only: name, " in message
+    assert message.endswith("finalists.count, finalists.choose, finalists.seeds")
+    assert asked(count=2).config.finalists.count == 2
+
+
+def test_goals_of_a_task_are_not_those_of_trainings(study):
+    folder = study(goals={"source": "task", "count": 3, "unseen_count": 3})
+    config = folder.config
+    own = {tuple(path.ravel()) for name in ("selection", "unseen") for path in folder.goals[name]}
+    assert len(own) == 6
+    trained = {
+        tuple(path.ravel())
+        for seed in range(config.training.seed, config.training.seed + config.training.num_envs)
+        for path in sample_goals(config.environment, 6, seed)
+    }
+    assert not own & trained
 
 
 def test_goals_differ(study):

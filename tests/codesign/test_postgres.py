@@ -261,6 +261,21 @@ def test_other_studies_are_refused(machine, server, tmp_path, tiny):
         machine("a")
 
 
+def test_options_of_tests_stay_once_there_is_one(machine):
+    """Also on a machine that has none of them."""
+
+    def on(folder, **options):
+        return machine(folder, finalists={"count": 1, "fem_options": options})
+
+    a = on("a", dynamics=True)
+    on("b", dynamics=False)
+    a = on("a", dynamics=False)
+    a.open_storage().publish({"finalists/trial0000-qp-fem-unseen.json": b"{}"})
+    with pytest.raises(ConfigError, match="another 'finalists.fem_options'; use another name, or change only: title"):
+        on("b", dynamics=True)
+    on("b", dynamics=False)
+
+
 def test_server_that_cannot_be_reached(tiny, tmp_path):
     data = tiny(storage="postgresql://nobody@127.0.0.1:1/none", patience=1.0)
     with pytest.raises(

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
+import time
 from wsgiref.util import setup_testing_defaults
 
 import pytest
@@ -13,11 +16,12 @@ from benchmarks.codesign_scale import Sweep, faults
 from codesign import worker
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
-from codesign.ledger import Ledger, open_study
+from codesign.ledger import CALL, Ledger, open_study
 from codesign.processes import run_workers
+from codesign.results import write_results
 from codesign.study import run_study
 from codesign.worker import run_trials
-from softgym_envs.errors import ConfigError
+from softgym_envs.errors import ConfigError, DataError, MeshingError
 
 SMALL = {"count": 2, "unseen_count": 2, "training_count": 2}
 
@@ -72,8 +76,12 @@ def test_given_up_body_has_the_record_of_a_trial(study):
         given_up = worker._give_up(folder, ledger.claim())
         ledger.finish(given_up)
     run_trials(folder)
-    (whole,) = folder.results()
+    first, whole = folder.results()
+    assert first == given_up
     assert given_up.keys() == whole.keys()
+    counts = write_results(folder)["trials"]
+    assert (counts["complete"], counts["infeasible"]) == (1, 1)
+    assert "5 workers died of it" in (folder.path / "trials.csv").read_text()
 
 
 def test_attempts_count_only_without_progress(study):
@@ -88,6 +96,63 @@ def test_attempts_count_only_without_progress(study):
                     trial.report(0.5, step)
         attempts.append(ledger.claim().user_attrs["attempt"])
     assert attempts == [1, 2, 3, 1, 2]
+
+
+def test_attempts_do_not_count_workers_that_ended_with_their_call(study):
+    """The call and its worker are interrupted, or killed together."""
+    folder = study(trials=1)
+    attempts = []
+    for _ in range(3):
+        with Ledger(folder), Ledger(folder) as victim:
+            attempts.append(victim.claim().user_attrs.get("attempt", 1))
+    assert attempts == [1, 1, 1]
+    assert CALL not in os.environ
+
+
+def test_body_that_raises_is_blamed(study, monkeypatch):
+    """An error that is a bug ends the call, and is the body's all the same; one of the installation is not."""
+    folder = study(trials=1, attempts=2)
+
+    def run(error):
+        def fail(folder, trial):
+            raise error
+
+        monkeypatch.setattr(worker, "run_trial", fail)
+        with Ledger(folder), pytest.raises(type(error)):
+            run_trials(folder)
+
+    run(ZeroDivisionError())
+    run(MeshingError())
+    run(ZeroDivisionError())
+    with Ledger(folder):
+        run_trials(folder)
+    (found,) = folder.results()
+    assert (found["state"], found["reason"]) == ("infeasible", "2 workers died of it")
+
+
+def test_interrupted_baseline_is_not_given_up(tmp_path, tiny, start_study):
+    """Though a single death would be enough."""
+    folder = tmp_path / "study"
+    data = tiny(trials=1, attempts=1, goals={"count": 2000, "unseen_count": 2, "training_count": 2})
+
+    def running(number):
+        try:
+            trials = open_study(StudyFolder(folder)).get_trials(deepcopy=False)
+        except DataError:
+            return False
+        return len(trials) > number and trials[number].state == TrialState.RUNNING
+
+    for number, how in enumerate((signal.SIGINT, signal.SIGINT, signal.SIGKILL)):
+        process = start_study(folder, data)
+        end = time.monotonic() + 120.0
+        while not running(number):
+            assert process.poll() is None and time.monotonic() < end
+            time.sleep(0.05)
+        process.send_signal(how)
+        process.communicate(timeout=120)
+    with Ledger(StudyFolder(folder)), Ledger(StudyFolder(folder)) as ledger:
+        again = ledger.claim()
+        assert (again.number, again.user_attrs["origin"], again.user_attrs["attempt"]) == (3, "baseline", 1)
 
 
 def test_worker_goes_on_when_its_trial_was_given_away(study, monkeypatch):

@@ -201,11 +201,15 @@ def test_who_names_the_winner(choose, winner, study):
 
 
 def test_error_of_a_worker_is_one_line(tmp_path, tiny):
-    policy = tmp_path / "policy.safetensors"
-    policy.write_bytes(b"not a policy")
-    config = StudyConfig.model_validate(tiny(strategy="warm_start", policy=str(policy)))
+    shown = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
+    config = StudyConfig.model_validate(tiny(strategy="policy", policy="finger_reach_designs", environment=shown))
+    folder = StudyFolder.create(tmp_path / "study", config)
+    # The judge was damaged after it was made, so that only the trials find out.
+    write_json(folder.path / "judge" / "judge.json", {})
+    (folder.path / "judge" / "policy.safetensors").write_bytes(b"not a policy")
+    (folder.path / "judge" / "policy.json").write_text("{}")
     with pytest.raises(WeightsError) as caught:
-        run_study(config, tmp_path / "study", progress=False)
+        run_study(config, folder.path, progress=False)
     assert "policy.safetensors" in str(caught.value)
     assert "\n" not in str(caught.value)
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from codesign.finalists import _mean
 from codesign.ledger import Ledger
 from codesign.objectives import OBJECTIVES
 from codesign.trial import run_trial
@@ -61,7 +62,7 @@ def pretend(monkeypatch):
     return called
 
 
-TRAINED = {"strategy": "scratch", "training": {"steps": 300, "report_every": 100}}
+TRAINED = {"strategy": "scratch", "training": {"steps": 300, "report_every": 100, "sac": {"learning_starts": 100}}}
 
 
 def test_complete(study, pretend):
@@ -128,3 +129,16 @@ def test_reports_of_a_continued_trial_are_not_repeated(study, pretend):
         trial = ledger.claim()
         trial.report(0.15, 100)
         assert run_trial(folder, trial)["curve"] == [[100, 0.15], [200, 0.4], [300, 0.6]]
+
+
+def test_mean_of_seeds():
+    """Steps are whole numbers, as the report prints them."""
+
+    def record(seed, steps, distance):
+        told = {"trial": 1, "agent": "sac", "backend": "fem", "goals": "unseen", "seed": seed, "steps": steps}
+        return {**told, "seconds": 0.5, "worst_distance": distance, "mean_distance": distance, "distances": [distance]}
+
+    merged = _mean([record(1, 2700, 1e-3), record(2, 2700, 3e-3)])
+    assert merged["steps"] == 5400 and isinstance(merged["steps"], int)
+    assert (merged["seeds"], merged["seconds"], merged["worst_distance"]) == ([1, 2], 1.0, 3e-3)
+    assert merged["distances"] == [merged["mean_distance"]] == [pytest.approx(2e-3)]

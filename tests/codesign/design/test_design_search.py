@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from codesign.design import calibration, gradient
 from codesign.design import search as module
 from codesign.design.bodies import Box
 from codesign.design.config import CalibrationConfig, OptimiseConfig, SensitivityConfig
@@ -123,6 +124,35 @@ def test_a_search_that_was_stopped_while_it_proposed(sampler, parameters, some, 
         assert parts[name] == whole[name]
     assert parts["front"][0]["design"] == whole["front"][0]["design"]
     assert some.count == 2 * (14 - whole["repeated"])  # nothing was evaluated again
+
+
+def test_folders_of_others_stay_as_they_are(some, tmp_path):
+    def contents():
+        return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    search(configured(), tmp_path, progress=False)
+    before = contents()
+    descent = check_config(OptimiseConfig, {**configured().model_dump(), "solver": {"method": "gradient"}}, "test")
+    with pytest.raises(ConfigError, match=f"'{tmp_path}' holds another optimisation, with other 'solver'"):
+        gradient.optimise(descent, tmp_path)
+    fit = {"name": "x", "robot": "finger", "robot_options": {"cables": 1}, "fit": ["poisson_ratio"], "data": "m.csv"}
+    with pytest.raises(ConfigError, match=f"'{tmp_path}' holds something else: its config.yaml is of no calibration"):
+        calibration.calibrate(check_config(CalibrationConfig, fit, "test"), tmp_path)
+    assert contents() == before
+    (tmp_path / "config.yaml").unlink()
+    with pytest.raises(ConfigError, match="holds a journal.log but no config.yaml"):
+        search(configured(), tmp_path, progress=False)
+
+
+def test_two_searches_in_one_folder(some, monkeypatch, tmp_path):
+    def other(self, design):
+        with pytest.raises(ConfigError, match=f"folder '{tmp_path}' is in use by another process; wait for its end"):
+            search(configured(), tmp_path, progress=False)
+        return {"bending_angle": design["length"], "contact_force": -design["length"]}
+
+    monkeypatch.setattr(some, "__call__", other)
+    assert search(configured(), tmp_path, progress=False)["feasible"] == 20
+    assert search(configured(), tmp_path, progress=False)["feasible"] == 20
 
 
 def test_generations_of_nsga_are_full(some, tmp_path):
