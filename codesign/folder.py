@@ -114,7 +114,7 @@ class StudyFolder:
             if mine not in (None, shared["id"]):
                 raise ConfigError(f"{where} holds another study '{config.name}' than folder '{shown}'; use another one")
             old = check_config(StudyConfig, shared["config"], f"study '{config.name}' of {where}")
-            made = MADE_BY if storage._execute(TESTED, study=config.name) else self._made()
+            made = MADE_BY if storage.execute(TESTED, study=config.name) else self._made()
             _accept(old, config, where, "name", made)
             return {"config": config.model_dump(mode="json"), "goals": shared["goals"]}
 

@@ -7,9 +7,8 @@ behind (``kill -9``, power cut). Its result is taken over if it was already writ
 A body is blamed for the death of its worker if the call that had started the worker outlived it, or if it was an error
 that is a bug. It is not if the call has ended as well: Ctrl-C, ``kill -9`` of everything and a power cut say nothing
 about a body. One that takes its call down with it (all memory of the machine) cannot be told from these and is not
-blamed either; whoever starts the call again sees it. Blamed wrongly is a body whose worker knows no call (a task on a
-Ray cluster that ran before), or whose call, killed with its worker, still shows as alive in a database, where the signs
-of life of the two differ by up to a sixth of ``heartbeat``.
+blamed either; whoever starts the call again sees it. Blamed wrongly is a body whose call, killed with its worker, still
+shows as alive in a database, where the signs of life of the two differ by up to a sixth of ``heartbeat``.
 """
 
 from __future__ import annotations

@@ -255,12 +255,12 @@ class PostgresStorage(StudyStorage):
         from sqlalchemy.exc import SQLAlchemyError
 
         ended = threading.Event()
-        self.patiently(lambda: self._execute(SIGN, worker=worker))
+        self.patiently(lambda: self.execute(SIGN, worker=worker))
 
         def signs() -> None:
             while not ended.wait(self.grace / 6.0):
                 try:
-                    self._execute(SIGN, worker=worker)
+                    self.execute(SIGN, worker=worker)
                 except SQLAlchemyError:  # the next one may come through
                     continue
 
@@ -272,12 +272,12 @@ class PostgresStorage(StudyStorage):
             ended.set()
             thread.join()
             try:
-                self._execute("DELETE FROM codesign_workers WHERE worker = :worker", worker=worker)
+                self.execute("DELETE FROM codesign_workers WHERE worker = :worker", worker=worker)
             except SQLAlchemyError as error:  # it will count as dead a little later
                 self._say(f"was not told that {worker} ended: {_reason(error)}")
 
     def lives(self, worker: str) -> bool:
-        return bool(self._execute(LIVES, worker=worker, grace=self.grace))
+        return bool(self.execute(LIVES, worker=worker, grace=self.grace))
 
     # -- jobs and files ---------------------------------------------------------------------------------------------
 
@@ -311,13 +311,13 @@ class PostgresStorage(StudyStorage):
     def publish(self, files: Mapping[str, bytes]) -> None:
         for path, content in files.items():
             parameters = {"study": self.study, "path": path, "content": content}
-            self.patiently(partial(self._execute, PUBLISH, **parameters))
+            self.patiently(partial(self.execute, PUBLISH, **parameters))
 
     def fetch(self, name: str) -> bytes | None:
-        content = self.patiently(lambda: self._execute(FETCH, study=self.study, path=name))
+        content = self.patiently(lambda: self.execute(FETCH, study=self.study, path=name))
         return None if content is None else bytes(content)
 
-    def _execute(self, statement: str, **parameters: Any) -> Any:
+    def execute(self, statement: str, **parameters: Any) -> Any:
         """Run a statement, and return the first value of what it gives."""
         from sqlalchemy import text
 

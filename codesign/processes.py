@@ -13,6 +13,7 @@ from typing import Any
 
 from codesign.config import JOURNAL, StudyConfig
 from codesign.folder import StudyFolder
+from codesign.ledger import CALL
 from softgym_envs import errors
 
 __all__ = ["run_workers"]
@@ -119,9 +120,9 @@ def _run_on_ray(folder: StudyFolder, phase: str, count: int, tick: Callable[[], 
             )
         task = ray.remote(num_cpus=1, max_retries=folder.config.attempts)(_task)
         arguments = (str(folder.path), folder.config.model_dump(mode="json"), phase)
-        running = [
-            task.options(runtime_env={"env_vars": dict.fromkeys(THREADS, "1")}).remote(*arguments) for _ in range(count)
-        ]
+        # A cluster that ran before does not have the call's environment.
+        variables = dict.fromkeys(THREADS, "1") | {key: os.environ[key] for key in (CALL,) if key in os.environ}
+        running = [task.options(runtime_env={"env_vars": variables}).remote(*arguments) for _ in range(count)]
         stopped = None
         while running:
             ended, running = ray.wait(running, timeout=interval)

@@ -174,7 +174,7 @@ def claimed(folder: str | Path, config: Config, kind: str, *, free: Sequence[str
 def _check(folder: Path, config: Config, kind: str, free: Sequence[str]) -> None:
     """Raise ConfigError unless a run may go to a folder; see `claimed`."""
     path = folder / "config.yaml"
-    results = [name for name in ("journal.log", "result.json") if (folder / name).exists()]
+    results = [name for name in ("journal.log", "evaluations.jsonl", "result.json") if (folder / name).exists()]
     if not path.exists():
         if results:
             raise ConfigError(f"folder '{folder}' holds a {results[0]} but no config.yaml; name another folder")

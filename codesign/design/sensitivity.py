@@ -14,8 +14,8 @@ import numpy as np
 
 from codesign.design.bodies import Box, Evaluator
 from codesign.design.config import SensitivityConfig
-from codesign.design.search import evaluate_numbered
-from softgym_envs.config import load_config, provenance, save_resolved
+from codesign.design.search import claimed, evaluate_numbered
+from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
 from softgym_envs.executors import run_jobs
 from softgym_envs.storage import write_json
@@ -202,16 +202,19 @@ def analyse(config: SensitivityConfig, folder: str | Path, *, progress: bool = T
         indices are) and ``seconds`` of evaluation over all processes.
 
     Raises:
-        ConfigError: if SALib is not installed (``morris``, ``sobol``), or the folder holds another study.
+        ConfigError: if SALib is not installed (``morris``, ``sobol``), or the folder holds something else or another
+            process is at it, see `codesign.design.search.claimed`.
+        DataError: if a line of ``evaluations.jsonl`` is damaged.
         ConvergenceError: if too few designs are feasible.
     """
+    folder = Path(folder)
+    with claimed(folder, config, "sensitivity study", free=("name", "workers")):
+        return _analyse(config, folder, progress)
+
+
+def _analyse(config: SensitivityConfig, folder: Path, progress: bool) -> dict[str, Any]:
     from codesign.design.plots import draw_sensitivity
 
-    folder = Path(folder)
-    if (folder / "config.yaml").exists():
-        kept = load_config(folder / "config.yaml", SensitivityConfig)
-        if kept.model_copy(update={"workers": config.workers, "name": config.name}) != config:
-            raise ConfigError(f"folder '{folder}' holds another sensitivity study; name another folder")
     box = config.bodies.box()
     try:
         points = sample(config, box)
@@ -219,7 +222,6 @@ def analyse(config: SensitivityConfig, folder: str | Path, *, progress: bool = T
         raise ConfigError(
             f"method '{config.method}' needs SALib ({error}): pip install 'softgym-envs[design]'"
         ) from None
-    save_resolved(folder, config)
     records = evaluate_all(
         config.bodies.evaluator(config.metrics),
         [box.design(point) for point in points],

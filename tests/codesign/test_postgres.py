@@ -54,14 +54,14 @@ def machine(server, tmp_path, tiny, request):
 def doomed(folder):
     """A ledger whose worker is killed at the end of the block: its signs of life stop, and nobody is told."""
     ledger = Ledger(folder)
-    execute = ledger.storage._execute
+    execute = ledger.storage.execute
 
     def silent(statement, **parameters):
         return None if "codesign_workers" in statement else execute(statement, **parameters)
 
     with ledger:
         yield ledger
-        ledger.storage._execute = silent
+        ledger.storage.execute = silent
 
 
 def result(trial, score=0.5):
@@ -131,9 +131,9 @@ def test_signs_of_life_keep_a_trial(machine):
 def test_time_without_the_server_does_not_count(machine, server):
     storage = machine(heartbeat=60.0).open_storage()
     assert not storage.lives("worker")
-    storage._execute(SIGN, worker="worker")
+    storage.execute(SIGN, worker="worker")
     assert storage.lives("worker")
-    storage._execute("UPDATE codesign_workers SET seen = now() - interval '1 hour'")
+    storage.execute("UPDATE codesign_workers SET seen = now() - interval '1 hour'")
     storage.grace = 1e-3  # the server has run for longer
     assert not storage.lives("worker")
     server.restart()
