@@ -37,6 +37,8 @@ PLAIN = {
     "environment": {"id": "SoftGym/FingerReach-v0"},
     "variables": ["height", "joint_height"],
     "workers": WORKERS,
+    # No body twice, by which one that ran twice is told; a Gaussian process comes back to a corner of the box.
+    "sampler": {"name": "tpe"},
     "heartbeat": 10.0,
     "finalists": {"count": 0},
 }
