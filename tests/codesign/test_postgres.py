@@ -288,8 +288,8 @@ def test_server_that_cannot_be_reached(tiny, tmp_path):
 
 
 def test_sweep_with_killed_workers_and_a_restarted_server(machine, server):
-    """Twelve trials on two machines; two workers killed, and two restarts of the server, of which one is a crash."""
-    folders = [machine(name, trials=12, goals={"count": 2, "unseen_count": 2, "training_count": 2}) for name in "ab"]
+    """Forty trials on two machines; two workers killed, and two restarts of the server, of which one is a crash."""
+    folders = [machine(name, trials=40, goals={"count": 20, "unseen_count": 2, "training_count": 2}) for name in "ab"]
     with Sweep(folders, seed=0) as sweep:
         for step in ("restart", "kill", "crash", "kill"):
             sweep.run_for(trials=2)
@@ -297,7 +297,8 @@ def test_sweep_with_killed_workers_and_a_restarted_server(machine, server):
                 sweep.kill()
             else:
                 server.restart("fast" if step == "restart" else "immediate")
-        sweep.run_for(trials=12)
+        assert len(sweep.seen) < 40
+        sweep.run_for(trials=40)
     for folder in folders:
         with Ledger(folder) as ledger:
             ledger.mirror()

@@ -27,14 +27,15 @@ SMALL = {"count": 2, "unseen_count": 2, "training_count": 2}
 
 
 def test_sweep_with_killed_workers(study):
-    """Ten trials on the journal, by two workers of which one is killed three times."""
-    folder = study(trials=10, goals=SMALL)
+    """Forty trials on the journal, more than are done by then, by two workers of which one is killed three times."""
+    folder = study(trials=40, goals={**SMALL, "count": 20})
     with Sweep([folder, folder], seed=1) as sweep:
         for _ in range(3):
             sweep.run_for(trials=2)
             sweep.kill()
-        sweep.run_for(trials=10)
-    assert len(sweep.seen) == 10
+        assert len(sweep.seen) < 40
+        sweep.run_for(trials=40)
+    assert len(sweep.seen) == 40
     assert faults(folder, sweep.seen) == []
 
 
