@@ -134,7 +134,10 @@ def test_body_that_raises_is_blamed(study, monkeypatch):
 def test_interrupted_baseline_is_not_given_up(tmp_path, tiny, start_study):
     """Though a single death would be enough."""
     folder = tmp_path / "study"
-    data = tiny(trials=1, attempts=1, goals={"count": 2000, "unseen_count": 2, "training_count": 2})
+    # On FEM a trial takes longer than it takes to see it and to stop it.
+    environment = {"id": "SoftGym/FingerReach-v0", "backend": "fem"}
+    goals = {"count": 300, "unseen_count": 2, "training_count": 2}
+    data = tiny(trials=1, attempts=1, environment=environment, goals=goals)
 
     def running(number):
         try:
