@@ -356,7 +356,7 @@ def screen(trials: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> s
 
 
 def transfer(results: Mapping[str, Any]) -> str | None:
-    """Finalists on the surrogate against FEM, on unseen goals; None without FEM."""
+    """Finalists on the surrogate against FEM, on test goals; None without FEM."""
     keys = [k for k in ("success_rate", "mean_distance") if any(r["objective"] == k for r in results["transfer"])]
     if not keys:
         return None
@@ -384,7 +384,7 @@ def transfer(results: Mapping[str, Any]) -> str | None:
 
 
 def reached(results: Mapping[str, Any]) -> str | None:
-    """Share of the unseen goals reached within a distance on FEM, baseline against winner; None without FEM."""
+    """Share of the test goals reached within a distance on FEM, baseline against winner; None without FEM."""
     agents = [row["agent"] for row in results["comparison"] if row["backend"] == "fem"]
     if not agents:
         return None
@@ -400,7 +400,7 @@ def reached(results: Mapping[str, Any]) -> str | None:
                 ax.step([0, *distances], share, where="post", color=colour, linewidth=2.0, label=role)
             radius = 1e3 * results["success_distance"]
             ax.axvline(radius, color="#d97706", linewidth=1.0, linestyle="--", label=f"success: {radius:g} mm")
-            ax.set(xlabel="final distance to the goal on FEM [mm]", ylabel="unseen goals reached [%]", ylim=(0, 102))
+            ax.set(xlabel="final distance to the goal on FEM [mm]", ylabel="test goals reached [%]", ylim=(0, 102))
             ax.set_title(AGENTS[agent][0], fontsize=10, color="#334155")
             ax.set_xlim(left=0)
             ax.legend(fontsize=8, loc="lower right")

@@ -151,7 +151,7 @@ def _headline(results: Mapping[str, Any]) -> str:
         sure = f", 95 % interval {1e3 * low:+.2f} to {1e3 * high:+.2f}"
     return (
         f"{finding}: on {BACKENDS[row['backend']]}, with its own {AGENTS[row['agent']]}, it ends "
-        f"{_mm(row['winner']['mean_distance'])} from {row['goals']} unseen goals on average instead of "
+        f"{_mm(row['winner']['mean_distance'])} from {row['goals']} test goals on average instead of "
         f"{_mm(row['baseline']['mean_distance'])} (difference {_mm(row['distance_change'], '+')}{sure}), and reaches "
         f"{_percent(row['winner']['success_rate'])} of them within {1e3 * results['success_distance']:g} mm instead of "
         f"{_percent(row['baseline']['success_rate'])}."
@@ -171,7 +171,7 @@ def _tiles(results: Mapping[str, Any]) -> list[dict[str, str]]:
             },
             {
                 "value": f"{100 * before['success_rate']:.0f} → {100 * after['success_rate']:.0f} %",
-                "label": f"unseen goals reached {where}",
+                "label": f"test goals reached {where}",
             },
         ]
     transfer = [row for row in results["transfer"] if row["objective"] == "mean_distance"]

@@ -178,7 +178,7 @@ def _run_finalists(study: StudyFolder, workers: int, printer: _Printer) -> None:
     missing = missing_jobs(study, jobs)
     if missing:
         bodies = len({job.path.name.partition("-")[0] for job in jobs})
-        printer.say(f"test: {bodies} bodies on {study.config.goals.unseen_count} unseen goals, surrogate and FEM")
+        printer.say(f"test: {bodies} bodies on {study.config.goals.unseen_count} test goals, surrogate and FEM")
         printer.tests(quiet=True)
         stopped = run_workers(study, "finalists", min(workers, len(missing)), printer.tests)
         _demand(all(job.path.exists() for job in jobs), "finalists", stopped)
@@ -271,7 +271,7 @@ class _Printer:
                 low, high = (1e3 * value for value in row["distance_change_interval"])
                 sure = f", 95 % interval {low:+.2f} to {high:+.2f}"
             self.say(
-                f"  {row['agent']} on {row['backend']}, {row['goals']} unseen goals: success "
+                f"  {row['agent']} on {row['backend']}, {row['goals']} test goals: success "
                 f"{100 * row['baseline']['success_rate']:.1f} -> {100 * row['winner']['success_rate']:.1f} %, distance "
                 f"{1e3 * row['baseline']['mean_distance']:.2f} -> {1e3 * row['winner']['mean_distance']:.2f} mm "
                 f"(change {1e3 * row['distance_change']:+.2f} mm{sure})"

@@ -25,6 +25,9 @@ __all__ = ["analyse", "evaluate_all", "morris", "one_at_a_time", "sobol"]
 Table = dict[str, dict[str, float]]
 """Indices of each variable."""
 
+GROUPS: dict[str, Callable[[int], int]] = {"oat": lambda d: 1, "morris": lambda d: d + 1, "sobol": lambda d: d + 2}
+"""How many samples belong together with d variables: each stands alone, a trajectory, a block of Saltelli's."""
+
 
 def one_at_a_time(points: np.ndarray, values: np.ndarray, box: Box) -> Table:
     """Indices of eq. 3.1: the range of a metric along one variable over its range along all, in percent.
@@ -71,7 +74,7 @@ def morris(points: np.ndarray, values: np.ndarray, box: Box, levels: int, confid
     """
     from SALib.analyze import morris as salib
 
-    kept = _whole_blocks(values, len(box) + 1)
+    kept = _whole_blocks(values, GROUPS["morris"](len(box)))
     found = salib.analyze(
         _problem(box), 0.5 * (points[kept] + 1.0), values[kept], conf_level=confidence, num_levels=levels, seed=seed
     )
@@ -96,7 +99,7 @@ def sobol(values: np.ndarray, box: Box, confidence: float, seed: int) -> Table:
     """
     from SALib.analyze import sobol as salib
 
-    kept = _whole_blocks(values, len(box) + 2)
+    kept = _whole_blocks(values, GROUPS["sobol"](len(box)))
     found = salib.analyze(
         _problem(box), values[kept], calc_second_order=False, conf_level=confidence, seed=seed, print_to_console=False
     )
@@ -106,10 +109,6 @@ def sobol(values: np.ndarray, box: Box, confidence: float, seed: int) -> Table:
 
 def _problem(box: Box) -> dict[str, Any]:
     return {"num_vars": len(box), "names": list(box.names), "bounds": [[0.0, 1.0]] * len(box)}
-
-
-#: Samples that belong together: the levels of a variable, a trajectory, a block of Saltelli's.
-GROUPS: dict[str, Callable[[int], int]] = {"oat": lambda d: 1, "morris": lambda d: d + 1, "sobol": lambda d: d + 2}
 
 
 def _whole(values: np.ndarray, size: int) -> np.ndarray:

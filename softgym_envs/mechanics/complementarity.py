@@ -12,8 +12,8 @@ __all__ = ["solve_complementarity", "solve_rows"]
 def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
     """Fill y (m,) with the efforts where the actuators of ``slack`` carry none.
 
-    Returns the actuators that contradict it, which push though they are unilateral or would fall short beyond their
-    commands; -1 if the others have no definite W. Sets of actuators are bits of an integer.
+    Returns the actuators that contradict it, which would have to push or, slack, would fall short of their commands;
+    -1 if those that are not slack have no definite W. Sets of actuators are bits of an integer.
     """
     m = len(gap)
     k = 0
