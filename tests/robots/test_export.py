@@ -169,7 +169,12 @@ def test_what_is_cast_is_the_body(name, options, design, occ):
     in_silicone = common(occ, bores, body)
     assert common(occ, bores, cavities) == pytest.approx(0.0, abs=1e-6)
     in_box = volume(occ, bores) - in_silicone
-    cast = block - volume(occ, box) - common(occ, lid, [(3, occ.addBox(*low, *(high - low)))]) - in_box
+    # What the lid fills, measured from half of the plugs on and clear of its rim: of faces that coincide gmsh finds
+    # nothing in common in about one run of fifty.
+    middle = lengths["cork_thickness"] / 2
+    inside = occ.addBox(low[0] - 0.05, middle, low[2] - 0.05, *(high - low + 0.1))
+    in_lid = common(occ, lid, [(3, inside)]) + plugs / 2
+    cast = block - volume(occ, box) - in_lid - in_box
     assert cast == pytest.approx(volume(occ, body) - plugs, rel=1e-5)
     assert low[1] == pytest.approx(0.0, abs=1e-5) and gmsh.model is not None
     assert high[2] == pytest.approx(WALL, abs=1e-5)
