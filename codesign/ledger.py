@@ -240,9 +240,9 @@ class Ledger:
             return None
         number = len(study.get_trials(deepcopy=False))
         trial = open_study(self.folder, self.storage, number).ask(distributions(config))
-        trial.set_user_attr("worker", self.worker)
         if self.call is not None:
             trial.set_user_attr("call", self.call)
+        trial.set_user_attr("worker", self.worker)  # last of what `_blamed` asks for
         trial.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
         if "origin" not in trial.user_attrs:
             trial.set_user_attr("origin", f"sampler {trial.number}")
@@ -312,6 +312,8 @@ class Ledger:
 
     def _blamed(self, trial: optuna.trial.FrozenTrial) -> bool:
         """Tell whether a trial counts as the cause of its worker's death; see the module."""
+        if "worker" not in trial.user_attrs:  # it was killed while it claimed the trial, before it looked at the body
+            return False
         call = trial.user_attrs.get("call")
         return "raised" in trial.user_attrs or call is None or self._lives(call)
 

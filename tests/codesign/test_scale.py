@@ -9,6 +9,7 @@ import sys
 import time
 from wsgiref.util import setup_testing_defaults
 
+import optuna
 import pytest
 from optuna.trial import TrialState
 
@@ -157,6 +158,29 @@ def test_interrupted_baseline_is_not_given_up(tmp_path, tiny, start_study):
     with Ledger(StudyFolder(folder)), Ledger(StudyFolder(folder)) as ledger:
         again = ledger.claim()
         assert (again.number, again.user_attrs["origin"], again.user_attrs["attempt"]) == (3, "baseline", 1)
+
+
+@pytest.mark.parametrize("marks", [0, 1])
+def test_worker_that_dies_while_it_claims_blames_no_body(study, monkeypatch, marks):
+    """Though the call that started it lives on: the body was not looked at yet."""
+    folder = study(trials=1, attempts=1)
+    original, written = optuna.Trial.set_user_attr, []
+
+    def set_user_attr(trial, key, value):
+        if len(written) == marks:
+            raise KeyboardInterrupt
+        written.append(key)
+        original(trial, key, value)
+
+    with Ledger(folder) as call:
+        call.enqueue([("baseline", {name: folder.config.baseline[name] for name in folder.config.variables})])
+        monkeypatch.setattr(optuna.Trial, "set_user_attr", set_user_attr)
+        with Ledger(folder) as ledger, pytest.raises(KeyboardInterrupt):
+            ledger.claim()
+        monkeypatch.undo()
+        with Ledger(folder) as ledger:
+            again = ledger.claim()
+    assert (again.number, again.user_attrs["origin"], again.user_attrs["attempt"]) == (1, "baseline", 1)
 
 
 def test_worker_goes_on_when_its_trial_was_given_away(study, monkeypatch):
