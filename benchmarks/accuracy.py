@@ -59,6 +59,9 @@ def test_set(folder: str | Path = "results/test_set", workers: int = 2) -> dict[
             result |= {
                 f"{variant}: left out: effector error, mean [mm]": 1e3 * float(off[left].mean()),
                 f"{variant}: left out: trusted all the same [%]": 100 * float(trusted[left].mean()),
+                f"{variant}: left out: effector error of these, mean [mm]": 1e3 * float(off[left & trusted].mean())
+                if trusted[left].any()
+                else "none there",
                 f"{variant}: left out: errors below the uncertainty [%]": 100
                 * float((off <= uncertainty)[left].mean()),
             }

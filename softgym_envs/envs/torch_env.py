@@ -245,6 +245,16 @@ def _complementarity(
     return torch.where(slack, value, 0.0) * scale, torch.where(slack, 0.0, value) / scale, slack, right
 
 
+def _definite(a: Tensor) -> Tensor:
+    """Whether symmetric matrices (B, n, n) are positive definite, (B,): all pivots of the elimination are positive."""
+    found = torch.ones(len(a), dtype=torch.bool, device=a.device)
+    while a.shape[1]:
+        pivot = a[:, :1, :1]
+        found &= pivot[:, 0, 0] > 0.0
+        a = a[:, 1:, 1:] - a[:, 1:, :1] * a[:, :1, 1:] / pivot
+    return found
+
+
 class TorchVectorEnv:
     """``num_envs`` copies of an environment on the surrogate, stepped together on one device.
 
@@ -337,6 +347,7 @@ class TorchVectorEnv:
         self._effector_scale, self._effector_mean = model.effector_scale, put(model.effector_mean)
         self._rates, self._axes = put(self.interface.rates / model.half_range), put(self.task.axes)
         self._inflation, self._limit = model._inflation, model._limit
+        self._growth = model._growth if np.isfinite(model._growth) else None  # the compiler knows no `isfinite`
         self._known_low, self._known_high = (
             put((bound - model.middle) / model.half_range) for bound in (model._low, model._high)
         )
@@ -391,6 +402,8 @@ class TorchVectorEnv:
         bodies["known"] = ((designs >= self._box[0]) & (designs <= self._box[1])).all(dim=1)
         bodies["unit"] = unit[:, self._shown].to(self.dtype)
         zero = (-self._middle / self._half).expand(len(designs), -1)
+        if self._growth is not None:
+            bodies["unmoved"] = self._ensemble.derivatives(bodies, zero)[1]
         if self._loaded:
             u, gradient, _ = self._ensemble.search(bodies, zero, zero, MORE_STEPS, stop=True)
         else:
@@ -429,6 +442,8 @@ class TorchVectorEnv:
         uncertainty = spread * (self._effector_scale * self._inflation)
         inside = ((u >= self._known_low) & (u <= self._known_high)).all(dim=1)
         trusted = inside & bodies["known"] & ((uncertainty <= self._limit) | torch.isinf(uncertainty))
+        if self._growth is not None:
+            trusted &= _definite(self._growth * self._ensemble.derivatives(bodies, u)[1] - bodies["unmoved"])
         return effector, uncertainty, trusted
 
     # -- episodes ---------------------------------------------------------------------------------------------------

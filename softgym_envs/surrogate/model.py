@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numba
 import numpy as np
 
 from softgym_envs.designs import DesignSpace
@@ -60,6 +61,28 @@ class Features:
     def actuation(self, displacement: np.ndarray) -> np.ndarray:
         """Scale displacements (B, n_a)."""
         return 2.0 * (displacement - self.lower) / (self.upper - self.lower) - 1.0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def stays_below(growth, stiffness, unmoved, slot):
+    """Whether actuators are less than ``growth`` times softer than unmoved, in every direction, shape (B,).
+
+    With stiffness (B, n, n) and that of the unmoved bodies (S, n, n), of which each row is one of ``slot`` (B,): by
+    elimination, ``growth * stiffness - unmoved`` has positive pivots only.
+    """
+    found = np.ones(len(stiffness), dtype=np.bool_)
+    n = stiffness.shape[1]
+    for row in range(len(stiffness)):
+        a = growth * stiffness[row] - unmoved[slot[row]]
+        for k in range(n):
+            if not a[k, k] > 0.0:
+                found[row] = False
+                break
+            for i in range(k + 1, n):
+                factor = a[i, k] / a[k, k]
+                for j in range(k + 1, n):
+                    a[i, j] -= factor * a[k, j]
+    return found
 
 
 @dataclass
@@ -140,6 +163,7 @@ class SurrogateModel(ABC):
         domain = self.card.get("domain", {})
         self._inflation = float(domain.get("inflation", 1.0))
         self._limit = float(domain.get("limit", np.inf))
+        self._growth = float(domain.get("growth", np.inf))
         box = np.array(domain.get("displacement", np.column_stack([robot.lower, robot.upper])), dtype=float)
         slack = 0.01 * (box[:, 1] - box[:, 0])
         self._low, self._high = box[:, 0] - slack, box[:, 1] + slack
@@ -158,7 +182,10 @@ class SurrogateModel(ABC):
         for name, (low, high) in self._known.items():
             value, slack = designs[:, names.index(name)], 0.01 * (high - low) + 1e-9 * abs(high)
             arrays["known"] &= (value >= low - slack) & (value <= high + slack)
-        return Context(stiffness, arrays, np.arange(len(designs)))
+        context = Context(stiffness, arrays, np.arange(len(designs)))
+        if np.isfinite(self._growth):
+            arrays["unmoved"] = self._stiffness(context, np.zeros((len(designs), self.count)))
+        return context
 
     def state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what is predicted at displacements (B, n_a).
@@ -239,12 +266,27 @@ class SurrogateModel(ABC):
             The uncertainty of the effector [m] (B,): the spread, inflated so that 95 % of the validation states err
             by less; and whether the prediction is trusted (B,): body and displacement lie where the model was
             trained, and the uncertainty is not larger than in 98 % of the validation states. A model without an
-            ensemble is judged by its domain alone.
+            ensemble is judged by its domain alone. Where a robot can buckle (the card has a limit of the growth), the
+            predicted `growth` must not be larger than in 98 % of them either: states about to buckle were no data.
         """
         uncertainty = self._inflation * spread
         inside = ((displacement >= self._low) & (displacement <= self._high)).all(axis=1)
         trusted = inside & context.arrays["known"][context.slot] & ((uncertainty <= self._limit) | np.isinf(spread))
+        if np.isfinite(self._growth):
+            trusted &= stays_below(
+                self._growth, self._stiffness(context, displacement), context.arrays["unmoved"], context.slot
+            )
         return uncertainty, trusted
+
+    def growth(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        """Return how many times softer the held actuators are at displacements (B, n_a) than at zero, shape (B,).
+
+        It is the largest ratio of the two compliances between actuators in any direction, as predicted: next to a
+        buckling it becomes large.
+        """
+        unmoved = np.linalg.cholesky(self._stiffness(context, np.zeros_like(displacement)))
+        compliance = np.linalg.inv(self._stiffness(context, displacement))
+        return np.linalg.eigvalsh(unmoved.swapaxes(1, 2) @ compliance @ unmoved)[:, -1]
 
     def compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         """Return W, shape (B, n, n), at displacements (B, n_a)."""

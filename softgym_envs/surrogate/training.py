@@ -31,6 +31,9 @@ __all__ = ["FitConfig", "fit", "generate", "test_errors"]
 
 SPLITS = ("train", "validation", "test")
 
+BUCKLING = 0.01
+"""Share of unstable training states from which on a model must tell them: less often it is not worth the time."""
+
 
 class SplitConfig(Config):
     """One dataset split."""
@@ -220,15 +223,16 @@ def domain_of(
 
     Returns:
         ``displacement`` and ``design`` ranges; ``inflation``: factor from the spread of the ensemble to a bound that
-        95 % of the validation errors keep; ``limit``: uncertainty that 98 % of the validation states stay below [m].
+        95 % of the validation errors keep; ``limit``: uncertainty that 98 % of the validation states stay below [m];
+        where more than `BUCKLING` of the training states were left out, ``growth``: how many times softer than
+        unmoved 98 % of the validation states are not.
     """
-    data = training
     names = model.robot.design_space.names
     domain: dict[str, Any] = {
-        "displacement": [[float(c.min()), float(c.max())] for c in data["displacement"].T],
+        "displacement": [[float(c.min()), float(c.max())] for c in training["displacement"].T],
         "design": {
             n: [float(c.min()), float(c.max())]
-            for n, c in zip(names, data["design"].T, strict=True)
+            for n, c in zip(names, training["design"].T, strict=True)
             if n != model.robot.stiffness_variable
         },
     }
@@ -239,6 +243,8 @@ def domain_of(
         distance = np.linalg.norm((effector - data["effector"]).reshape(len(spread), -1, 3), axis=2).max(axis=1)
         domain["inflation"] = float(np.quantile(distance / np.maximum(spread, 1e-12), 0.95))
         domain["limit"] = domain["inflation"] * float(np.quantile(spread, 0.98))
+    if model.robot.convex and 1.0 - stable_rows(model.robot, training).mean() > BUCKLING:
+        domain["growth"] = float(np.quantile(model.growth(context, data["displacement"]), 0.98))
     return domain
 
 

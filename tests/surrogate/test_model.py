@@ -257,6 +257,27 @@ def test_trust_follows_domain_and_spread():
     assert trusted.tolist() == [True, False, False, False]
 
 
+def test_trust_ends_where_actuators_become_soft():
+    robot = make_robot("diamond")
+    model, _ = untrained_potential(robot)
+    designs, displacement = random_bodies(robot, 200)
+    context = model.context(designs)
+    found = model.growth(context, displacement)
+    n, zero = model.count, np.zeros_like(displacement)
+    W, unmoved = (model.compliance(context, d)[:, :n, :n] for d in (displacement, zero))
+    ratio = np.linalg.eigvals(np.linalg.solve(unmoved, W)).real.max(axis=1)
+    np.testing.assert_allclose(found, ratio, rtol=1e-4)
+    np.testing.assert_allclose(model.growth(context, zero), 1.0, rtol=1e-6)
+    limit = float(np.median(found))
+    # Young's modulus is another in every row, and does not matter.
+    limited = potential.Model(robot, model.tensors, {"domain": {"growth": limit}})
+    trusted = limited.trust(limited.context(designs), displacement, np.zeros(200))[1]
+    assert trusted.tolist() == (found < limit).tolist()
+    index = np.arange(50, 150)[::-1]
+    some = limited.trust(limited.context(designs).rows(index), displacement[index], np.zeros(100))[1]
+    assert some.tolist() == trusted[index].tolist()
+
+
 @pytest.mark.parametrize("cables", CABLES)
 def test_youngs_modulus_scales_exactly(cables):
     robot = make_robot("finger", cables=cables)
