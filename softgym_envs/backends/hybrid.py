@@ -29,7 +29,7 @@ __all__ = ["HybridBackend"]
 #: tangent, stands for them. What is left out is of second order: 0.3 um at the tip of the finger.
 NEAR = 1e-3
 
-#: States nearer than this to one already kept of the same episode teach nothing new [fraction of the actuator range].
+#: States nearer than this to one already kept of the same body teach nothing new [fraction of the actuator range].
 DISTINCT = 5e-3
 
 #: Kept states wait in memory for this many, or the end of the episode, before they are written.
@@ -110,11 +110,14 @@ class HybridBackend(SurrogateBackend):
         self._fem: FEMBackend | None = None
         self._known: list[State] = []  # of the finite elements in this episode, rest first
         self._waiting: list[State] = []
-        self._taught: list[np.ndarray] = []  # displacements [range] of the episode's states that were kept
+        self._taught: dict[tuple[float, ...], list[np.ndarray]] = {}  # displacements [range] of states kept, by body
         self._store = StateStore(robot, folder)
         self._learned = 0  # of the states in the store
         self.design = {}
         if self._store.count:
+            data = self._store.data
+            for body, displacement in zip(data["design"].tolist(), data["displacement"], strict=True):
+                self._taught.setdefault(tuple(body), []).append(displacement / (robot.upper - robot.lower))
             self._take_up()
         self.reset(robot.design_space.complete(design))
 
@@ -123,7 +126,7 @@ class HybridBackend(SurrogateBackend):
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)
         self._write()
-        self._known, self._taught = [], []
+        self._known = []
         changed = complete != self.design
         if self._retrain_after and self._store.count - self._learned >= self._retrain_after:
             self._learn()
@@ -200,8 +203,9 @@ class HybridBackend(SurrogateBackend):
         self._known.append(found)
         place = found.displacement / span
         # What the learned model cannot represent (equilibria that only hold while driven) teaches nothing.
-        if found.stable and rest.stable and all(np.abs(place - p).max() > DISTINCT for p in self._taught):
-            self._taught.append(place)
+        taught = self._taught.setdefault(tuple(self.design.values()), [])
+        if found.stable and rest.stable and all(np.abs(place - p).max() > DISTINCT for p in taught):
+            taught.append(place)
             self._waiting.append(found)
             if len(self._waiting) >= WRITTEN:
                 self._write()

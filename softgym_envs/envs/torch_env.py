@@ -95,6 +95,7 @@ class _Ensemble:
             "a": softplus(part["a"] - 4.0) * (0.5 / M),
             "b": softplus(part["b"] - 4.0) / M,
             "quadratic": (factor @ factor.mT).mean(dim=0),
+            "first": factor[0] @ factor[0].mT,
             "linear": part["linear"].mean(dim=0),
             "d1": part["d1"].contiguous(),
             "d2": part["d2"].contiguous(),
@@ -106,34 +107,45 @@ class _Ensemble:
             bodies["linear"] = -self.gradient(bodies, self._rest.expand(len(x), n))
         return bodies
 
-    def _forward(self, bodies: Bodies, u: Tensor) -> tuple[Tensor, ...]:
-        U = u.expand(self.members, *u.shape)
-        z1, z2 = torch.baddbmm(bodies["c"], U, self._A).split(self.width, dim=2)
+    def _forward(self, bodies: Bodies, u: Tensor, m: int) -> tuple[Tensor, ...]:
+        """Sum of the gradients of the first ``m`` members' networks (B, n), and what their Hessians need."""
+        U = u.expand(m, *u.shape)
+        z1, z2 = torch.baddbmm(bodies["c"][:m], U, self._A[:m]).split(self.width, dim=2)
         square = 1.0 + z1 * z1
         r1 = torch.rsqrt(square)
         ramp, slope = z1 + square * r1, 1.0 + z1 * r1  # twice the ramp and its derivative
-        z2 = torch.baddbmm(z2, ramp, self._PT)
+        z2 = torch.baddbmm(z2, ramp, self._PT[:m])
         r2 = torch.rsqrt(1.0 + z2 * z2)
-        upper = bodies["a"] * (1.0 + z2 * r2)
-        lower = torch.baddbmm(bodies["b"], upper, self._P)
-        gradient = torch.baddbmm(torch.bmm(upper, self._E2), slope * lower, self._E1).sum(dim=0)
-        gradient = gradient + bodies["linear"] + (bodies["quadratic"] * u[:, None, :]).sum(dim=2)
+        upper = bodies["a"][:m] * (1.0 + z2 * r2)
+        lower = torch.baddbmm(bodies["b"][:m], upper, self._P[:m])
+        gradient = torch.baddbmm(torch.bmm(upper, self._E2[:m]), slope * lower, self._E1[:m]).sum(dim=0)
         return gradient, slope, lower, r1, r2
+
+    def _hessian(self, bodies: Bodies, slope: Tensor, lower: Tensor, r1: Tensor, r2: Tensor) -> Tensor:
+        """Sum of the Hessians of the first members' networks (B, n, n), from what `_forward` says of them."""
+        (m, B, w), n = slope.shape, self.count
+        first = (slope[:, :, None] * self._A1[:m]).reshape(m, B * n, w)
+        through = torch.bmm(first, self._PT[:m]).reshape(m, B, n, w) + self._A2[:m]
+        bent = bodies["a"][:m] * r2**3
+        hessian = torch.matmul(through * bent[:, :, None], through.mT).sum(dim=0)
+        return hessian + torch.bmm(lower * r1**3, self._outer[:m]).sum(dim=0).reshape(B, n, n)
 
     def gradient(self, bodies: Bodies, u: Tensor) -> Tensor:
         """Gradient of the energy (B, n) at displacements u (B, n)."""
-        return self._forward(bodies, u)[0]
+        return self._plus_body(bodies, u, self._forward(bodies, u, self.members)[0])
+
+    def _plus_body(self, bodies: Bodies, u: Tensor, gradient: Tensor) -> Tensor:
+        return gradient + bodies["linear"] + (bodies["quadratic"] * u[:, None, :]).sum(dim=2)
 
     def derivatives(self, bodies: Bodies, u: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient (B, n) and Hessian (B, n, n) of the energy."""
-        M, B, n, w = self.members, len(u), self.count, self.width
-        gradient, slope, lower, r1, r2 = self._forward(bodies, u)
-        first = (slope[:, :, None] * self._A1).reshape(M, B * n, w)
-        through = torch.bmm(first, self._PT).reshape(M, B, n, w) + self._A2
-        bent = bodies["a"] * r2**3
-        hessian = torch.matmul(through * bent[:, :, None], through.mT).sum(dim=0)
-        hessian = hessian + torch.bmm(lower * r1**3, self._outer).sum(dim=0).reshape(B, n, n)
-        return gradient, hessian + bodies["quadratic"]
+        gradient, *parts = self._forward(bodies, u, self.members)
+        return self._plus_body(bodies, u, gradient), self._hessian(bodies, *parts) + bodies["quadratic"]
+
+    def curvature(self, bodies: Bodies, u: Tensor) -> Tensor:
+        """Hessian (B, n, n) of the first member alone."""
+        _, *parts = self._forward(bodies, u, 1)
+        return self.members * self._hessian(bodies, *parts) + bodies["first"]
 
     def effector(self, bodies: Bodies, u: Tensor) -> tuple[Tensor, Tensor]:
         """Effector (B, e) and its spread (B,) over the members, infinite where they are not all."""
@@ -403,7 +415,8 @@ class TorchVectorEnv:
         bodies["unit"] = unit[:, self._shown].to(self.dtype)
         zero = (-self._middle / self._half).expand(len(designs), -1)
         if self._growth is not None:
-            bodies["unmoved"] = self._ensemble.derivatives(bodies, zero)[1]
+            bodies["unmoved"] = self._ensemble.curvature(bodies, zero)
+            bodies["known"] &= _definite(bodies["unmoved"])
         if self._loaded:
             u, gradient, _ = self._ensemble.search(bodies, zero, zero, MORE_STEPS, stop=True)
         else:
@@ -443,7 +456,7 @@ class TorchVectorEnv:
         inside = ((u >= self._known_low) & (u <= self._known_high)).all(dim=1)
         trusted = inside & bodies["known"] & ((uncertainty <= self._limit) | torch.isinf(uncertainty))
         if self._growth is not None:
-            trusted &= _definite(self._growth * self._ensemble.derivatives(bodies, u)[1] - bodies["unmoved"])
+            trusted &= _definite(self._growth * self._ensemble.curvature(bodies, u) - bodies["unmoved"])
         return effector, uncertainty, trusted
 
     # -- episodes ---------------------------------------------------------------------------------------------------

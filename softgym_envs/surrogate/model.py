@@ -85,6 +85,12 @@ def stays_below(growth, stiffness, unmoved, slot):
     return found
 
 
+def _definite(a: np.ndarray) -> np.ndarray:
+    """Whether matrices (B, n, n) are symmetric positive definite up to rounding, shape (B,)."""
+    finite = np.isfinite(a).all(axis=(1, 2))
+    return finite & (np.linalg.eigvalsh(np.where(finite[:, None, None], a, 0.0))[:, 0] > 0.0)
+
+
 @dataclass
 class Context:
     """What a model knows of bodies before they are actuated.
@@ -184,7 +190,8 @@ class SurrogateModel(ABC):
             arrays["known"] &= (value >= low - slack) & (value <= high + slack)
         context = Context(stiffness, arrays, np.arange(len(designs)))
         if np.isfinite(self._growth):
-            arrays["unmoved"] = self._stiffness(context, np.zeros((len(designs), self.count)))
+            arrays["unmoved"] = self._curvature(context, np.zeros((len(designs), self.count)))
+            arrays["known"] &= _definite(arrays["unmoved"])
         return context
 
     def state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -274,7 +281,7 @@ class SurrogateModel(ABC):
         trusted = inside & context.arrays["known"][context.slot] & ((uncertainty <= self._limit) | np.isinf(spread))
         if np.isfinite(self._growth):
             trusted &= stays_below(
-                self._growth, self._stiffness(context, displacement), context.arrays["unmoved"], context.slot
+                self._growth, self._curvature(context, displacement), context.arrays["unmoved"], context.slot
             )
         return uncertainty, trusted
 
@@ -282,11 +289,15 @@ class SurrogateModel(ABC):
         """Return how many times softer the held actuators are at displacements (B, n_a) than at zero, shape (B,).
 
         It is the largest ratio of the two compliances between actuators in any direction, as predicted: next to a
-        buckling it becomes large.
+        buckling it becomes large. Infinite where one of the two is not positive definite.
         """
-        unmoved = np.linalg.cholesky(self._stiffness(context, np.zeros_like(displacement)))
-        compliance = np.linalg.inv(self._stiffness(context, displacement))
-        return np.linalg.eigvalsh(unmoved.swapaxes(1, 2) @ compliance @ unmoved)[:, -1]
+        unmoved, stiffness = (self._curvature(context, d) for d in (np.zeros_like(displacement), displacement))
+        found = np.full(len(displacement), np.inf)
+        definite = _definite(unmoved) & _definite(stiffness)
+        root = np.linalg.cholesky(unmoved[definite])
+        ratio = root.swapaxes(1, 2) @ np.linalg.inv(stiffness[definite]) @ root
+        found[definite] = np.linalg.eigvalsh(ratio)[:, -1]
+        return found
 
     def compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         """Return W, shape (B, n, n), at displacements (B, n_a)."""
@@ -313,6 +324,10 @@ class SurrogateModel(ABC):
 
     def _stiffness(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         return np.linalg.inv(self._compliance(context, displacement)[:, : self.count, : self.count])
+
+    def _curvature(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        """The stiffness that growth is judged by: every step asks for it, so a cheaper one will do."""
+        return self._stiffness(context, displacement)
 
     @abstractmethod
     def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:

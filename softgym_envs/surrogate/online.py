@@ -5,10 +5,12 @@ predicts where the ensemble is trusted. It does not forget, and the data it was 
 rehearse their own predictions, not those of the ensemble, and none sees all new states, so that they go on differing
 where nothing is known.
 
-When is a prediction trusted afterwards? Three things decide, and each errs to the safe side:
+When is a prediction trusted afterwards? Four things decide, and each errs to the safe side:
 
 * The box of known displacements and designs grows to include the new states. A box has corners where no state is, so
   it only says that the model may be asked there at all.
+* Where a robot can buckle, its actuators may become as soft as in the softest of the new states, but not as soft as in
+  one that was no data because it is about to buckle.
 * The spread of the ensemble decides inside the box, with the limit of the original weights: new states never make the
   model less demanding.
 * Some of the new states are kept from all members. Where the ensemble errs there by more than its spread says, the
@@ -40,7 +42,7 @@ from softgym_envs.storage import atomic_write, read_npz, write_json
 from softgym_envs.surrogate.dataset import COLUMNS
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.networks.potential import Model, _targets, potential_loss, stack_members, unstack_members
-from softgym_envs.surrogate.states import States, stable_rows, training_states
+from softgym_envs.surrogate.states import GROWTH, States, stable_rows, training_states
 
 __all__ = ["StateStore", "check_ensemble", "fine_tune", "is_of", "rehearsal_states", "save_model"]
 
@@ -291,6 +293,7 @@ def fine_tune(
     card["online"] = {
         "parent_data_sha256": model.card.get("data_sha256"),
         "parent_weights_sha256": _digest(model.tensors, sorted(model.tensors)),
+        "parent_domain": model.card["domain"],
         "states_sha256": digest,
         "rows": len(data["rest"]),
         "states": len(data["rest"]) - int(np.sum(data["rest"])),
@@ -313,7 +316,7 @@ def is_of(model: Model, parent: Model, data: Mapping[str, np.ndarray], steps: in
     return bool(
         0 < rows <= len(data["rest"])
         and (online["steps"], online["seed"]) == (steps, seed)
-        and model.card["domain"]["limit"] == parent.card["domain"]["limit"]
+        and online.get("parent_domain") == parent.card["domain"]
         and online["parent_weights_sha256"] == _digest(parent.tensors, sorted(parent.tensors))
         and online["states_sha256"] == _digest({k: v[:rows] for k, v in data.items()}, COLUMNS)
     )
@@ -336,6 +339,7 @@ def _widened(before: Model, after: Model, data: Mapping[str, np.ndarray], kept: 
     """The card of a model after it learned states, of which ``kept`` (of the stable ones) no member saw."""
     robot, names = before.robot, before.robot.design_space.names
     stable = stable_rows(robot, data)
+    left_out = {name: data[name][~stable] for name in ("design", "displacement")}
     data = {name: data[name][stable] for name in COLUMNS}
     card = {k: v for k, v in before.card.items() if k not in _OF_TRAINING}
     domain = json.loads(json.dumps(card["domain"]))
@@ -343,6 +347,10 @@ def _widened(before: Model, after: Model, data: Mapping[str, np.ndarray], kept: 
         domain["displacement"][k] = _grown(box, data["displacement"][:, k])
     for name, box in domain["design"].items():
         domain["design"][name] = _grown(box, data["design"][:, names.index(name)])
+    if "growth" in domain:
+        learned, beyond = (after.growth(after.context(d["design"]), d["displacement"]) for d in (data, left_out))
+        bound = min(GROWTH, float(beyond.min(initial=np.inf)))
+        domain["growth"] = max(domain["growth"], min(float(learned.max()), bound))
     if kept.any():
         designs, displacement, truth = (data[k][kept] for k in ("design", "displacement", "effector"))
         _, effector, spread = after.state(after.context(designs), displacement)

@@ -62,6 +62,21 @@ def test_finite_elements_answer_where_it_is_not(robot, weights, fem):
     assert (backend.calls, backend.fem_calls, backend.tangent_calls) == (5, 3, 2)
 
 
+def test_states_of_a_body_are_kept_once(robot, weights, tmp_path):
+    def episodes(backend):
+        for _ in range(2):
+            for command in (0.012, 0.015):
+                backend.step(np.array([command]))
+            backend.reset()
+        return backend._store.count
+
+    assert episodes(HybridBackend(robot, weights=weights, folder=tmp_path, retrain_after=0)) == 2
+    again = HybridBackend(robot, weights=weights, folder=tmp_path, retrain_after=0)
+    assert episodes(again) == 2
+    again.reset({"length": 0.0405})
+    assert episodes(again) == 4
+
+
 def test_probe_and_restore_know_both(robot, weights):
     backend = HybridBackend(robot, weights=weights)
     near = backend.step(np.array([0.005]))

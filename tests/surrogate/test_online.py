@@ -120,6 +120,25 @@ def test_the_domain_grows_and_its_limit_stays(model, learned, middle):
     assert learned.card["data_sha256"] != model.card.get("data_sha256")
 
 
+def test_the_growth_rises_to_what_was_learned_and_not_to_what_was_left_out(model, middle):
+    rows = np.flatnonzero(~middle["rest"].astype(bool))
+    strict = Model(model.robot, model.tensors, {**model.card, "domain": {**model.card["domain"], "growth": 0.1}})
+
+    def growth(data):
+        tuned = fine_tune(strict, data, steps=3)
+        states = tuned.growth(tuned.context(data["design"]), data["displacement"])
+        return tuned.card["domain"]["growth"], states
+
+    found, states = growth(middle)
+    assert found == pytest.approx(min(10.0, states.max()))
+    # One that is as good as buckled: its actuators' compliance is a hundred times that at rest.
+    compliance = middle["compliance"].copy()
+    compliance[rows[5], 0] *= 100.0 * compliance[0, 0] / compliance[rows[5], 0]
+    found, states = growth({**middle, "compliance": compliance})
+    assert found == pytest.approx(max(0.1, min(states[rows[5]], states.max())))
+    assert not is_of(fine_tune(strict, middle, steps=3), model, middle, 3, 0)  # a parent of another domain
+
+
 def test_learning_depends_on_states_and_seed_alone(model, middle):
     first, again, other = (fine_tune(model, middle, steps=3, seed=seed) for seed in (0, 0, 1))
     assert all(np.array_equal(first.tensors[k], again.tensors[k]) for k in first.tensors)

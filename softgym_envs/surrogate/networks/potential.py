@@ -584,6 +584,15 @@ class Model(SurrogateModel):
         _hessians(u, context.slot, *self._energy, *coefficients, hessian)
         return hessian.astype(float) * (self._effort_scale[:, None] / self.half_range)
 
+    def _curvature(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        """Of the first member alone, in a fifth of the time: members agree that actuators become soft."""
+        body = context.arrays
+        hessian = np.empty((len(displacement), self.count, self.count), dtype=np.float32)
+        coefficients = (body["c1"], body["c2"], body["a"], body["b"], body["first"], body["linear"])
+        one = (part[:1] for part in self._energy)
+        _hessians(self._scaled(displacement), context.slot, *one, *coefficients, hessian)
+        return hessian.astype(float) * (self._effort_scale[:, None] / self.half_range)
+
     def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         u, body = self._scaled(displacement), context.arrays
         rows, n, e = len(u), self.count, self.effectors
