@@ -113,6 +113,9 @@ class DesignSpace:
         except KeyError:
             raise DesignError(f"unknown design variable '{name}'; allowed: {', '.join(self.names)}") from None
 
+    def __reduce__(self) -> tuple[type[DesignSpace], tuple[DesignVariable, ...]]:
+        return DesignSpace, tuple(self.variables.values())
+
     def __repr__(self) -> str:
         return f"DesignSpace({', '.join(self.names)})"
 

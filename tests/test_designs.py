@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import DesignError, SoftGymError
+from softgym_envs.robots import ROBOTS, make_robot
 
 SPACE = DesignSpace(
     DesignVariable("length", 0.038, 0.042, 0.040, "m", "length of a segment"),
@@ -204,6 +207,14 @@ def test_impossible_variables(change, message):
     arguments = {"name": "v", "low": 0.5, "high": 1.0, "baseline": 0.7, "unit": "m", "description": "", **change}
     with pytest.raises(DesignError, match=message):
         DesignVariable(**arguments)
+
+
+def test_robots_can_be_copied_and_pickled():
+    for name in ROBOTS:
+        robot = make_robot(name)
+        for again in (copy.deepcopy(robot), pickle.loads(pickle.dumps(robot))):
+            assert again.design_space.variables == robot.design_space.variables
+            assert again.signature == robot.signature
 
 
 def test_names_must_differ():

@@ -53,7 +53,7 @@ def released(model: SurrogateModel, context: Context, effort: np.ndarray, start:
     for _ in range(50):
         found, effector, spread = model.state(context, displacement)
         step = np.linalg.solve(model.stiffness(context, displacement), (effort - found)[:, :, None])[:, :, 0]
-        moving = (np.abs(step) > TOLERANCE * limit).any(axis=1)
+        moving = ~(np.abs(step) <= TOLERANCE * limit).all(axis=1)
         if not moving.any():
             break
         displacement = displacement + np.clip(step, -limit, limit) * moving[:, None]

@@ -57,6 +57,10 @@ class FingerModel(Protocol):
         """
         ...
 
+    def trust(self, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the uncertainty of the tips [m] (F,), and whether the model knows such states (F,)."""
+        ...
+
 
 class FEMFingers:
     """Finite-element fingers; each follows a path of its own.
@@ -90,6 +94,9 @@ class FEMFingers:
             np.stack([state.condensed.delta.e[:3] for state in states]),
         )
 
+    def trust(self, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(len(displacement)), np.ones(len(displacement), dtype=bool)
+
 
 class SurrogateFingers:
     """Learned fingers, all evaluated in one call of the model.
@@ -114,6 +121,10 @@ class SurrogateFingers:
         effort, effector = self.model.state(context, displacement)[:2]
         return effort, self.model.compliance(context, displacement), effector
 
+    def trust(self, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        context = Context.shared(self._context, len(displacement))
+        return self.model.trust(context, displacement, self.model.effector(context, displacement)[1])
+
 
 @dataclass(frozen=True)
 class FingersState:
@@ -131,6 +142,8 @@ class FingersState:
         tips: of the fingers [m], shape (F, 3).
         condensed: model of all cables (role ``a``) and the object's centre (role ``e``).
         iterations: of Newton's method, over all increments.
+        uncertainty: the largest of the tips' [m]; 0 on finite elements.
+        trusted: the model knows the states of all fingers.
     """
 
     command: np.ndarray
@@ -144,6 +157,8 @@ class FingersState:
     tips: np.ndarray
     condensed: CondensedModel
     iterations: int
+    uncertainty: float
+    trusted: bool
 
 
 @dataclass(frozen=True)
@@ -449,6 +464,7 @@ class CoupledFingers:
         effort = np.where(slack, 0.0, np.where(self.unilateral, np.maximum(here.tension, 0.0), here.tension))
         W = C[: n + 3, : n + 3].copy()
         full = np.append(effort, np.zeros(3))
+        uncertainty, trusted = self.fingers.trust(here.coordinates)
         return FingersState(
             command=command.copy(),
             displacement=point.cables,
@@ -463,4 +479,6 @@ class CoupledFingers:
                 W, np.concatenate([point.cables, point.position]) - W @ full, full, (("a", n), ("e", 3))
             ),
             iterations=iterations,
+            uncertainty=float(uncertainty.max()),
+            trusted=bool(trusted.all()),
         )

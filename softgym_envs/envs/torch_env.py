@@ -319,6 +319,8 @@ class TorchVectorEnv:
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs = {num_envs} must be at least 1")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps = {max_episode_steps} must be at least 1")
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype = {dtype} is not supported; allowed: torch.float32, torch.float64")
         supported = [name for name, row in ENVIRONMENTS.items() if row.backend == "surrogate"]

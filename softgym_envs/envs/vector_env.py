@@ -75,6 +75,8 @@ class SoftRobotVectorEnv(VectorEnv):
             )
         if num_envs < 1:
             raise ValueError(f"num_envs = {num_envs} must be at least 1")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps = {max_episode_steps} must be at least 1")
         self.num_envs = num_envs
         self.render_mode = None
         robot_options, task_options, backend_options = merge_defaults(

@@ -35,8 +35,11 @@ def _read_shard(path: Path, manifest: dict[str, Any]) -> dict[str, np.ndarray]:
         raise DataError(f"shard '{path}' has columns of different lengths")
     if shard["rest"].size == 0:
         return shard
-    for name, labels in manifest["columns"].items():
-        width = len(labels) if isinstance(labels, list) else shard[name].shape[-1]  # of W there are no labels
+    if not shard["rest"][0]:
+        raise DataError(f"shard '{path}' does not begin with a rest state")
+    widths = {name: len(labels) for name, labels in manifest["columns"].items() if isinstance(labels, list)}
+    size = widths["effort"] + widths["effector"]
+    for name, width in (widths | {"compliance": size * (size + 1) // 2}).items():
         if shard[name].shape != (len(shard["rest"]), width):
             raise DataError(f"shard '{path}': column '{name}' has shape {shard[name].shape}, not {width} wide")
     return shard

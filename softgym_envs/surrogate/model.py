@@ -167,13 +167,19 @@ class SurrogateModel(ABC):
         self.span = 0.25 * (robot.upper - robot.lower)
 
         domain = self.card.get("domain", {})
+        if not isinstance(domain, dict):
+            raise ValueError(f"the domain of the card is no mapping: {domain!r}")
         self._inflation = float(domain.get("inflation", 1.0))
         self._limit = float(domain.get("limit", np.inf))
         self._growth = float(domain.get("growth", np.inf))
         box = np.array(domain.get("displacement", np.column_stack([robot.lower, robot.upper])), dtype=float)
+        if box.shape != (self.count, 2):
+            raise ValueError(f"the card's domain has displacements of shape {box.shape}, not ({self.count}, 2)")
         slack = 0.01 * (box[:, 1] - box[:, 0])
         self._low, self._high = box[:, 0] - slack, box[:, 1] + slack
         self._known = {k: (float(v[0]), float(v[1])) for k, v in domain.get("design", {}).items()}
+        if strange := sorted(self._known.keys() - set(robot.design_space.names)):
+            raise ValueError(f"the card's domain has unknown design variables: {', '.join(strange)}")
 
     def context(self, designs: np.ndarray) -> Context:
         """Prepare bodies: designs (B, len(space)) in the order of the space."""
@@ -395,6 +401,8 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
         tensors = load_file(weights_path)
     except (SafetensorError, OSError, ValueError) as error:
         raise WeightsError(f"weights '{weights_path}' are damaged or truncated: {error}") from None
+    if wrong := sorted(name for name, tensor in tensors.items() if not np.isfinite(tensor).all()):
+        raise WeightsError(f"weights '{weights_path}' are not finite in {', '.join(wrong)}")
     try:
         return module.Model(robot, tensors, card, members)
     except (KeyError, ValueError, IndexError, TypeError) as error:

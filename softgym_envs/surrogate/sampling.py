@@ -51,8 +51,12 @@ class SamplingPlan:
     def __post_init__(self) -> None:
         if self.sequence not in SEQUENCES:
             raise ValueError(f"sequence = {self.sequence!r} is unknown; allowed: {', '.join(map(repr, SEQUENCES))}")
-        if self.groups < 1 or self.states < 1:
-            raise ValueError(f"groups = {self.groups} and states = {self.states} must be at least 1")
+        for name, least in (("groups", 1), ("states", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+                raise ValueError(f"{name} = {value!r} must be a whole number of {least} or more")
+        if self.vary is not None and len(set(self.vary)) < len(self.vary):
+            raise ValueError(f"vary = {list(self.vary)} names a variable twice")
         if not 0.0 <= self.margin <= 1.0:
             raise ValueError(f"margin = {self.margin} is out of bounds; allowed: [0, 1]")
 
@@ -199,7 +203,7 @@ def select_states(data: Mapping[str, np.ndarray], count: int, seed: int = 0) -> 
     from scipy.cluster.vq import kmeans2
 
     rows = len(data["effort"])
-    if not 1 <= count <= rows:
+    if not isinstance(count, int | np.integer) or not 1 <= count <= rows:
         raise ValueError(f"count = {count} states cannot be chosen from {rows}; allowed: 1 to {rows}")
     actuators, effectors = data["effort"].shape[1], data["effector"].shape[1]
     n = int(np.sqrt(2 * data["compliance"].shape[1]))  # more than these where there are contacts

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from softgym_envs.config import Config, provenance, save_resolved
 from softgym_envs.errors import DataError
@@ -41,11 +41,14 @@ class SplitConfig(Config):
     groups: int = Field(gt=0)
     states: int = Field(gt=0)
     sequence: Literal["halton", "sobol", "latin", "random"] = "random"
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
 
 
 class DataConfig(Config):
-    """Three separate datasets: the best epoch is chosen on validation, and the test set is used once."""
+    """Three separate datasets: the best epoch is chosen on validation, and the test set is used once.
+
+    Seeds default to 0, 1 and 2.
+    """
 
     train: SplitConfig
     validation: SplitConfig
@@ -54,6 +57,25 @@ class DataConfig(Config):
     vary: tuple[str, ...] | None = None
     design: dict[str, float] = {}
     bounds: dict[str, tuple[float, float]] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _seeds_of_their_own(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        given = {name: data[name] for name in SPLITS if isinstance(data.get(name), dict)}
+        return data | {name: {"seed": SPLITS.index(name), **split} for name, split in given.items()}
+
+    @model_validator(mode="after")
+    def _separate(self) -> DataConfig:
+        drawn = [(getattr(self, split).sequence, getattr(self, split).seed) for split in SPLITS]
+        for k, split in enumerate(SPLITS):
+            if drawn[k] in drawn[:k]:
+                raise ValueError(
+                    f"{split} would draw the points of {SPLITS[drawn.index(drawn[k])]} again (sequence "
+                    f"'{drawn[k][0]}', seed {drawn[k][1]}); give it another seed"
+                )
+        return self
 
     def plan(self, split: str) -> SamplingPlan:
         """What the dataset ``split`` ("train", "validation" or "test") is drawn by."""
@@ -122,14 +144,20 @@ class Trainer:
         import copy
 
         import torch
+        from safetensors import SafetensorError
         from safetensors.torch import load, save
         from tqdm import tqdm
 
         options = self.options
         path = None if self.folder is None else self.folder / f"{name.replace(' ', '_')}-{self.key}.safetensors"
         if path is not None and path.exists() and path.with_suffix(".json").exists():
-            net.load_state_dict(load(path.read_bytes()))
-            return json.loads(path.with_suffix(".json").read_text())
+            try:
+                net.load_state_dict(load(path.read_bytes()))
+                return json.loads(path.with_suffix(".json").read_text())
+            except (SafetensorError, ValueError, RuntimeError, OSError) as error:
+                aside = path.with_suffix(".corrupt")
+                path.rename(aside)
+                print(f"part '{path}' is damaged ({error}); set aside as '{aside.name}' and trained again")
         generator = torch.Generator().manual_seed(self.seed if seed is None else seed)
         optimiser = _optimiser(options, net.parameters())
         schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -227,6 +255,8 @@ def domain_of(
         where more than `BUCKLING` of the training states were left out, ``growth``: how many times softer than
         unmoved 98 % of the validation states are not.
     """
+    stable = stable_rows(model.robot, training)
+    training = {name: column[stable] for name, column in training.items()}
     names = model.robot.design_space.names
     domain: dict[str, Any] = {
         "displacement": [[float(c.min()), float(c.max())] for c in training["displacement"].T],
@@ -243,15 +273,16 @@ def domain_of(
         distance = np.linalg.norm((effector - data["effector"]).reshape(len(spread), -1, 3), axis=2).max(axis=1)
         domain["inflation"] = float(np.quantile(distance / np.maximum(spread, 1e-12), 0.95))
         domain["limit"] = domain["inflation"] * float(np.quantile(spread, 0.98))
-    if model.robot.convex and 1.0 - stable_rows(model.robot, training).mean() > BUCKLING:
+    if model.robot.convex and 1.0 - stable.mean() > BUCKLING:
         domain["growth"] = float(np.quantile(model.growth(context, data["displacement"]), 0.98))
     return domain
 
 
 def generate(config: FitConfig, data_folder: str | Path, *, progress: bool = True) -> dict[str, dict[str, np.ndarray]]:
     """Generate the datasets ``train``, ``validation`` and ``test`` of a surrogate, or take up what is there."""
-    save_resolved(data_folder, config)
-    return {
+    if not (Path(data_folder) / "config.yaml").exists():  # what is there stands until the data are accepted
+        save_resolved(data_folder, config)
+    data = {
         split: generate_dataset(
             Path(data_folder) / split,
             config.robot,
@@ -264,6 +295,8 @@ def generate(config: FitConfig, data_folder: str | Path, *, progress: bool = Tru
         )
         for split in SPLITS
     }
+    save_resolved(data_folder, config)
+    return data
 
 
 def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progress: bool = True) -> dict[str, float]:

@@ -56,6 +56,9 @@ class Energy:
         W = np.block([[compliance, moved.swapaxes(1, 2)], [moved, moved @ jacobian.T + 1e-6 * np.eye(3)]])
         return effort, W, displacement @ jacobian.T
 
+    def trust(self, displacement):
+        return np.zeros(len(displacement)), np.ones(len(displacement), dtype=bool)
+
 
 def turned(count=3):
     """Placements in no special direction around the origin."""
@@ -146,6 +149,21 @@ def test_one_learned_finger_makes_the_gripper():
             assert np.linalg.norm(found.position - expected.condensed.delta.e) < 1e-3
             assert np.abs(found.effort - expected.effort[:6]).max() < 0.05 * expected.effort.max()
             np.testing.assert_array_equal(found.slack, expected.slack)
+            assert found.trusted and 0.0 < found.uncertainty < 1e-3
+
+
+def test_a_finger_out_of_its_domain_is_told():
+    model, gripper = pretrained_model(make_robot("contact_finger")), make_robot("three_finger_gripper")
+    box = np.array(model.card["domain"]["displacement"])
+    box[0, 1] = 2e-3  # of the first cable
+    narrow = type(model)(
+        model.robot, model.tensors, {**model.card, "domain": {**model.card["domain"], "displacement": box}}
+    )
+    fingers = CoupledFingers.like(gripper, SurrogateFingers(narrow))
+    command = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0]) * 1e-3
+    assert fingers.solve(command).trusted
+    command[2] = 4e-3
+    assert not fingers.solve(command).trusted
 
 
 def test_a_contact_finger_alone_is_no_environment():

@@ -48,10 +48,16 @@ def equal(a, b):
 def test_malformed_plans():
     with pytest.raises(ValueError, match=r"'grid' is unknown; allowed: 'halton', 'sobol', 'latin', 'random'"):
         SamplingPlan(1, 1, "grid")
-    with pytest.raises(ValueError, match="groups = 0"):
-        SamplingPlan(0, 1)
-    with pytest.raises(ValueError, match="states = 0"):
-        SamplingPlan(1, 0)
+    for groups, states, seed, message in (
+        (0, 1, 0, "groups = 0 must be a whole number of 1 or more"),
+        (2.5, 1, 0, "groups = 2.5 must be a whole number"),
+        (1, 0, 0, "states = 0"),
+        (1, 1, -1, "seed = -1 must be a whole number of 0 or more"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            SamplingPlan(groups, states, seed=seed)
+    with pytest.raises(ValueError, match="names a variable twice"):
+        SamplingPlan(1, 1, vary=("length", "length"))
     for margin in (-0.1, 1.5, float("nan")):
         with pytest.raises(ValueError, match=r"margin = .* is out of bounds; allowed: \[0, 1\]"):
             SamplingPlan(1, 1, margin=margin)
@@ -396,6 +402,8 @@ DAMAGES = {
     "column missing": rewritten(lambda columns: columns.pop("compliance")),
     "column shorter": rewritten(lambda columns: columns.update(effector=columns["effector"][:-1])),
     "column narrower": rewritten(lambda columns: columns.update(effector=columns["effector"][:, :-1])),
+    "compliance narrower": rewritten(lambda columns: columns.update(compliance=columns["compliance"][:, :-1])),
+    "no rest first": rewritten(lambda columns: columns.update(rest=1 - columns["rest"])),
     "column flat": rewritten(lambda columns: columns.update(compliance=columns["compliance"][:, 0])),
     "column of one number": rewritten(lambda columns: columns.update(rest=np.float64(1.0))),
     "column of words": rewritten(lambda columns: columns.update(rest=np.array(["rest"] * len(columns["rest"])))),
@@ -567,7 +575,7 @@ def alive(session):
     return found
 
 
-def wait(condition, seconds=120.0):
+def wait(condition, seconds=300.0):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "took too long"

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file, save_file
 
 from softgym_envs.config import load_config
-from softgym_envs.errors import WeightsError
+from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.mechanics import complementarity
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate import online
@@ -19,7 +20,7 @@ from softgym_envs.surrogate.networks import NETWORKS, potential, residual
 from softgym_envs.surrogate.networks.potential_torch import PotentialNet
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
 from softgym_envs.surrogate.sampling import learned_variables
-from softgym_envs.surrogate.training import FitConfig, fit
+from softgym_envs.surrogate.training import FitConfig, Trainer, fit, generate
 
 CABLES = (1, 2)
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "surrogate"
@@ -389,6 +390,33 @@ def test_truncated_weights(copied):
             load_model(folder, robot)
 
 
+def test_weights_that_are_not_finite(copied):
+    robot, folder = copied
+    tensors = load_file(folder / "model.safetensors")
+    tensors["effector"] = tensors["effector"].copy()
+    tensors["effector"].flat[3] = np.nan
+    save_file(tensors, folder / "model.safetensors")
+    with pytest.raises(WeightsError, match="not finite in effector"):
+        load_model(folder, robot)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ([], "no mapping"),
+        ({"displacement": [[0.0, 0.01]]}, r"displacements of shape \(1, 2\), not \(2, 2\)"),
+        ({"design": {"weight": [0.0, 1.0]}}, "unknown design variables: weight"),
+    ],
+)
+def test_damaged_domains(copied, change, message):
+    robot, folder = copied
+    card = json.loads((folder / "model.json").read_text())
+    card["domain"] = change if isinstance(change, list) else card["domain"] | change
+    (folder / "model.json").write_text(json.dumps(card))
+    with pytest.raises(WeightsError, match=message):
+        load_model(folder, robot)
+
+
 def test_missing_and_foreign_weights(copied):
     robot, folder = copied
     with pytest.raises(WeightsError, match=r"cables = 2, asked 1"):
@@ -408,6 +436,50 @@ def test_missing_and_foreign_weights(copied):
     (folder / "model.json").unlink()
     with pytest.raises(WeightsError, match=r"model\.json.*does not exist"):
         load_model(folder, robot)
+
+
+def splits(**changes):
+    data = {name: {"groups": 2, "states": 4} for name in ("train", "validation", "test")}
+    return {name: data[name] | changes.get(name, {}) for name in data}
+
+
+def test_splits_are_of_different_states():
+    data = FitConfig.model_validate({"robot": "finger", "data": splits()}).data
+    assert [getattr(data, name).seed for name in splits()] == [0, 1, 2]
+    robot = make_robot("finger")
+    designs = [tuple(data.plan(name).designs(robot, 0, 1)[0].values()) for name in splits()]
+    assert len(set(designs)) == 3
+    with pytest.raises(ValueError, match=r"test would draw the points of train again \(sequence 'random', seed 0\)"):
+        FitConfig.model_validate({"robot": "finger", "data": splits(test={"seed": 0})})
+
+
+def test_a_refused_run_leaves_the_configuration_of_the_data(tmp_path):
+    config = {"robot": "finger", "robot_options": {"cables": 1}, "workers": 1}
+    asked = [FitConfig.model_validate({**config, "data": splits(train={"states": states})}) for states in (4, 5)]
+    generate(asked[0], tmp_path, progress=False)
+    before = (tmp_path / "config.yaml").read_text()
+    with pytest.raises(DataError, match="another dataset"):
+        generate(asked[1], tmp_path, progress=False)
+    assert (tmp_path / "config.yaml").read_text() == before
+
+
+def test_a_damaged_part_is_trained_again(tmp_path, capsys):
+    options = FitConfig.model_validate({"robot": "finger", "data": splits(), "network": {"kind": "potential"}}).network
+    trainer = Trainer(options.model_copy(update={"steps": 3}), 0, tmp_path, "key")
+
+    def trained():
+        torch.manual_seed(0)
+        net = torch.nn.Linear(2, 1)
+        points = torch.arange(8.0).reshape(4, 2)
+        trainer.optimise("line", net, lambda rows: (net(points if rows is None else points[rows]) ** 2).mean(), 4)
+        return net.weight.detach().numpy().copy()
+
+    first = trained()
+    (part,) = tmp_path.glob("line-*.safetensors")
+    part.write_bytes(part.read_bytes()[:20])
+    np.testing.assert_array_equal(trained(), first)
+    assert "set aside as 'line-key.corrupt' and trained again" in capsys.readouterr().out
+    np.testing.assert_array_equal(trained(), first)
 
 
 @pytest.mark.parametrize("kind", sorted(NETWORKS))
