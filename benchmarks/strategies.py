@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.config import load_config, provenance
+from softgym_envs.errors import DataError
 from softgym_envs.storage import write_json
 
 __all__ = ["strategies"]
@@ -325,6 +326,8 @@ def _steps_to(curve: list[list[float]], limit: float) -> float:
 def strategies() -> dict[str, object]:
     """Regret of the co-design strategies by environment steps: median of the repeats (smallest to largest)."""
     kept = json.loads(KEPT.read_text())
+    if strange := sorted({run["name"] for run in kept["runs"]} - STRATEGIES.keys()):
+        raise DataError(f"'{KEPT.name}' has runs of unknown strategies: {', '.join(strange)}")
     result: dict[str, object] = {
         "bodies of the ground truth": len(kept["truth"]),
         "baseline, true score [mm]": 1e3 * kept["baseline"],
