@@ -7,8 +7,8 @@ behind (``kill -9``, power cut). Its result is taken over if it was already writ
 A body is blamed for the death of its worker if the call that had started the worker outlived it, or if it was an error
 that is a bug. It is not if the call has ended as well: Ctrl-C, ``kill -9`` of everything and a power cut say nothing
 about a body. One that takes its call down with it (all memory of the machine) cannot be told from these and is not
-blamed either; whoever starts the call again sees it. Blamed wrongly is a body whose call, killed with its worker, still
-shows as alive in a database, where the signs of life of the two differ by up to a sixth of ``heartbeat``.
+blamed either; whoever starts the call again sees it. Nor is one whose worker died while it claimed the trial, before it
+looked at the body.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 import socket
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -40,6 +40,17 @@ CALL = "SOFTGYM_STUDY_CALL"
 
 TOLD = ("success_rate", "mean_distance", "mean_return")
 """What Optuna is told of an evaluation beside its score, for people who look there (``optuna-dashboard``)."""
+
+
+def _reports(trials: Sequence[optuna.trial.FrozenTrial], number: int) -> dict[int, float]:
+    """What was reported by a trial and by those that it replaces, by step: a worker may die before it says it again."""
+    chain = [trials[number]]
+    while "replaces" in chain[-1].user_attrs:
+        chain.append(trials[chain[-1].user_attrs["replaces"]])
+    found: dict[int, float] = {}
+    for trial in reversed(chain):
+        found |= trial.intermediate_values
+    return dict(sorted(found.items()))
 
 
 def make_sampler(config: StudyConfig, number: int) -> optuna.samplers.BaseSampler:
@@ -242,15 +253,13 @@ class Ledger:
         trial = open_study(self.folder, self.storage, number).ask(distributions(config))
         if self.call is not None:
             trial.set_user_attr("call", self.call)
-        trial.set_user_attr("worker", self.worker)  # last of what `_blamed` asks for
         trial.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
         if "origin" not in trial.user_attrs:
             trial.set_user_attr("origin", f"sampler {trial.number}")
             trial.set_user_attr("sampler_seed", trial_seed(config, trial.number))
-        if "replaces" in trial.user_attrs:
-            replaced = study.get_trials(deepcopy=False)[trial.user_attrs["replaces"]]
-            for step, value in replaced.intermediate_values.items():
-                trial.report(value, step)
+        for step, value in _reports(study.get_trials(deepcopy=False), trial.number).items():
+            trial.report(value, step)
+        trial.set_user_attr("worker", self.worker)  # the last: without it, it was not claimed
         return trial
 
     def _claimable(self, study: optuna.Study) -> bool:
@@ -299,8 +308,9 @@ class Ledger:
                     for key in ("origin", "sampler_seed"):
                         if key in trial.user_attrs:
                             marks[key] = trial.user_attrs[key]
-                    earlier = trials[trial.user_attrs["replaces"]] if "replaces" in trial.user_attrs else None
-                    progress = len(trial.intermediate_values) > len(earlier.intermediate_values if earlier else ())
+                    earlier = trial.user_attrs.get("replaces")
+                    known = {} if earlier is None else _reports(trials, earlier)
+                    progress = len(_reports(trials, trial.number)) > len(known)
                     blamed = self._blamed(trial)
                     marks["attempt"] = 1 if progress else trial.user_attrs.get("attempt", 1) + blamed
                     study.enqueue_trial(values, user_attrs=marks)
@@ -315,7 +325,9 @@ class Ledger:
         if "worker" not in trial.user_attrs:  # it was killed while it claimed the trial, before it looked at the body
             return False
         call = trial.user_attrs.get("call")
-        return "raised" in trial.user_attrs or call is None or self._lives(call)
+        if "raised" in trial.user_attrs or call is None or call == self.worker:
+            return True
+        return self.storage.outlived(call, trial.user_attrs["worker"])
 
     # ---------------------------------------------------------------------------------------------------------------
 

@@ -64,6 +64,13 @@ LIVES = """
 SELECT clock_timestamp() - greatest(seen, pg_postmaster_start_time()) < make_interval(secs => :grace)
 FROM codesign_workers WHERE worker = :worker
 """
+# Who is killed at the same instant gave the last sign up to a sixth of the grace earlier or later.
+OUTLIVED = """
+SELECT clock_timestamp() - greatest(call.seen, pg_postmaster_start_time()) < make_interval(secs => :grace)
+    AND (worker.seen IS NULL OR call.seen > worker.seen + make_interval(secs => :grace / 3))
+FROM codesign_workers call LEFT JOIN codesign_workers worker ON worker.worker = :worker
+WHERE call.worker = :call
+"""
 PUBLISH = """
 INSERT INTO codesign_files SELECT study_id, :path, :content FROM studies WHERE study_name = :study
 ON CONFLICT DO NOTHING
@@ -278,6 +285,9 @@ class PostgresStorage(StudyStorage):
 
     def lives(self, worker: str) -> bool:
         return bool(self.execute(LIVES, worker=worker, grace=self.grace))
+
+    def outlived(self, call: str, worker: str) -> bool:
+        return bool(self.execute(OUTLIVED, call=call, worker=worker, grace=self.grace))
 
     # -- jobs and files ---------------------------------------------------------------------------------------------
 

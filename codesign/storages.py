@@ -84,6 +84,10 @@ class StudyStorage(ABC):
         """Tell whether a worker shows as alive."""
 
     @abstractmethod
+    def outlived(self, call: str, worker: str) -> bool:
+        """Tell whether ``call`` shows as alive, and did so well after the last sign of a worker that is dead."""
+
+    @abstractmethod
     def attempt(self, job: str) -> AbstractContextManager[bool]:
         """Try to be the only one at a job while the block runs, and tell whether this came true."""
 
@@ -149,6 +153,9 @@ class JournalStorage(StudyStorage):
             if free:
                 (self.folder / "locks" / f"{worker}.lock").unlink(missing_ok=True)
             return not free
+
+    def outlived(self, call: str, worker: str) -> bool:
+        return self.lives(call)  # a lock ends with its holder
 
     @contextmanager
     def attempt(self, job: str) -> Iterator[bool]:

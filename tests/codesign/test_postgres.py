@@ -99,6 +99,30 @@ def test_machines_share_the_budget_and_the_goals(machine):
         assert a.results() == b.results() == [result(trial) for trial in claimed]
 
 
+@pytest.mark.parametrize("call_lives", [False, True])
+def test_who_was_killed_together_is_told_from_who_died_alone(machine, call_lives):
+    """The last sign of life of the call came a little later: when the worker counts as dead, the call does not yet."""
+    folder = machine(trials=1)
+    with Ledger(folder) as survivor:
+        with doomed(folder) as call:
+            with doomed(folder) as victim:
+                assert victim.call == call.worker
+                lost = victim.claim()
+                victim.storage.execute(SIGN, worker=victim.worker)
+            time.sleep(GRACE / 8.0)
+            call.storage.execute(SIGN, worker=call.worker)
+
+        def claimable():
+            if call_lives:
+                survivor.storage.execute(SIGN, worker=call.worker)
+            return survivor.claimable()
+
+        wait_for(claimable)
+        again = survivor.claim()
+    assert (again.number, again.params) == (1, lost.params)
+    assert again.user_attrs["attempt"] == 1 + call_lives
+
+
 def test_body_of_a_dead_worker_runs_again_on_another_machine(machine):
     a, b = machine("a", trials=1), machine("b", trials=1)
     with Ledger(b) as survivor:

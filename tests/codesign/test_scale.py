@@ -160,7 +160,7 @@ def test_interrupted_baseline_is_not_given_up(tmp_path, tiny, start_study):
         assert (again.number, again.user_attrs["origin"], again.user_attrs["attempt"]) == (3, "baseline", 1)
 
 
-@pytest.mark.parametrize("marks", [0, 1])
+@pytest.mark.parametrize("marks", [0, 1, 2])
 def test_worker_that_dies_while_it_claims_blames_no_body(study, monkeypatch, marks):
     """Though the call that started it lives on: the body was not looked at yet."""
     folder = study(trials=1, attempts=1)
@@ -181,6 +181,31 @@ def test_worker_that_dies_while_it_claims_blames_no_body(study, monkeypatch, mar
         with Ledger(folder) as ledger:
             again = ledger.claim()
     assert (again.number, again.user_attrs["origin"], again.user_attrs["attempt"]) == (1, "baseline", 1)
+
+
+@pytest.mark.parametrize("method", ["set_user_attr", "report"])
+def test_reports_outlive_a_worker_that_dies_while_it_claims(study, monkeypatch, method):
+    folder = study(trials=1, attempts=3)
+    with Ledger(folder) as ledger:
+        ledger.enqueue([("baseline", {name: folder.config.baseline[name] for name in folder.config.variables})])
+        first = ledger.claim()
+        for step in (10, 20, 30):
+            first.report(0.1 * step, step)
+    original = getattr(optuna.Trial, method)
+
+    def die(trial, *arguments):
+        original(trial, *arguments)
+        raise KeyboardInterrupt
+
+    with Ledger(folder) as call:
+        monkeypatch.setattr(optuna.Trial, method, die)
+        with Ledger(folder) as ledger, pytest.raises(KeyboardInterrupt):
+            ledger.claim()
+        monkeypatch.undo()
+        again = call.claim()
+    trial = open_study(folder).get_trials()[again.number]
+    assert trial.intermediate_values == {10: 1.0, 20: 2.0, 30: 3.0}
+    assert (trial.number, trial.user_attrs["attempt"]) == (2, 1)
 
 
 def test_worker_goes_on_when_its_trial_was_given_away(study, monkeypatch):
