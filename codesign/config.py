@@ -413,7 +413,8 @@ class StudyConfig(Config):
                 f"finalists.seeds = {self.finalists.seeds} trains policies, strategy 'qp' has none; allowed: 0"
             )
         shown = self.environment.design_in_observation
-        if plan.proposer and shown is not True and not set(self.variables) <= set(shown or ()):
+        judges = plan.proposer or (plan.policy and not plan.trains)
+        if judges and shown is not True and not set(self.variables) <= set(shown or ()):
             raise ValueError(
                 f"strategy '{self.strategy}' needs a policy that sees the body: name {', '.join(self.variables)} in "
                 "environment.design_in_observation"

@@ -151,7 +151,7 @@ class StudyFolder:
         return {name: np.array(stored[name], dtype=float) for name in ("training", "selection", "unseen")}
 
     def account(self) -> dict[str, Any]:
-        """Command that last ran the study, and wall-clock time of each phase so far [s]."""
+        """Command that last ran the study, and wall-clock time of each phase so far, added up over calls [s]."""
         path = self.path / "account.json"
         return read_json(path) if path.exists() else {"command": "", "wall_seconds": {}}
 

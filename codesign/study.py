@@ -62,7 +62,14 @@ def run_study(
         raise ConfigError(f"workers = {count} is out of bounds; allowed: 1 or more")
     # What cannot go well is told before anything starts, and before the folder is taken.
     if config.policy is not None:
-        Policy(config.policy).check_environment(config.environment)
+        policy = Policy(config.policy)
+        policy.check_environment(config.environment)
+        drawn = policy.environment.sample_design
+        if not config.plan.trains and drawn is not True and (strange := set(config.variables) - set(drawn or ())):
+            raise ConfigError(
+                f"policy '{config.policy}' judges bodies, and has not seen {', '.join(sorted(strange))} vary in its "
+                f"training; allowed variables: {', '.join(drawn or ()) or 'none'}"
+            )
     if not (Path(folder) / "config.yaml").exists():
         _try_environment(config)
         _try_sampler(config)
@@ -262,7 +269,7 @@ class _Printer:
     def verdict(self, results: dict[str, Any]) -> None:
         """Tell who won."""
         if results["winner"] is None:
-            self.say("no winner: no trial was complete, or no finalists were asked for")
+            self.say("no winner: no trial is complete, no body keeps the limits, or no finalists were asked for")
             return
         self.say(f"winner: trial {results['winner']['trial']}")
         for row in results["comparison"]:

@@ -520,6 +520,8 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
             text += f", {100 * result['level']:g} % interval {ends[0]:.{digits}g} to {ends[1]:.{digits}g}"
         elif ends is not None:
             text += ", no interval: the model fits the data exactly"
+        if name in result["at_bound"]:
+            text += "; at its bound: the data ask for more than the bounds allow"
         click.echo(text)
     errors = ", ".join(f"{name} {value:.3g}" for name, value in result["errors"].items())
     click.echo(f"root mean square errors: {errors} [SI]; {result['seconds']:.1f} s; wrote {folder}")

@@ -108,7 +108,8 @@ class Misfit(ABC):
         self.evaluations = 0
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         if not (self._scale > 0.0).all():
-            raise DataError("the measured states are all the same: nothing can be fitted to them")
+            what = "one measured state is too little" if len(data) == 1 else "the measured states are all the same"
+            raise DataError(f"{what}: nothing can be fitted to them")
         if self.count <= len(box):
             raise DataError(f"{self.count} measured numbers cannot determine {len(box)} variables and their error")
 
@@ -435,7 +436,7 @@ def calibrate(
 
     Returns:
         ``design`` (complete), ``fits`` (one per start), ``refined`` (the fit on FEM, or None), ``interval``
-        (``{name: [low, high]}``), ``errors`` (root mean square, SI) and ``seconds``.
+        (``{name: [low, high]}``), ``at_bound`` (names), ``errors`` (root mean square, SI) and ``seconds``.
 
     Raises:
         ConfigError: for a variable that changes nothing that was measured; if the folder holds something else or
@@ -479,6 +480,7 @@ def _calibrate(config: CalibrationConfig, data: Measurements | None) -> tuple[di
         "design": design,
         "interval": interval,
         "level": config.level,
+        "at_bound": [name for name, unit in zip(box.names, box.unit(design), strict=True) if abs(unit) > 1.0 - 1e-6],
         "errors": misfit.errors(misfit.coordinates.point(design)),
         "fits": [asdict(fit) for fit in fits],
         "refined": None if refined is None else asdict(refined),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -116,7 +117,7 @@ class SearchConfig(Config):
         trials: designs to evaluate, infeasible ones included.
         batch: designs that are proposed together, for NSGA-II the population. The result depends on it and not on the
             number of workers.
-        starts: designs to evaluate first, ``{name: value}`` each; missing variables take the reference.
+        starts: designs to evaluate first, ``{name: value}`` each; missing variables take the reference, within bounds.
     """
 
     method: Literal["search"]
@@ -157,6 +158,19 @@ class GradientConfig(Config):
     check: bool = True
 
 
+def check_starts(starts: Sequence[Mapping[str, float]], box: Box) -> None:
+    """Check that starts are of free variables, within their bounds.
+
+    Raises:
+        ValueError: for a variable that is not free.
+        DesignError: for a value out of bounds.
+    """
+    for start in starts:
+        if unknown := sorted(start.keys() - set(box.names)):
+            raise ValueError(f"starts: '{unknown[0]}' is not free; free: {', '.join(box.names)}")
+        box.free.complete(start)
+
+
 class OptimiseConfig(Config):
     """A search for the best bodies.
 
@@ -184,6 +198,8 @@ class OptimiseConfig(Config):
         if len(set(self.metrics)) != len(self.metrics):
             raise ValueError(f"objectives: a metric is named twice in {', '.join(self.metrics)}")
         check_metrics(self.bodies.make_robot(), self.metrics, self.bodies.backend)
+        if isinstance(self.solver, SearchConfig):
+            check_starts(self.solver.starts, self.bodies.box())
         if isinstance(self.solver, GradientConfig) and self.bodies.backend != "surrogate":
             raise ValueError("solver 'gradient' needs bodies.backend = 'surrogate': meshes have no derivative")
         return self
@@ -264,12 +280,7 @@ class CalibrationConfig(Config):
 
     @model_validator(mode="after")
     def _exists(self) -> CalibrationConfig:
-        box = self.box()
-        for start in self.starts:
-            unknown = sorted(set(start) - set(self.fit))
-            if unknown:
-                raise ValueError(f"starts: '{unknown[0]}' is not fitted; fitted: {', '.join(self.fit)}")
-            box.free.complete(start)
+        check_starts(self.starts, self.box())
         return self
 
     def make_robot(self) -> Robot:

@@ -118,7 +118,7 @@ def _search(config: OptimiseConfig, folder: Path, progress: bool) -> dict[str, A
                 for number in range(len(trials), len(trials) + missing):
                     study.sampler = _sampler(solver.sampler, number)
                     if number < len(solver.starts):
-                        values = {**box.reference, **solver.starts[number]}
+                        values = box.free.complete(solver.starts[number])
                         study.enqueue_trial({name: values[name] for name in box.names})
                     asked.append(study.ask(_distributions(config)))
                 study.set_user_attr("asked", asked[-1].number + 1)

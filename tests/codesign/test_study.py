@@ -18,7 +18,7 @@ from codesign.finalists import choose_winner, evaluations, finalist_jobs
 from codesign.folder import StudyFolder
 from codesign.ledger import open_study
 from codesign.report import write_report
-from codesign.results import bootstrap_interval, mean_interval, rank_correlation, rate_interval
+from codesign.results import mean_interval, rank_correlation, rate_interval
 from codesign.study import run_study
 from softgym_envs.errors import WeightsError
 from softgym_envs.storage import write_json
@@ -215,12 +215,12 @@ def test_error_of_a_worker_is_one_line(tmp_path, tiny):
 
 
 def test_statistics(rng):
-    values = rng.normal(1.0, 0.1, 200)
-    low, high = bootstrap_interval(values)
+    values = rng.normal(1.0, 0.1, (1, 200))
+    low, high = mean_interval(values)
     assert low < values.mean() < high
-    assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(200), rel=0.1)
-    assert bootstrap_interval([2.0, 2.0]) == (2.0, 2.0)
-    assert bootstrap_interval([2.0]) is None and mean_interval(np.ones((1, 1))) is None
+    assert high - low == pytest.approx(2 * 1.972 * values.std(ddof=1) / np.sqrt(200), rel=1e-3)
+    assert mean_interval(np.full((1, 2), 2.0)) == (2.0, 2.0)
+    assert mean_interval(np.ones((1, 1))) is None and mean_interval(np.ones((3, 1))) is None
     assert rate_interval(np.ones((1, 10)))[0] == pytest.approx(0.7225, abs=1e-3)
     low, high = rate_interval(np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]]))
     assert 0.0 <= low < 5.0 / 6.0 < high <= 1.0
@@ -228,8 +228,21 @@ def test_statistics(rng):
     assert rank_correlation([1, 1, 1], [1, 2, 3]) is None
 
 
+@pytest.mark.parametrize("seeds", [1, 2, 3])
+@pytest.mark.parametrize("rate", [0.5, 0.9, 0.99])
+def test_intervals_of_rates_cover(rng, seeds, rate):
+    """Goals differ in how hard they are, and seeds do in how good they are at them."""
+    covered = 0
+    for _ in range(300):
+        hard = rng.beta(2.0 * rate, 2.0 * (1.0 - rate), 24)
+        low, high = rate_interval((rng.random((seeds, 24)) < hard).astype(float))
+        assert 0.0 <= low < high <= 1.0
+        covered += low <= rate <= high
+    assert covered / 300 > 0.91  # three standard deviations of the count below 0.95
+
+
 def test_interval_of_a_difference_heeds_the_seeds(rng):
-    """With one seed each it is the bootstrap over goals; a lucky seed of several widens it."""
+    """With one seed each it is over goals alone; a lucky seed of several widens it."""
     goals = rng.normal(0.0, 1.0, 40)
     baseline, winner = goals[None], goals[None] - 0.1
     assert mean_interval(winner, baseline) == pytest.approx((-0.1, -0.1))
