@@ -463,7 +463,7 @@ def _calibrate(config: CalibrationConfig, data: Measurements | None) -> tuple[di
         data = read_measurements(config.data, config.make_robot())
     misfit = make_misfit(config, data, config.backend)
     box = misfit.coordinates.box
-    starts = [{**box.reference, **start} for start in config.starts] or [dict(box.reference)]
+    starts = [{**box.reference, **box.free.complete(start)} for start in config.starts or ({},)]
     if config.method == "tpe":
         fits = [fit_tpe(misfit, start, trials=config.trials, seed=config.seed) for start in starts]
     else:

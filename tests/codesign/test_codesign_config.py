@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from agents.evaluation import sample_goals
-from agents.policy import policy_path
+from agents.policy import Policy, policy_path
 from codesign.config import StudyConfig
 from codesign.study import run_study
 from softgym_envs.config import load_config
@@ -196,11 +196,26 @@ JUDGED = {"strategy": "policy", "policy": "finger_reach_designs"}
             {**JUDGED, "environment": {**SHOWN, "design_in_observation": ["height", "length", "joint_height"]}},
             r"environment\.design_in_observation = \['height'",
         ),
+        ({**JUDGED, "environment": {"id": SHOWN["id"]}}, "strategy 'policy' needs a policy that sees the body: name h"),
+        (
+            {**JUDGED, "environment": {**SHOWN, "design_in_observation": True}, "variables": ["young_modulus"]},
+            r"environment\.design_in_observation = .*'young_modulus'",
+        ),
     ],
 )
 def test_wrong_values_are_told_before_the_folder_is_taken(changes, words, tmp_path, tiny):
     with pytest.raises(ValueError, match=words):
         run_study(StudyConfig.model_validate(tiny(**changes)), tmp_path / "study", progress=False)
+    assert not (tmp_path / "study").exists()
+
+
+def test_a_judge_has_seen_what_varies(tmp_path, tiny, monkeypatch):
+    policy = Policy("finger_reach_designs")
+    monkeypatch.setattr(policy, "environment", policy.environment.model_copy(update={"sample_design": ["length"]}))
+    monkeypatch.setattr("codesign.study.Policy", lambda name: policy)
+    config = StudyConfig.model_validate(tiny(**JUDGED, environment=SHOWN, variables=["length", "height"]))
+    with pytest.raises(ConfigError, match="has not seen height vary in its training; allowed variables: length"):
+        run_study(config, tmp_path / "study", progress=False)
     assert not (tmp_path / "study").exists()
 
 

@@ -214,6 +214,16 @@ def test_error_of_a_worker_is_one_line(tmp_path, tiny):
     assert "\n" not in str(caught.value)
 
 
+def test_tests_of_former_finalists_stay_in_the_cost(study):
+    folder = study(trials=3, finalists={"count": 2})
+    before = run_study(folder.config, folder.path, progress=False)
+    finalists = folder.config.finalists.model_copy(update={"count": 1})
+    after = run_study(folder.config.model_copy(update={"finalists": finalists}), folder.path, progress=False)
+    assert len(after["finalists"]) < len(before["finalists"])
+    assert after["cost"]["test_steps_surrogate"] == before["cost"]["test_steps_surrogate"]
+    assert after["cost"]["cpu_seconds"] == before["cost"]["cpu_seconds"]
+
+
 def test_statistics(rng):
     values = rng.normal(1.0, 0.1, (1, 200))
     low, high = mean_interval(values)

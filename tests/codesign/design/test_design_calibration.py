@@ -146,6 +146,12 @@ def test_coordinates_are_those_of_equation_3_14(finger):
     assert row[:4].tolist() == [finger.design_space.baseline[name] for name in finger.design_space.names[:4]]
 
 
+def test_a_value_at_its_bound_is_told(positions):
+    result = calibrate(configured("poisson_ratio", bounds={"poisson_ratio": [0.30, 0.46]}, level=None), data=positions)
+    assert result["at_bound"] == ["poisson_ratio"] and result["design"]["poisson_ratio"] == pytest.approx(0.46)
+    assert calibrate(configured("poisson_ratio", level=None), data=positions)["at_bound"] == []
+
+
 def test_what_cannot_be_fitted(positions):
     with pytest.raises(ConfigError, match="'young_modulus' changes nothing that was measured"):
         calibrate(configured("young_modulus"), data=positions)

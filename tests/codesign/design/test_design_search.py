@@ -91,6 +91,22 @@ def test_a_stopped_search_ends_as_one_that_was_not(some, monkeypatch, tmp_path):
         search(configured(objectives=[{"metric": "travel"}]), tmp_path / "parts", progress=False)
 
 
+def test_starts_lie_within_the_bounds(some, tmp_path):
+    def asked(**start):
+        bodies = {**BODIES, "bounds": {"length": [0.041, 0.042]}}
+        solver = {"method": "search", "sampler": {"name": "random"}, "trials": 3, "starts": [start]}
+        return configured(bodies=bodies, solver=solver)
+
+    with pytest.raises(ConfigError, match="starts: 'heigth' is not free; free: length, "):
+        asked(heigth=0.021)
+    with pytest.raises(ConfigError, match="length"):
+        asked(length=0.040)
+    search(asked(height=0.0205), tmp_path, progress=False)
+    rows = [row.split(",") for row in (tmp_path / "trials.csv").read_text().splitlines()]
+    first = dict(zip(*rows[:2], strict=True))
+    assert (float(first["length"]), float(first["height"])) == (0.041, 0.0205)
+
+
 @pytest.mark.parametrize("sampler", [SAMPLER, {"name": "tpe", "seed": 3}])
 @pytest.mark.parametrize("parameters", [1, 15, 26, 27])  # of which the first 18 are those of the first batch
 def test_a_search_that_was_stopped_while_it_proposed(sampler, parameters, some, monkeypatch, tmp_path):
