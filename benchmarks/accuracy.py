@@ -58,13 +58,18 @@ def test_set(folder: str | Path = "results/test_set", workers: int = 2) -> dict[
             left = ~kept
             result |= {
                 f"{variant}: left out: effector error, mean [mm]": 1e3 * float(off[left].mean()),
+                f"{variant}: left out: effector error, worst [mm]": 1e3 * float(off[left].max()),
                 f"{variant}: left out: trusted all the same [%]": 100 * float(trusted[left].mean()),
-                f"{variant}: left out: effector error of these, mean [mm]": 1e3 * float(off[left & trusted].mean())
-                if trusted[left].any()
-                else "none there",
                 f"{variant}: left out: errors below the uncertainty [%]": 100
                 * float((off <= uncertainty)[left].mean()),
             }
+            if (left & trusted).any():
+                result |= {
+                    f"{variant}: left out and trusted: effector error, mean [mm]": 1e3
+                    * float(off[left & trusted].mean()),
+                    f"{variant}: left out and trusted: effector error, worst [mm]": 1e3
+                    * float(off[left & trusted].max()),
+                }
         result |= {
             f"{variant}: trusted below an uncertainty of [mm]": 1e3 * model.card["domain"].get("limit", np.nan),
             f"{variant}: size of the files [kB]": size / 1e3,
