@@ -376,7 +376,7 @@ def _comparison_row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _interval_note(study: StudyFolder) -> str:
     seeds = study.config.finalists.seeds
-    note = "Intervals of 95&nbsp;% of means and differences are Student's, of rates Wilson's"
+    note = "Intervals of 95 % of means and differences are Student's, of rates Wilson's"
     if seeds > 1:
         note += (
             f"; those of SAC are over goals and over {seeds} trainings for each body, with other seeds, those of the "
@@ -384,7 +384,7 @@ def _interval_note(study: StudyFolder) -> str:
         )
     else:
         note += " over goals, for the controllers as trained: they do not contain the chance of another training seed."
-    return f"{note} Where a few goals decide the mean they cover less than 95&nbsp;%, of a dozen goals 75&nbsp;%."
+    return f"{note} Where a few goals decide the mean they cover less than 95 %, of a dozen goals 75 %."
 
 
 def _search(trials: list[dict[str, Any]], results: Mapping[str, Any]) -> list[tuple[str, str]]:
