@@ -65,7 +65,7 @@ def draw_environment(name: str) -> np.ndarray:
 
 def draw_codesign() -> np.ndarray:
     """Draw the baseline finger and the winner of the demo study."""
-    designs = [{}, {"length": 0.038, "height": 0.022, "joint_height": 0.005}]
+    designs = [{}, {"length": 0.038, "height": 0.0211, "joint_height": 0.005}]
     return render_bodies(
         make_robot("finger"), designs, np.array([0.020, 0.017]), (480, 480), texts=["baseline", "co-designed"]
     )
