@@ -42,7 +42,7 @@ PLAIN = {
     "heartbeat": 10.0,
     "finalists": {"count": 0},
 }
-SCORED = {"strategy": "qp", "trials": TRIALS, "goals": {"count": 10, "unseen_count": 2, "training_count": 2}}
+SCORED = {"strategy": "qp", "trials": TRIALS, "goals": {"count": 30, "unseen_count": 2, "training_count": 2}}
 TRAINED = {"strategy": "scratch", "trials": 8, "goals": {"count": 40, "unseen_count": 40, "training_count": 300}}
 
 
