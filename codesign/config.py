@@ -53,6 +53,11 @@ class Strategy:
     policy: bool = False
     proposer: str | None = None
 
+    @property
+    def judges(self) -> bool:
+        """One policy scores all bodies: the given one, or that of the joint training."""
+        return not self.trains and (self.policy or bool(self.proposer))
+
 
 STRATEGIES: dict[str, Strategy] = {
     "scratch": Strategy(trains=True),
@@ -413,8 +418,7 @@ class StudyConfig(Config):
                 f"finalists.seeds = {self.finalists.seeds} trains policies, strategy 'qp' has none; allowed: 0"
             )
         shown = self.environment.design_in_observation
-        judges = plan.proposer or (plan.policy and not plan.trains)
-        if judges and shown is not True and not set(self.variables) <= set(shown or ()):
+        if plan.judges and shown is not True and not set(self.variables) <= set(shown or ()):
             raise ValueError(
                 f"strategy '{self.strategy}' needs a policy that sees the body: name {', '.join(self.variables)} in "
                 "environment.design_in_observation"

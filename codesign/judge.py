@@ -27,7 +27,7 @@ JUDGE = "judge/policy.safetensors"
 def judge_jobs(folder: StudyFolder) -> list[Job]:
     """The job that makes the judge, or none where the strategy needs none."""
     config = folder.config
-    if config.plan.trains or config.strategy == "qp":
+    if not config.plan.judges:
         return []
     return [Job(folder.path / "judge" / "judge.json", lambda: _make(folder))]
 

@@ -257,8 +257,9 @@ class Ledger:
         if "origin" not in trial.user_attrs:
             trial.set_user_attr("origin", f"sampler {trial.number}")
             trial.set_user_attr("sampler_seed", trial_seed(config, trial.number))
-        for step, value in _reports(study.get_trials(deepcopy=False), trial.number).items():
-            trial.report(value, step)
+        if "replaces" in trial.user_attrs:
+            for step, value in _reports(study.get_trials(deepcopy=False), trial.user_attrs["replaces"]).items():
+                trial.report(value, step)
         trial.set_user_attr("worker", self.worker)  # the last: without it, it was not claimed
         return trial
 

@@ -131,10 +131,8 @@ def _headline(results: Mapping[str, Any]) -> str:
     objective = OBJECTIVES[results["objective"]]
     interval = row["objective_change_interval"]
     low, high = sorted(objective.sign * value for value in interval or (0.0, 0.0))
-    if interval is None:
-        finding = "One goal does not tell chance from a better body"
-    elif row["goals"] < FEW:
-        finding = f"{row['goals']} goals are too few to tell chance from a better body"
+    if row["goals"] < FEW:
+        finding = f"Test goals are too few to tell chance from a better body ({row['goals']})"
     elif low > 0.0:
         finding = "The optimised body is better than the baseline"
     elif high < 0.0:

@@ -182,7 +182,7 @@ def importance(folder: StudyFolder) -> dict[str, float]:
     return {name: float(value) for name, value in found.items()}
 
 
-def _cost(folder: StudyFolder, trials: list[dict[str, Any]], tests: list[dict[str, Any]]) -> dict[str, Any]:
+def _cost(folder: StudyFolder, trials: list[dict[str, Any]]) -> dict[str, Any]:
     screened = [record["qp"] for record in screen_records(folder)]
     judged = [trial[key] for trial in trials for key in ("qp", "evaluation") if trial[key] and trial["agent"] != key]
     config = folder.config
@@ -284,7 +284,7 @@ def collect(folder: StudyFolder) -> dict[str, Any]:
         "trainings": trainings(folder),
         "evaluations": tests,
         "importance": importance(folder),
-        "cost": _cost(folder, trials, tests),
+        "cost": _cost(folder, trials),
         "success_distance": success_distance(folder),
         "provenance": provenance(),
     }

@@ -24,6 +24,7 @@ from codesign.objectives import OBJECTIVES
 from codesign.processes import run_workers
 from codesign.results import write_results
 from codesign.screen import kept_bodies, screen_jobs
+from softgym_envs.envs.soft_robot_env import design_names
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign, SoftGymError
 from softgym_envs.storage import read_json, write_json
 
@@ -64,11 +65,11 @@ def run_study(
     if config.policy is not None:
         policy = Policy(config.policy)
         policy.check_environment(config.environment)
-        drawn = policy.environment.sample_design
-        if not config.plan.trains and drawn is not True and (strange := set(config.variables) - set(drawn or ())):
+        drawn = design_names(config.space, policy.environment.sample_design)
+        if config.plan.judges and (strange := sorted(set(config.variables) - set(drawn))):
             raise ConfigError(
-                f"policy '{config.policy}' judges bodies, and has not seen {', '.join(sorted(strange))} vary in its "
-                f"training; allowed variables: {', '.join(drawn or ()) or 'none'}"
+                f"policy '{config.policy}' judges bodies, and has not seen {', '.join(strange)} vary in its training; "
+                f"allowed variables: {', '.join(drawn) or 'none'}"
             )
     if not (Path(folder) / "config.yaml").exists():
         _try_environment(config)

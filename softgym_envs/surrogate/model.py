@@ -64,16 +64,12 @@ class Features:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def stays_below(growth, stiffness, unmoved, slot):
-    """Whether actuators are less than ``growth`` times softer than unmoved, in every direction, shape (B,).
-
-    With stiffness (B, n, n) and that of the unmoved bodies (S, n, n), of which each row is one of ``slot`` (B,): by
-    elimination, ``growth * stiffness - unmoved`` has positive pivots only.
-    """
-    found = np.ones(len(stiffness), dtype=np.bool_)
-    n = stiffness.shape[1]
-    for row in range(len(stiffness)):
-        a = growth * stiffness[row] - unmoved[slot[row]]
+def definite(matrices):
+    """Whether symmetric matrices (B, n, n) are positive definite, (B,): all pivots of the elimination are positive."""
+    found = np.ones(len(matrices), dtype=np.bool_)
+    n = matrices.shape[1]
+    for row in range(len(matrices)):
+        a = matrices[row].copy()
         for k in range(n):
             if not a[k, k] > 0.0:
                 found[row] = False
@@ -83,12 +79,6 @@ def stays_below(growth, stiffness, unmoved, slot):
                 for j in range(k + 1, n):
                     a[i, j] -= factor * a[k, j]
     return found
-
-
-def _definite(a: np.ndarray) -> np.ndarray:
-    """Whether matrices (B, n, n) are symmetric positive definite up to rounding, shape (B,)."""
-    finite = np.isfinite(a).all(axis=(1, 2))
-    return finite & (np.linalg.eigvalsh(np.where(finite[:, None, None], a, 0.0))[:, 0] > 0.0)
 
 
 @dataclass
@@ -197,7 +187,7 @@ class SurrogateModel(ABC):
         context = Context(stiffness, arrays, np.arange(len(designs)))
         if np.isfinite(self._growth):
             arrays["unmoved"] = self._curvature(context, np.zeros((len(designs), self.count)))
-            arrays["known"] &= _definite(arrays["unmoved"])
+            arrays["known"] &= definite(arrays["unmoved"])
         return context
 
     def state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -286,9 +276,8 @@ class SurrogateModel(ABC):
         inside = ((displacement >= self._low) & (displacement <= self._high)).all(axis=1)
         trusted = inside & context.arrays["known"][context.slot] & ((uncertainty <= self._limit) | np.isinf(spread))
         if np.isfinite(self._growth):
-            trusted &= stays_below(
-                self._growth, self._curvature(context, displacement), context.arrays["unmoved"], context.slot
-            )
+            unmoved = context.arrays["unmoved"][context.slot]
+            trusted &= definite(self._growth * self._curvature(context, displacement) - unmoved)
         return uncertainty, trusted
 
     def growth(self, context: Context, displacement: np.ndarray) -> np.ndarray:
@@ -299,10 +288,10 @@ class SurrogateModel(ABC):
         """
         unmoved, stiffness = (self._curvature(context, d) for d in (np.zeros_like(displacement), displacement))
         found = np.full(len(displacement), np.inf)
-        definite = _definite(unmoved) & _definite(stiffness)
-        root = np.linalg.cholesky(unmoved[definite])
-        ratio = root.swapaxes(1, 2) @ np.linalg.inv(stiffness[definite]) @ root
-        found[definite] = np.linalg.eigvalsh(ratio)[:, -1]
+        both = definite(unmoved) & definite(stiffness)
+        root = np.linalg.cholesky(unmoved[both])
+        ratio = root.swapaxes(1, 2) @ np.linalg.inv(stiffness[both]) @ root
+        found[both] = np.linalg.eigvalsh(ratio)[:, -1]
         return found
 
     def compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:

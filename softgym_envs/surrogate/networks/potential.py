@@ -28,7 +28,7 @@ members' ``Phi``, and so a potential again; their spread is the uncertainty.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -578,19 +578,20 @@ class Model(SurrogateModel):
         return displacement, effort, converged
 
     def _stiffness(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        u, body = self._scaled(displacement), context.arrays
-        hessian = np.empty((len(u), self.count, self.count), dtype=np.float32)
-        coefficients = (body["c1"], body["c2"], body["a"], body["b"], body["quadratic"], body["linear"])
-        _hessians(u, context.slot, *self._energy, *coefficients, hessian)
-        return hessian.astype(float) * (self._effort_scale[:, None] / self.half_range)
+        return self._hessian(context, displacement, self._energy, "quadratic")
 
     def _curvature(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         """Of the first member alone, in a fifth of the time: members agree that actuators become soft."""
-        body = context.arrays
-        hessian = np.empty((len(displacement), self.count, self.count), dtype=np.float32)
-        coefficients = (body["c1"], body["c2"], body["a"], body["b"], body["first"], body["linear"])
-        one = (part[:1] for part in self._energy)
-        _hessians(self._scaled(displacement), context.slot, *one, *coefficients, hessian)
+        return self._hessian(context, displacement, [part[:1] for part in self._energy], "first")
+
+    def _hessian(
+        self, context: Context, displacement: np.ndarray, energy: Iterable[np.ndarray], quadratic: str
+    ) -> np.ndarray:
+        """Stiffness of the members whose weights are given, with their quadratic part by its name."""
+        u, body = self._scaled(displacement), context.arrays
+        hessian = np.empty((len(u), self.count, self.count), dtype=np.float32)
+        coefficients = (body["c1"], body["c2"], body["a"], body["b"], body[quadratic], body["linear"])
+        _hessians(u, context.slot, *energy, *coefficients, hessian)
         return hessian.astype(float) * (self._effort_scale[:, None] / self.half_range)
 
     def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
