@@ -11,9 +11,9 @@ import numpy as np
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.control import InverseQP, PICorrection
-from softgym_envs.envs.task import Task
+from softgym_envs.envs.tasks.base import Task
 from softgym_envs.errors import ConvergenceError, WeightsError
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 
 __all__ = ["BASELINES", "PI_GAINS", "Agent", "InverseQPAgent", "make_baseline", "make_controller"]
 

@@ -13,7 +13,7 @@ from softgym_envs.robots import make_robot
 if TYPE_CHECKING:
     import gymnasium
 
-    from softgym_envs.robots.robot import Robot
+    from softgym_envs.robots.base import Robot
 
 __all__ = ["EnvironmentConfig", "SACConfig", "TrainConfig", "check_hindsight", "check_start"]
 
@@ -21,8 +21,8 @@ __all__ = ["EnvironmentConfig", "SACConfig", "TrainConfig", "check_hindsight", "
 class EnvironmentConfig(Config):
     """An environment: its ID and the options of ``gymnasium.make``; the backend is by default that of its row.
 
-    With ``on_qp`` the agent acts on top of the inverse QP: the action that is done is
-    ``clip(action of the QP + on_qp * action of the agent, -1, 1)``.
+    With ``residual_scale`` the agent acts on top of the inverse QP: the action that is done is
+    ``clip(action of the QP + residual_scale * action of the agent, -1, 1)``.
     """
 
     id: str
@@ -34,7 +34,7 @@ class EnvironmentConfig(Config):
     robot_options: dict[str, Any] = {}
     task_options: dict[str, Any] = {}
     backend_options: dict[str, Any] = {}
-    on_qp: float = Field(
+    residual_scale: float = Field(
         default=0.0, ge=0, le=2, description="share of the agent's action on top of the QP's; 0: no QP"
     )
 
@@ -66,7 +66,7 @@ class EnvironmentConfig(Config):
         return make_robot(row.robot, **{**row.robot_options, **self.robot_options})
 
     def _options(self, overrides: dict[str, Any]) -> dict[str, Any]:
-        options = self.model_dump(exclude={"id", "on_qp"})
+        options = self.model_dump(exclude={"id", "residual_scale"})
         return {**options, **overrides}
 
     def make(self, **overrides: Any) -> gymnasium.Env:
@@ -76,12 +76,12 @@ class EnvironmentConfig(Config):
         import softgym_envs  # noqa: F401 - registers the IDs
 
         env = gymnasium.make(self.id, **self._options(overrides))
-        return self._wrapped(env) if self.on_qp else env
+        return self._wrapped(env) if self.residual_scale else env
 
     def _wrapped(self, env: gymnasium.Env) -> gymnasium.Wrapper:
-        from agents.on_qp import OnQP
+        from agents.residual import ResidualQP
 
-        return OnQP(env, self.on_qp)
+        return ResidualQP(env, self.residual_scale)
 
     def make_vec(self, num_envs: int, **overrides: Any) -> gymnasium.vector.VectorEnv:
         """Return the batched environment on the surrogate, or one process for each environment on finite elements."""
@@ -91,11 +91,11 @@ class EnvironmentConfig(Config):
 
         if self.backend == "surrogate":
             envs = gymnasium.make_vec(self.id, num_envs=num_envs, **self._options(overrides))
-            if not self.on_qp:
+            if not self.residual_scale:
                 return envs
-            from agents.on_qp import VectorOnQP
+            from agents.residual import VectorResidualQP
 
-            return VectorOnQP(envs, self.on_qp)
+            return VectorResidualQP(envs, self.residual_scale)
         return gymnasium.make_vec(
             self.id,
             num_envs=num_envs,
@@ -105,7 +105,7 @@ class EnvironmentConfig(Config):
                 # Said, because joblib's workers have a start method of their own that cannot pickle these.
                 **({"context": "fork"} if num_envs > 1 else {}),
             },
-            wrappers=[self._wrapped] if self.on_qp else [],
+            wrappers=[self._wrapped] if self.residual_scale else [],
             **self._options(overrides),
         )
 
@@ -171,10 +171,11 @@ class TrainConfig(Config):
 def check_hindsight(sac: SACConfig, environment: EnvironmentConfig) -> None:
     """Raise ValueError for hindsight goals on top of the QP."""
     # What was done held the QP's action for the goal of then; it says nothing about another goal.
-    if sac.hindsight and environment.on_qp:
+    if sac.hindsight and environment.residual_scale:
         raise ValueError(
             f"sac.hindsight = {sac.hindsight:g} cannot be had on top of the QP "
-            f"(environment.on_qp = {environment.on_qp:g}), whose action depends on the goal; allowed: 0"
+            f"(environment.residual_scale = {environment.residual_scale:g}), whose action depends on the goal; "
+            "allowed: 0"
         )
 
 

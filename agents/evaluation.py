@@ -134,7 +134,7 @@ def evaluate(
 
     Args:
         agent: one of `AGENTS`, or the path of a policy.
-        environment: where; its ``backend`` decides the physics. Its ``on_qp`` counts for policies only.
+        environment: where; its ``backend`` decides the physics. Its ``residual_scale`` counts for policies only.
         goals: goals or paths of goals [m], shape (n, 3) or (n, p, 3).
         design: the body, or one for each goal (default: the environment's).
         seed: seed of the random agent and of the environment.
@@ -147,7 +147,7 @@ def evaluate(
     goals = goals[:, None, :] if goals.ndim == 2 else goals
     if agent in AGENTS:
         act = make_baseline(str(agent), seed)
-        environment = environment.model_copy(update={"on_qp": 0.0})
+        environment = environment.model_copy(update={"residual_scale": 0.0})
     else:
         policy = Policy(agent)
         policy.check_environment(environment)

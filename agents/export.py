@@ -14,7 +14,7 @@ from softgym_envs.storage import atomic_write
 from softgym_envs.version import __version__
 
 if TYPE_CHECKING:
-    from softgym_envs.envs.interface import Interface
+    from softgym_envs.envs.spaces import Interface
 
 __all__ = ["export_policy_onnx"]
 
@@ -109,7 +109,7 @@ def _graph(policy: Policy, interface: Interface, config: EnvironmentConfig, onnx
     weight, bias = policy.mean
     action = g("Tanh", g("Add", g("MatMul", h, weight), bias), output="action")
     outputs = ["action"]
-    if not config.on_qp:
+    if not config.residual_scale:
         outputs.append("next_command")
         if interface.action_mode == "increment":
             target = g("Add", "command", g("Mul", action, interface.rates))

@@ -9,8 +9,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from softgym_envs.envs.interface import Interface
-from softgym_envs.envs.task import Task
+from softgym_envs.envs.spaces import Interface
+from softgym_envs.envs.tasks.base import Task
 
 __all__ = ["HindsightBuffer"]
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from agents.config import EnvironmentConfig
 from softgym_envs.config import check_config
+from softgym_envs.envs.env import design_names
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.envs.soft_robot_env import design_names
 from softgym_envs.errors import ConfigError, DataError, WeightsError
 from softgym_envs.storage import atomic_write, read_json, write_json
 
@@ -148,12 +148,12 @@ def _meaning(environment: EnvironmentConfig) -> dict[str, tuple[Any, object]]:
     variables = [robot.design_space[name] for name in shown]
     scales = (
         [(actuator.name, actuator.low, actuator.high, actuator.rate) for actuator in robot.actuators],
-        (robot.size, robot.motion, robot.effort_scale.tolist()),
+        (robot.size, robot.workspace_scale, robot.effort_scale.tolist()),
         [(variable.low, variable.high, variable.log) for variable in variables],
     )
     return {
         "id": ((row.robot, row.task), f"{environment.id} (robot {row.robot}, task {row.task})"),
-        "on_qp": (environment.on_qp, environment.on_qp),
+        "residual_scale": (environment.residual_scale, environment.residual_scale),
         "action_mode": (environment.action_mode, environment.action_mode),
         "design_in_observation": (shown, list(shown)),
         "robot_options": (scales, environment.robot_options),

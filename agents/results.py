@@ -145,7 +145,7 @@ def _present(estimate: Estimate, digits: int = 3) -> str:
 
 def _together(runs: list[StoredRuns]) -> str:
     """Returns as a share of the largest, over environments: one task each, its plain configuration."""
-    plain = [entry for entry in runs if not entry.environment.on_qp and not entry.environment.sample_design]
+    plain = [entry for entry in runs if not entry.environment.residual_scale and not entry.environment.sample_design]
     lines = [
         "Return as a share of the largest possible one; interquartile mean over seeds and the plain configurations "
         "(intervals: seeds resampled within each).\n",

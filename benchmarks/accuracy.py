@@ -22,9 +22,9 @@ def test_set(folder: str | Path = "results/test_set", workers: int = 2) -> dict[
     """
     from softgym_envs.config import load_config
     from softgym_envs.robots import make_robot
-    from softgym_envs.surrogate.dataset import generate_dataset
+    from softgym_envs.surrogate.data.dataset import generate_dataset
+    from softgym_envs.surrogate.data.states import full_compliance, stable_rows
     from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
-    from softgym_envs.surrogate.states import full_compliance, stable_rows
     from softgym_envs.surrogate.training import FitConfig
 
     result: dict[str, object] = {}
@@ -134,11 +134,11 @@ def design_gradients(bodies: int = 12) -> dict[str, object]:
     import torch
 
     from softgym_envs.errors import ConvergenceError, InfeasibleDesign
-    from softgym_envs.mechanics.statics import Statics
+    from softgym_envs.mechanics.solvers.statics import Statics
     from softgym_envs.robots import make_robot
+    from softgym_envs.surrogate.data.sampling import learned_variables
     from softgym_envs.surrogate.gradients import TorchModel
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
-    from softgym_envs.surrogate.sampling import learned_variables
 
     result: dict[str, object] = {}
     for variant, (name, options) in shipped_robots().items():

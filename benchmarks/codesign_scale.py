@@ -25,8 +25,8 @@ import yaml
 from benchmarks.postgres_server import PostgresServer, temporary_server
 from codesign.config import JOURNAL, StudyConfig
 from codesign.folder import StudyFolder
-from codesign.ledger import open_study
-from codesign.storages import StudyStorage
+from codesign.scheduling.queue import open_study
+from codesign.scheduling.storage import StudyStorage
 
 TRIALS = 200
 WORKERS = 2
@@ -102,7 +102,14 @@ class Sweep:
         self._rng = np.random.default_rng(seed)
         self._context = multiprocessing.get_context("forkserver")  # what workers import is imported once
         self._context.set_forkserver_preload(
-            ["codesign.worker", "codesign.postgres", "agents.evaluation", "optuna", "psycopg", "sqlalchemy.orm"]
+            [
+                "codesign.scheduling.worker",
+                "codesign.scheduling.postgres",
+                "agents.evaluation",
+                "optuna",
+                "psycopg",
+                "sqlalchemy.orm",
+            ]
         )
         self._processes: dict[int, multiprocessing.process.BaseProcess] = {}
 
@@ -136,7 +143,7 @@ class Sweep:
 
 
 def _work(path: str) -> None:
-    from codesign.worker import run_trials
+    from codesign.scheduling.worker import run_trials
 
     run_trials(StudyFolder(path))
 
@@ -206,8 +213,8 @@ def kills() -> dict[str, object]:
 def _timed_worker(path: str, output: str, started: str) -> None:
     """A worker, started at a time, that writes down how long it was inside training, evaluation and the ledger [s]."""
     import agents.training
-    import codesign.trial
-    import codesign.worker
+    import codesign.phases.trial
+    import codesign.scheduling.worker
 
     spent = Counter[str]()
 
@@ -224,11 +231,11 @@ def _timed_worker(path: str, output: str, started: str) -> None:
         setattr(module, name, wrapper)
 
     timed(agents.training, "train")
-    timed(codesign.trial, "assess")
+    timed(codesign.phases.trial, "assess")
     for name in ("claim", "finish"):
-        timed(codesign.worker.Ledger, name)
+        timed(codesign.scheduling.worker.Ledger, name)
     spent["start"] = time.time() - float(started)
-    codesign.worker.run_trials(StudyFolder(path))
+    codesign.scheduling.worker.run_trials(StudyFolder(path))
     Path(output).write_text(json.dumps(spent))
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from softgym_envs.errors import DataError
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.storage import read_npz
 
 __all__ = ["build_diamond", "compare"]

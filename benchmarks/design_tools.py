@@ -34,9 +34,9 @@ def optima() -> dict[str, object]:
 
     Designs are length, height and joint height [mm]; angles are in rad, forces in N.
     """
-    from codesign.design.config import OptimiseConfig
-    from codesign.design.gradient import optimise
-    from codesign.design.search import search
+    from codesign.tools.config import OptimiseConfig
+    from codesign.tools.gradient import optimise
+    from codesign.tools.search import search
     from softgym_envs.config import check_config
 
     bodies = {
@@ -84,9 +84,9 @@ def optima() -> dict[str, object]:
 
 def calibration() -> dict[str, object]:
     """Calibration of the one-cable finger from FEM states: Poisson's ratio, Young's modulus, noise of 1 %."""
-    from codesign.design.calibration import calibrate
-    from codesign.design.config import CalibrationConfig
-    from codesign.design.measurements import measure
+    from codesign.tools.calibration import calibrate
+    from codesign.tools.config import CalibrationConfig
+    from codesign.tools.measurements import measure
     from softgym_envs.config import check_config
     from softgym_envs.robots import make_robot
 
@@ -146,9 +146,9 @@ def sensor_front() -> dict[str, object]:
     Volume changes are in mm3, angles in degrees. It works in ``results/sensorized_finger_front``.
     """
     from benchmarks.sensor_finger import DESIGNS
-    from codesign.design.config import OptimiseConfig
-    from codesign.design.plots import draw_front
-    from codesign.design.search import search
+    from codesign.tools.config import OptimiseConfig
+    from codesign.tools.plots import draw_front
+    from codesign.tools.search import search
     from softgym_envs.config import load_config
 
     folder = Path("results/sensorized_finger_front")

@@ -21,13 +21,13 @@ from scipy.spatial.transform import Rotation
 from benchmarks.validation import box
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.assembly import Assembly
-from softgym_envs.mechanics.beams import Section
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints import Bond, EmbeddedPoints, Point
-from softgym_envs.mechanics.dynamics import SCHEMES, Dynamics, Motion
+from softgym_envs.mechanics.elements.beams import Section
+from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.rigid import box_inertia
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.dynamics import SCHEMES, Dynamics, Motion
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
 
 __all__ = ["CASES", "Row", "dynamics"]
@@ -73,7 +73,7 @@ def solid_bar(
     """A bar of 0.2 x 0.02 x 0.02 m along x, clamped at x = 0 or free."""
     nodes, tetrahedra = box(cells)
     fixed = (nodes[:, 0] == 0.0) & clamped
-    body = Assembly(floating=not clamped, **options)
+    body = ModelBuilder(floating=not clamped, **options)
     material = {"young_modulus": young_modulus, "poisson_ratio": 0.3, "density": 1000.0}
     body.add_solid(nodes * [0.2, 0.02, 0.02], tetrahedra, fixed=fixed, element=element, **material)
     model = body.build()
@@ -84,7 +84,7 @@ def solid_bar(
 
 def rod(*, clamped: bool, elements: int = 8, order: int = 2, radius: float = 0.01, **options) -> MechanicalModel:
     """A round beam of 1 m along x, clamped at x = 0 or free."""
-    body = Assembly(floating=not clamped, **options)
+    body = ModelBuilder(floating=not clamped, **options)
     frames = [
         body.add_frame([s, 0.0, 0.0], fixed=clamped and s == 0.0, fixed_spin=clamped and s == 0.0)
         for s in np.linspace(0.0, 1.0, order * elements + 1)
@@ -98,7 +98,7 @@ def rod(*, clamped: bool, elements: int = 8, order: int = 2, radius: float = 0.0
 
 def rigid_box(**options) -> MechanicalModel:
     """A free box of 1 kg with half-extents 0.1, 0.2 and 0.4 m."""
-    body = Assembly(floating=True, **options)
+    body = ModelBuilder(floating=True, **options)
     frame = body.add_frame([0.0, 0.0, 0.0])
     body.add_mass(frame, 1.0, box_inertia(1.0, np.array([0.1, 0.2, 0.4])))
     return body.build()
@@ -318,7 +318,7 @@ def pendulum(count: int, spin: Sequence[float], *, joint: str = "bond", **option
         joint: how the first bar is held: ``"bond"``, or ``"frame"``: its frame is on one at the fixed point.
         **options: of `Dynamics`.
     """
-    body = Assembly(gravity=GRAVITY, floating=joint == "bond")
+    body = ModelBuilder(gravity=GRAVITY, floating=joint == "bond")
     end = np.array([0.0, 0.0, BAR[2]])
     bars = []
     for k in range(count):
@@ -431,7 +431,7 @@ def rigid(levels: Sequence[int] = (50, 100, 200, 400)) -> list[Row]:
 def pulled_bar(**options) -> MechanicalModel:
     """A hanging bar of 0.2 m with a cable off its axis and an effector at its tip."""
     nodes, tetrahedra = box((2, 2, 8))
-    body = Assembly(gravity=GRAVITY)
+    body = ModelBuilder(gravity=GRAVITY)
     nodes = nodes * [0.02, 0.02, 0.2]
     body.add_solid(
         nodes, tetrahedra, fixed=nodes[:, 2] > 0.199, young_modulus=5e5, poisson_ratio=0.4, density=1000.0, **options

@@ -10,7 +10,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 
 #: The surrogate knows the cables up to here [m], of 20 mm.
 KNOWN = 10e-3
@@ -21,7 +21,7 @@ BAD = 1e-3
 
 def sample(robot: Robot, states: int, seed: int, *, limit: float, sequence: str = "random") -> dict[str, np.ndarray]:
     """Equilibria of the baseline body, its actuators commanded up to ``limit``."""
-    from softgym_envs.surrogate.sampling import SamplingPlan, sample_group
+    from softgym_envs.surrogate.data.sampling import SamplingPlan, sample_group
 
     full = robot.actuators
     robot.actuators = tuple(replace(actuator, high=limit) for actuator in full)
@@ -44,11 +44,11 @@ def make_weights(
     steps: int = 1500,
 ) -> None:
     """Train a surrogate of the baseline body that knows displacements up to ``limit``, and write its weights."""
+    from softgym_envs.surrogate.data.sampling import learned_variables
+    from softgym_envs.surrogate.data.states import training_states
     from softgym_envs.surrogate.model import Features, card_of
-    from softgym_envs.surrogate.networks import potential
     from softgym_envs.surrogate.online import save_model
-    from softgym_envs.surrogate.sampling import learned_variables
-    from softgym_envs.surrogate.states import training_states
+    from softgym_envs.surrogate.potential import model as potential
     from softgym_envs.surrogate.training import Trainer, domain_of
 
     training = sample(robot, states, 0, limit=limit, sequence="halton")

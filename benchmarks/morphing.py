@@ -38,7 +38,7 @@ LINES = (Line("finger", "length", 1), Line("diamond", "elbow_radius", 2))
 
 def follow(line: Line, meshing: str, points: int = POINTS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the values of the variable, W between the effector and the first cable, and the numbers of nodes."""
-    from softgym_envs.mechanics.statics import Statics
+    from softgym_envs.mechanics.solvers.statics import Statics
     from softgym_envs.robots import make_robot
 
     robot = make_robot(line.robot, meshing=meshing)

@@ -113,7 +113,7 @@ NETWORKS: dict[str, Row] = {
 
 def standardised_loss(model: Any, training: dict[str, np.ndarray], test: dict[str, np.ndarray]) -> float:
     """The test loss of the thesis: mean squared error of all entries of W and delta_free, in units of their spread."""
-    from softgym_envs.surrogate.states import full_compliance, stable_rows
+    from softgym_envs.surrogate.data.states import full_compliance, stable_rows
 
     training, test = (
         {k: v[stable] for k, v in data.items()}
@@ -139,8 +139,8 @@ def standardised_loss(model: Any, training: dict[str, np.ndarray], test: dict[st
 
 
 def _data(folder: Path, case: str, workers: int) -> dict[str, dict[str, np.ndarray]]:
-    from softgym_envs.surrogate.dataset import generate_dataset
-    from softgym_envs.surrogate.sampling import SamplingPlan
+    from softgym_envs.surrogate.data.dataset import generate_dataset
+    from softgym_envs.surrogate.data.sampling import SamplingPlan
 
     given = CASES[case]
     plans = {
@@ -165,10 +165,10 @@ def _run(path: Path, case: str, name: str, data: dict[str, dict[str, np.ndarray]
     import torch
 
     from softgym_envs.robots import make_robot
+    from softgym_envs.surrogate.data.sampling import learned_variables
+    from softgym_envs.surrogate.data.states import training_states
     from softgym_envs.surrogate.model import Features
     from softgym_envs.surrogate.networks import network_module
-    from softgym_envs.surrogate.sampling import learned_variables
-    from softgym_envs.surrogate.states import training_states
     from softgym_envs.surrogate.training import Trainer, test_errors
 
     torch.set_num_threads(1)
@@ -219,11 +219,11 @@ def _track(path: Path, case: str, data: dict[str, dict[str, np.ndarray]], size: 
 
     from benchmarks.robots import predicted_path
     from softgym_envs.robots import make_robot
+    from softgym_envs.surrogate.data.sampling import learned_variables, select_states
+    from softgym_envs.surrogate.data.states import stable_rows, training_states
     from softgym_envs.surrogate.model import Features, card_of
-    from softgym_envs.surrogate.networks import potential
     from softgym_envs.surrogate.online import save_model
-    from softgym_envs.surrogate.sampling import learned_variables, select_states
-    from softgym_envs.surrogate.states import stable_rows, training_states
+    from softgym_envs.surrogate.potential import model as potential
     from softgym_envs.surrogate.training import Trainer
 
     torch.set_num_threads(1)

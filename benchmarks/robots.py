@@ -303,7 +303,7 @@ def shared_finger(bodies: int = 5, commands: int = 12) -> dict[str, object]:
 
 def rest_compliance() -> dict[str, float]:
     """Compliance of the Stiff-Flop at rest, in the units of `PUBLISHED_COMPLIANCE`."""
-    from softgym_envs.mechanics.statics import Statics
+    from softgym_envs.mechanics.solvers.statics import Statics
     from softgym_envs.robots.stiff_flop import StiffFlop
 
     W = Statics(StiffFlop().build()).solve(np.zeros(6), "effort").condensed.W

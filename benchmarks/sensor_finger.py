@@ -25,8 +25,8 @@ import numpy as np
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConvergenceError, DataError, InfeasibleDesign
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.finger_shape import draw_finger
-from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
+from softgym_envs.robots.geometry.finger_shape import draw_finger
+from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.sensorized_finger import SensorizedFinger
 from softgym_envs.storage import atomic_write, write_json
 

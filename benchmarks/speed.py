@@ -70,8 +70,8 @@ class _Shares:
     """
 
     def __init__(self) -> None:
-        from softgym_envs.mechanics.linear_solver import CholmodSolver, SuperLUSolver
         from softgym_envs.mechanics.model import MechanicalModel
+        from softgym_envs.mechanics.solvers.linear import CholmodSolver, SuperLUSolver
 
         solvers = (CholmodSolver, SuperLUSolver)
         self.parts: list[tuple[Any, str, str]] = [
@@ -111,7 +111,7 @@ class _Shares:
 
 def fem_profile() -> dict[str, object]:
     """Where the time of a FEM step goes (milliseconds per step, default finger, increments up to 1 mm)."""
-    from softgym_envs.mechanics.statics import Statics
+    from softgym_envs.mechanics.solvers.statics import Statics
     from softgym_envs.robots import make_robot
 
     robot = make_robot("finger")
@@ -210,7 +210,7 @@ def fem_speed() -> dict[str, object]:
 def notched_beam() -> dict[str, object]:
     """Equilibrium of the notched reference beam for a 10 mm pull from rest, in one increment."""
     from softgym_envs.mechanics.model import MechanicalModel
-    from softgym_envs.mechanics.statics import Statics
+    from softgym_envs.mechanics.solvers.statics import Statics
 
     data = np.load(_BEAM / "notched_lc6_mesh.npz")
     model = MechanicalModel.from_mesh(

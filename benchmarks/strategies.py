@@ -136,7 +136,7 @@ def _truth(path: Path, values: tuple[float, ...], folder: Path) -> Path:
 
     from agents.training import train
     from codesign.folder import StudyFolder
-    from codesign.trial import assess, training_config
+    from codesign.phases.trial import assess, training_config
 
     torch.set_num_threads(1)
     study = StudyFolder.create(folder / "question", _question(**PLAIN, strategy="qp", trials=1))
@@ -245,7 +245,7 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
     from scipy.interpolate import RBFInterpolator
     from scipy.optimize import minimize
 
-    from codesign.trial import assess
+    from codesign.phases.trial import assess
 
     config = _question()
     space = config.space

@@ -14,13 +14,13 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ellipeinc, ellipk, ellipkinc
 
-from softgym_envs.mechanics.assembly import SOLIDS, Assembly
-from softgym_envs.mechanics.beams import Section
+from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
 from softgym_envs.mechanics.constraints import Cavity, Chamber, EmbeddedPoints, Point
+from softgym_envs.mechanics.elements.beams import Section
+from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 
 __all__ = ["CASES", "Row", "validation"]
 
@@ -162,7 +162,7 @@ def clamped_beam(
     curve: Callable[[float], tuple[np.ndarray, np.ndarray]], elements: int, order: int, section: Section, **options
 ) -> MechanicalModel:
     """A beam along a curve on [0, 1] (position, rotation), clamped at 0, with an effector at 1."""
-    body = Assembly()
+    body = ModelBuilder()
     places = np.linspace(0.0, 1.0, order * elements + 1)
     frames = [body.add_frame(*curve(t), fixed=t == 0.0, fixed_spin=t == 0.0) for t in places]
     body.add_beam(frames, section=section, order=order, **options)
@@ -577,7 +577,7 @@ def finger(halvings: int = 1, ratios: Sequence[float] = (0.3, 0.47, 0.499)) -> l
             if level:
                 nodes, tetrahedra, fixed = halved(nodes, tetrahedra, fixed)
             for element in SOLIDS:
-                body = Assembly()
+                body = ModelBuilder()
                 young = design["young_modulus"]
                 body.add_solid(nodes, tetrahedra, fixed=fixed, element=element, young_modulus=young, poisson_ratio=nu)
                 model = body.build()

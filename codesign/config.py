@@ -15,7 +15,7 @@ from codesign.objectives import OBJECTIVES
 from softgym_envs.config import Config
 from softgym_envs.designs import DesignSpace
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 
 __all__ = [
     "JOURNAL",

@@ -10,7 +10,7 @@ import numpy as np
 
 from codesign.config import JOURNAL, StudyConfig
 from codesign.goals import draw_goals
-from codesign.storages import StudyStorage, file_lock, open_storage
+from codesign.scheduling.storage import StudyStorage, file_lock, open_storage
 from softgym_envs.config import check_config, load_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.storage import atomic_write, read_json, write_json
@@ -70,7 +70,7 @@ class StudyFolder:
             ConfigError: if the folder, or the study of this name in the database, is of another study, or FEM does not
                 take ``finalists.fem_options``.
         """
-        from codesign.finalists import check_tests  # whose module needs this one
+        from codesign.phases.finalists import check_tests  # whose module needs this one
 
         folder = cls(path)
         folder.path.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ class StudyFolder:
 
     def _agree(self, config: StudyConfig, shown: str, wait: bool) -> dict[str, Any]:
         """Agree with the other machines on configuration and goals of a study; return the goals."""
-        from codesign.postgres import PostgresStorage
+        from codesign.scheduling.postgres import PostgresStorage
 
         storage = PostgresStorage(
             config.storage, config.name, grace=config.heartbeat, patience=config.patience, wait=wait
@@ -156,7 +156,7 @@ class StudyFolder:
         return read_json(path) if path.exists() else {"command": "", "wall_seconds": {}}
 
     def lock(self, name: str) -> BaseFileLock:
-        """Return a lock shared by all processes of the folder; see `codesign.storages.file_lock`."""
+        """Return a lock shared by all processes of the folder; see `codesign.scheduling.storage.file_lock`."""
         return file_lock(self.path, name)
 
     def policy(self, name: str) -> Path:

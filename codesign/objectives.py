@@ -14,7 +14,7 @@ class Objective:
     """One way to judge an evaluation.
 
     Args:
-        key: field of a trial's evaluation, see `codesign.trial.assess`.
+        key: field of a trial's evaluation, see `codesign.phases.trial.assess`.
         label: for people.
         unit: unit that people read.
         scale: from SI to ``unit``.

@@ -15,16 +15,16 @@ import numpy as np
 
 from agents.policy import Policy
 from codesign.config import StudyConfig
-from codesign.finalists import finalist_jobs
 from codesign.folder import StudyFolder
-from codesign.jobs import missing_jobs
-from codesign.judge import judge_jobs, promising_bodies
-from codesign.ledger import Ledger, distributions, make_pruner, make_sampler
 from codesign.objectives import OBJECTIVES
-from codesign.processes import run_workers
-from codesign.results import write_results
-from codesign.screen import kept_bodies, screen_jobs
-from softgym_envs.envs.soft_robot_env import design_names
+from codesign.phases.finalists import finalist_jobs
+from codesign.phases.screen import kept_bodies, screen_jobs
+from codesign.phases.shared_policy import judge_jobs, promising_bodies
+from codesign.report.results import write_results
+from codesign.scheduling.jobs import missing_jobs
+from codesign.scheduling.processes import run_workers
+from codesign.scheduling.queue import Ledger, distributions, make_pruner, make_sampler
+from softgym_envs.envs.env import design_names
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign, SoftGymError
 from softgym_envs.storage import read_json, write_json
 

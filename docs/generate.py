@@ -22,15 +22,15 @@ import numpy as np
 
 import softgym_envs  # noqa: F401 - registers the environments
 from softgym_envs.backends import BACKENDS
-from softgym_envs.envs.interface import Interface
+from softgym_envs.envs.env import SoftRobotEnv
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.envs.soft_robot_env import SoftRobotEnv
-from softgym_envs.envs.task import TASKS, Task
-from softgym_envs.mechanics.beams import Beam
-from softgym_envs.mechanics.block import ElementBlock
-from softgym_envs.mechanics.tetrahedra import SolidBlock
+from softgym_envs.envs.spaces import Interface
+from softgym_envs.envs.tasks.base import TASKS, Task
+from softgym_envs.mechanics.elements.beams import Beam
+from softgym_envs.mechanics.elements.block import ElementBlock
+from softgym_envs.mechanics.elements.tetrahedra import SolidBlock
 from softgym_envs.robots import ROBOTS, make_robot
-from softgym_envs.robots.robot import Actuator, Robot
+from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.surrogate.pretrained import pretrained_folder
 
 ROOT = Path(__file__).resolve().parent
@@ -309,7 +309,7 @@ def robot_sections(name: str) -> dict[str, Callable[[], str]]:
 
     def weights() -> str:
         if pretrained_folder(robot).is_dir():
-            return f"Weights of a surrogate ship for the default options (`{robot.variant}`)."
+            return f"Weights of a surrogate ship for the default options (`{robot.weights_name}`)."
         return "No surrogate ships for the default options: environments run on FEM; `softgym fit` makes one."
 
     def environments() -> str:
@@ -347,7 +347,7 @@ def summary(identifier: str) -> str:
 
 def observation_scales(robot: Robot) -> dict[str, float]:
     """Scales of positions, errors [m] and speeds [m/s] in the observation (a test compares them with the real one)."""
-    return {"position": 1.25 * robot.size, "error": robot.motion / 2.5, "speed": robot.size}
+    return {"position": 1.25 * robot.size, "error": robot.workspace_scale / 2.5, "speed": robot.size}
 
 
 def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
@@ -417,7 +417,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
     def rewards() -> str:
         if task_class.reward_terms is not Task.reward_terms:
             return code(inspect.cleandoc(task_class.reward_terms.__doc__ or "")).partition("\nArgs:")[0]
-        near, far = quantity(task.success_distance, "m"), quantity(robot.motion, "m")
+        near, far = quantity(task.success_distance, "m"), quantity(robot.workspace_scale, "m")
         terms = (
             f"* distance: `(t(d, {near}) + t(d, {far})) / 2` with `t(d, m) = 1 / (1 + 9 (d / m)^2)` and `d` the "
             f"distance of the effector to the goal{along};\n"

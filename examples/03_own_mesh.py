@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 
 # A bar of 100 x 20 x 20 mm, in millimetres as most programs write it.
 axes = np.linspace(0, 100, 11), np.linspace(0, 20, 4), np.linspace(0, 20, 4)

@@ -17,7 +17,7 @@ from softgym_envs.errors import ConfigError, SoftGymError
 from softgym_envs.version import __version__
 
 if TYPE_CHECKING:
-    from softgym_envs.robots.robot import Robot
+    from softgym_envs.robots.base import Robot
 
 __all__ = ["main"]
 
@@ -95,7 +95,7 @@ def list_() -> None:
     """List environments, robots, backends and tasks."""
     from softgym_envs.backends import BACKENDS
     from softgym_envs.envs.registration import ENVIRONMENTS
-    from softgym_envs.envs.task import TASKS
+    from softgym_envs.envs.tasks.base import TASKS
     from softgym_envs.robots import ROBOTS
 
     click.echo("environments:")
@@ -126,10 +126,10 @@ def _robot(name: str, options: tuple[str, ...]) -> Robot:
 @click.option("--picture", type=click.Path(path_type=Path), help="Write a PNG of the body.")
 def show(robot: str, options: tuple[str, ...], design: tuple[str, ...], picture: Path | None) -> None:
     """Show a robot: its design space, actuators and mesh."""
-    from softgym_envs.robots.robot import MeshedRobot
+    from softgym_envs.robots.base import MeshedRobot
 
     body = _robot(robot, options)
-    click.echo(f"{robot} ({body.variant})\n\ndesign variables:")
+    click.echo(f"{robot} ({body.weights_name})\n\ndesign variables:")
     for variable in body.design_space.variables.values():
         unit = "" if variable.unit == "1" else f" {variable.unit}"
         bounds = f"[{variable.low:g}, {variable.high:g}]{unit}"
@@ -167,8 +167,8 @@ def export(
     robot: str, files: tuple[Path, ...], options: tuple[str, ...], design: tuple[str, ...], moulds: Path | None
 ) -> None:
     """Write a body to FILES ending with .step or .stl (in millimetres), or the moulds it is cast in."""
-    from softgym_envs.robots.export import export_body
-    from softgym_envs.robots.moulds import export_moulds
+    from softgym_envs.robots.geometry.export import export_body
+    from softgym_envs.robots.geometry.moulds import export_moulds
 
     if not files and moulds is None:
         raise ConfigError("nothing to write: name a file ending with .step or .stl, or a folder with --moulds")
@@ -429,7 +429,7 @@ def codesign(
 ) -> None:
     """Optimise body and controller together; resumes, and ends with a report."""
     from codesign.config import StudyConfig
-    from codesign.report import write_report
+    from codesign.report.page import write_report
     from codesign.study import run_study
     from softgym_envs.config import load_config
 
@@ -451,8 +451,8 @@ _results = click.option("--folder", type=click.Path(path_type=Path), help="Where
 @_overrides
 def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
     """Show which design variables matter: one at a time, Morris or Sobol; resumes."""
-    from codesign.design.config import SensitivityConfig
-    from codesign.design.sensitivity import analyse
+    from codesign.tools.config import SensitivityConfig
+    from codesign.tools.sensitivity import analyse
     from softgym_envs.config import load_config
 
     study = load_config(config, SensitivityConfig, overrides)
@@ -475,9 +475,9 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
 @_overrides
 def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
     """Search the best bodies without a controller, by Optuna (resumes) or along gradients."""
-    from codesign.design import gradient
-    from codesign.design.config import OptimiseConfig
-    from codesign.design.search import search
+    from codesign.tools import gradient
+    from codesign.tools.config import OptimiseConfig
+    from codesign.tools.search import search
     from softgym_envs.config import load_config
 
     study = load_config(config, OptimiseConfig, overrides)
@@ -504,8 +504,8 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
 @_overrides
 def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> None:
     """Fit design variables to measured states in a CSV or JSON file."""
-    from codesign.design.calibration import calibrate as run
-    from codesign.design.config import CalibrationConfig
+    from codesign.tools.calibration import calibrate as run
+    from codesign.tools.config import CalibrationConfig
     from softgym_envs.config import load_config
 
     study = load_config(config, CalibrationConfig, overrides)

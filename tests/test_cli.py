@@ -110,8 +110,8 @@ STRENGTH = "configs/design/finger_strength.yaml"
         (["train", "--config", CONFIG, "--folder", "x", "environment.action_mode=foo"], ["action_mode", "foo"]),
         (["train", "--config", CONFIG, "--folder", "x", "environment.task_options={foo: 1}"], ["task 'reach'", "foo"]),
         (
-            ["train", "--config", CONFIG, "--folder", "x", "initial=finger_reach", "environment.on_qp=0.5"],
-            ["environment.on_qp = 0.5", "finger_reach", "0.0"],
+            ["train", "--config", CONFIG, "--folder", "x", "initial=finger_reach", "environment.residual_scale=0.5"],
+            ["environment.residual_scale = 0.5", "finger_reach", "0.0"],
         ),
         (["evaluate", "--config", CONFIG, "--goals", "0"], ["goals", "0"]),
         (
@@ -148,8 +148,8 @@ def test_malformed_files(monkeypatch, capsys, tmp_path, text):
     [
         ("agents.training", "train", ["train", "--config", CONFIG, "--folder", "x"], True),
         ("agents.evaluation", "evaluate", ["evaluate", "--config", CONFIG, "--goals", "1"], False),
-        ("codesign.design.search", "search", ["optimise", "--config", FRONT], True),
-        ("codesign.design.gradient", "optimise", ["optimise", "--config", STRENGTH], False),
+        ("codesign.tools.search", "search", ["optimise", "--config", FRONT], True),
+        ("codesign.tools.gradient", "optimise", ["optimise", "--config", STRENGTH], False),
     ],
 )
 def test_a_stopped_verb_says_so_and_goes_on_only_where_it_can(

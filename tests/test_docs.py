@@ -11,8 +11,8 @@ import yaml
 
 from codesign.config import StudyConfig
 from softgym_envs.config import check_config
-from softgym_envs.envs.interface import Interface
 from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.envs.spaces import Interface
 from softgym_envs.robots import ROBOTS
 from softgym_envs.surrogate.training import FitConfig
 

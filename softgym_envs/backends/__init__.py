@@ -8,7 +8,7 @@ from softgym_envs.registry import make_registered
 
 if TYPE_CHECKING:
     from softgym_envs.backends.backend import Backend
-    from softgym_envs.robots.robot import Robot
+    from softgym_envs.robots.base import Robot
 
 __all__ = ["BACKENDS", "make_backend"]
 

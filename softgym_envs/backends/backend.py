@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from softgym_envs.mechanics.condensation import CondensedModel
-from softgym_envs.mechanics.dynamics import Motion
-from softgym_envs.robots.robot import Robot
+from softgym_envs.mechanics.solvers.dynamics import Motion
+from softgym_envs.robots.base import Robot
 
 __all__ = ["Backend", "State"]
 

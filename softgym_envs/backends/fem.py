@@ -9,10 +9,10 @@ import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.statics import Equilibrium, Statics
-from softgym_envs.robots.robot import Robot
+from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
+from softgym_envs.mechanics.solvers.statics import Equilibrium, Statics
+from softgym_envs.robots.base import Robot
 
 __all__ = ["FEMBackend"]
 

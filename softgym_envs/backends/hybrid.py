@@ -16,11 +16,11 @@ from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBackend, at_rest
 from softgym_envs.errors import ConvergenceError, DataError
-from softgym_envs.mechanics.complementarity import solve_complementarity
-from softgym_envs.robots.robot import Robot
+from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
+from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import load_model
-from softgym_envs.surrogate.networks.potential import Model
 from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of, save_model
+from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_model
 
 __all__ = ["HybridBackend"]
@@ -57,8 +57,8 @@ class HybridBackend(SurrogateBackend):
             kept and taken up again; default in memory alone.
         retrain_after: new states of the finite elements after which the ensemble learns; 0 never.
         steps: steps of Adam for each member each time.
-        tolerance: uncertainty of the effector that is accepted [m]; default a tenth of the robot's ``precision``. The
-            limit of the weights is accepted in any case.
+        tolerance: uncertainty of the effector that is accepted [m]; default a tenth of the robot's ``goal_tolerance``.
+            The limit of the weights is accepted in any case.
         seed: of the learning.
 
     Attributes:
@@ -93,7 +93,7 @@ class HybridBackend(SurrogateBackend):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ValueError(f"{name} = {value!r} must be a whole number of {least} or more")
         if tolerance is None:
-            tolerance = 0.1 * robot.precision
+            tolerance = 0.1 * robot.goal_tolerance
         elif not (np.isfinite(tolerance) and tolerance > 0.0):
             raise ValueError(f"tolerance = {tolerance} m must be positive and finite")
         self.robot = robot

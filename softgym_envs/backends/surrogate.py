@@ -12,7 +12,7 @@ import numpy as np
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_model
 

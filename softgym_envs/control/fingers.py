@@ -22,10 +22,10 @@ import numpy as np
 
 from softgym_envs.control.coupling import cross_matrix
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.complementarity import solve_complementarity
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.frames import frame_rows, rotation_vector_matrix
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.contact_finger import ContactFinger
 from softgym_envs.robots.grippers import FingerRobot
 from softgym_envs.surrogate.model import Context, SurrogateModel

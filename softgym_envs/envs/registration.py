@@ -61,7 +61,7 @@ def register_environments() -> None:
         if identifier not in gymnasium.registry:
             gymnasium.register(
                 id=identifier,
-                entry_point="softgym_envs.envs.soft_robot_env:SoftRobotEnv",
+                entry_point="softgym_envs.envs.env:SoftRobotEnv",
                 # Only the surrogate is batched; without an entry point make_vec steps single environments in turn.
                 vector_entry_point=(
                     "softgym_envs.envs.vector_env:SoftRobotVectorEnv" if row.backend == "surrogate" else None

@@ -18,15 +18,15 @@ import torch
 from torch import Tensor
 
 from softgym_envs.backends.surrogate import TOLERANCE
-from softgym_envs.envs.interface import Interface
-from softgym_envs.envs.reach import Reach
+from softgym_envs.envs.env import design_names
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.envs.soft_robot_env import design_names
-from softgym_envs.envs.task import make_task
-from softgym_envs.envs.track import Track
+from softgym_envs.envs.spaces import Interface
+from softgym_envs.envs.tasks.base import make_task
+from softgym_envs.envs.tasks.reach import Reach
+from softgym_envs.envs.tasks.track import Track
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots import make_robot
-from softgym_envs.surrogate.networks import potential
+from softgym_envs.surrogate.potential import model as potential
 from softgym_envs.surrogate.pretrained import pretrained_model
 
 __all__ = ["TorchVectorEnv"]
@@ -720,9 +720,10 @@ class TorchVectorEnv:
         effector, relative = state["effector"], state["effort"] / self._typical_effort
         error = self._axes * (goal - effector)
         distance = torch.linalg.vector_norm(error, dim=1)
-        near, far = (1.0 / (1.0 + 9.0 * (distance / m) ** 2) for m in (self.task.success_distance, self.robot.motion))
+        margins = self.task.success_distance, self.robot.workspace_scale
+        near, far = (1.0 / (1.0 + 9.0 * (distance / m) ** 2) for m in margins)
         terms = {"distance": 0.5 * (near + far), "effort": 1.0 - 0.05 * relative.abs().mean(dim=1).clamp(0.0, 1.0)}
-        error = error * (2.5 / self.robot.motion)
+        error = error * (2.5 / self.robot.workspace_scale)
         reach = 1.25 * self.robot.size
         parts = (
             state["command"],

@@ -10,9 +10,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from softgym_envs.backends.surrogate import Settled, at_rest, settle
-from softgym_envs.envs.interface import Interface
-from softgym_envs.envs.soft_robot_env import design_names, merge_defaults
-from softgym_envs.envs.task import make_task
+from softgym_envs.envs.env import design_names, merge_defaults
+from softgym_envs.envs.spaces import Interface
+from softgym_envs.envs.tasks.base import make_task
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots import make_robot

@@ -15,13 +15,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.errors import DataError
-from softgym_envs.mechanics.block import ElementBlock
 from softgym_envs.mechanics.constraints import Cable, Constraint, EmbeddedPoints, Point
+from softgym_envs.mechanics.elements.block import ElementBlock
+from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra
 from softgym_envs.mechanics.frames import Frames, KinematicMap
-from softgym_envs.mechanics.linear_solver import LinearSolver, make_solver
 from softgym_envs.mechanics.materials import Material
 from softgym_envs.mechanics.skins import Skin
-from softgym_envs.mechanics.tetrahedra import SolidBlock, Tetrahedra
+from softgym_envs.mechanics.solvers.linear import LinearSolver, make_solver
 
 __all__ = ["Inertia", "MechanicalModel", "read_mesh"]
 

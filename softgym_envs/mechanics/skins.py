@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softgym_envs.mechanics.beams import Beam
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.elements.beams import Beam
 
 __all__ = ["Skin", "box_skin", "tube_skin"]
 

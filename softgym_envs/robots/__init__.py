@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from softgym_envs.registry import make_registered
 
 if TYPE_CHECKING:
-    from softgym_envs.robots.robot import Robot
+    from softgym_envs.robots.base import Robot
 
 __all__ = ["ROBOTS", "make_robot"]
 

@@ -13,7 +13,7 @@ import numpy as np
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.robot import Actuator, Robot
+from softgym_envs.robots.base import Actuator, Robot
 
 __all__ = ["CableTrunk"]
 
@@ -143,12 +143,12 @@ class CableTrunk(Robot):
         )
 
     @property
-    def variant(self) -> str:
+    def weights_name(self) -> str:
         """``cable_trunk``."""
         return "cable_trunk"
 
     @property
-    def signature(self) -> dict[str, object]:
+    def mechanics_key(self) -> dict[str, object]:
         """Options that change the condensed model (a cable that may push has the same one)."""
         return {
             "layers": self.layers,

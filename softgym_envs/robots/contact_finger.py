@@ -19,8 +19,8 @@ import numpy as np
 
 from softgym_envs.mechanics.constraints import Point, Pose
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.base import Actuator
 from softgym_envs.robots.grippers import STRAIGHT, FingerRobot
-from softgym_envs.robots.robot import Actuator
 
 __all__ = ["ContactFinger"]
 

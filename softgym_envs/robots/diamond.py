@@ -12,10 +12,10 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
-from softgym_envs.robots.morphing import Feature, Plane
-from softgym_envs.robots.robot import Actuator, MeshedRobot
-from softgym_envs.robots.symmetry import mirrored
+from softgym_envs.robots.base import Actuator, MeshedRobot
+from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
+from softgym_envs.robots.geometry.morphing import Feature, Plane
+from softgym_envs.robots.geometry.symmetry import mirrored
 
 __all__ = ["Diamond"]
 
@@ -118,12 +118,12 @@ class Diamond(MeshedRobot):
         )
 
     @property
-    def variant(self) -> str:
+    def weights_name(self) -> str:
         """``diamond``."""
         return "diamond"
 
     @property
-    def signature(self) -> dict[str, object]:
+    def mechanics_key(self) -> dict[str, object]:
         """Options that change the condensed model (a cable that may push has the same one)."""
         return {
             "mesh_size": self.mesh_size,

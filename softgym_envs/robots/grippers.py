@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.mechanics.assembly import Assembly
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints import Bond, EmbeddedPoints, Point
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin
-from softgym_envs.robots.robot import Actuator, Robot
+from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.soft_finger import SoftFinger
 
 __all__ = ["FingerRobot", "PressFinger", "ThreeFingerGripper", "TwoFingerGripper"]
@@ -73,14 +73,14 @@ class FingerRobot(Robot):
         self.stiffness_variable = "young_modulus" if self.scales and not any(gravity) else None
 
     @property
-    def variant(self) -> str:
+    def weights_name(self) -> str:
         """Name of the gripper."""
         return self.name
 
     @property
-    def signature(self) -> dict[str, object]:
+    def mechanics_key(self) -> dict[str, object]:
         """Options that change the condensed model."""
-        return {"finger": self.finger.signature, "gravity": list(self.gravity)}
+        return {"finger": self.finger.mechanics_key, "gravity": list(self.gravity)}
 
     def variables(self) -> tuple[DesignVariable, ...]:
         """Design variables: those of the finger, and more if there are any."""
@@ -104,7 +104,7 @@ class FingerRobot(Robot):
         self._shape = {name: design[name] for name in names}
         mesh = self.finger.body(self._shape)
         fixed = self.finger.clamped(mesh)
-        assembly = Assembly(gravity=self.gravity)
+        assembly = ModelBuilder(gravity=self.gravity)
         for turn, shift in self.placements:
             assembly.add_solid(
                 mesh.nodes @ turn.T + shift,
@@ -171,7 +171,7 @@ class PressFinger(FingerRobot):
     placements = ((STRAIGHT, (0.0, 0.0, 0.0)),)
     half_extents = (13.75e-3, 13.75e-3, 13.75e-3)
     goal_axes = np.array([0.0, 1.0, 0.0])
-    precision = 5e-4
+    goal_tolerance = 5e-4
     scales = False  # the button's force stays what it is
 
     def __init__(
@@ -192,9 +192,9 @@ class PressFinger(FingerRobot):
         )
 
     @property
-    def signature(self) -> dict[str, object]:
+    def mechanics_key(self) -> dict[str, object]:
         """Options that change the condensed model."""
-        return {**super().signature, "button_force": self.button_force}
+        return {**super().mechanics_key, "button_force": self.button_force}
 
     def variables(self) -> tuple[DesignVariable, ...]:
         """Those of the finger, without bodies so soft that the button folds them."""
@@ -238,7 +238,7 @@ class TwoFingerGripper(FingerRobot):
     effectors = ("bar",)
     placements = ((STRAIGHT, (0.0, 0.0, 0.0)), (TURNED, (0.0, 0.080, 0.0)))
     goal_axes = np.array([1.0, 1.0, 0.0])
-    precision = 5e-4
+    goal_tolerance = 5e-4
 
     def variables(self) -> tuple[DesignVariable, ...]:
         """Those of the finger and the length of the bar."""
@@ -283,8 +283,8 @@ class ThreeFingerGripper(FingerRobot):
     )
     half_extents = (35.0e-3, 13.75e-3, 13.75e-3)
     cable_range = (-0.002, 0.020)
-    motion = 0.004
-    precision = 1e-4
+    workspace_scale = 0.004
+    goal_tolerance = 1e-4
 
     def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
         """Centre of the cube, between the fingers."""

@@ -17,11 +17,11 @@ from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.constraints import Cavity
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.statics import Statics
-from softgym_envs.robots.finger_shape import FLANGE, THICKNESS, check_finger, draw_finger, finger_features
-from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
-from softgym_envs.robots.morphing import Feature
-from softgym_envs.robots.robot import Actuator, MeshedRobot
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.base import Actuator, MeshedRobot
+from softgym_envs.robots.geometry.finger_shape import FLANGE, THICKNESS, check_finger, draw_finger, finger_features
+from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
+from softgym_envs.robots.geometry.morphing import Feature
 
 __all__ = ["SensorReadings", "SensorizedFinger"]
 
@@ -130,12 +130,12 @@ class SensorizedFinger(MeshedRobot):
         self.actuators = (Actuator("cable", 0.0, 0.015, 0.001, unilateral=unilateral),)
 
     @property
-    def variant(self) -> str:
+    def weights_name(self) -> str:
         """``sensorized_finger_2cavities`` or ``sensorized_finger_4cavities``."""
         return f"sensorized_finger_{self.cavities}cavities"
 
     @property
-    def signature(self) -> dict[str, object]:
+    def mechanics_key(self) -> dict[str, object]:
         """Options that change the condensed model (a cable that may push has the same one)."""
         return {
             "cavities": self.cavities,

@@ -14,10 +14,10 @@ import numpy as np
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.constraints import Point
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.finger_shape import FLANGE, check_finger, draw_finger, finger_features
-from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
-from softgym_envs.robots.morphing import Feature
-from softgym_envs.robots.robot import Actuator, Drawing, MeshedRobot
+from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
+from softgym_envs.robots.geometry.finger_shape import FLANGE, check_finger, draw_finger, finger_features
+from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
+from softgym_envs.robots.geometry.morphing import Feature
 
 __all__ = ["SoftFinger"]
 
@@ -97,12 +97,12 @@ class SoftFinger(MeshedRobot):
         )
 
     @property
-    def variant(self) -> str:
+    def weights_name(self) -> str:
         """``finger_1cable`` or ``finger_2cables``."""
         return "finger_1cable" if self.cables == 1 else "finger_2cables"
 
     @property
-    def signature(self) -> dict[str, object]:
+    def mechanics_key(self) -> dict[str, object]:
         """Options that change the condensed model (a cable that may push has the same one)."""
         return {
             "cables": self.cables,

@@ -13,12 +13,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.mechanics.assembly import Assembly
-from softgym_envs.mechanics.beams import Beam, Section
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints import Chamber, EmbeddedPoints, Point
+from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import tube_skin
-from softgym_envs.robots.robot import Actuator, Robot
+from softgym_envs.robots.base import Actuator, Robot
 
 __all__ = ["StiffFlop"]
 
@@ -89,12 +89,12 @@ class StiffFlop(Robot):
         )
 
     @property
-    def variant(self) -> str:
+    def weights_name(self) -> str:
         """``trunk``."""
         return "trunk"
 
     @property
-    def signature(self) -> dict[str, object]:
+    def mechanics_key(self) -> dict[str, object]:
         """Options that change the condensed model."""
         return {"elements": self.elements, "gravity": list(self.gravity)}
 
@@ -102,7 +102,7 @@ class StiffFlop(Robot):
         """Lay out the frames along the axis, the beam elements, the chambers and the tip."""
         length, radius = design["module_length"], design["outer_radius"]
         soft = length - STIFF_LENGTH
-        assembly = Assembly(gravity=self.gravity)
+        assembly = ModelBuilder(gravity=self.gravity)
         # Two half elements per element; each module is a soft part and a stiff end piece of one element.
         soft_ends = np.linspace(0.0, soft, 2 * self.elements + 1)
         stations = [0.0]

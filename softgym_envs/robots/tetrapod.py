@@ -12,14 +12,14 @@ import numpy as np
 from scipy.optimize import brentq
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.mechanics.assembly import Assembly
-from softgym_envs.mechanics.beams import Beam, Section
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints import EmbeddedPoints, Point, Servo
+from softgym_envs.mechanics.elements.beams import Beam, Section
+from softgym_envs.mechanics.elements.rigid import sphere_inertia
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.rigid import sphere_inertia
 from softgym_envs.mechanics.skins import box_skin, tube_skin
-from softgym_envs.robots.robot import Actuator, Robot
+from softgym_envs.robots.base import Actuator, Robot
 
 __all__ = ["Tetrapod"]
 
@@ -94,19 +94,19 @@ class Tetrapod(Robot):
         )
 
     @property
-    def variant(self) -> str:
+    def weights_name(self) -> str:
         """``tetrapod``."""
         return "tetrapod"
 
     @property
-    def signature(self) -> dict[str, object]:
+    def mechanics_key(self) -> dict[str, object]:
         """Options that change the condensed model."""
         return {"payload": self.payload, "elements": self.elements, "gravity": list(self.gravity)}
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Lay out servos, legs and centre, bent as a first guess; the equilibrium is found by the solver."""
         radius, length = design["servo_radius"], design["leg_length"]
-        assembly = Assembly(gravity=self.gravity)
+        assembly = ModelBuilder(gravity=self.gravity)
         middle = HANGING * UP
         centre = assembly.add_frame(middle)
         mass = CENTRE_MASS + self.payload

@@ -1,6 +1,6 @@
 """Trained condensed models outside Python: a C header for microcontrollers, an ONNX graph for everything else.
 
-Both compute what `softgym_envs.surrogate.networks.potential.Model` computes, in single precision. The header holds one
+Both compute what `softgym_envs.surrogate.potential.model.Model` computes, in single precision. The header holds one
 body, prepared once, and needs nothing but ``math.h``; the graph takes the design as an input.
 """
 
@@ -20,7 +20,7 @@ from softgym_envs.version import __version__
 
 if TYPE_CHECKING:
     from softgym_envs.surrogate.model import SurrogateModel
-    from softgym_envs.surrogate.networks.potential import Model
+    from softgym_envs.surrogate.potential.model import Model
 
 __all__ = ["FORMATS", "export_c", "export_onnx"]
 
@@ -111,7 +111,7 @@ def _check_path(path: str | Path, ending: str) -> Path:
 
 def _potential(model: SurrogateModel, members: int | None) -> Model:
     """The model with the first of its members only."""
-    from softgym_envs.surrogate.networks.potential import Model
+    from softgym_envs.surrogate.potential.model import Model
 
     if not isinstance(model, Model):
         raise ValueError(f"a model of network '{model.network}' cannot be exported; allowed: 'potential'")
@@ -236,8 +236,8 @@ def _header(model: Model, design: Mapping[str, float], name: str) -> str:
     about = [
         f"Condensed model of a soft robot, written by softgym-envs {__version__} (C99, header format 1).",
         "",
-        f"Robot      {robot.name} ({robot.variant})",
-        f"Options    {json.dumps(robot.signature)}",
+        f"Robot      {robot.name} ({robot.weights_name})",
+        f"Options    {json.dumps(robot.mechanics_key)}",
         *(f"{'Design' if k == 0 else '':10s} {key} = {design[key]!r}{units[key]}" for k, key in enumerate(variables)),
         *(
             f"{'Actuators' if k == 0 else '':10s} {k}: {a['name']}, {a['low']:g} to {a['high']:g} {a['unit']}, "
@@ -650,7 +650,7 @@ def _features(model: Model, g: _Builder) -> Any:
 
 def _graph(model: Model, onnx: Any) -> Any:
     """The graph; values of members are (M, B, ...)."""
-    from softgym_envs.surrogate.networks.potential import body_parts
+    from softgym_envs.surrogate.potential.model import body_parts
 
     g = _Builder(onnx)
     n, e, w = model.count, model.effectors, model.width
@@ -753,7 +753,7 @@ def _finished(model: Model, g: _Builder) -> Any:
     robot = model.robot
     inputs = [tensor("design", len(robot.design_space)), tensor("displacement", model.count)]
     outputs = [tensor("effort", model.count), tensor("effector", model.effectors), tensor("W", size, size)]
-    graph = helper.make_graph(g.nodes, robot.variant, inputs, outputs, initializer=g.constants)
+    graph = helper.make_graph(g.nodes, robot.weights_name, inputs, outputs, initializer=g.constants)
     opset = [helper.make_opsetid("", OPSET)]
     made = helper.make_model(graph, opset_imports=opset, ir_version=IR_VERSION, producer_name="softgym-envs")
     made.producer_version = __version__
@@ -767,8 +767,8 @@ def _finished(model: Model, g: _Builder) -> Any:
     ]
     properties = {
         "robot": robot.name,
-        "variant": robot.variant,
-        "signature": json.dumps(robot.signature),
+        "variant": robot.weights_name,
+        "signature": json.dumps(robot.mechanics_key),
         "design": json.dumps(variables),
         "displacement": json.dumps(_actuators(model)),
         "effector": json.dumps({"names": robot.effectors, "coordinates": "xyz", "unit": "m"}),

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from softgym_envs.surrogate.networks import potential
-from softgym_envs.surrogate.networks.potential_torch import PotentialNet
+from softgym_envs.surrogate.potential import model as potential
+from softgym_envs.surrogate.potential.network import PotentialNet
 
 __all__ = ["TorchModel"]
 

@@ -19,11 +19,11 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace
 from softgym_envs.errors import WeightsError
-from softgym_envs.mechanics.complementarity import solve_rows
 from softgym_envs.mechanics.condensation import CondensedModel, Roles
-from softgym_envs.robots.robot import Robot
+from softgym_envs.mechanics.solvers.complementarity import solve_rows
+from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.data.sampling import learned_variables
 from softgym_envs.surrogate.networks import network_module
-from softgym_envs.surrogate.sampling import learned_variables
 
 __all__ = ["Context", "Features", "SurrogateModel", "card_of", "load_model"]
 
@@ -335,7 +335,7 @@ def card_of(robot: Robot, network: str) -> dict[str, Any]:
         "format": FORMAT,
         "network": network,
         "robot": robot.name,
-        "signature": robot.signature,
+        "signature": robot.mechanics_key,
         "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
         "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
     }
@@ -371,8 +371,8 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
         module = network_module(str(card.get("network")))
     except ValueError as error:
         raise WeightsError(f"'{card_path}': {error}") from None
-    if card.get("robot") != robot.name or card.get("signature") != robot.signature:
-        wanted = {"robot": robot.name, **robot.signature}
+    if card.get("robot") != robot.name or card.get("signature") != robot.mechanics_key:
+        wanted = {"robot": robot.name, **robot.mechanics_key}
         found = {"robot": card.get("robot"), **card.get("signature", {})}
         different = sorted(k for k in wanted if wanted[k] != found.get(k))
         raise WeightsError(

@@ -37,12 +37,12 @@ import numpy as np
 
 from softgym_envs.config import provenance
 from softgym_envs.errors import DataError, WeightsError
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write, read_npz, write_json
-from softgym_envs.surrogate.dataset import COLUMNS
+from softgym_envs.surrogate.data.dataset import COLUMNS
+from softgym_envs.surrogate.data.states import GROWTH, States, stable_rows, training_states
 from softgym_envs.surrogate.model import SurrogateModel
-from softgym_envs.surrogate.networks.potential import Model, _targets, potential_loss, stack_members, unstack_members
-from softgym_envs.surrogate.states import GROWTH, States, stable_rows, training_states
+from softgym_envs.surrogate.potential.model import Model, _targets, potential_loss, stack_members, unstack_members
 
 __all__ = ["StateStore", "check_ensemble", "fine_tune", "is_of", "rehearsal_states", "save_model"]
 
@@ -89,7 +89,7 @@ class StateStore:
         folder: where they are kept, or None for memory alone. What it holds is read.
 
     Attributes:
-        data: all states, columns of `softgym_envs.surrogate.dataset.COLUMNS`; shards one after the other.
+        data: all states, columns of `softgym_envs.surrogate.data.dataset.COLUMNS`; shards one after the other.
         count: states in it, without rest states.
 
     Raises:
@@ -106,7 +106,7 @@ class StateStore:
         self._parts: list[dict[str, np.ndarray]] = []
         if self.folder is None:
             return
-        asked = json.loads(json.dumps({"format": _FORMAT, "robot": robot.name, "signature": robot.signature}))
+        asked = json.loads(json.dumps({"format": _FORMAT, "robot": robot.name, "signature": robot.mechanics_key}))
         path = self.folder / "manifest.json"
         if path.exists():
             try:
@@ -221,8 +221,8 @@ def fine_tune(
 
     Args:
         model: an ensemble of potential networks whose card holds its domain.
-        data: columns of equilibria, as `softgym_envs.surrogate.dataset.load_dataset` gives them; unstable ones are left
-            out.
+        data: columns of equilibria, as `softgym_envs.surrogate.data.dataset.load_dataset` gives them; unstable ones are
+            left out.
         steps: steps of Adam for each member.
         learning_rate: the largest, of a one-cycle schedule.
         batch_size: rows of a batch.
@@ -235,7 +235,7 @@ def fine_tune(
     """
     import torch
 
-    from softgym_envs.surrogate.networks.potential_torch import PotentialNet
+    from softgym_envs.surrogate.potential.network import PotentialNet
 
     check_ensemble(model)
     start = time.perf_counter()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from softgym_envs.errors import WeightsError
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import SurrogateModel, load_model
 
 __all__ = ["pretrained_folder", "pretrained_model", "shipped_robots"]
@@ -17,7 +17,7 @@ _ROOT = Path(__file__).parent / "weights"
 
 def pretrained_folder(robot: Robot) -> Path:
     """Folder of the shipped weights of a robot."""
-    return _ROOT / robot.variant
+    return _ROOT / robot.weights_name
 
 
 def pretrained_model(robot: Robot, weights: str | Path | None = None, members: int | None = None) -> SurrogateModel:
@@ -34,7 +34,7 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
     folder = Path(weights) if weights is not None else pretrained_folder(robot)
     if weights is None and not folder.is_dir():
         shipped = sorted(p.name for p in _ROOT.iterdir()) if _ROOT.is_dir() else []
-        raise WeightsError(f"no weights ship for '{robot.variant}'; shipped: {', '.join(shipped) or 'none'}")
+        raise WeightsError(f"no weights ship for '{robot.weights_name}'; shipped: {', '.join(shipped) or 'none'}")
     return load_model(folder, robot, members)
 
 

@@ -20,11 +20,11 @@ from softgym_envs.config import Config, provenance, save_resolved
 from softgym_envs.errors import DataError
 from softgym_envs.robots import make_robot
 from softgym_envs.storage import atomic_write, write_json
-from softgym_envs.surrogate.dataset import generate_dataset
+from softgym_envs.surrogate.data.dataset import generate_dataset
+from softgym_envs.surrogate.data.sampling import SamplingPlan, learned_variables
+from softgym_envs.surrogate.data.states import full_compliance, stable_rows, training_states
 from softgym_envs.surrogate.model import Features, SurrogateModel, card_of, load_model
 from softgym_envs.surrogate.networks import NETWORKS, network_module
-from softgym_envs.surrogate.sampling import SamplingPlan, learned_variables
-from softgym_envs.surrogate.states import full_compliance, stable_rows, training_states
 
 __all__ = ["FitConfig", "fit", "generate", "test_errors"]
 

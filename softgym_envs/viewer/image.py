@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from softgym_envs.backends.backend import State
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.scene import STUB, Scene
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 

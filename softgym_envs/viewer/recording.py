@@ -13,9 +13,9 @@ import gymnasium
 import numpy as np
 
 from softgym_envs.backends.backend import State
-from softgym_envs.envs.soft_robot_env import SoftRobotEnv
+from softgym_envs.envs.env import SoftRobotEnv
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.scene import COLORS, STUB, tension_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import State
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.surface import BodySurface, cable_lines, surface_kinds
 
 if TYPE_CHECKING:

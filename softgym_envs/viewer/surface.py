@@ -12,9 +12,9 @@ from scipy.sparse.csgraph import connected_components
 from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.tetrahedra import boundary_triangles
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 
 if TYPE_CHECKING:
     import pyvista

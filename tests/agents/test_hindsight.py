@@ -145,10 +145,10 @@ def test_a_step_that_was_not_found_earns_nothing_whatever_the_goal():
 
 
 def test_hindsight_on_top_of_the_qp_is_refused():
-    config = {"environment": {"id": REACH.id, "on_qp": 0.3}, "sac": {"hindsight": 0.8}}
-    with pytest.raises(ValueError, match=r"sac\.hindsight = 0\.8 .*environment\.on_qp = 0\.3.* allowed: 0"):
+    config = {"environment": {"id": REACH.id, "residual_scale": 0.3}, "sac": {"hindsight": 0.8}}
+    with pytest.raises(ValueError, match=r"sac\.hindsight = 0\.8 .*environment\.residual_scale = 0\.3.* allowed: 0"):
         TrainConfig.model_validate(config)
-    assert TrainConfig.model_validate({**config, "sac": {}}).environment.on_qp == 0.3
+    assert TrainConfig.model_validate({**config, "sac": {}}).environment.residual_scale == 0.3
     assert TrainConfig.model_validate({**config, "environment": {"id": REACH.id}}).sac.hindsight == 0.8
 
 

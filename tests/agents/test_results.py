@@ -234,7 +234,7 @@ POLICIES = {
     },
     "one axis": {"environment": {"id": "SoftGym/FingerPress-v0"}},
     "moving": {"environment": {"id": "SoftGym/TetrapodReach-v0"}, "num_envs": 1},
-    "on the QP": {"environment": {"id": "SoftGym/TrunkReach-v0", "on_qp": 0.3}},
+    "on the QP": {"environment": {"id": "SoftGym/TrunkReach-v0", "residual_scale": 0.3}},
 }
 
 

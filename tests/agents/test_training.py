@@ -181,7 +181,7 @@ def test_a_training_that_would_learn_nothing_is_refused():
 
 
 OTHER = {
-    "on_qp": ({"on_qp": 0.5}, r"environment\.on_qp = 0\.5 .*trained with 0\.0"),
+    "residual_scale": ({"residual_scale": 0.5}, r"environment\.residual_scale = 0\.5 .*trained with 0\.0"),
     "action_mode": ({"action_mode": "absolute"}, r"environment\.action_mode = absolute .*trained with increment"),
     "order of the body": (
         {"design_in_observation": ["height", "length", "joint_height"]},

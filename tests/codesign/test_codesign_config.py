@@ -106,7 +106,7 @@ BAD = {
     "hindsight on top of the QP": (
         {
             "strategy": "scratch",
-            "environment": {"id": "SoftGym/FingerReach-v0", "on_qp": 0.5},
+            "environment": {"id": "SoftGym/FingerReach-v0", "residual_scale": 0.5},
             "training": {"sac": {"hindsight": 0.8}},
         },
         "hindsight = 0.8",
@@ -191,7 +191,10 @@ JUDGED = {"strategy": "policy", "policy": "finger_reach_designs"}
         ({"environment": {**SHOWN, "task_options": {"foo": 1}}}, "task 'reach'.*foo"),
         ({"sampler": {"name": "tpe", "options": {"n_startup_trials": "x"}}}, "sampler 'tpe'.*'n_startup_trials': 'x'"),
         ({"sampler": {"name": "tpe", "options": {"n_ei_candidates": "x"}}}, "sampler 'tpe'.*'n_ei_candidates': 'x'"),
-        ({**JUDGED, "environment": {**SHOWN, "on_qp": 0.3}}, r"environment\.on_qp = 0\.3.*finger_reach_designs"),
+        (
+            {**JUDGED, "environment": {**SHOWN, "residual_scale": 0.3}},
+            r"environment\.residual_scale = 0\.3.*finger_reach_designs",
+        ),
         (
             {**JUDGED, "environment": {**SHOWN, "design_in_observation": ["height", "length", "joint_height"]}},
             r"environment\.design_in_observation = \['height'",

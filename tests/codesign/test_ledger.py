@@ -7,8 +7,8 @@ from contextlib import nullcontext
 import pytest
 from optuna.trial import TrialState
 
-from codesign.ledger import Ledger, open_study
-from codesign.storages import JOURNAL_LOCK
+from codesign.scheduling.queue import Ledger, open_study
+from codesign.scheduling.storage import JOURNAL_LOCK
 from softgym_envs.storage import write_json
 
 

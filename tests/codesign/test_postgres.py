@@ -15,12 +15,13 @@ import sqlalchemy as sql
 
 from benchmarks.codesign_scale import Sweep, faults
 from benchmarks.postgres_server import find_programs, temporary_server
-from codesign import finalists, worker
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
-from codesign.jobs import Job, missing_jobs, run_jobs
-from codesign.ledger import Ledger
-from codesign.postgres import SIGN, PostgresStorage
+from codesign.phases import finalists
+from codesign.scheduling import worker
+from codesign.scheduling.jobs import Job, missing_jobs, run_jobs
+from codesign.scheduling.postgres import SIGN, PostgresStorage
+from codesign.scheduling.queue import Ledger
 from codesign.study import run_study
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 

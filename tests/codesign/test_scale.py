@@ -14,14 +14,14 @@ import pytest
 from optuna.trial import TrialState
 
 from benchmarks.codesign_scale import Sweep, faults
-from codesign import worker
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
-from codesign.ledger import CALL, Ledger, open_study
-from codesign.processes import run_workers
-from codesign.results import write_results
+from codesign.report.results import write_results
+from codesign.scheduling import worker
+from codesign.scheduling.processes import run_workers
+from codesign.scheduling.queue import CALL, Ledger, open_study
+from codesign.scheduling.worker import run_trials
 from codesign.study import run_study
-from codesign.worker import run_trials
 from softgym_envs.errors import ConfigError, DataError, MeshingError
 
 SMALL = {"count": 2, "unseen_count": 2, "training_count": 2}

@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 
 from codesign.config import StudyConfig
-from codesign.finalists import evaluations, finalists, pareto_trials
 from codesign.folder import StudyFolder
-from codesign.judge import JUDGE, joint_config
-from codesign.ledger import open_study
-from codesign.report import write_report
+from codesign.phases.finalists import evaluations, finalists, pareto_trials
+from codesign.phases.shared_policy import JUDGE, joint_config
+from codesign.report.page import write_report
+from codesign.scheduling.queue import open_study
 from codesign.study import run_study
 
 SHOWN = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
@@ -168,7 +168,7 @@ def test_report_opens_in_a_browser(run, tmp_path):
 
 def test_every_strategy_is_described():
     from codesign.config import STRATEGIES
-    from codesign.report import CONTROLLERS
+    from codesign.report.page import CONTROLLERS
 
     assert set(CONTROLLERS) == set(STRATEGIES)
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from codesign.config import StudyConfig
-from codesign.finalists import choose_winner, evaluations, finalist_jobs
 from codesign.folder import StudyFolder
-from codesign.ledger import open_study
-from codesign.report import write_report
-from codesign.results import mean_interval, rank_correlation, rate_interval
+from codesign.phases.finalists import choose_winner, evaluations, finalist_jobs
+from codesign.report.page import write_report
+from codesign.report.results import mean_interval, rank_correlation, rate_interval
+from codesign.scheduling.queue import open_study
 from codesign.study import run_study
 from softgym_envs.errors import WeightsError
 from softgym_envs.storage import write_json

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from codesign.finalists import _mean
-from codesign.ledger import Ledger
 from codesign.objectives import OBJECTIVES
-from codesign.trial import run_trial
+from codesign.phases.finalists import _mean
+from codesign.phases.trial import run_trial
+from codesign.scheduling.queue import Ledger
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 

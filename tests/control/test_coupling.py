@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from softgym_envs.control import HeldObject, couple, rotate, tie_points
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
 
 TURN = np.diag([-1.0, -1.0, 1.0])  # half a turn about z
@@ -246,8 +246,8 @@ def contact_finger():
 def test_contacts_are_an_option_that_changes_nothing_else(contact_finger):
     robot, model, _ = contact_finger
     plain = make_robot("finger", unilateral=False)
-    assert robot.variant == plain.variant
-    assert robot.signature == {**plain.signature, "contacts": True}
+    assert robot.weights_name == plain.weights_name
+    assert robot.mechanics_key == {**plain.mechanics_key, "contacts": True}
     assert model.roles == (("a", 2), ("e", 3), ("c", 9))
     assert [c.name for c in model.constraints["c"]] == ["contact_1", "contact_2", "contact_3"]
     points = np.array([c.value(model.nodes) for c in model.constraints["c"]])

@@ -11,7 +11,7 @@ from softgym_envs.control import InverseQP
 from softgym_envs.control.fingers import CoupledFingers, FEMFingers, SurrogateFingers
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.frames import rotation_of
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.export import export_c
 from softgym_envs.surrogate.model import SurrogateModel

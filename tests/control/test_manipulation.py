@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from softgym_envs.control import HeldObject, InverseQP, Manipulation, rotate
 from softgym_envs.mechanics.condensation import CondensedModel
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
 
 TURN = np.diag([-1.0, -1.0, 1.0])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import softgym_envs  # noqa: F401  (registers the environments)
-from softgym_envs.envs.task import make_task
+from softgym_envs.envs.tasks.base import make_task
 from softgym_envs.robots import make_robot
 
 

@@ -11,10 +11,10 @@ from gymnasium.utils.env_checker import check_env
 
 import softgym_envs
 from softgym_envs.backends import BACKENDS
-from softgym_envs.envs.task import make_task
+from softgym_envs.envs.tasks.base import make_task
 from softgym_envs.errors import ConvergenceError, DesignError
 from softgym_envs.robots import make_robot
-from softgym_envs.robots.robot import Robot
+from softgym_envs.robots.base import Robot
 
 # Weights ship for the robots whose environments run on the surrogate unless told otherwise.
 CASES = [
@@ -166,7 +166,7 @@ def test_rows_choose_the_backend_and_make_vec_follows():
 def test_a_surrogate_without_weights_says_what_ships(identifier):
     from softgym_envs.errors import WeightsError
 
-    variant = make_robot(softgym_envs.ENVIRONMENTS[identifier].robot).variant
+    variant = make_robot(softgym_envs.ENVIRONMENTS[identifier].robot).weights_name
     with pytest.raises(WeightsError, match=f"'{variant}'.*finger_1cable, finger_2cables"):
         gymnasium.make(identifier, backend="surrogate")
 

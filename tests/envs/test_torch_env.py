@@ -9,7 +9,7 @@ import softgym_envs
 from softgym_envs.envs import torch_env
 from softgym_envs.envs.torch_env import TorchVectorEnv
 from softgym_envs.errors import DesignError, WeightsError
-from softgym_envs.mechanics.complementarity import solve_complementarity
+from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 
 IDENTIFIERS = [name for name, row in softgym_envs.ENVIRONMENTS.items() if row.backend == "surrogate"]
 FINGER = "SoftGym/FingerReach-v0"

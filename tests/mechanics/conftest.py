@@ -9,8 +9,8 @@ import pytest
 from scipy.sparse import csc_matrix
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.mechanics.assembly import SOLIDS, Assembly
-from softgym_envs.mechanics.beams import Section
+from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
+from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.materials import MATERIALS
 
 SECTION = Section(6e-4, (2e-8, 5e-8), 3e-8, (0.8, 0.7))
@@ -84,7 +84,7 @@ BODIES = [f"{element}-{material}" for element in SOLIDS for material in MATERIAL
 def _solid(box, element, material, cells=(2, 2, 2), **options):
     """A block of solid elements on an irregular mesh, clamped below: its model."""
     nodes, tetrahedra = box((0.02, 0.02, 0.03), cells, jitter=0.2)
-    body = Assembly()
+    body = ModelBuilder()
     options = {"young_modulus": 2e5, "poisson_ratio": 0.45, "density": 1000.0, **options}
     body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] < 1e-9, element=element, material=material, **options)
     return body.build()
@@ -92,7 +92,7 @@ def _solid(box, element, material, cells=(2, 2, 2), **options):
 
 def _beam(order, shape, elements=3, **options):
     """A clamped beam, straight or along a helix: its model."""
-    body = Assembly()
+    body = ModelBuilder()
     frames = []
     for k, t in enumerate(np.linspace(0.0, 1.0, order * elements + 1)):
         if shape == "straight":

@@ -1,4 +1,4 @@
-"""Assembly: parts become one model, with the rows and boundary conditions that were asked for."""
+"""ModelBuilder: parts become one model, with the rows and boundary conditions that were asked for."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import pickle
 import numpy as np
 import pytest
 
-from softgym_envs.mechanics.assembly import SOLIDS, Assembly
-from softgym_envs.mechanics.beams import Beam, Section
+from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
 from softgym_envs.mechanics.constraints import Bond, EmbeddedPoints, Point
+from softgym_envs.mechanics.elements.beams import Beam, Section
+from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.quadratic import add_midside_nodes
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 
 SIZE = (0.04, 0.01, 0.01)
 
@@ -20,7 +20,7 @@ SIZE = (0.04, 0.01, 0.01)
 @pytest.mark.parametrize("element", SOLIDS)
 def test_one_solid_is_the_model_of_its_block(box, element):
     nodes, tetrahedra = box(SIZE, (4, 1, 1), 0.1)
-    body = Assembly(gravity=(0.0, 0.0, -9.81))
+    body = ModelBuilder(gravity=(0.0, 0.0, -9.81))
     start = body.add_solid(nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, element=element, young_modulus=1e5)
     model = body.build()
     assert start == 0 and body.size == len(model.nodes)
@@ -42,7 +42,7 @@ def test_one_solid_is_the_model_of_its_block(box, element):
 )
 def test_fixed_nodes_by_index_by_mask_and_by_axis(fixed):
     nodes = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    body = Assembly()
+    body = ModelBuilder()
     body.add_solid(nodes, [[0, 1, 2, 3]], fixed=fixed)
     model = body.build()
     np.testing.assert_array_equal(model.fixed, [True, True, False, True])
@@ -54,7 +54,7 @@ def test_midside_nodes_are_fixed_along_the_axes_of_both_ends(box):
     mask = np.zeros((len(nodes), 3), dtype=bool)
     mask[nodes[:, 0] == 0.0, 0] = True
     mask[nodes[:, 1] == 0.0, 1] = True
-    body = Assembly()
+    body = ModelBuilder()
     body.add_solid(nodes, tetrahedra, fixed=mask, element="quadratic")
     model = body.build()
     held = np.ones(3 * len(model.nodes), dtype=bool)
@@ -67,7 +67,7 @@ def test_midside_nodes_are_fixed_along_the_axes_of_both_ends(box):
 
 def test_ready_made_quadratic_elements_are_taken_as_they_are(box):
     nodes, ten = add_midside_nodes(*box(SIZE, (2, 1, 1)))
-    body = Assembly()
+    body = ModelBuilder()
     body.add_solid(nodes, ten, fixed=nodes[:, 0] == 0.0, element="quadratic")
     model = body.build()
     assert len(model.nodes) == len(nodes)
@@ -78,7 +78,7 @@ def test_ready_made_quadratic_elements_are_taken_as_they_are(box):
 def composite(box, solver="auto"):
     """A block, a plate that carries its end, a beam that starts at the plate, and a block bonded to the beam."""
     nodes, tetrahedra = box(SIZE, (4, 1, 1), 0.1)
-    body = Assembly(gravity=(0.0, 0.0, -9.81), solver=solver)
+    body = ModelBuilder(gravity=(0.0, 0.0, -9.81), solver=solver)
     first = body.add_solid(
         nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, element="averaged", poisson_ratio=0.49, young_modulus=1e6
     )
@@ -137,7 +137,7 @@ def test_a_model_can_be_pickled(box):
 
 def test_unknown_names_are_refused(box):
     nodes, tetrahedra = box(SIZE, (2, 1, 1))
-    body = Assembly()
+    body = ModelBuilder()
     with pytest.raises(ValueError, match="unknown element 'cubic'; allowed: linear, averaged, quadratic"):
         body.add_solid(nodes, tetrahedra, fixed=[0], element="cubic")
     with pytest.raises(ValueError, match="no frame begins at row 3"):
@@ -147,7 +147,7 @@ def test_unknown_names_are_refused(box):
         body.build()
     with pytest.raises(ValueError, match="orthonormal"):
         body.add_frame([0, 0, 0], 2.0 * np.eye(3))
-    nothing = Assembly()
+    nothing = ModelBuilder()
     nothing.add_solid(nodes, tetrahedra, fixed=[])
     with pytest.raises(ValueError, match="no node is fixed"):
         nothing.build()

@@ -10,18 +10,18 @@ from scipy.linalg import expm
 from scipy.sparse import coo_matrix
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.mechanics import averaged, beams, quadratic, tetrahedra
-from softgym_envs.mechanics.assembly import SOLIDS, Assembly
-from softgym_envs.mechanics.averaged import AveragedTetrahedra
-from softgym_envs.mechanics.beams import Beam, Section
-from softgym_envs.mechanics.block import ElementBlock
+from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
 from softgym_envs.mechanics.constraints import Point
+from softgym_envs.mechanics.elements import averaged, beams, quadratic, tetrahedra
+from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
+from softgym_envs.mechanics.elements.beams import Beam, Section
+from softgym_envs.mechanics.elements.block import ElementBlock
+from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, add_midside_nodes, split_triangles
+from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.quadratic import QuadraticTetrahedra, add_midside_nodes, split_triangles
-from softgym_envs.mechanics.statics import Statics
-from softgym_envs.mechanics.tetrahedra import Tetrahedra
+from softgym_envs.mechanics.solvers.statics import Statics
 
 KINDS = {
     cls
@@ -243,7 +243,7 @@ def test_patch_under_tension_on_its_faces(box, element, material):
     """Uniaxial tension by forces: held by three planes of symmetry (nodes free along two axes), nothing else."""
     size = np.array([0.04, 0.03, 0.02])
     nodes, tetrahedra = box(size, (3, 2, 2), jitter=0.3)
-    body = Assembly()
+    body = ModelBuilder()
     body.add_solid(
         nodes,
         tetrahedra,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
-from softgym_envs.mechanics.complementarity import solve_complementarity
+from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 
 
 def enumerate_sets(W, gap, unilateral):

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.mechanics import constraints
-from softgym_envs.mechanics.beams import Beam, Section
 from softgym_envs.mechanics.constraints import (
     Bond,
     Cable,
@@ -22,8 +21,9 @@ from softgym_envs.mechanics.constraints import (
     Servo,
 )
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
+from softgym_envs.mechanics.elements.beams import Beam, Section
+from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.frames import frame_rows
-from softgym_envs.mechanics.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 
 CLASSES = {
     name: cls

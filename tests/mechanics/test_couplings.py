@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.assembly import SOLIDS, Assembly
-from softgym_envs.mechanics.beams import Section
+from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
 from softgym_envs.mechanics.constraints import Bond, Cavity, Chamber, EmbeddedPoints, Point
+from softgym_envs.mechanics.elements.beams import Section
+from softgym_envs.mechanics.elements.quadratic import quadratic_triangles
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.quadratic import quadratic_triangles
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 
 
 def relative(found, expected):
@@ -41,7 +41,7 @@ def compliance_by_differences(statics, state, solve, steps):
 def bonded(request, box):
     """A soft column with a cable; beside it a rigid part that three bonds hold, with an effector and a contact."""
     nodes, tetrahedra = box((0.02, 0.02, 0.06), (2, 2, 5), jitter=0.2)
-    body = Assembly()
+    body = ModelBuilder()
     body.add_solid(
         nodes,
         tetrahedra,
@@ -149,7 +149,7 @@ def test_a_bond_to_a_point_in_space_and_a_gap(box):
 def test_a_body_held_by_bonds_alone(box):
     """Four bonds at corners instead of a clamp: statically determined in no way, yet stable; it hangs by its weight."""
     nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 3))
-    body = Assembly(gravity=(0.0, 0.0, -9.81))
+    body = ModelBuilder(gravity=(0.0, 0.0, -9.81))
     wall = body.add_frame([0.0, 0.0, 0.0], fixed=True, fixed_spin=True)
     body.add_solid(nodes, tetrahedra, fixed=[], young_modulus=1e5, poisson_ratio=0.4, density=1000.0)
     model = body.build()
@@ -164,7 +164,7 @@ def test_a_body_held_by_bonds_alone(box):
 
 def test_a_rigid_pendulum_hangs_in_line_with_its_load(box):
     """Only the geometric stiffness of load and bond holds it: no element has a part in it."""
-    body = Assembly()
+    body = ModelBuilder()
     body.add_solid(*box(), fixed=[0])
     base = body.add_frame([0.0, 0.0, 0.5], fixed=True, fixed_spin=True)
     link = body.add_frame([0.1, 0.0, 0.5], fixed_spin=(True, False, True))
@@ -203,7 +203,7 @@ def test_redundant_bonds_are_refused_or_right(bonded):
 
 def test_a_part_that_nothing_holds_is_an_error(box):
     nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 3))
-    body = Assembly()
+    body = ModelBuilder()
     body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] == 0.0)
     loose = body.add_frame([0.05, 0.0, 0.0])
     model = body.build()
@@ -358,7 +358,7 @@ def hollow_block(box, element="linear", **options):
     corners = nodes[faces]
     inward = np.linalg.det(corners - 0.015) < 0.0
     faces[inward] = faces[inward][:, ::-1]
-    body = Assembly()
+    body = ModelBuilder()
     options = {"young_modulus": 2e5, "poisson_ratio": 0.45, "density": 1000.0, **options}
     body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] < 1e-9, element=element, **options)
     model = body.build()
@@ -453,7 +453,7 @@ def test_a_chamber_bends_its_beam_with_a_moment(box):
     """Pressure in a chamber off the axis: a constant moment p A y and a tension p A, so an arc of known curvature."""
     young, area, offset, pressure = 1e6, 2e-5, 0.004, 2e4
     section = Section.circle(0.005)
-    body = Assembly()
+    body = ModelBuilder()
     count = 9
     frames = [
         body.add_frame([s, 0.0, 0.0], fixed=k == 0, fixed_spin=k == 0)

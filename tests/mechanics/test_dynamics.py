@@ -7,10 +7,10 @@ import pytest
 
 from benchmarks import dynamics as cases
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.assembly import Assembly
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints import EmbeddedPoints, Point, Servo
-from softgym_envs.mechanics.dynamics import SCHEMES, Dynamics
-from softgym_envs.mechanics.rigid import sphere_inertia
+from softgym_envs.mechanics.elements.rigid import sphere_inertia
+from softgym_envs.mechanics.solvers.dynamics import SCHEMES, Dynamics
 
 
 def by_case(rows):
@@ -25,7 +25,7 @@ def by_case(rows):
 
 def ball(**options):
     """A free ball of 2 kg with a radius of 0.1 m."""
-    body = Assembly(floating=True, gravity=cases.GRAVITY)
+    body = ModelBuilder(floating=True, gravity=cases.GRAVITY)
     frame = body.add_frame([0.0, 0.0, 0.0])
     body.add_mass(frame, 2.0, sphere_inertia(2.0, 0.1))
     model = body.build()
@@ -304,7 +304,7 @@ def test_rest_and_reset():
 
 def test_statics_of_the_same_model_are_not_disturbed():
     """Both share model and factorisation; inertia is gone after each step."""
-    from softgym_envs.mechanics.statics import Statics
+    from softgym_envs.mechanics.solvers.statics import Statics
 
     model = cases.pulled_bar()
     statics, solver = Statics(model), Dynamics(model, step=0.01)
@@ -362,7 +362,7 @@ def test_bad_options(options, message):
 
 
 def test_bad_commands_and_launches():
-    body = Assembly()
+    body = ModelBuilder()
     frame = body.add_frame([0.0, 0.0, 0.0], fixed=True, fixed_spin=(True, False, True))
     body.add_mass(frame, 1.0, sphere_inertia(1.0, 0.02))
     model = body.build()

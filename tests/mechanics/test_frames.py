@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.mechanics.assembly import SOLIDS, Assembly
-from softgym_envs.mechanics.beams import Section
+from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
 from softgym_envs.mechanics.constraints import Bond, Cable, Cavity, Chamber, EmbeddedPoints, Point, Servo
+from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.frames import Frames, frame_rows, rotation_of, rotation_vector_matrix
 from softgym_envs.mechanics.materials import MATERIALS
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 
 
 def cap(nodes, height=0.03):
@@ -24,7 +24,7 @@ def capped(box):
 
     def make(element="linear", material="corotational", bonds=True):
         nodes, tetrahedra = box((0.02, 0.02, 0.03), (2, 2, 2), jitter=0.2)
-        body = Assembly()
+        body = ModelBuilder()
         start = body.add_solid(
             nodes,
             tetrahedra,
@@ -116,7 +116,7 @@ def test_each_constraint_contributes_its_curvature_through_frames(capped, full_t
 
 def test_spins_and_origins_can_be_held_one_by_one(derivatives, rng, box):
     nodes, tetrahedra = box((0.02, 0.02, 0.03), (2, 2, 2), jitter=0.2)
-    body = Assembly()
+    body = ModelBuilder()
     body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] < 1e-9, poisson_ratio=0.4, young_modulus=2e5)
     hinge = body.add_frame([0.01, 0.01, 0.03], fixed=(False, True, False), fixed_spin=(True, False, True))
     body.carry(hinge, cap(nodes))
@@ -209,7 +209,7 @@ def test_a_clamped_frame_is_a_clamp(box):
     options = {"young_modulus": 1e6, "poisson_ratio": 0.3}
     tips = []
     for by_frame in (False, True):
-        body = Assembly(gravity=(0.0, 0.0, -9.81))
+        body = ModelBuilder(gravity=(0.0, 0.0, -9.81))
         body.add_solid(nodes, tetrahedra, fixed=[] if by_frame else face, **options)
         if by_frame:
             clamp = body.add_frame([0.0, 0.01, 0.01], fixed=True, fixed_spin=True)

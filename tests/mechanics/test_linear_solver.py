@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_matrix, random_array, tril
 
-from softgym_envs.mechanics.linear_solver import CholmodSolver, LinearSolver, SuperLUSolver, make_solver
+from softgym_envs.mechanics.solvers.linear import CholmodSolver, LinearSolver, SuperLUSolver, make_solver
 
 NAMES = ["cholmod", "superlu"]
 SIZE = 60

@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.materials import MATERIALS, lame_parameters
-from softgym_envs.mechanics.tetrahedra import Tetrahedra
 
 MU, LAME = 2.0, 3.0
 ELASTICITIES = [(2.0, 3.0), (1.0, 0.0), (1.0, -0.4), (1.0, 400.0)]  # nu = 0.3, 0, -0.33 and 0.49875

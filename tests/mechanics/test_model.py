@@ -10,10 +10,10 @@ import pytest
 from scipy.sparse import csc_matrix
 
 from softgym_envs.errors import DataError
+from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel, read_mesh
-from softgym_envs.mechanics.statics import Statics
-from softgym_envs.mechanics.tetrahedra import Tetrahedra
+from softgym_envs.mechanics.solvers.statics import Statics
 
 ONE_TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 

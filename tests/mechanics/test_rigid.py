@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks import dynamics as cases
-from softgym_envs.mechanics.assembly import Assembly
-from softgym_envs.mechanics.dynamics import Dynamics
+from softgym_envs.mechanics.builder import ModelBuilder
+from softgym_envs.mechanics.elements.rigid import RigidBody, box_inertia, sphere_inertia
 from softgym_envs.mechanics.frames import rotation_of
-from softgym_envs.mechanics.rigid import RigidBody, box_inertia, sphere_inertia
+from softgym_envs.mechanics.solvers.dynamics import Dynamics
 
 
 def by_case(rows):
@@ -24,7 +24,7 @@ def by_case(rows):
 
 def free(inertia, mass=1.0, rotation=None, **options):
     """A body without weight, at rest at the origin."""
-    body = Assembly(floating=True)
+    body = ModelBuilder(floating=True)
     frame = body.add_frame([0.0, 0.0, 0.0], rotation)
     body.add_mass(frame, mass, inertia)
     return Dynamics(body.build(), **options)

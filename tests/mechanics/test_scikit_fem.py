@@ -13,7 +13,7 @@ from skfem.helpers import ddot, sym_grad, trace
 from skfem.models.elasticity import lame_parameters
 
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 
 SIZE = (0.1, 0.02, 0.02)
 YOUNG, POISSON = 3.0e5, 0.35

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.linear_solver import CholmodSolver
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.statics import Statics, _NotFound
+from softgym_envs.mechanics.solvers.linear import CholmodSolver
+from softgym_envs.mechanics.solvers.statics import Statics, _NotFound
 
 # -- reference ------------------------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from scipy.sparse import bmat
 from skfem.helpers import ddot, div, sym_grad
 
 from benchmarks import validation
-from softgym_envs.mechanics.beams import Section
+from softgym_envs.mechanics.elements.beams import Section
 
 
 def by_element(rows):

@@ -10,10 +10,10 @@ import pytest
 
 from softgym_envs.backends import make_backend
 from softgym_envs.control import InverseQP
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
 from softgym_envs.robots.cable_trunk import octagonal_bar
-from softgym_envs.robots.morphing import mean_ratio
+from softgym_envs.robots.geometry.morphing import mean_ratio
 
 COARSE = {"layers": 12, "rings": 1}
 
@@ -152,9 +152,9 @@ def test_follows_its_circle(trunk):
 
 
 def test_describes_itself(trunk, coarse):
-    assert trunk.variant.startswith(trunk.name)
-    assert json.loads(json.dumps(trunk.signature)) == trunk.signature
-    assert coarse.signature != trunk.signature
+    assert trunk.weights_name.startswith(trunk.name)
+    assert json.loads(json.dumps(trunk.mechanics_key)) == trunk.mechanics_key
+    assert coarse.mechanics_key != trunk.mechanics_key
     np.testing.assert_allclose(trunk.upper, [0.035] * 4 + [0.020] * 4)
     np.testing.assert_allclose(make_robot("cable_trunk", strokes=(0.07, 0.04)).upper, [0.070] * 4 + [0.040] * 4)
     assert make_robot("cable_trunk", gravity=(0.0, 0.0, -9.81)).stiffness_variable is None

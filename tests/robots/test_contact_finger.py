@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from softgym_envs.mechanics.constraints import Pose
 from softgym_envs.mechanics.frames import frame_rows, rotation_of
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
 from softgym_envs.robots.soft_finger import SoftFinger
 
@@ -58,7 +58,7 @@ def test_an_unknown_component_is_refused():
 
 def test_describes_itself(finger):
     robot, model = finger
-    assert robot.variant == robot.name == "contact_finger"
+    assert robot.weights_name == robot.name == "contact_finger"
     assert [a.name for a in robot.actuators] == [
         "finger_1_cable_1",
         "finger_1_cable_2",
@@ -75,7 +75,7 @@ def test_describes_itself(finger):
     assert robot.lower.shape == robot.effort_scale.shape == (8,)
     assert (robot.lower < 0.0).all() and (robot.upper > 0.0).all() and (robot.rates > 0.0).all()
     assert model.roles == (("a", 8), ("e", 3), ("b", 9))
-    assert json.loads(json.dumps(robot.signature)) == robot.signature
+    assert json.loads(json.dumps(robot.mechanics_key)) == robot.mechanics_key
     assert robot.design_space.names == SoftFinger(cables=2).design_space.names
 
 

@@ -9,11 +9,11 @@ import pytest
 
 from softgym_envs.backends import make_backend
 from softgym_envs.control import InverseQP
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
-from softgym_envs.robots.meshing import BodyMesh
-from softgym_envs.robots.morphing import mean_ratio
-from softgym_envs.robots.symmetry import mirrored
+from softgym_envs.robots.geometry.meshing import BodyMesh
+from softgym_envs.robots.geometry.morphing import mean_ratio
+from softgym_envs.robots.geometry.symmetry import mirrored
 
 
 @pytest.fixture(scope="module")

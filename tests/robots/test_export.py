@@ -11,9 +11,9 @@ from softgym_envs import cli
 from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.robots import make_robot
-from softgym_envs.robots.export import export_body, write_drawing
-from softgym_envs.robots.finger_shape import draw_finger
-from softgym_envs.robots.moulds import MOULD_PARTS, WALL, WIRE_RADIUS, export_moulds, mould_parts
+from softgym_envs.robots.geometry.export import export_body, write_drawing
+from softgym_envs.robots.geometry.finger_shape import draw_finger
+from softgym_envs.robots.geometry.moulds import MOULD_PARTS, WALL, WIRE_RADIUS, export_moulds, mould_parts
 
 FINGERS = [
     ("finger", {"cables": 1}, {}),

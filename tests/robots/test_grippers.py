@@ -13,7 +13,7 @@ import pytest
 from softgym_envs.control import HeldObject, couple, rotate, tie_points
 from softgym_envs.errors import DesignError
 from softgym_envs.mechanics.frames import rotation_of
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
 from softgym_envs.robots.soft_finger import SoftFinger
 
@@ -312,11 +312,11 @@ def test_the_bar_may_be_longer_or_shorter():
 
 @pytest.mark.parametrize("name", GRIPPERS)
 def test_signatures_tell_options_apart(name):
-    base = make_robot(name).signature
-    assert make_robot(name).signature == base
+    base = make_robot(name).mechanics_key
+    assert make_robot(name).mechanics_key == base
     for options in ({"mesh_size": MESH_SIZE}, {"gravity": (0.0, 0.0, -9.81)}, {"material": "stable_neo_hookean"}):
-        assert make_robot(name, **options).signature != base
-    assert make_robot(name, unilateral=False).signature == base  # the same condensed model
+        assert make_robot(name, **options).mechanics_key != base
+    assert make_robot(name, unilateral=False).mechanics_key == base  # the same condensed model
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
-from softgym_envs.robots import meshing
-from softgym_envs.robots.finger_shape import draw_finger
-from softgym_envs.robots.meshing import BodyMesh, mesh_geometry
+from softgym_envs.robots.geometry import meshing
+from softgym_envs.robots.geometry.finger_shape import draw_finger
+from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.soft_finger import BELLOWS
 
 COARSE = 0.02

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softgym_envs.robots.meshing import BodyMesh
-from softgym_envs.robots.morphing import Cone, Cylinder, Morpher, Plane, mean_ratio
+from softgym_envs.robots.geometry.meshing import BodyMesh
+from softgym_envs.robots.geometry.morphing import Cone, Cylinder, Morpher, Plane, mean_ratio
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from softgym_envs.errors import DesignError, InfeasibleDesign
-from softgym_envs.mechanics.statics import Statics
-from softgym_envs.robots import ROBOTS, make_robot, meshing
-from softgym_envs.robots.finger_shape import draw_finger
-from softgym_envs.robots.morphing import mean_ratio
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots import ROBOTS, make_robot
+from softgym_envs.robots.geometry import meshing
+from softgym_envs.robots.geometry.finger_shape import draw_finger
+from softgym_envs.robots.geometry.morphing import mean_ratio
 from softgym_envs.robots.soft_finger import BELLOWS
 
 # Every robot with a mesh from gmsh, in every variant: a new one adds its row. The others have files of their own.
@@ -30,7 +31,7 @@ def robot(request):
 @pytest.fixture(scope="module")
 def remeshing(robot):
     """The same robot, meshing every design anew."""
-    options = next(o for n, o in VARIANTS if make_robot(n, **o).variant == robot.variant)
+    options = next(o for n, o in VARIANTS if make_robot(n, **o).weights_name == robot.weights_name)
     return make_robot(robot.name, **options, meshing="remesh")
 
 
@@ -69,15 +70,15 @@ def test_describes_itself(robot):
     assert (robot.rates > 0.0).all()
     assert np.shape(robot.effort_scale) == (count,)
     assert len({actuator.name for actuator in robot.actuators}) == count
-    assert json.loads(json.dumps(robot.signature)) == robot.signature
-    assert robot.variant.startswith(robot.name)
+    assert json.loads(json.dumps(robot.mechanics_key)) == robot.mechanics_key
+    assert robot.weights_name.startswith(robot.name)
     assert robot.stiffness_variable is None or robot.stiffness_variable in robot.design_space.names
 
 
 def test_variants_have_their_own_names_and_signatures():
     robots = [make_robot(name, **options) for name, options in VARIANTS]
-    assert len({r.variant for r in robots}) == len(robots)
-    assert len({json.dumps(r.signature, sort_keys=True) for r in robots}) == len(robots)
+    assert len({r.weights_name for r in robots}) == len(robots)
+    assert len({json.dumps(r.mechanics_key, sort_keys=True) for r in robots}) == len(robots)
 
 
 def test_baseline_model(robot):
@@ -156,7 +157,7 @@ def test_reference_body_is_the_mesh_not_moved(robot):
 
 
 def test_the_same_design_gives_the_same_body_to_the_bit(robot):
-    options = next(o for n, o in VARIANTS if make_robot(n, **o).variant == robot.variant)
+    options = next(o for n, o in VARIANTS if make_robot(n, **o).weights_name == robot.weights_name)
     design = robot.design_space.from_unit(np.linspace(-0.3, 0.4, len(robot.design_space)))
     first = robot.body(design)
     robot.body(robot.design_space.from_unit(np.linspace(0.5, -0.2, len(robot.design_space))))  # no memory of others

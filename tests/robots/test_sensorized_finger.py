@@ -9,10 +9,11 @@ import pytest
 
 from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
-from softgym_envs.mechanics.statics import Statics
-from softgym_envs.robots import make_robot, meshing
-from softgym_envs.robots.finger_shape import check_finger
-from softgym_envs.robots.meshing import BodyMesh
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots import make_robot
+from softgym_envs.robots.geometry import meshing
+from softgym_envs.robots.geometry.finger_shape import check_finger
+from softgym_envs.robots.geometry.meshing import BodyMesh
 
 MM = 1e-3
 

@@ -10,7 +10,7 @@ import pytest
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.control import InverseQP
 from softgym_envs.errors import DesignError
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
 from softgym_envs.robots.stiff_flop import StiffFlop
 

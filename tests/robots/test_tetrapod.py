@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks import dynamics as cases
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError, DesignError
-from softgym_envs.mechanics.beams import Beam
-from softgym_envs.mechanics.statics import Statics
+from softgym_envs.mechanics.elements.beams import Beam
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
 from softgym_envs.robots.tetrapod import CENTRE_MASS
 
@@ -271,9 +271,9 @@ def test_a_command_without_equilibrium_says_how_far_it_came(robot):
 
 
 def test_signature_and_options_that_change_it(robot):
-    assert robot.variant == "tetrapod"
-    assert robot.signature == {"payload": 0.0, "elements": 6, "gravity": [0.0, 0.0, -9.81]}
-    assert make_robot("tetrapod", payload=0.5).signature != robot.signature
+    assert robot.weights_name == "tetrapod"
+    assert robot.mechanics_key == {"payload": 0.0, "elements": 6, "gravity": [0.0, 0.0, -9.81]}
+    assert make_robot("tetrapod", payload=0.5).mechanics_key != robot.mechanics_key
     path = robot.reference_path(12)
     assert path.shape == (12, 3)
     np.testing.assert_allclose(np.linalg.norm(path[:, :2], axis=1), 0.040)

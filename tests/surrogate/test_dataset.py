@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from softgym_envs.errors import DataError, DesignError, InfeasibleDesign
 from softgym_envs.robots import make_robot
-from softgym_envs.surrogate import dataset
-from softgym_envs.surrogate.dataset import COLUMNS, generate_dataset, load_dataset
-from softgym_envs.surrogate.sampling import (
+from softgym_envs.surrogate.data import dataset
+from softgym_envs.surrogate.data.dataset import COLUMNS, generate_dataset, load_dataset
+from softgym_envs.surrogate.data.sampling import (
     SEQUENCES,
     SamplingPlan,
     learned_variables,
@@ -548,8 +548,8 @@ LONG = SamplingPlan(groups=200, states=2, sequence="random", seed=1)
 STARTER = f"""
 import os, sys
 import joblib.externals.loky.backend.resource_tracker
-from softgym_envs.surrogate.dataset import generate_dataset
-from softgym_envs.surrogate.sampling import SamplingPlan
+from softgym_envs.surrogate.data.dataset import generate_dataset
+from softgym_envs.surrogate.data.sampling import SamplingPlan
 
 for folder in sys.stdin:
     process = os.fork()

@@ -15,10 +15,10 @@ import pytest
 from softgym_envs import cli
 from softgym_envs.errors import DesignError
 from softgym_envs.robots import make_robot
+from softgym_envs.surrogate.data.sampling import learned_variables
 from softgym_envs.surrogate.export import export_c, export_onnx
 from softgym_envs.surrogate.model import Features, SurrogateModel
-from softgym_envs.surrogate.networks import potential
-from softgym_envs.surrogate.sampling import learned_variables
+from softgym_envs.surrogate.potential import model as potential
 
 CC = shutil.which("cc") or shutil.which("gcc")
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler")
@@ -44,7 +44,7 @@ def random_model(case, seed=0, learned=None):
     """
     import torch
 
-    from softgym_envs.surrogate.networks.potential_torch import PotentialNet
+    from softgym_envs.surrogate.potential.network import PotentialNet
 
     name, options, at_rest, members = CASES[case]
     robot = make_robot(name, **options)
@@ -188,7 +188,7 @@ def test_the_graph_computes_what_the_model_does(case, tmp_path):
         assert_same(model, designs, displacement, run_graph(runtime, path, designs, displacement), 1e-4)
     properties = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
     assert properties["robot"] == model.robot.name
-    assert json.loads(properties["signature"]) == json.loads(json.dumps(model.robot.signature))
+    assert json.loads(properties["signature"]) == json.loads(json.dumps(model.robot.mechanics_key))
     assert [variable["name"] for variable in json.loads(properties["design"])] == list(model.robot.design_space.names)
     efforts = {actuator["effort_unit"] for actuator in json.loads(properties["displacement"])}
     assert efforts == ({"Pa"} if case == "six" else {"N"})

@@ -12,14 +12,16 @@ from safetensors.numpy import load_file, save_file
 
 from softgym_envs.config import load_config
 from softgym_envs.errors import DataError, WeightsError
-from softgym_envs.mechanics import complementarity
+from softgym_envs.mechanics.solvers import complementarity
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate import online
+from softgym_envs.surrogate.baselines import residual
+from softgym_envs.surrogate.data.sampling import learned_variables
 from softgym_envs.surrogate.model import Context, Features, SurrogateModel, load_model
-from softgym_envs.surrogate.networks import NETWORKS, potential, residual
-from softgym_envs.surrogate.networks.potential_torch import PotentialNet
+from softgym_envs.surrogate.networks import NETWORKS
+from softgym_envs.surrogate.potential import model as potential
+from softgym_envs.surrogate.potential.network import PotentialNet
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
-from softgym_envs.surrogate.sampling import learned_variables
 from softgym_envs.surrogate.training import FitConfig, Trainer, fit, generate
 
 CABLES = (1, 2)
@@ -340,7 +342,7 @@ def test_card_tells_where_the_weights_come_from(cables):
     assert card["network"] in NETWORKS
     assert card["test"]["positive_definite"] == 1.0
     assert card["states"]["test"] >= 500
-    config = load_config(CONFIGS / f"{robot.variant}.yaml", FitConfig)
+    config = load_config(CONFIGS / f"{robot.weights_name}.yaml", FitConfig)
     asked = config.model_dump(mode="json", exclude={"workers", "executor"})  # what made them is not part of it
     assert {k: v for k, v in card["config"].items() if k != "workers"} == asked
 

@@ -10,10 +10,10 @@ import pytest
 from benchmarks.hybrid import sample
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.robots import make_robot
-from softgym_envs.surrogate.dataset import COLUMNS
+from softgym_envs.surrogate.data.dataset import COLUMNS
 from softgym_envs.surrogate.model import load_model
-from softgym_envs.surrogate.networks.potential import Model, stack_members, unstack_members
 from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of, rehearsal_states, save_model
+from softgym_envs.surrogate.potential.model import Model, stack_members, unstack_members
 
 LIMIT = 8e-3  # that of `weights`
 
@@ -63,7 +63,7 @@ def test_members_can_be_taken_apart_and_put_together(model):
 def test_members_in_torch_are_those_of_the_kernel(model, robot):
     import torch
 
-    from softgym_envs.surrogate.networks.potential_torch import PotentialNet
+    from softgym_envs.surrogate.potential.network import PotentialNet
 
     states, scales = unstack_members(model.tensors)
     displacement = np.linspace(0.0, 0.02, 7)[:, None]

@@ -1,0 +1,1 @@
+"""Phases of a study: screen, shared policy, trials, finalists."""

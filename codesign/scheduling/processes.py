@@ -1,0 +1,150 @@
+"""Starting and watching the workers of a study: processes of this machine, or tasks of a Ray cluster."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from codesign.config import JOURNAL, StudyConfig
+from codesign.folder import StudyFolder
+from codesign.scheduling.queue import CALL
+from softgym_envs import errors
+
+__all__ = ["run_workers"]
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+
+
+def run_workers(
+    folder: StudyFolder, phase: str, count: int, tick: Callable[[], None] = lambda: None, *, interval: float = 0.2
+) -> str | None:
+    """Run a phase of a study in workers of one thread each, and wait for all of them.
+
+    The workers end when this process does, however it ends. One that was killed is replaced, up to ``attempts`` times
+    for each of them.
+
+    Args:
+        folder: the study; its configuration names the executor.
+        phase: name in `codesign.scheduling.worker.PHASES`.
+        count: number of workers.
+        tick: called every ``interval`` seconds, and once at the end.
+        interval: [s].
+
+    Returns:
+        What ended a worker that was not replaced, or None.
+
+    Raises:
+        ConfigError: if Ray is asked for and missing, or has several machines and the storage is of one.
+        SoftGymError: if a worker ended with an error of the suite, or with one that is a bug.
+    """
+    run = _run_on_ray if folder.config.executor == "ray" else _run_processes
+    return run(folder, phase, count, tick, interval)
+
+
+def _run_processes(
+    folder: StudyFolder, phase: str, count: int, tick: Callable[[], None], interval: float
+) -> str | None:
+    root = str(Path(__file__).resolve().parents[2])
+    paths = [root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": os.pathsep.join(paths)}
+    command = [sys.executable, "-m", "codesign.scheduling.worker", str(folder.path), phase]
+    with tempfile.TemporaryFile("w+") as complaints:
+
+        def start() -> subprocess.Popen[bytes]:
+            return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=complaints, env=environment)
+
+        workers = [start() for _ in range(count)]
+        spare = folder.config.attempts * count
+        try:
+            while any(worker.poll() is None for worker in workers):
+                time.sleep(interval)
+                tick()
+                for index, worker in enumerate(workers):
+                    if (worker.poll() or 0) < 0 and spare > 0:
+                        _release(worker)
+                        workers[index] = start()
+                        spare -= 1
+                if any((worker.returncode or 0) > 0 for worker in workers):
+                    break
+            failed = [worker.returncode for worker in workers if worker.returncode]
+        finally:
+            for worker in workers:
+                _release(worker)
+        tick()
+        for status in failed:
+            if status > 0:
+                complaints.seek(0)
+                raise _failure(phase, status, complaints.read())
+    return f"killed by signal {-failed[0]}" if failed else None
+
+
+def _release(worker: subprocess.Popen[bytes]) -> None:
+    """End a worker by closing its standard input, and wait for its end."""
+    if worker.stdin is not None:
+        worker.stdin.close()
+    worker.wait()
+
+
+def _failure(phase: str, status: int, text: str) -> errors.SoftGymError:
+    """The error of a worker, read back from its last line."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    last = lines[-1].strip() if lines else "no message"
+    kind, separator, message = last.partition(": ")
+    if status == 2 and separator and kind in errors.__all__:
+        return getattr(errors, kind)(message)
+    sys.stderr.write(text)
+    return errors.SoftGymError(f"a worker of phase '{phase}' stopped: {last}")
+
+
+def _run_on_ray(folder: StudyFolder, phase: str, count: int, tick: Callable[[], None], interval: float) -> str | None:
+    try:
+        import ray
+    except ImportError as error:
+        raise errors.ConfigError(f"executor = 'ray' needs Ray ({error}): pip install 'softgym-envs[ray]'") from None
+
+    ours = not ray.is_initialized()
+    if ours:
+        ray.init(log_to_driver=False, configure_logging=False)
+    try:
+        machines = len({node["NodeID"] for node in ray.nodes() if node["Alive"]})
+        if machines > 1 and folder.config.storage == JOURNAL:
+            raise errors.ConfigError(
+                f"storage '{JOURNAL}' serves one machine, and the Ray cluster has {machines}; set 'storage' to a "
+                "PostgreSQL database"
+            )
+        task = ray.remote(num_cpus=1, max_retries=folder.config.attempts)(_task)
+        arguments = (str(folder.path), folder.config.model_dump(mode="json"), phase)
+        # A cluster that ran before does not have the call's environment.
+        variables = dict.fromkeys(THREADS, "1") | {key: os.environ[key] for key in (CALL,) if key in os.environ}
+        running = [task.options(runtime_env={"env_vars": variables}).remote(*arguments) for _ in range(count)]
+        stopped = None
+        while running:
+            ended, running = ray.wait(running, timeout=interval)
+            tick()
+            for reference in ended:
+                try:
+                    ray.get(reference)
+                except ray.exceptions.RayTaskError as error:
+                    if isinstance(error.cause, errors.SoftGymError):
+                        raise error.cause from None
+                    raise errors.SoftGymError(f"a worker of phase '{phase}' stopped: {error.cause!r}") from error
+                except ray.exceptions.WorkerCrashedError:
+                    stopped = "killed"
+        tick()
+        return stopped
+    finally:
+        if ours:
+            ray.shutdown()
+
+
+def _task(path: str, config: dict[str, Any], phase: str) -> None:
+    """One worker as a task of Ray, perhaps on a machine that has no folder of the study yet."""
+    from codesign.scheduling.worker import PHASES
+
+    PHASES[phase](StudyFolder.create(path, StudyConfig.model_validate(config), wait=True))

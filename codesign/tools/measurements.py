@@ -1,0 +1,230 @@
+"""Measured states of a robot: read from a file, or simulated."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from softgym_envs.backends import make_backend
+from softgym_envs.errors import DataError
+from softgym_envs.robots.base import Robot
+from softgym_envs.storage import atomic_write
+
+__all__ = ["Measurements", "measure", "read_measurements", "write_measurements"]
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """N states of one body. What was not measured is NaN, whole columns at a time.
+
+    Attributes:
+        driven: what was imposed: ``"displacement"`` or ``"effort"`` of the actuators.
+        displacement: of the actuators [m, ...], shape (N, n_a).
+        effort: of the actuators [N, ...], shape (N, n_a).
+        effector: positions [m], shape (N, 3 k) for k effectors.
+    """
+
+    driven: Literal["displacement", "effort"]
+    displacement: np.ndarray
+    effort: np.ndarray
+    effector: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.effector)
+
+    @property
+    def command(self) -> np.ndarray:
+        """What was imposed, shape (N, n_a)."""
+        return self.displacement if self.driven == "displacement" else self.effort
+
+    def with_noise(self, relative: float, rng: np.random.Generator) -> Measurements:
+        """Return a copy with Gaussian noise on what was measured, not on what was imposed.
+
+        Args:
+            relative: standard deviation, relative to the root mean square of the effectors' distances from their mean,
+                and of the efforts.
+            rng: of the noise.
+        """
+        spread = np.sqrt(np.nanmean((self.effector - self.effector.mean(axis=0)) ** 2))
+        noisy = replace(self, effector=self.effector + rng.normal(0.0, relative * spread, self.effector.shape))
+        if self.driven == "displacement":
+            size = np.sqrt(np.mean(self.effort**2))
+            noisy = replace(noisy, effort=self.effort + rng.normal(0.0, relative * size, self.effort.shape))
+        return noisy
+
+
+def columns_of(robot: Robot) -> tuple[list[str], list[str], list[str]]:
+    """Names of the columns of displacements, efforts and effector coordinates."""
+    return (
+        [f"{actuator.name}_displacement" for actuator in robot.actuators],
+        [f"{actuator.name}_effort" for actuator in robot.actuators],
+        [f"{effector}_{axis}" for effector in robot.effectors for axis in AXES],
+    )
+
+
+def read_measurements(path: str | Path, robot: Robot) -> Measurements:
+    """Read measured states from a file, in SI: metres, newtons, cubic metres, pascals.
+
+    A CSV file has a header; a JSON file is a list of records, or an object of columns. The columns are
+    ``<actuator>_displacement`` or ``<actuator>_effort`` of every actuator (with both, displacements were imposed and
+    efforts measured), and ``<effector>_x``, ``_y``, ``_z``, those that were measured.
+
+    Args:
+        path: ends with .csv or .json.
+        robot: what was measured.
+
+    Raises:
+        DataError: if the file is missing or malformed; the message names the column, the row and what is allowed.
+    """
+    path = Path(path)
+    readers = {".csv": _read_csv, ".json": _read_json}
+    if path.suffix not in readers:
+        raise DataError(f"measurements '{path}' must be a file that ends with {' or '.join(readers)}")
+    try:
+        table = readers[path.suffix](path)
+    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
+        raise DataError(f"measurements '{path}' cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    return _checked(path, table, robot)
+
+
+def write_measurements(path: str | Path, robot: Robot, data: Measurements) -> None:
+    """Write a CSV file that `read_measurements` reads. Columns of NaN are left out."""
+    names = [name for group in columns_of(robot) for name in group]
+    table = np.column_stack([data.displacement, data.effort, data.effector])
+    if data.driven == "effort":  # a displacement beside it would mean that it was imposed
+        table[:, : data.displacement.shape[1]] = np.nan
+    kept = ~np.isnan(table).any(axis=0)
+    with atomic_write(path, "w") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([name for name, keep in zip(names, kept, strict=True) if keep])
+        writer.writerows([[repr(float(value)) for value in row] for row in table[:, kept]])
+
+
+def measure(
+    robot: Robot,
+    design: Mapping[str, float],
+    commands: Sequence[Sequence[float]] | np.ndarray,
+    *,
+    driven: Literal["displacement", "effort"] = "displacement",
+    backend: str = "fem",
+) -> Measurements:
+    """Simulate measured states.
+
+    Args:
+        robot: the family of bodies.
+        design: the body; missing variables take their baseline.
+        commands: imposed displacements or efforts, shape (N, n_a).
+        driven: which of them.
+        backend: ``"fem"`` or ``"surrogate"``.
+
+    Raises:
+        DesignError: for a malformed design.
+        InfeasibleDesign: if the geometry cannot exist.
+        ConvergenceError: if an equilibrium is not found.
+    """
+    physics = make_backend(backend, robot, design=design)
+    states = [physics.step(np.asarray(command, dtype=float), driven) for command in commands]
+    return Measurements(
+        driven,
+        # What was imposed on a cable that hangs slack is not what it reached.
+        displacement=np.array([s.command if driven == "displacement" else s.displacement for s in states]),
+        effort=np.array([state.effort for state in states]),
+        effector=np.array([state.effector.ravel() for state in states]),
+    )
+
+
+def _read_csv(path: Path) -> dict[str, list]:
+    with open(path, newline="", encoding="utf-8-sig") as stream:
+        rows = [row for row in csv.reader(stream) if row]
+    if not rows:
+        raise ValueError("it is empty")
+    header = [name.strip() for name in rows[0]]
+    if len(set(header)) != len(header):
+        raise ValueError(f"its header names a column twice: {', '.join(header)}")
+    for number, row in enumerate(rows[1:], start=1):
+        if len(row) != len(header):
+            raise ValueError(f"row {number} has {len(row)} values, the header {len(header)}")
+    return {name: [row[k] for row in rows[1:]] for k, name in enumerate(header)}
+
+
+def _read_json(path: Path) -> dict[str, list]:
+    data = json.loads(path.read_text(encoding="utf-8"))
+    if isinstance(data, list) and all(isinstance(record, dict) for record in data):
+        names = list(data[0]) if data else []
+        for number, record in enumerate(data, start=1):
+            if set(record) != set(names):
+                raise ValueError(f"record {number} has {', '.join(record)}, the first {', '.join(names)}")
+        return {name: [record[name] for record in data] for name in names}
+    if isinstance(data, dict) and all(isinstance(column, list) for column in data.values()):
+        if len({len(column) for column in data.values()}) > 1:
+            raise ValueError(f"its columns differ in length: { {k: len(v) for k, v in data.items()} }")
+        return data
+    raise ValueError("it must be a list of records, or an object of columns")
+
+
+def _checked(path: Path, table: dict[str, list], robot: Robot) -> Measurements:
+    displacement, effort, effector = columns_of(robot)
+    known = [*displacement, *effort, *effector]
+    where = f"measurements '{path}'"
+    for name in table:
+        if name not in known:
+            raise DataError(f"{where}: unknown column '{name}'; allowed: {', '.join(known)}")
+    count = len(next(iter(table.values()), []))
+    if count == 0:
+        raise DataError(f"{where}: it holds no states")
+    found = {name: np.full(count, np.nan) for name in known}
+    for name, column in table.items():
+        for k, entry in enumerate(column):
+            try:
+                value = math.nan if isinstance(entry, bool) else float(entry)
+            except (TypeError, ValueError):
+                value = math.nan
+            if not math.isfinite(value):
+                raise DataError(f"{where}: column '{name}', row {k + 1}: {entry!r} is not a finite number")
+            found[name][k] = value
+    driven: Literal["displacement", "effort"]
+    if all(name in table for name in displacement):
+        driven = "displacement"
+    elif all(name in table for name in effort):
+        driven = "effort"
+    else:
+        raise DataError(f"{where}: it needs the columns {', '.join(displacement)}, or {', '.join(effort)}")
+    given = [name for name in (displacement if driven == "effort" else effort) if name in table]
+    if given and (driven == "effort" or len(given) < len(effort)):
+        raise DataError(f"{where}: column '{given[0]}' is there, but not that of every actuator")
+    if not any(name in table for name in (*effector, *(effort if driven == "displacement" else ()))):
+        raise DataError(f"{where}: nothing was measured; give some of {', '.join(effector)}")
+    for k, actuator in enumerate(robot.actuators):
+        values = found[(displacement if driven == "displacement" else effort)[k]]
+        if driven == "displacement":
+            low, high, unit = actuator.low, actuator.high, f" {actuator.unit}"
+        else:
+            low, high, unit = (0.0 if actuator.unilateral else -actuator.max_effort), actuator.max_effort, ""
+        slack = 1e-6 * (actuator.high - actuator.low) if driven == "displacement" else 0.0
+        outside = np.flatnonzero((values < low - slack) | (values > high + slack))
+        if len(outside):
+            raise DataError(
+                f"{where}: {driven} {values[outside[0]]:g}{unit} of '{actuator.name}' in row {outside[0] + 1} is out "
+                f"of bounds; allowed: {low:g} to {high:g}{unit}"
+            )
+    far = 10.0 * robot.size
+    for name in effector:
+        if name in table and np.abs(found[name]).max() > far:
+            raise DataError(
+                f"{where}: column '{name}' reaches {np.abs(found[name]).max():g} m, on a robot of {robot.size:g} m; "
+                "lengths are in metres"
+            )
+
+    def block(names: list[str]) -> np.ndarray:
+        return np.column_stack([found[name] for name in names])
+
+    return Measurements(driven, block(displacement), block(effort), block(effector))

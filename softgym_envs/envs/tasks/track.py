@@ -1,0 +1,33 @@
+"""Track: follow a path of goals, the robot's published one by default."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softgym_envs.envs.tasks.base import Kinematics, Task, check_goals
+from softgym_envs.robots.base import Robot
+
+__all__ = ["Track"]
+
+
+class Track(Task):
+    """A path of goals, one after the other.
+
+    Args:
+        robot: the robot.
+        path: goals [m], shape (p, 3); default the robot's `reference_path`.
+        jitter: largest random shift of the path along each axis per episode [m].
+    """
+
+    name = "track"
+    horizon = 100
+
+    def __init__(self, robot: Robot, *, path: np.ndarray | None = None, jitter: float = 0.0) -> None:
+        super().__init__(robot)
+        self.path = robot.reference_path() if path is None else check_goals(path, "path")
+        if not (np.isfinite(jitter) and jitter >= 0.0):
+            raise ValueError(f"jitter = {jitter} m must be non-negative and finite")
+        self.jitter = jitter
+
+    def sample(self, rng: np.random.Generator, count: int, kinematics: Kinematics) -> np.ndarray:
+        return self.path + rng.uniform(-self.jitter, self.jitter, (count, 1, 3))

@@ -1,0 +1,156 @@
+"""Putting bodies together: solids, beams and rigid parts become one model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
+from softgym_envs.mechanics.elements.beams import Beam, Section
+from softgym_envs.mechanics.elements.block import ElementBlock
+from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, add_midside_nodes
+from softgym_envs.mechanics.elements.rigid import RigidBody
+from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra
+from softgym_envs.mechanics.frames import frame_rows
+from softgym_envs.mechanics.model import MechanicalModel
+
+__all__ = ["SOLIDS", "ModelBuilder"]
+
+SOLIDS: dict[str, type[SolidBlock]] = {
+    "linear": Tetrahedra,
+    "averaged": AveragedTetrahedra,
+    "quadratic": QuadraticTetrahedra,
+}
+"""Solid elements by name."""
+
+
+class ModelBuilder:
+    """Collects parts, then builds a `MechanicalModel`. Each part returns where its rows begin.
+
+    Args:
+        gravity: acceleration [m/s2], shape (3,).
+        floating: allow bodies that nothing holds.
+        solver: name of the linear solver.
+    """
+
+    def __init__(
+        self, *, gravity: Sequence[float] = (0.0, 0.0, 0.0), floating: bool = False, solver: str = "auto"
+    ) -> None:
+        self._gravity = gravity
+        self._floating = floating
+        self._solver = solver
+        self._rows: list[np.ndarray] = []
+        self._fixed: list[np.ndarray] = []
+        self._frames: list[int] = []
+        self._spins: list[np.ndarray] = []
+        self._carried: dict[int, np.ndarray] = {}
+        self._mounted: dict[int, list[int]] = {}
+        self._parts: list[tuple[type[ElementBlock], np.ndarray, dict[str, object]]] = []
+        self.size = 0
+
+    def _append(self, rows: np.ndarray, fixed: np.ndarray) -> int:
+        start = self.size
+        self._rows.append(np.asarray(rows, dtype=float))
+        self._fixed.append(fixed)
+        self.size += len(rows)
+        return start
+
+    def add_solid(
+        self, nodes: np.ndarray, tetrahedra: np.ndarray, *, fixed: np.ndarray, element: str = "linear", **material
+    ) -> int:
+        """Add a solid body.
+
+        Args:
+            nodes: [m], shape (n, 3).
+            tetrahedra: corner indices (m, 4), or with midside nodes (m, 10) for ``"quadratic"``, which is given them
+                otherwise: new midside nodes come after the old nodes and are fixed where both ends are.
+            fixed: boolean mask (n,) or (n, 3) of clamped nodes.
+            element: a name of `SOLIDS`.
+            **material: options of the element block: material, young_modulus, poisson_ratio, density.
+        """
+        if element not in SOLIDS:
+            raise ValueError(f"unknown element '{element}'; allowed: {', '.join(SOLIDS)}")
+        nodes, tetrahedra = np.asarray(nodes, dtype=float), np.asarray(tetrahedra)
+        mask = np.zeros((len(nodes), 3), dtype=bool)
+        flags = np.asarray(fixed)
+        mask[flags if flags.size else flags.astype(int)] = True
+        if element == "quadratic" and tetrahedra.shape[1] == 4:
+            count = len(nodes)
+            nodes, tetrahedra = add_midside_nodes(nodes, tetrahedra)
+            ends = np.zeros((len(nodes) - count, 2), dtype=np.int64)
+            for slot, (a, b) in enumerate([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]):
+                ends[tetrahedra[:, 4 + slot] - count] = tetrahedra[:, [a, b]]
+            mask = np.vstack([mask, mask[ends[:, 0]] & mask[ends[:, 1]]])
+        start = self._append(nodes, mask)
+        self._parts.append((SOLIDS[element], tetrahedra + start, dict(material)))
+        return start
+
+    def add_frame(
+        self,
+        position: np.ndarray | Sequence[float],
+        rotation: np.ndarray | None = None,
+        *,
+        fixed: bool | Sequence[bool] = False,
+        fixed_spin: bool | Sequence[bool] = False,
+        on: int | None = None,
+    ) -> int:
+        """Add a frame: a rigid part, or a node of a beam.
+
+        Args:
+            position: [m], shape (3,).
+            rotation: matrix (3, 3), default identity.
+            fixed: origin held, all of it or by axis of space.
+            fixed_spin: spin held, all of it or by axis of space.
+            on: first row of another frame that this one is fixed to.
+
+        Returns:
+            Its first row.
+        """
+        mask = np.zeros((4, 3), dtype=bool)
+        mask[0] = fixed
+        start = self._append(frame_rows(position, rotation), mask)
+        if on is not None and on not in self._frames:
+            raise ValueError(f"there is no frame at row {on} to mount on; frames: {self._frames}")
+        if on is not None:
+            self._mounted.setdefault(self._frames.index(on), []).append(start)
+            return start
+        self._frames.append(start)
+        self._spins.append(np.broadcast_to(np.asarray(fixed_spin, dtype=bool), (3,)))
+        return start
+
+    def carry(self, frame: int, rows: np.ndarray) -> None:
+        """Let mesh nodes move with the frame at a row."""
+        if frame not in self._frames:
+            raise ValueError(f"no frame begins at row {frame}; frames begin at {self._frames}")
+        index = self._frames.index(frame)
+        self._carried[index] = np.concatenate([self._carried.get(index, np.empty(0, dtype=np.int64)), rows])
+
+    def add_beam(self, frames: Sequence[int] | np.ndarray, *, section: Section | list[Section], **options) -> None:
+        """Add beam elements along frames that were added before; options as for `Beam`."""
+        known = {*self._frames, *(row for rows in self._mounted.values() for row in rows)}
+        strange = [int(row) for row in frames if int(row) not in known]
+        if strange:
+            raise ValueError(f"there is no frame at row {strange[0]} for a beam; frames: {sorted(known)}")
+        self._parts.append((Beam, np.asarray(frames, dtype=np.int64), {"section": section, **options}))
+
+    def add_mass(self, frame: int, mass: float, inertia: np.ndarray) -> None:
+        """Give the rigid part at a frame its mass [kg] and its inertia along the directors [kg m2], shape (3, 3)."""
+        self._parts.append((RigidBody, np.array(frame), {"mass": mass, "inertia": inertia}))
+
+    def build(self) -> MechanicalModel:
+        """Return the model. Blocks come in the order in which they were added."""
+        nodes = np.vstack(self._rows)
+        blocks = [kind(nodes, topology, **options) for kind, topology, options in self._parts]  # type: ignore[call-arg]
+        return MechanicalModel(
+            nodes,
+            blocks,
+            fixed=np.vstack(self._fixed),
+            frames=self._frames,
+            carried=self._carried,
+            mounted={frame: np.array(rows) for frame, rows in self._mounted.items()},
+            fixed_spin=np.array(self._spins) if self._spins else None,
+            floating=self._floating,
+            gravity=self._gravity,
+            solver=self._solver,
+        )

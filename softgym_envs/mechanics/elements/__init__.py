@@ -1,0 +1,1 @@
+"""Element blocks: energy, forces and exact tangents of solids, beams and rigid parts."""

@@ -1,0 +1,80 @@
+"""Mass of rigid parts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softgym_envs.mechanics.elements.block import ElementBlock, lower_pairs
+
+__all__ = ["RigidBody", "box_inertia", "sphere_inertia"]
+
+
+def box_inertia(mass: float, half_extents: np.ndarray) -> np.ndarray:
+    """Inertia tensor [kg m2] of a box about its centre, shape (3, 3)."""
+    squares = np.asarray(half_extents, dtype=float) ** 2
+    return mass / 3.0 * np.diag(squares.sum() - squares)
+
+
+def sphere_inertia(mass: float, radius: float) -> np.ndarray:
+    """Inertia tensor [kg m2] of a ball about its centre, shape (3, 3)."""
+    return 0.4 * mass * radius**2 * np.eye(3)
+
+
+class RigidBody(ElementBlock):
+    """Mass of a rigid part whose centre of mass is the origin of its frame.
+
+    Args:
+        nodes: rest rows [m], shape (n, 3).
+        row: first row of its frame.
+        mass: [kg].
+        inertia: about the centre of mass, along the directors [kg m2], shape (3, 3).
+
+    Raises:
+        ValueError: for a mass or an inertia that no body can have.
+    """
+
+    volume = 0.0
+    stiffness = 0.0
+
+    def __init__(self, nodes: np.ndarray, row: int, *, mass: float, inertia: np.ndarray) -> None:
+        inertia = np.asarray(inertia, dtype=float)
+        if not (np.isfinite(mass) and mass > 0.0):
+            raise ValueError(f"mass = {mass} kg of a rigid body must be positive and finite")
+        if inertia.shape != (3, 3) or not np.allclose(inertia, inertia.T):
+            raise ValueError(f"inertia must be a symmetric matrix (3, 3), got {inertia.tolist()}")
+        # Kinetic energy in terms of directors: 1/2 sum_kl E_kl d_k' . d_l' with Euler's tensor E.
+        self._euler = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+        if np.linalg.eigvalsh(self._euler)[0] < -1e-9 * np.trace(inertia):
+            raise ValueError(f"no body has the inertia {inertia.tolist()} kg m2: it breaks the triangle inequality")
+        self.row = int(row)
+        self.mass = float(mass)
+        self.nodes_used = self.row + np.arange(4)
+
+    def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        return [lower_pairs((3 * self.nodes_used[:, None] + np.arange(3)).reshape(1, 12))]
+
+    def add(
+        self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
+    ) -> tuple[float, int]:
+        return 0.0, 0
+
+    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        """A rigid part has no strain."""
+
+    def nodal_masses(self, count: int) -> np.ndarray:
+        masses = np.zeros(count)
+        masses[self.row] = self.mass
+        return masses
+
+    def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        matrix = np.zeros((4, 4))
+        matrix[0, 0] = self.mass
+        matrix[1:, 1:] = self._euler
+        i, j = np.tril_indices(4)
+        return self.row + i, self.row + j, matrix[i, j]
+
+    def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
+        """A rigid part is not warped."""
+
+    def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)

@@ -1,0 +1,402 @@
+"""Four-node tetrahedra: shape-function gradients, deformation gradients, and assembly of forces and tangents."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+from numba import njit
+
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.elements.block import ElementBlock, lower_pairs
+from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
+
+__all__ = ["SolidBlock", "Tetrahedra", "boundary_triangles", "check_density", "element_masses", "orient_corners"]
+
+
+@njit(cache=True, error_model="numpy")
+def _deformation_gradients(x, connectivity, points, gradients, F):
+    for q in range(gradients.shape[0]):
+        e = q // points
+        for i in range(9):
+            F[q, i] = 0.0
+        for a in range(connectivity.shape[1]):
+            node = connectivity[e, a]
+            for i in range(3):
+                for j in range(3):
+                    F[q, 3 * i + j] += x[node, i] * gradients[q, a, j]
+
+
+@njit(cache=True, error_model="numpy")
+def _add_forces(connectivity, points, gradients, weights, stress, out):
+    """Add the gradient of the energy to ``out``, shape (n, 3)."""
+    for q in range(gradients.shape[0]):
+        e = q // points
+        for a in range(connectivity.shape[1]):
+            node = connectivity[e, a]
+            for i in range(3):
+                value = 0.0
+                for j in range(3):
+                    value += stress[q, 3 * i + j] * gradients[q, a, j]
+                out[node, i] += weights[q] * value
+
+
+@njit(cache=True, error_model="numpy")
+def _add_tangent(gradients, volumes, tangent, scatter, out):
+    """Add the lower triangle of each 12 x 12 element matrix to the CSC values ``out`` through ``scatter``."""
+    half = np.empty((12, 9))
+    for e in range(gradients.shape[0]):
+        v = volumes[e]
+        g = gradients[e]
+        c = tangent[e]
+        for a in range(4):
+            for i in range(3):
+                for q in range(9):
+                    half[3 * a + i, q] = v * (
+                        g[a, 0] * c[3 * i, q] + g[a, 1] * c[3 * i + 1, q] + g[a, 2] * c[3 * i + 2, q]
+                    )
+        k = 0
+        for r in range(12):
+            for s in range(r + 1):
+                b = s // 3
+                j = s - 3 * b
+                target = scatter[e, k]
+                k += 1
+                if target >= 0:
+                    out[target] += (
+                        half[r, 3 * j] * g[b, 0] + half[r, 3 * j + 1] * g[b, 1] + half[r, 3 * j + 2] * g[b, 2]
+                    )
+
+
+@njit(cache=True, error_model="numpy")
+def _viscosity(F, mu, lame, inverse, out):
+    """Second derivative (m, 9, 9) of ``mu D : D + lame / 2 (tr D)^2``, D = sym(F' F^-1), by F'; and F^-T (m, 9)."""
+    rate = np.empty((6, 9))
+    for e in range(F.shape[0]):
+        f = F[e]
+        c = inverse[e]
+        for i in range(3):
+            for j in range(3):
+                a, b, p, q = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+                c[3 * i + j] = f[3 * a + p] * f[3 * b + q] - f[3 * a + q] * f[3 * b + p]
+        c /= f[0] * c[0] + f[1] * c[1] + f[2] * c[2]
+        # Rows: D_00, D_11, D_22 and sqrt(2) times D_01, D_02, D_12.
+        rate[:] = 0.0
+        s = np.sqrt(0.5)
+        k = 3
+        for i in range(3):
+            rate[i, 3 * i : 3 * i + 3] = c[3 * i : 3 * i + 3]
+            for j in range(i + 1, 3):
+                rate[k, 3 * i : 3 * i + 3] = s * c[3 * j : 3 * j + 3]
+                rate[k, 3 * j : 3 * j + 3] = s * c[3 * i : 3 * i + 3]
+                k += 1
+        for p in range(9):
+            for q in range(p + 1):
+                value = 0.0
+                for k in range(6):
+                    value += rate[k, p] * rate[k, q]
+                out[e, p, q] = 2.0 * mu[e] * value + lame[e] * c[p] * c[q]
+                out[e, q, p] = out[e, p, q]
+
+
+@njit(cache=True, error_model="numpy")
+def _add_warped(x, step, connectivity, points, gradients, volumes, out):
+    """Add ``V (F' - F) g_a``, with F' the gradient F turned and strained by a step, to ``out``, shape (n, 3)."""
+    f = np.empty((3, 3))
+    d = np.empty((3, 3))
+    h = np.empty((3, 3))
+    turn = np.empty((3, 3))
+    strained = np.empty((3, 3))
+    for e in range(gradients.shape[0]):
+        element = e // points
+        f[:, :] = 0.0
+        d[:, :] = 0.0
+        for a in range(connectivity.shape[1]):
+            node = connectivity[element, a]
+            for i in range(3):
+                for j in range(3):
+                    f[i, j] += x[node, i] * gradients[e, a, j]
+                    d[i, j] += step[node, i] * gradients[e, a, j]
+        c00 = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]
+        c01 = f[1, 2] * f[2, 0] - f[1, 0] * f[2, 2]
+        c02 = f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0]
+        inverse = 1.0 / (f[0, 0] * c00 + f[0, 1] * c01 + f[0, 2] * c02)
+        for i in range(3):
+            # Row i of h = d F^-1, with F^-1 the transposed cofactors over the determinant.
+            h[i, 0] = inverse * (d[i, 0] * c00 + d[i, 1] * c01 + d[i, 2] * c02)
+            h[i, 1] = inverse * (
+                d[i, 0] * (f[0, 2] * f[2, 1] - f[0, 1] * f[2, 2])
+                + d[i, 1] * (f[0, 0] * f[2, 2] - f[0, 2] * f[2, 0])
+                + d[i, 2] * (f[0, 1] * f[2, 0] - f[0, 0] * f[2, 1])
+            )
+            h[i, 2] = inverse * (
+                d[i, 0] * (f[0, 1] * f[1, 2] - f[0, 2] * f[1, 1])
+                + d[i, 1] * (f[0, 2] * f[1, 0] - f[0, 0] * f[1, 2])
+                + d[i, 2] * (f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0])
+            )
+        w0 = 0.5 * (h[2, 1] - h[1, 2])
+        w1 = 0.5 * (h[0, 2] - h[2, 0])
+        w2 = 0.5 * (h[1, 0] - h[0, 1])
+        angle2 = w0 * w0 + w1 * w1 + w2 * w2
+        angle = np.sqrt(angle2)
+        if angle < 1e-4:
+            a1 = 1.0 - angle2 / 6.0
+            a2 = 0.5 - angle2 / 24.0
+        else:
+            a1 = np.sin(angle) / angle
+            a2 = (1.0 - np.cos(angle)) / angle2
+        # Rodrigues' formula for exp([w]x).
+        turn[0, 0] = 1.0 - a2 * (w1 * w1 + w2 * w2)
+        turn[1, 1] = 1.0 - a2 * (w0 * w0 + w2 * w2)
+        turn[2, 2] = 1.0 - a2 * (w0 * w0 + w1 * w1)
+        turn[0, 1] = a2 * w0 * w1 - a1 * w2
+        turn[1, 0] = a2 * w0 * w1 + a1 * w2
+        turn[0, 2] = a2 * w0 * w2 + a1 * w1
+        turn[2, 0] = a2 * w0 * w2 - a1 * w1
+        turn[1, 2] = a2 * w1 * w2 - a1 * w0
+        turn[2, 1] = a2 * w1 * w2 + a1 * w0
+        for i in range(3):
+            for j in range(3):
+                strained[i, j] = f[i, j]
+                for k in range(3):
+                    strained[i, j] += 0.5 * (h[i, k] + h[k, i]) * f[k, j]
+        v = volumes[e]
+        for i in range(3):
+            for j in range(3):
+                value = -f[i, j]
+                for k in range(3):
+                    value += turn[i, k] * strained[k, j]
+                d[i, j] = v * value
+        for a in range(connectivity.shape[1]):
+            node = connectivity[element, a]
+            for i in range(3):
+                out[node, i] += (
+                    d[i, 0] * gradients[e, a, 0] + d[i, 1] * gradients[e, a, 1] + d[i, 2] * gradients[e, a, 2]
+                )
+
+
+def orient_corners(nodes: np.ndarray, connectivity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Check tetrahedra and turn those that are negatively oriented.
+
+    Args:
+        nodes: rest positions [m], shape (n, 3).
+        connectivity: corner indices, shape (m, 4).
+
+    Returns:
+        Corner indices (m, 4), volumes [m3] (m,), and which were turned (m,).
+
+    Raises:
+        ValueError: for a wrong shape, an index out of range or a degenerate element.
+    """
+    connectivity = np.array(connectivity, dtype=np.int64)
+    if connectivity.ndim != 2 or connectivity.shape[1] != 4 or len(connectivity) == 0:
+        raise ValueError(f"tetrahedra must have shape (m, 4) with m > 0, got {connectivity.shape}")
+    if connectivity.min() < 0 or connectivity.max() >= len(nodes):
+        raise ValueError(
+            f"tetrahedra refer to nodes {connectivity.min()}..{connectivity.max()}, the mesh has {len(nodes)}"
+        )
+    corners = nodes[connectivity]
+    edges = corners[:, 1:] - corners[:, :1]
+    volumes = np.linalg.det(edges) / 6.0
+    turned = volumes < 0
+    connectivity[turned] = connectivity[turned][:, [0, 2, 1, 3]]
+    flat = np.flatnonzero(np.abs(volumes) < 1e-9 * np.abs(edges).max(axis=(1, 2)) ** 3)
+    if len(flat):
+        raise ValueError(f"{len(flat)} degenerate tetrahedra, the first is number {flat[0]}")
+    return connectivity, np.abs(volumes), turned
+
+
+def element_masses(
+    connectivity: np.ndarray, masses: np.ndarray, shares: np.ndarray, lumped: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mass entries of elements (m, k) with masses [kg] (m,) and a mass matrix ``shares`` (k, k) of unit mass.
+
+    Lumping keeps the diagonal, scaled to the mass (Hinton, Rock and Zienkiewicz 1976).
+    """
+    if lumped:
+        diagonal = np.diag(shares) / np.trace(shares)
+        nodes = connectivity.ravel()
+        return nodes, nodes, (masses[:, None] * diagonal).ravel()
+    i, j = np.tril_indices(connectivity.shape[1])
+    return connectivity[:, i].ravel(), connectivity[:, j].ravel(), (masses[:, None] * shares[i, j]).ravel()
+
+
+def boundary_triangles(tetrahedra: np.ndarray) -> np.ndarray:
+    """Return the faces (t, 3) that belong to one tetrahedron only, seen counter-clockwise from outside.
+
+    Args:
+        tetrahedra: corner indices of positively oriented tetrahedra, shape (m, 4).
+    """
+    faces = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[np.sort(first[count == 1])]
+
+
+def check_density(density: float) -> float:
+    """Return a density [kg/m3].
+
+    Raises:
+        ValueError: if it is negative or not finite.
+    """
+    if not (np.isfinite(density) and density >= 0.0):
+        raise ValueError(f"density = {density} kg/m3 must be finite and not negative")
+    return float(density)
+
+
+class SolidBlock(ElementBlock):
+    """What blocks of solid elements share: material, quadrature and the warping of steps.
+
+    Args:
+        connectivity: node indices, shape (m, k).
+        gradients: shape-function gradients [1/m] at the quadrature points, shape (m q, k, 3), element by element.
+        weights: volumes [m3] of the quadrature points, shape (m q,).
+        material: a `Material` or its name.
+        young_modulus: [Pa], scalar or shape (m,).
+        poisson_ratio: scalar or shape (m,), inside (-1, 0.5).
+        density: [kg/m3].
+    """
+
+    def __init__(
+        self,
+        connectivity: np.ndarray,
+        gradients: np.ndarray,
+        weights: np.ndarray,
+        *,
+        material: str | Material,
+        young_modulus: float | np.ndarray,
+        poisson_ratio: float | np.ndarray,
+        density: float,
+    ) -> None:
+        self.material = resolve_material(material)
+        self.density = check_density(density)
+        self.connectivity = connectivity
+        self.gradients = np.ascontiguousarray(gradients)
+        self.weights = weights
+        self.points = len(weights) // len(connectivity)
+        self.volumes = weights.reshape(len(connectivity), -1).sum(axis=1)
+        self.nodes_used = np.unique(connectivity)
+        self.volume = float(weights.sum())
+        self.mass = self.density * self.volume
+        self.set_elasticity(young_modulus, poisson_ratio)
+        count = len(weights)
+        self.stiffness = float(np.mean(self.mu)) * float(np.cbrt(self.volumes).mean())
+        self._F = np.empty((count, 9))
+        self._energy = np.empty(count)
+        self._stress = np.empty((count, 9))
+        self._tangent = np.empty((count, 9, 9))
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Corner nodes of the elements, shape (m, 4)."""
+        return self.connectivity[:, :4]
+
+    def set_elasticity(self, young_modulus: float | np.ndarray, poisson_ratio: float | np.ndarray) -> None:
+        """Set Young's modulus [Pa] and Poisson's ratio, scalars or shape (m,).
+
+        A model in use learns of it by its `refresh_loads`.
+        """
+        m = len(self.connectivity)
+        young = np.broadcast_to(np.asarray(young_modulus, dtype=float), (m,))
+        poisson = np.broadcast_to(np.asarray(poisson_ratio, dtype=float), (m,))
+        pairs, which = np.unique(np.column_stack([young, poisson]), axis=0, return_inverse=True)
+        parameters = np.repeat(
+            np.array([lame_parameters(e, nu) for e, nu in pairs])[which.ravel()], self.points, axis=0
+        )
+        self.mu, self.lame = np.ascontiguousarray(parameters[:, 0]), np.ascontiguousarray(parameters[:, 1])
+
+    def embed(self, points: np.ndarray, nodes: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
+        """Embed points [m] (p, 3) of the rest shape ``nodes`` [m] (n, 3) in the elements."""
+        return EmbeddedPoints(points, nodes, self.connectivity, hint)
+
+    def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        k = self.connectivity.shape[1]
+        return [lower_pairs((3 * self.connectivity[:, :, None] + np.arange(3)).reshape(-1, 3 * k))]
+
+    def add(
+        self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
+    ) -> tuple[float, int]:
+        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
+        inverted = self.material.evaluate(self._F, self.mu, self.lame, self._energy, self._stress, self._tangent)
+        if inverted:
+            return np.inf, inverted
+        _add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
+        if values is not None:
+            assert scatter is not None
+            self._add_stiffness(self._tangent, values, scatter)
+        return float(self._energy @ self.weights), 0
+
+    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
+        _viscosity(self._F, self.mu, self.lame, self._stress, self._tangent)
+        self._add_stiffness(self._tangent, values, scatter)
+
+    @abstractmethod
+    def _add_stiffness(self, tangent: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        """Add the element matrices of tangents (m q, 9, 9) at the quadrature points."""
+
+    def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
+        _add_warped(x, step, self.connectivity, self.points, self.gradients, self.weights, out)
+
+    def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        m, k = self.connectivity.shape
+        values = (self.weights[:, None, None] * self.gradients) @ np.swapaxes(self.gradients, 1, 2)
+        values = values.reshape(m, self.points, k, k).sum(axis=1)
+        rows = np.repeat(self.connectivity, k, axis=1)
+        columns = np.tile(self.connectivity, (1, k))
+        return rows.ravel(), columns.ravel(), values.ravel()
+
+
+class Tetrahedra(SolidBlock):
+    """A block of linear (four-node) tetrahedra of one material.
+
+    Args:
+        nodes: rest positions [m], shape (n, 3).
+        connectivity: corner indices, shape (m, 4). Negatively oriented elements are turned.
+        material: a `Material` or its name.
+        young_modulus: [Pa], scalar or shape (m,).
+        poisson_ratio: scalar or shape (m,), inside (-1, 0.5).
+        density: [kg/m3].
+
+    Raises:
+        ValueError: for a degenerate element, an index out of range or an unknown material.
+    """
+
+    def __init__(
+        self,
+        nodes: np.ndarray,
+        connectivity: np.ndarray,
+        *,
+        material: str | Material = "corotational",
+        young_modulus: float | np.ndarray = 3.0e6,
+        poisson_ratio: float | np.ndarray = 0.3,
+        density: float = 1100.0,
+    ) -> None:
+        material = resolve_material(material)
+        connectivity, volumes, _ = orient_corners(nodes, connectivity)
+        corners = nodes[connectivity]
+        inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
+        gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+        super().__init__(
+            connectivity,
+            gradients,
+            volumes,
+            material=material,
+            young_modulus=young_modulus,
+            poisson_ratio=poisson_ratio,
+            density=density,
+        )
+
+    def embed(self, points: np.ndarray, nodes: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
+        return EmbeddedPoints(points, nodes, self.connectivity, hint, gradients=self.gradients[:, 1:])
+
+    def nodal_masses(self, count: int) -> np.ndarray:
+        share = np.repeat(0.25 * self.density * self.volumes, 4)
+        return np.bincount(self.connectivity.ravel(), weights=share, minlength=count)
+
+    def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return element_masses(
+            self.connectivity, self.density * self.volumes, (np.ones((4, 4)) + np.eye(4)) / 20, lumped
+        )
+
+    def _add_stiffness(self, tangent: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+        _add_tangent(self.gradients, self.volumes, tangent, scatter[0], values)

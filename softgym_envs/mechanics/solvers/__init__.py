@@ -1,0 +1,1 @@
+"""Solvers: linear systems, static equilibrium, time stepping, complementarity."""

@@ -1,0 +1,369 @@
+"""Static equilibrium of displacement- and effort-driven actuators.
+
+Newton's method on the KKT system by the Schur complement: the tangent is factorised once per iteration, solved for
+the few constraint columns, and ``W`` is there. Step lengths follow the affine-invariant natural monotonicity test
+of Deuflhard (Newton Methods for Nonlinear Problems, 2004, algorithm NLEQ-ERR): a step is accepted when the
+simplified Newton correction that follows it is smaller, which needs no scaling between forces and displacements.
+Displacement-driven cables are unilateral: each correction solves a small linear complementarity problem.
+Bonds are driven rows that are always held at zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
+from softgym_envs.mechanics.solvers.linear import SuperLUSolver
+
+__all__ = ["Equilibrium", "Statics"]
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """A solved state.
+
+    Attributes:
+        x: node positions [m], shape (n, 3).
+        condensed: the condensed model at the state; bonds are eliminated from it.
+        delta: constraint values of all rows, bonds last, shape (size,).
+        effort: efforts of all rows, bonds last, shape (size,).
+        slack: per actuator row, True where a unilateral actuator hangs slack.
+        stable: the tangent is positive definite: the state is stable whatever drives the actuators. Where it is not, a
+            displacement-driven state may still be.
+        iterations: Newton iterations spent, over all load increments.
+        increments: load increments used.
+    """
+
+    x: np.ndarray
+    condensed: CondensedModel
+    delta: np.ndarray
+    effort: np.ndarray
+    slack: np.ndarray
+    stable: bool
+    iterations: int
+    increments: int
+
+
+class _NotFound(Exception):
+    """Newton's method failed on one increment."""
+
+
+def _complementary_step(W: np.ndarray, gap: np.ndarray, effort: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
+    """Steps of driven efforts that close ``gap`` where a row is bilateral, and in which no unilateral row pushes."""
+    if not unilateral.any():
+        return np.linalg.solve(W, -gap)
+    if unilateral.all():
+        return solve_complementarity(W[None], (gap - W @ effort)[None], unilateral)[0] - effort
+    loose, firm = np.flatnonzero(unilateral), np.flatnonzero(~unilateral)
+    offset = gap - W @ effort
+    # Bilateral rows are eliminated: only the few others are a question of taut or slack.
+    below, right = firm[:, None], loose[:, None]
+    reduced = np.linalg.solve(W[below, firm], np.column_stack([W[below, loose], offset[firm]]))
+    across = W[right, firm] @ reduced
+    new = np.empty_like(effort)
+    new[loose] = solve_complementarity(
+        (W[right, loose] - across[:, :-1])[None],
+        (offset[loose] - across[:, -1])[None],
+        np.ones(len(loose), dtype=bool),
+    )[0]
+    new[firm] = -(reduced[:, :-1] @ new[loose] + reduced[:, -1])
+    return new - effort
+
+
+class Statics:
+    """Follows the equilibrium of a model under changing commands, starting each solve from the last state.
+
+    Args:
+        model: the body.
+        tolerance: largest correction of any node left at convergence [m].
+        max_iterations: Newton iterations per load increment.
+        max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the way.
+
+    Attributes:
+        x: present node positions [m], shape (n, 3).
+        effort: present efforts of all rows, shape (size,).
+        unilateral: actuator rows that cannot push, shape (n_a,); may be changed between solves.
+    """
+
+    def __init__(
+        self,
+        model: MechanicalModel,
+        *,
+        tolerance: float = 1e-10,
+        max_iterations: int = 30,
+        max_halvings: int = 8,
+    ) -> None:
+        self.model = model
+        self.tolerance = tolerance
+        self.max_iterations = max_iterations
+        self.max_halvings = max_halvings
+        model.prepare()
+        sizes = dict(model.roles)
+        self._actuators = sizes.get("a", 0)
+        self._effectors = self._actuators + np.arange(sizes.get("e", 0))
+        self._contacts = self._actuators + sizes.get("e", 0) + np.arange(sizes.get("c", 0))
+        self._bonds = model.size - sizes.get("b", 0) + np.arange(sizes.get("b", 0))
+        self.unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
+        self._fallback: SuperLUSolver | None = None
+        self._version = model.version
+        self.reset()
+
+    def reset(self) -> None:
+        """Go back to the undeformed shape with no effort. The equilibrium under loads is found by `solve`."""
+        self.x = self.model.nodes.copy()
+        self.effort = np.zeros(self.model.size)
+        self._carried = np.zeros_like(self.x)  # dead loads that the present state carries
+        self._fresh = False
+
+    def restore(self, x: np.ndarray, effort: np.ndarray) -> None:
+        """Start the next solve from node positions ``x`` (n, 3) and efforts (size,) of all rows."""
+        self.x = x.copy()
+        self.effort = effort.copy()
+        self._carried = self.model.loads
+        self._fresh = False
+
+    # -- one linearisation ------------------------------------------------------------------------------------------
+
+    def _linearise(self) -> bool:
+        """Assemble and factorise at the current state. False if elements are inverted or the tangent is singular."""
+        assembled = self.model.assemble(self.x, self.effort)
+        if assembled is None:
+            return False
+        return self._factorise(assembled)
+
+    def _factorise(self, assembled: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]) -> bool:
+        self._residual, values, self._H, self._delta = assembled
+        solver = self.model.solver
+        self.model.factor_owner = self
+        if solver.factorise(values):
+            self._active = solver
+        else:
+            # Cholesky fails on a tangent that is indefinite though the constrained problem is stable.
+            if self._fallback is None:
+                self._fallback = SuperLUSolver(solver.indptr, solver.indices)
+            if not self._fallback.factorise(values):
+                return False
+            self._active = self._fallback
+        self._Ar = self._active.solve(self._residual[:, None])[:, 0]
+        self._W, self._half = self._active.condense(self._H)
+        if not np.isfinite(self._W).all():
+            return False
+        self._W = 0.5 * (self._W + self._W.T)
+        self._fresh = True
+        return True
+
+    def _correction(
+        self, Ar: np.ndarray, delta: np.ndarray, effort: np.ndarray, target: np.ndarray, driven: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Solve the linearised KKT system; returns the step of the free dofs and of the efforts."""
+        step_effort = np.zeros_like(effort)
+        # Effort-driven rows: the residual already holds their current effort; move it to the commanded value.
+        forced = np.ones(len(effort), dtype=bool)
+        forced[driven] = False
+        step_effort[forced] = target[forced] - effort[forced]
+        if len(driven):
+            gap = (delta - target - Ar @ self._H + self._W @ step_effort)[driven]
+            W = self._W[driven[:, None], driven]
+            loose = np.zeros(len(effort), dtype=bool)
+            loose[: self._actuators] = self.unilateral
+            try:
+                step_effort[driven] = _complementary_step(W, gap, effort[driven], loose[driven])
+            except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (actuators that do the same)
+                raise _NotFound from None
+        step_q = self._active.expand(self._half @ step_effort) - Ar
+        if len(self._bonds):
+            # The tangent holds `bond_stiffness` H_b H_b^T, which already carries its share of the force.
+            step_effort[self._bonds] += self.model.bond_stiffness * (delta[self._bonds] - target[self._bonds])
+        return step_q, step_effort
+
+    def _norm(self, step: np.ndarray) -> float:
+        """Largest displacement [m] of a step of the equations."""
+        return float(np.abs(step * self.model.dof_scale).max(initial=0.0))
+
+    def _move(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Displacement of the rows (n, 3) that a step of the equations (N,) stands for."""
+        return self.model.warp(x, step)
+
+    # -- Newton -----------------------------------------------------------------------------------------------------
+
+    def _newton(self, target: np.ndarray, driven: np.ndarray) -> int:
+        """Converge at one load level; returns the iterations. After `_NotFound` the caller restores the state."""
+        if not self._fresh and not self._linearise():
+            raise _NotFound
+        step_q, step_effort = self._correction(self._Ar, self._delta, self.effort, target, driven)
+        length = 1.0
+        for iteration in range(1, self.max_iterations + 1):
+            norm = self._norm(step_q)
+            if not np.isfinite(norm):
+                raise _NotFound
+            while True:
+                x = self.x + self._move(self.x, length * step_q)
+                effort = self.effort + length * step_effort
+                assembled = self.model.assemble(x, effort)
+                if assembled is not None:
+                    Ar = self._active.solve(assembled[0][:, None])[:, 0]
+                    next_q, next_effort = self._correction(Ar, assembled[3], effort, target, driven)
+                    remaining = self._norm(next_q)
+                    # At the last digits round-off decides, not Newton.
+                    if remaining <= (1.0 - 0.25 * length) * norm or remaining <= self.tolerance:
+                        break
+                length *= 0.5
+                if length < 1e-3:
+                    raise _NotFound
+            contraction = remaining / norm if norm > 0.0 else 0.0
+            if length == 1.0 and remaining > self.tolerance and remaining * contraction <= 0.1 * self.tolerance:
+                # The simplified correction alone reaches the tolerance: take it and save a factorisation.
+                closer = x + self._move(x, next_q)
+                finished = self.model.assemble(closer, effort + next_effort)
+                if finished is not None:
+                    x, effort, assembled = closer, effort + next_effort, finished
+                else:  # the failed assembly has used the buffers
+                    assembled = self.model.assemble(x, effort)
+                    assert assembled is not None
+            self.x, self.effort = x, effort
+            if not self._factorise(assembled):
+                raise _NotFound
+            step_q, step_effort = self._correction(self._Ar, self._delta, effort, target, driven)
+            if length == 1.0 and self._norm(step_q) <= self.tolerance:
+                return iteration
+            length = min(1.0, 2.0 * length)
+        raise _NotFound
+
+    def solve(
+        self,
+        target: Sequence[float] | np.ndarray,
+        mode: str | Sequence[str] = "displacement",
+        *,
+        effector_force: Sequence[float] | np.ndarray | None = None,
+        contact: Sequence[float] | np.ndarray | None = None,
+        contact_mode: str = "effort",
+    ) -> Equilibrium:
+        """Find the equilibrium under commanded actuators.
+
+        Args:
+            target: one value per actuator row: displacement [m, m3, ...] or effort [N, Pa, ...].
+            mode: ``"displacement"`` or ``"effort"`` for all actuators, or one of them per row.
+            effector_force: loads on the effector rows [N], shape (n_e,); default none.
+            contact: of the contact rows, shape (n_c,): forces [N], or positions [m] that they are driven to; default
+                no force.
+            contact_mode: ``"effort"`` (forces) or ``"displacement"`` (driven positions).
+
+        Returns:
+            The equilibrium. Unilateral actuators driven in displacement may end slack: their reached displacement
+            is then larger than commanded, and their effort is zero.
+
+        Raises:
+            ConvergenceError: with the fraction of the increment that was reached; the last converged state is kept.
+            ValueError: for a wrong shape, a non-finite value, an unknown mode, or a negative effort on an actuator that
+                cannot push.
+        """
+        count = self._actuators
+        target = _checked("target", target, count)
+        modes = [mode] * count if isinstance(mode, str) else list(mode)
+        if len(modes) != count or any(m not in ("displacement", "effort") for m in modes):
+            raise ValueError(f"mode must be 'displacement' or 'effort' (one, or {count} of them), got {mode!r}")
+        if contact_mode not in ("displacement", "effort"):
+            raise ValueError(f"contact_mode must be 'displacement' or 'effort', got {contact_mode!r}")
+        if contact_mode == "displacement" and contact is None:
+            raise ValueError("contact_mode = 'displacement' needs the positions in 'contact'")
+        held = [np.array([i for i, m in enumerate(modes) if m == "displacement"], dtype=int)]
+        if contact_mode == "displacement":
+            held.append(self._contacts)
+        driven = np.concatenate([*held, self._bonds])
+        forced = np.array([i for i, m in enumerate(modes) if m == "effort"], dtype=int)
+        for row in forced[self.unilateral[forced]] if len(forced) else forced:
+            if target[row] < 0.0:
+                raise ValueError(f"effort {target[row]:g} on actuator row {row} must not be negative: it cannot push")
+        goal = np.zeros(self.model.size)
+        goal[:count] = target
+        if effector_force is not None:
+            goal[self._effectors] = _checked("effector_force", effector_force, len(self._effectors))
+        if contact is not None:
+            goal[self._contacts] = _checked("contact", contact, len(self._contacts))
+        if self._version != self.model.version or self.model.factor_owner is not self:
+            self._version = self.model.version
+            self._fresh = False
+        self.model.applied_loads = self._carried
+        if not self._fresh and not self._linearise():
+            raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
+
+        # The path goes from the present values.
+        start = self.effort.copy()
+        start[driven] = self._delta[driven]
+        done, size, iterations, increments = 0.0, 1.0, 0, 0
+        loads, start_loads = self.model.loads, self._carried
+        ramped = bool((loads != start_loads).any())
+        while done < 1.0:
+            level = min(1.0, done + size)
+            kept = self.x, self.effort
+            if ramped:
+                self.model.applied_loads = start_loads + level * (loads - start_loads)
+                self._fresh = False
+            try:
+                iterations += self._newton(start + level * (goal - start), driven)
+            except BaseException as problem:
+                # Whatever stopped it, also Ctrl-C, the last equilibrium stands.
+                self.x, self.effort = kept
+                self.model.applied_loads = self._carried
+                self._fresh = False
+                if not isinstance(problem, _NotFound):
+                    raise
+                size = 0.5 * (level - done)
+                if size < 0.5**self.max_halvings or not (ramped or self._linearise()):
+                    reached = ", ".join(f"{v:.6g}" for v in (start + done * (goal - start))[:count])
+                    wanted = ", ".join(f"{v:.6g}" for v in target)
+                    raise ConvergenceError(
+                        f"no equilibrium for actuators [{wanted}] ({'/'.join(sorted(set(modes)))}): "
+                        f"stopped at {100 * done:.1f} % of the increment, actuators [{reached}]",
+                        fraction=done,
+                    ) from None
+                continue
+            increments += 1
+            done, self._carried = level, self.model.applied_loads
+            size *= 1.5
+        return self._state(target, driven, iterations, increments)
+
+    def _state(self, target: np.ndarray, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
+        effort = self.effort.copy()
+        slack = np.zeros(self._actuators, dtype=bool)
+        rows = driven[driven < self._actuators]
+        rows = rows[self.unilateral[rows]] if len(rows) else rows
+        # At rest round-off would decide by the effort alone.
+        slack[rows] = (effort[rows] <= 0.0) & (self._delta[rows] > target[rows] + 1e-9)
+        W = self._W.copy()
+        count = self.model.size - len(self._bonds)
+        if len(self._bonds):
+            across = W[:count, count:]
+            W = W[:count, :count] - across @ np.linalg.solve(W[count:, count:], across.T)
+            W = 0.5 * (W + W.T)
+        condensed = CondensedModel(
+            compliance=W,
+            free=self._delta[:count] - W @ effort[:count],
+            effort=effort[:count],
+            roles=tuple(role for role in self.model.roles if role[0] != "b"),
+        )
+        return Equilibrium(
+            x=self.x.copy(),
+            condensed=condensed,
+            delta=self._delta.copy(),
+            effort=effort,
+            slack=slack,
+            stable=self._active.positive_definite,
+            iterations=iterations,
+            increments=increments,
+        )
+
+
+def _checked(name: str, values: Sequence[float] | np.ndarray, count: int) -> np.ndarray:
+    array = np.asarray(values, dtype=float)
+    if array.shape != (count,):
+        raise ValueError(f"{name} must have shape ({count},), got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {array.tolist()}")
+    return array

@@ -1,0 +1,275 @@
+"""Meshes from gmsh, behind a content-keyed cache and a time limit.
+
+A geometry is a function ``build(**parameters)`` that draws one volume in the current gmsh model **in millimetres**;
+it runs in a process of its own, because OpenCASCADE may hang on an infeasible shape. Nodes come back in metres. SciPy
+and the mechanics are imported where they are used: loading them would take that process longer than a coarse mesh.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import inspect
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import textwrap
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
+from softgym_envs.storage import atomic_write, cache_directory, read_npz
+
+__all__ = ["BodyMesh", "mesh_geometry", "run_gmsh"]
+
+_FORMAT = 2
+_BROKEN = 3  # exit status of the meshing process when gmsh itself is missing or does not load
+_SHIPPED = Path(__file__).parents[1] / "meshes"
+
+
+@dataclass(frozen=True)
+class BodyMesh:
+    """A tetrahedral mesh with its classified surface.
+
+    Attributes:
+        nodes: positions [m], shape (n, 3).
+        tetrahedra: corner indices, shape (m, 4).
+        triangles: boundary triangles, shape (k, 3).
+        surfaces: geometric surface of each boundary triangle, shape (k,).
+        origin: ``"meshed"``, ``"morphed"`` or ``"remeshed"``: how this mesh came to be.
+    """
+
+    nodes: np.ndarray
+    tetrahedra: np.ndarray
+    triangles: np.ndarray
+    surfaces: np.ndarray
+    origin: str = "meshed"
+
+    def surface(self) -> np.ndarray:
+        """Return the boundary triangles (k, 3), seen counter-clockwise from outside the material."""
+        from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles, orient_corners
+
+        return boundary_triangles(orient_corners(self.nodes, self.tetrahedra)[0])
+
+    def cavities(
+        self, along: Sequence[float] = (0.0, 0.0, -1.0), across: Sequence[float] = (1.0, 0.0, 0.0)
+    ) -> list[np.ndarray]:
+        """Find the closed cavities: the connected pieces of the boundary but the outer hull.
+
+        Args:
+            along: cavities are ordered by the position of their middle in this direction, shape (3,),
+            across: and, where these agree within a hundredth of the body's size, in this one, shape (3,).
+
+        Returns:
+            Triangles (k, 3) of each cavity, seen counter-clockwise from inside it.
+        """
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components
+
+        from softgym_envs.mechanics.constraints.cavity import enclosed_volume
+
+        triangles = self.surface()
+        pairs = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
+        graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(self.nodes),) * 2)
+        _, piece = connected_components(graph, directed=False)
+        pieces = [triangles[piece[triangles[:, 0]] == number] for number in np.unique(piece[triangles[:, 0]])]
+        # Material lies inside the hull and outside the cavities: the volume within a cavity counts negative.
+        hollow = [part for part in pieces if enclosed_volume(self.nodes, part) < 0.0]
+        middle = np.array([self.nodes[np.unique(part)].mean(axis=0) for part in hollow]).reshape(-1, 3)
+        grid = 1e-2 * np.ptp(self.nodes, axis=0).max()
+        order = np.lexsort([middle @ np.asarray(across), np.round(middle @ np.asarray(along) / grid)])
+        return [hollow[k] for k in order]
+
+    def save(self, path: Path) -> None:
+        """Write to an npz file, atomically."""
+        with atomic_write(path) as stream:
+            np.savez_compressed(
+                stream,
+                format=_FORMAT,
+                nodes=self.nodes,
+                tetrahedra=self.tetrahedra.astype(np.int32),
+                triangles=self.triangles.astype(np.int32),
+                surfaces=self.surfaces.astype(np.int32),
+            )
+
+    @classmethod
+    def load(cls, path: Path) -> BodyMesh:
+        """Read an npz file.
+
+        Raises:
+            DataError: if the file is missing, truncated or of another format.
+        """
+        data = read_npz(path, ("format", "nodes", "tetrahedra", "triangles", "surfaces"))
+        if int(data["format"]) != _FORMAT:
+            raise DataError(f"mesh '{path}' has format {int(data['format'])}, expected {_FORMAT}")
+        return cls(
+            nodes=data["nodes"],
+            tetrahedra=data["tetrahedra"].astype(np.int64),
+            triangles=data["triangles"].astype(np.int64),
+            surfaces=data["surfaces"].astype(np.int64),
+        )
+
+
+def mesh_geometry(
+    build: Callable[..., None], parameters: dict[str, float], *, mesh_size: float, time_limit: float = 60.0
+) -> BodyMesh:
+    """Mesh a geometry, or return it from the cache.
+
+    Args:
+        build: module-level function that draws one volume with ``gmsh.model.occ`` in millimetres.
+        parameters: its keyword arguments.
+        mesh_size: target edge length [m].
+        time_limit: wall-clock limit of the meshing process [s].
+
+    Raises:
+        InfeasibleDesign: if the geometry cannot be drawn or meshed, or takes too long.
+        MeshingError: if gmsh cannot be imported.
+    """
+    name = f"{build.__module__}:{build.__qualname__}"
+    parameters = {key: float(value) for key, value in sorted(parameters.items())}
+    request = {"build": name, "parameters": parameters, "mesh_size": float(mesh_size)}
+    key = _cache_key(build, parameters, mesh_size)
+    for folder in (_SHIPPED, cache_directory("meshes")):
+        path = folder / f"{key}.npz"
+        if path.exists():
+            try:
+                return BodyMesh.load(path)
+            except DataError:
+                if folder == _SHIPPED:
+                    raise
+                path.unlink(missing_ok=True)  # a damaged cache entry is made again
+    with tempfile.TemporaryDirectory() as scratch:
+        output = Path(scratch) / "mesh.npz"
+        run_gmsh({**request, "output": str(output)}, time_limit=time_limit)
+        mesh = BodyMesh.load(output)
+    try:
+        mesh.save(path)
+    except OSError as error:
+        warnings.warn(f"the mesh is not kept, its cache '{path.parent}' cannot be written: {error}", stacklevel=2)
+    return mesh
+
+
+def _cache_key(build: Callable[..., None], parameters: dict[str, float], mesh_size: float) -> str:
+    """Key of a mesh: code and constants of the drawing are part of it, so an edited shape never meets an old mesh.
+
+    Comments, docstrings, white space and the place of the file are not: they do not change the shape.
+    """
+    code = ast.parse(textwrap.dedent(inspect.getsource(build)))
+    function = code.body[0]
+    assert isinstance(function, ast.FunctionDef)
+    if ast.get_docstring(function) is not None:
+        del function.body[0]
+    constants = {
+        k: v for k, v in vars(sys.modules[build.__module__]).items() if k.isupper() and isinstance(v, int | float)
+    }
+    parts = {
+        "code": "".join(ast.unparse(code).split()),
+        "constants": constants,
+        "parameters": parameters,
+        "mesh_size": float(mesh_size),
+        "format": _FORMAT,
+    }
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def run_gmsh(request: dict, *, time_limit: float) -> None:
+    """Draw a geometry in a process of its own and write it to a file.
+
+    Args:
+        request: ``build`` (``module:function``), its ``parameters``, ``mesh_size`` [m] and ``output``: a path that
+            ends with .npz (a `BodyMesh`), .step (the exact shape, in mm) or .stl (its surface, in mm).
+        time_limit: wall-clock limit of the process [s].
+
+    Raises:
+        InfeasibleDesign: if the geometry cannot be drawn or meshed, or takes too long.
+        MeshingError: if gmsh cannot be imported.
+    """
+    command = [sys.executable, "-m", "softgym_envs.robots.geometry.meshing", json.dumps(request)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    parameters = request["parameters"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=time_limit, env=environment, check=False)
+    except subprocess.TimeoutExpired:
+        raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s for {parameters}") from None
+    if done.returncode == _BROKEN:
+        raise MeshingError(f"gmsh cannot be used: {done.stderr.strip().splitlines()[-1]}")
+    if done.returncode != 0:
+        reason = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
+        raise InfeasibleDesign(f"the geometry cannot be meshed for {parameters}: {reason}")
+
+
+def _draw_here(request: dict) -> None:
+    """Draw in this process, mesh where the output asks for it, and write the output."""
+    import gmsh
+
+    module, _, function = request["build"].partition(":")
+    gmsh.initialize()
+    try:
+        for option, value in (
+            ("General.Terminal", 0),
+            ("General.NumThreads", 1),
+            ("Mesh.RandomSeed", 1),
+            ("Mesh.MeshSizeExtendFromBoundary", 0),
+            ("Mesh.MeshSizeFromPoints", 0),
+            ("Mesh.MeshSizeFromCurvature", 0),
+            ("Mesh.OptimizeNetgen", 1),
+            ("Mesh.MeshSizeMax", request["mesh_size"] * 1e3),
+            ("Mesh.MeshSizeMin", request["mesh_size"] * 1e3),
+        ):
+            gmsh.option.setNumber(option, value)
+        gmsh.model.add("body")
+        getattr(import_module(module), function)(**request["parameters"])
+        gmsh.model.occ.synchronize()
+        volumes = gmsh.model.getEntities(3)
+        if len(volumes) != 1:
+            raise ValueError(f"the geometry has {len(volumes)} volumes, expected one")
+        output = Path(request["output"])
+        if output.suffix != ".npz":
+            if output.suffix == ".stl":
+                gmsh.option.setNumber("Mesh.MeshSizeMin", 0.0)
+                gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", 24)  # edges per turn: round parts look round
+                gmsh.option.setNumber("Mesh.Binary", 1)
+                gmsh.model.mesh.generate(2)
+                gmsh.model.mesh.setOutwardOrientation(volumes[0][1])
+            gmsh.write(str(output))
+            return
+        gmsh.model.mesh.generate(3)
+        tags, coordinates, _ = gmsh.model.mesh.getNodes()
+        number = np.zeros(int(tags.max()) + 1, dtype=np.int64)
+        number[tags] = np.arange(len(tags))
+        tetrahedra = number[gmsh.model.mesh.getElementsByType(4)[1].reshape(-1, 4)]
+        triangles, surfaces = [], []
+        for _, surface in gmsh.model.getEntities(2):
+            found = number[gmsh.model.mesh.getElementsByType(2, surface)[1].reshape(-1, 3)]
+            triangles.append(found)
+            surfaces.append(np.full(len(found), surface))
+        if len(tetrahedra) == 0:
+            raise ValueError("gmsh made no tetrahedra")
+        nodes = coordinates.reshape(-1, 3) * 1e-3
+        used, renumbered = np.unique(tetrahedra, return_inverse=True)
+        back = np.full(len(nodes), -1)
+        back[used] = np.arange(len(used))
+        BodyMesh(
+            nodes=nodes[used],
+            tetrahedra=renumbered.reshape(tetrahedra.shape),
+            triangles=back[np.concatenate(triangles)],
+            surfaces=np.concatenate(surfaces),
+        ).save(output)
+    finally:
+        gmsh.finalize()
+
+
+if __name__ == "__main__":
+    arguments = json.loads(sys.argv[1])
+    try:
+        _draw_here(arguments)
+    except (ImportError, OSError) as problem:  # OSError: a system library that gmsh needs is missing
+        print(problem, file=sys.stderr)
+        sys.exit(_BROKEN)

@@ -1,0 +1,81 @@
+"""Radial basis functions, as a strong baseline without a network: W and delta_free interpolated between the states.
+
+Thin-plate splines in the scaled actuation and design (`scipy.interpolate.RBFInterpolator`), over the nearest states
+where there are many. Exact at the samples and without training; W is symmetric but not kept positive definite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from softgym_envs.config import Config
+from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.baselines.direct import DirectModel
+from softgym_envs.surrogate.baselines.perceptron import mean_scale, standardise
+from softgym_envs.surrogate.data.states import States
+from softgym_envs.surrogate.model import Context
+
+__all__ = ["Model", "Options", "train"]
+
+
+class Options(Config):
+    """Hyper-parameters."""
+
+    kind: Literal["rbf"] = "rbf"
+    kernel: Literal["thin_plate_spline", "cubic", "quintic", "linear"] = "cubic"
+    neighbors: int = Field(default=200, gt=0)
+
+
+KERNELS = ("thin_plate_spline", "cubic", "quintic", "linear")
+
+
+class Model(DirectModel):
+    """Interpolated condensed models (see the module)."""
+
+    network = "rbf"
+
+    def __init__(
+        self, robot: Robot, tensors: Mapping[str, np.ndarray], card: Mapping[str, Any], members: int | None = None
+    ) -> None:
+        from scipy.interpolate import RBFInterpolator
+
+        super().__init__(robot, tensors, card, members)
+        points, values = tensors["points"].astype(float), tensors["values"].astype(float)
+        self._scales = tensors["mean"].astype(float), tensors["scale"].astype(float)
+        kernel, neighbors = KERNELS[int(tensors["kernel"].item())], int(tensors["neighbors"].item())
+        self._used = tensors["used"].astype(bool)
+        self._interpolate = RBFInterpolator(
+            points[:, self._used], values, kernel=kernel, neighbors=neighbors if neighbors < len(points) else None
+        )
+
+    def _prepare(self, design: np.ndarray) -> dict[str, np.ndarray]:
+        return {"design": design}
+
+    def _entries(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        x = np.concatenate([self.features.actuation(displacement), context.gather()["design"]], axis=1)
+        return self._interpolate(x[:, self._used]) * self._scales[1] + self._scales[0]
+
+
+def train(
+    robot: Robot, training: States, validation: States, trainer: Any
+) -> tuple[dict[str, np.ndarray], dict[str, list[dict[str, float]]]]:
+    """Keep the states themselves; repeated ones once."""
+    y = training.entries
+    x = np.concatenate([training.actuation, training.design], axis=1)
+    x, first = np.unique(np.round(x, 9), axis=0, return_index=True)
+    mean, scale = mean_scale(y)
+    options: Options = trainer.options
+    return {
+        "points": x,
+        "values": standardise(y[first], mean, scale),
+        "mean": mean,
+        "scale": scale,
+        # Inputs that never change, as of a single body, would make the problem singular.
+        "used": np.ptp(x, axis=0) > 1e-9,
+        "kernel": np.array(KERNELS.index(options.kernel)),
+        "neighbors": np.array(options.neighbors),
+    }, {}

@@ -1,0 +1,1 @@
+"""Training data: sampling of designs and commands, labelled states, datasets on disk."""

@@ -1,0 +1,142 @@
+"""A dataset as the matrices that networks are trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from softgym_envs.errors import DataError
+from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.model import Features
+
+__all__ = ["States", "full_compliance", "stable_rows", "training_states"]
+
+#: Largest growth of the actuators' compliance over that at rest of states that are learned.
+GROWTH = 10.0
+
+
+@dataclass(frozen=True)
+class States:
+    """Condensed models of N equilibria, at the baseline stiffness where one variable only scales efforts.
+
+    Attributes:
+        design: features of the design, shape (N, d).
+        actuation: scaled displacements, shape (N, n_a).
+        displacement: reached actuator displacements, shape (N, n_a).
+        effort: shape (N, n_a).
+        effector: shape (N, n_e).
+        W: compliance, shape (N, n, n).
+        rest_of: row of the rest state of the same body, shape (N,).
+    """
+
+    design: np.ndarray
+    actuation: np.ndarray
+    displacement: np.ndarray
+    effort: np.ndarray
+    effector: np.ndarray
+    W: np.ndarray
+    rest_of: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.effort)
+
+    @property
+    def rest_rows(self) -> np.ndarray:
+        """Rows of the rest states, one per body."""
+        return np.unique(self.rest_of)
+
+    @property
+    def unloaded(self) -> bool:
+        """Every body is at rest without effort and at zero displacement."""
+        rows = self.rest_rows
+        return bool(np.abs(self.displacement[rows]).max() < 1e-9 and np.abs(self.effort[rows]).max() < 1e-9)
+
+    @property
+    def entries(self) -> np.ndarray:
+        """What the thesis learns: the upper triangle of W, row by row, then delta_free, shape (N, k)."""
+        effort = np.concatenate([self.effort, np.zeros_like(self.effector)], axis=1)
+        delta = np.concatenate([self.displacement, self.effector], axis=1)
+        free = delta - np.einsum("bij,bj->bi", self.W, effort)
+        return np.concatenate([self.W[:, *np.triu_indices(self.W.shape[1])], free], axis=1)
+
+    def rows(self, index: np.ndarray) -> States:
+        """Some of the states. Rest states they refer to are not brought along: only for networks without rest."""
+        parts = {f.name: getattr(self, f.name)[index] for f in fields(self)}
+        parts["rest_of"] = np.arange(len(parts["effort"]))
+        return States(**parts)
+
+
+def full_compliance(upper: np.ndarray, size: int) -> np.ndarray:
+    """Symmetric matrices (N, size, size) from upper triangles, row by row (N, size (size + 1) / 2)."""
+    W = np.empty((len(upper), size, size))
+    rows, columns = np.triu_indices(size)
+    W[:, rows, columns] = upper
+    W[:, columns, rows] = upper
+    return W
+
+
+def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Which equilibria of a dataset a robot can be kept in, shape (N,).
+
+    Those whose W is not positive definite are unstable even with their actuators held (volume-driven chambers can
+    buckle). Those whose actuators' compliance has grown `GROWTH` times over that at rest, in any direction, are about
+    to buckle: W is singular there, which no smooth model follows. Bodies that are unstable at rest teach nothing.
+    Where the energy is not convex (`Robot.convex`) states are kept whose actuators must be held.
+
+    Raises:
+        DataError: if the dataset does not begin with a rest state.
+    """
+    rest = data["rest"].astype(bool)
+    if len(rest) == 0 or not rest[0]:
+        raise DataError("the dataset has no rest state at its beginning")
+    count = data["effort"].shape[1]
+    W = full_compliance(data["compliance"], count + data["effector"].shape[1]) * _stiffness(robot, data)[:, None, None]
+    a, e = slice(0, count), slice(count, None)
+    scale = np.sqrt(np.abs(np.einsum("bii->bi", W)).mean(axis=0))
+    rest_of = np.flatnonzero(rest)[np.cumsum(rest) - 1]
+    convex = np.linalg.eigvalsh((W / scale[:, None] / scale)[:, a, a])[:, 0] > 1e-9
+    stable = convex if robot.convex else convex[rest_of]
+    # What is left once the actuators are held may vanish (a chain of rigid directions) but not be negative.
+    held = W[:, e, e] - W[:, e, a] @ np.linalg.solve(W[:, a, a], W[:, a, e])
+    least = np.linalg.eigvalsh(0.5 * (held + held.swapaxes(1, 2)))[:, 0]
+    stable &= least > -1e-6 * np.einsum("bii->b", W[:, e, e])
+    stable &= stable[rest_of]
+    if not robot.convex:
+        return stable
+    C = np.linalg.cholesky(W[rest_of][stable][:, a, a])
+    half = np.linalg.solve(C, W[stable][:, a, a])
+    growth = np.linalg.eigvalsh(np.linalg.solve(C, half.swapaxes(1, 2)))[:, -1]
+    stable[np.flatnonzero(stable)[growth > GROWTH]] = False
+    return stable
+
+
+def _stiffness(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Stiffness relative to the baseline, shape (N,)."""
+    if robot.stiffness_variable is None:
+        return np.ones(len(data["rest"]))
+    variable = robot.design_space[robot.stiffness_variable]
+    return data["design"][:, robot.design_space.names.index(variable.name)] / variable.baseline
+
+
+def training_states(robot: Robot, data: Mapping[str, np.ndarray], features: Features) -> States:
+    """Return the stable states of a dataset as matrices.
+
+    Raises:
+        DataError: if the dataset does not begin with a rest state.
+    """
+    stable = stable_rows(robot, data)
+    data = {name: column[stable] for name, column in data.items()}
+    factor = _stiffness(robot, data)
+    rest = np.flatnonzero(data["rest"])
+    return States(
+        design=features.design(data["design"]),
+        actuation=features.actuation(data["displacement"]),
+        displacement=data["displacement"],
+        effort=data["effort"] / factor[:, None],
+        effector=data["effector"],
+        W=full_compliance(data["compliance"], data["effort"].shape[1] + data["effector"].shape[1])
+        * factor[:, None, None],
+        rest_of=rest[np.cumsum(data["rest"]) - 1],
+    )

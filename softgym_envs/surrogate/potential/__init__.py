@@ -1,0 +1,1 @@
+"""The default surrogate: a network that learns the condensed energy."""

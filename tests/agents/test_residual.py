@@ -1,0 +1,109 @@
+"""Agents on top of the QP, and the QPs themselves."""
+
+import numpy as np
+import pytest
+
+from agents.baselines import BASELINES, InverseQPAgent, make_baseline
+from agents.config import EnvironmentConfig
+from agents.evaluation import evaluate, sample_goals
+
+
+def on(identifier, **options):
+    return EnvironmentConfig(id=f"SoftGym/{identifier}-v0", **options)
+
+
+@pytest.mark.parametrize("identifier", ["FingerReach", "CableTrunkReach", "TrunkReach", "DiamondTrack"])
+def test_the_batched_qp_is_the_single_one(identifier):
+    config = on(identifier, residual_scale=0.25)
+    envs = config.make_vec(3)
+    goals = sample_goals(config, 3, seed=4)
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (12, *envs.action_space.shape))
+    envs.reset(seed=0, options={"goal": goals})
+    states = []
+    for action in actions:
+        envs.step(action)
+        states.append(envs.unwrapped.command.copy())
+    for i, goal in enumerate(goals):
+        env = config.make()
+        env.reset(seed=0, options={"goal": goal})
+        span = env.unwrapped.robot.upper - env.unwrapped.robot.lower
+        for k, action in enumerate(actions):
+            env.step(action[i])
+            assert np.abs((env.unwrapped.state.command - states[k][i]) / span).max() < 1e-5
+
+
+def test_what_is_done_is_the_clipped_sum():
+    config = on("FingerReach", residual_scale=0.5)
+    env = config.make()
+    env.reset(seed=3)
+    qp = InverseQPAgent()
+    for action in (np.array([1.0, -1.0]), np.array([-0.5, 0.25]), np.zeros(2)):
+        expected = np.clip(qp(None, env.unwrapped) + 0.5 * action, -1, 1)
+        before = env.unwrapped.state.command
+        env.step(action)
+        done = env.unwrapped.interface.command(expected, before)
+        assert np.abs(env.unwrapped.state.command - done).max() < 1e-9
+
+
+def test_an_agent_that_does_nothing_leaves_the_qp():
+    plain, topped = on("DiamondReach"), on("DiamondReach", residual_scale=1.0)
+    goal = sample_goals(plain, 1, seed=2)[0]
+    env = topped.make()
+    _, info = env.reset(options={"goal": goal})
+    for _ in range(50):
+        _, _, _, _, info = env.step(np.zeros(4))
+    assert info["distance"] == pytest.approx(evaluate("qp", plain, goal[None]).distances[0], abs=1e-7)
+    # The baselines are not put on top of themselves.
+    assert evaluate("qp", topped, goal[None]).returns == pytest.approx(evaluate("qp", plain, goal[None]).returns)
+
+
+def test_residual_works_in_processes_of_their_own():
+    config = on("TrunkReach", residual_scale=0.3, backend="fem")
+    envs = config.make_vec(2)
+    single = config.make()
+    goals = sample_goals(config.on("surrogate"), 1, seed=0)
+    observation, _ = single.reset(seed=0, options={"goal": goals[0]})
+    batch, _ = envs.reset(seed=0, options={"goal": goals[0]})
+    for _ in range(3):
+        action = np.full(6, 0.2)
+        observation = single.step(action)[0]
+        batch = envs.step(np.tile(action, (2, 1)))[0]
+    assert np.abs(batch - observation).max() < 1e-5
+    envs.close()
+
+
+def test_pi_corrects_a_model_that_is_not_the_plant():
+    plant = on("TrunkReach", backend="fem")
+    goals = sample_goals(on("TrunkReach"), 3, seed=11)
+    distances = {name: evaluate(name, plant, goals).distances for name in ("qp", "qp_model", "qp_pi")}
+    assert (distances["qp_model"] > 2e-5).all()  # the surrogate's own error
+    assert (distances["qp_pi"] < 0.2 * distances["qp_model"]).all()
+    # Where the model is the plant there is nothing to correct.
+    own = on("TrunkReach")
+    assert evaluate("qp_model", own, goals).distances == pytest.approx(evaluate("qp", own, goals).distances, abs=1e-6)
+
+
+def test_pi_does_not_take_a_moving_goal_for_an_error():
+    own = on("GripperPinch")
+    path = sample_goals(own, 1, seed=0)
+    corrected, plain = (evaluate(name, own, path).mean_distances[0] for name in ("qp_pi", "qp_model"))
+    assert corrected < 1.1 * plain
+
+
+def test_a_robot_without_a_surrogate_is_predicted_by_its_static_equilibrium():
+    tetrapod = on("TetrapodReach")
+    goal = sample_goals(tetrapod, 1, seed=0)
+    env = tetrapod.make()
+    model, static = make_baseline("qp_model"), make_baseline("qp_static")
+    observation, _ = env.reset(seed=0, options={"goal": goal[0]})
+    for _ in range(5):
+        action = model(observation, env.unwrapped)
+        assert np.abs(action - static(observation, env.unwrapped)).max() < 1e-5
+        observation = env.step(action)[0]
+
+
+def test_unknown_baseline():
+    with pytest.raises(ValueError, match="agent = 'octopus' is unknown; allowed: qp, qp_static"):
+        make_baseline("octopus")
+    assert BASELINES == ("qp", "qp_static", "qp_model", "qp_pi", "random")

@@ -1,0 +1,132 @@
+"""Metrics: each formula against an independent computation; both backends and torch agree."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.tools.bodies import Box, Evaluator, LearnedBodies, full_command
+from codesign.tools.metrics import METRICS
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.errors import ConfigError, DesignError
+from softgym_envs.robots import make_robot
+
+STATES = tuple(name for name, metric in METRICS.items() if metric.needs == "states")
+PULL = 0.01
+
+
+@pytest.fixture(scope="module")
+def finger():
+    return make_robot("finger", cables=1)
+
+
+@pytest.fixture(scope="module")
+def on_fem(finger):
+    return Evaluator(finger, (*STATES, "material_volume"), actuation=[PULL], steps=2)({})
+
+
+def test_formulas_of_the_thesis_on_fem(finger, on_fem):
+    backend = FEMBackend(finger)
+    rest = backend.state.effector[0]
+    half = backend.step(np.array([PULL / 2]))
+    state = backend.step(np.array([PULL]))
+    tip, W = state.effector[0], state.condensed.W
+    assert on_fem["bending_angle"] == pytest.approx(math.acos(abs(tip[2]) / np.linalg.norm(rest)))
+    assert on_fem["angular_displacement"] == pytest.approx(math.acos(abs(tip[2]) / np.linalg.norm(tip)))
+    # Eq. 4.16 as printed, with delta_c counted from rest.
+    free = state.condensed.delta_free
+    B = W.ea @ np.linalg.inv(W.aa) @ W.ae - W.ee
+    force = np.linalg.inv(B) @ (W.ea @ np.linalg.inv(W.aa) @ (np.array([PULL]) - free.a) + free.e - rest)
+    assert on_fem["contact_force"] == pytest.approx(abs(force[1]), rel=1e-4)  # the way is y but for the mesh
+    assert on_fem["normal_force"] == pytest.approx(abs((tip - rest)[1] / B[1, 1]), rel=1e-4)
+    assert on_fem["tip_stiffness"] == pytest.approx(1.0 / np.linalg.eigvalsh(-B)[-1])
+    assert on_fem["effort"] == pytest.approx(state.effort[0])
+    assert on_fem["work"] == pytest.approx(0.5 * PULL * (half.effort[0] + 0.5 * state.effort[0]))
+    assert on_fem["material_volume"] == pytest.approx(finger.build().volume)
+
+
+def test_normal_force_is_that_of_a_tip_blocked_across(finger, on_fem):
+    """The tangent's answer against the equilibrium with a force that holds the tip where it was."""
+    backend = FEMBackend(finger)
+    rest, force = backend.state.effector[0, 1], np.zeros(3)
+    for _ in range(20):
+        state = backend.step(np.array([PULL]), force=force)
+        W = state.condensed.W
+        held = (W.ee - W.ea @ np.linalg.solve(W.aa, W.ae))[1, 1]
+        force = force - np.array([0.0, (state.effector[0, 1] - rest) / held, 0.0])
+    assert abs(state.effector[0, 1] - rest) < 1e-9
+    assert on_fem["normal_force"] == pytest.approx(-force[1], rel=0.15)
+
+
+def test_surrogate_and_torch_agree_with_fem(finger, on_fem):
+    surrogate = Evaluator(finger, STATES, backend="surrogate", actuation=[PULL], steps=2)({})
+    learned = LearnedBodies(finger, STATES, actuation=[PULL], steps=2)
+    values = learned(torch.tensor([list(finger.design_space.baseline.values())], dtype=torch.float64))[0]
+    for name, value in zip(STATES, values.tolist(), strict=True):
+        assert surrogate[name] == pytest.approx(on_fem[name], rel=0.02), name
+        assert value == pytest.approx(surrogate[name], rel=1e-4), name
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_gradients_are_derivatives(finger, name):
+    learned = LearnedBodies(finger, [name], actuation=[PULL], steps=2)
+    box = Box(finger.design_space)
+    point = torch.tensor([[0.3, -0.4, 0.2, 0.1, -0.3]], dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(learned(box.values(point)).sum(), point)
+    with torch.no_grad():
+        for k in range(5):
+            h = torch.zeros(1, 5, dtype=torch.float64)
+            h[0, k] = 1e-5
+            difference = (learned(box.values(point + h)) - learned(box.values(point - h)))[0, 0] / 2e-5
+            assert float(gradient[0, k]) == pytest.approx(
+                float(difference), rel=1e-5, abs=1e-7 * float(gradient.norm())
+            )
+
+
+def test_sensorized_finger_reads_what_the_robot_reads():
+    robot = make_robot("sensorized_finger")
+    names = ("volume_change", "relative_volume_change", "cavity_volume", "angular_displacement")
+    found, readings = Evaluator(robot, names, actuation=[PULL])({}), robot.readings()
+    assert found["volume_change"] == pytest.approx(readings.volume_change)
+    assert found["relative_volume_change"] == pytest.approx(readings.relative_volume_change)
+    assert found["cavity_volume"] == pytest.approx(readings.initial_volume)
+    assert found["angular_displacement"] == pytest.approx(readings.bending_angle)
+
+
+def test_what_cannot_be_asked_for(finger):
+    for metrics, options, words in (
+        (["beauty"], {}, "unknown metric 'beauty'; allowed: bending_angle"),
+        (["volume_change"], {}, "needs a robot with sensing cavities, got 'finger'"),
+        (["material_volume"], {"backend": "surrogate"}, "needs backend 'fem', got 'surrogate'"),
+        (["travel"], {"actuation": [0.03]}, "allowed: cable_1 0 to 0.02 m"),
+        (["travel"], {"actuation": [0.01, 0.01]}, "allowed: cable_1 0 to 0.02 m"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            Evaluator(finger, metrics, **options)
+
+
+@pytest.mark.parametrize("name", ["finger", "diamond", "tetrapod"])
+def test_the_default_actuation_is_not_rest(name):
+    robot = make_robot(name)
+    command = full_command(robot, None)
+    assert (command > 0.0).all() and command == pytest.approx(0.5 * robot.upper)
+
+
+def test_box(finger):
+    space = finger.design_space
+    box = Box(space, ["height", "young_modulus"], {"height": (0.0205, 0.0215)}, {"length": 0.041})
+    assert box.reference["length"] == 0.041 and len(box.corners()) == 4 and len(box.grid(30)) == 36
+    for point in (np.array([-1.0, 1.0]), np.array([0.25, -0.5])):
+        design = box.design(point)
+        assert design["length"] == 0.041
+        row = box.values(torch.as_tensor(point[None]))[0].numpy()
+        assert row == pytest.approx(np.array([design[name] for name in space.names]))
+        assert box.unit(design) == pytest.approx(point)
+    assert box.design(np.array([-1.0, 0.0]))["height"] == 0.0205
+    with pytest.raises(DesignError, match="out of bounds"):
+        Box(space, ["height"], {"height": (0.0, 0.021)})
+    with pytest.raises(ConfigError, match="not among the variables height"):
+        Box(space, ["height"], {"length": (0.039, 0.04)})
+    with pytest.raises(ConfigError, match="twice"):
+        Box(space, ["height", "height"])

@@ -1,0 +1,280 @@
+"""Search and sensitivity: fronts, interruption, infeasible designs; indices against known functions."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from codesign.tools import calibration, gradient
+from codesign.tools import search as module
+from codesign.tools.bodies import Box
+from codesign.tools.config import CalibrationConfig, OptimiseConfig, SensitivityConfig
+from codesign.tools.search import non_dominated, search
+from codesign.tools.sensitivity import analyse, morris, one_at_a_time, sample, sobol
+from softgym_envs.config import check_config, load_config
+from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
+from softgym_envs.robots import make_robot
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "design"
+BODIES = {
+    "robot": "finger",
+    "robot_options": {"cables": 1},
+    "variables": ["length", "height", "joint_height"],
+    "actuation": [0.01],
+}
+SAMPLER = {"name": "nsgaii", "seed": 3, "options": {"population_size": 6}}
+
+
+def configured(**changes):
+    data = {
+        "name": "x",
+        "bodies": BODIES,
+        "objectives": [{"metric": "bending_angle"}, {"metric": "contact_force"}],
+        "solver": {"method": "search", "sampler": SAMPLER, "trials": 20, "batch": 6},
+    }
+    return check_config(OptimiseConfig, {**data, **changes}, "test")
+
+
+def test_non_dominated():
+    rng = np.random.default_rng(0)
+    costs = rng.integers(0, 8, (60, 3)).astype(float)
+    beaten = [any((b <= a).all() and (b < a).any() for b in costs) for a in costs]
+    assert non_dominated(costs).tolist() == np.flatnonzero(~np.array(beaten)).tolist()
+
+
+class Some:
+    """An evaluator with infeasible designs, that stops after a number of evaluations."""
+
+    stop = np.inf
+    count = 0
+
+    def __call__(self, design):
+        Some.count += 1
+        if Some.count > Some.stop:
+            raise KeyboardInterrupt
+        if design["joint_height"] > 0.0072:
+            raise InfeasibleDesign("too thick")
+        return {"bending_angle": design["length"] + design["height"], "contact_force": -design["length"]}
+
+
+@pytest.fixture
+def some(monkeypatch):
+    monkeypatch.setattr("codesign.tools.config.BodiesConfig.evaluator", lambda *arguments: Some())
+    monkeypatch.setattr(Some, "count", 0)
+    monkeypatch.setattr(Some, "stop", np.inf)
+    return Some
+
+
+def test_a_stopped_search_ends_as_one_that_was_not(some, monkeypatch, tmp_path):
+    whole = search(configured(), tmp_path / "whole", progress=False)
+    assert whole["infeasible"] > 0 and whole["feasible"] + whole["infeasible"] == 20
+    some.count = 0
+    for stop in (4, 11):
+        some.stop = stop
+        with pytest.raises(KeyboardInterrupt):
+            search(configured(), tmp_path / "parts", progress=False)
+        some.count = stop
+    with (tmp_path / "parts" / "journal.log").open("a") as stream:
+        stream.write('{"op_code": 5, "wor')  # what a crash leaves
+    some.stop = np.inf
+    parts = search(configured(), tmp_path / "parts", progress=False)
+    assert parts["front"] == whole["front"]
+    assert [(row["trial"], row["metrics"]) for row in parts["front"]] != []
+    assert (tmp_path / "parts" / "trials.csv").read_text().count("\n") == 21
+    assert (tmp_path / "parts" / "front.png").read_bytes().startswith(b"\x89PNG")
+    more = configured(solver={"method": "search", "sampler": SAMPLER, "trials": 26, "batch": 6})
+    before = some.count
+    longer = search(more, tmp_path / "parts", progress=False)
+    assert longer["feasible"] + longer["infeasible"] == 26 and some.count - before <= 6
+    with pytest.raises(ConfigError, match="holds another search, with other 'objectives'"):
+        search(configured(objectives=[{"metric": "travel"}]), tmp_path / "parts", progress=False)
+
+
+def test_starts_lie_within_the_bounds(some, tmp_path):
+    def asked(**start):
+        bodies = {**BODIES, "bounds": {"length": [0.041, 0.042]}}
+        solver = {"method": "search", "sampler": {"name": "random"}, "trials": 3, "starts": [start]}
+        return configured(bodies=bodies, solver=solver)
+
+    with pytest.raises(ConfigError, match="starts: 'heigth' is not free; free: length, "):
+        asked(heigth=0.021)
+    with pytest.raises(ConfigError, match="length"):
+        asked(length=0.040)
+    search(asked(height=0.0205), tmp_path, progress=False)
+    rows = [row.split(",") for row in (tmp_path / "trials.csv").read_text().splitlines()]
+    first = dict(zip(*rows[:2], strict=True))
+    assert (float(first["length"]), float(first["height"])) == (0.041, 0.0205)
+
+
+@pytest.mark.parametrize("sampler", [SAMPLER, {"name": "tpe", "seed": 3}])
+@pytest.mark.parametrize("parameters", [1, 15, 26, 27])  # of which the first 18 are those of the first batch
+def test_a_search_that_was_stopped_while_it_proposed(sampler, parameters, some, monkeypatch, tmp_path):
+    import optuna
+
+    starts = [{"length": 0.039}, {"length": 0.0415}]
+    solver = {"method": "search", "sampler": sampler, "trials": 14, "batch": 6, "starts": starts}
+    config = configured(objectives=[{"metric": "bending_angle"}], solver=solver)
+
+    def designs(folder):
+        rows = (folder / "trials.csv").read_text().splitlines()[1:]
+        return [row.split(",")[1:-1] for row in rows]  # without number and seconds
+
+    whole = search(config, tmp_path / "whole", progress=False)
+    suggest, count = optuna.Trial._suggest, 0
+
+    def stop(self, *arguments):
+        nonlocal count
+        count += 1
+        if count == parameters:
+            raise KeyboardInterrupt
+        return suggest(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(optuna.Trial, "_suggest", stop)
+        with pytest.raises(KeyboardInterrupt):
+            search(config, tmp_path / "parts", progress=False)
+    parts = search(config, tmp_path / "parts", progress=False)
+    assert designs(tmp_path / "parts") == designs(tmp_path / "whole") and len(designs(tmp_path / "parts")) == 14
+    for name in ("feasible", "infeasible", "repeated"):
+        assert parts[name] == whole[name]
+    assert parts["front"][0]["design"] == whole["front"][0]["design"]
+    assert some.count == 2 * (14 - whole["repeated"])  # nothing was evaluated again
+
+
+def test_folders_of_others_stay_as_they_are(some, tmp_path):
+    def contents():
+        return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    search(configured(), tmp_path, progress=False)
+    before = contents()
+    descent = check_config(OptimiseConfig, {**configured().model_dump(), "solver": {"method": "gradient"}}, "test")
+    with pytest.raises(ConfigError, match=f"'{tmp_path}' holds another optimisation, with other 'solver'"):
+        gradient.optimise(descent, tmp_path)
+    fit = {"name": "x", "robot": "finger", "robot_options": {"cables": 1}, "fit": ["poisson_ratio"], "data": "m.csv"}
+    with pytest.raises(ConfigError, match=f"'{tmp_path}' holds something else: its config.yaml is of no calibration"):
+        calibration.calibrate(check_config(CalibrationConfig, fit, "test"), tmp_path)
+    assert contents() == before
+    (tmp_path / "config.yaml").unlink()
+    with pytest.raises(ConfigError, match="holds a journal.log but no config.yaml"):
+        search(configured(), tmp_path, progress=False)
+
+
+def test_two_searches_in_one_folder(some, monkeypatch, tmp_path):
+    def other(self, design):
+        with pytest.raises(ConfigError, match=f"folder '{tmp_path}' is in use by another process; wait for its end"):
+            search(configured(), tmp_path, progress=False)
+        return {"bending_angle": design["length"], "contact_force": -design["length"]}
+
+    monkeypatch.setattr(some, "__call__", other)
+    assert search(configured(), tmp_path, progress=False)["feasible"] == 20
+    assert search(configured(), tmp_path, progress=False)["feasible"] == 20
+
+
+def test_generations_of_nsga_are_full(some, tmp_path):
+    import optuna
+
+    search(configured(), tmp_path, progress=False)
+    study = module._open(tmp_path, configured())
+    generations = [
+        trial.system_attrs["NSGAIISampler:generation"]
+        for trial in study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
+    ]
+    assert all(generations.count(k) == 6 for k in range(max(generations)))
+
+
+def test_nothing_feasible(some, tmp_path):
+    bodies = {**BODIES, "bounds": {"joint_height": (0.0075, 0.008)}}
+    with pytest.raises(
+        ConvergenceError, match="none of 20 designs is feasible; the first: InfeasibleDesign: too thick"
+    ):
+        search(configured(bodies=bodies), tmp_path, progress=False)
+
+
+def test_search_on_the_surrogate_by_tpe(tmp_path):
+    solver = {"method": "search", "trials": 40, "starts": [{"length": 0.042}]}
+    config = configured(objectives=[{"metric": "bending_angle"}], solver=solver)
+    (best,) = search(config, tmp_path, progress=False)["front"]
+    assert best["metrics"]["bending_angle"] > 0.525
+    first = (tmp_path / "trials.csv").read_text().splitlines()[1].split(",")
+    assert float(first[1]) == 0.042
+
+
+def ishigami(unit):
+    """Ishigami's function on [-1, 1]^3 scaled to pi, whose indices are known."""
+    x = np.pi * unit
+    return np.sin(x[:, 0]) + 7.0 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
+
+
+def study(method, **changes):
+    return check_config(
+        SensitivityConfig,
+        {"name": "x", "bodies": BODIES, "metrics": ["bending_angle"], "method": method, **changes},
+        "t",
+    )
+
+
+def test_sobol_indices_of_a_known_function():
+    config = study("sobol", samples=2048)
+    box = config.bodies.box()
+    values = ishigami(sample(config, box))
+    table = sobol(values, box, 0.95, 0)
+    for (first, total), row in zip(((0.3139, 0.5576), (0.4424, 0.4424), (0.0, 0.2437)), table.values(), strict=True):
+        assert row["first"] == pytest.approx(first, abs=0.03) and row["total"] == pytest.approx(total, abs=0.03)
+    values[::40] = np.nan
+    assert sobol(values, box, 0.95, 0)["height"]["first"] == pytest.approx(0.4424, abs=0.08)
+    with pytest.raises(ConvergenceError, match="narrow the bounds"):
+        sobol(np.full_like(values, np.nan), box, 0.95, 0)
+
+
+def test_morris_effects_of_a_known_function():
+    config = study("morris", levels=4, samples=20)
+    box = config.bodies.box()
+    points = sample(config, box)
+    values = 3.0 * points[:, 0] - points[:, 1] ** 3
+    table = morris(points, values, box, 4, 0.95, 0)
+    assert table["length"]["mu"] == pytest.approx(6.0) and table["length"]["sigma"] == pytest.approx(0.0, abs=1e-9)
+    assert table["height"]["mu"] < 0.0 and table["joint_height"]["mu_star"] == pytest.approx(0.0)
+
+
+def test_one_at_a_time_is_equation_3_1():
+    box = Box(make_robot("finger", cables=1).design_space, BODIES["variables"], None, {"height": 0.021})
+    points = sample(study("oat", bodies={**BODIES, "design": {"height": 0.021}}), box)
+    assert len(points) == 7 and (points[0] == box.unit(box.reference)).all()
+    values = 4.0 * points[:, 0] + points[:, 1]  # 4 * [-1, 1] and [-1, 1] about the reference, which is (0, 0)
+    table = one_at_a_time(points, values, box)
+    assert [table[name]["share"] for name in BODIES["variables"]] == pytest.approx([100.0, 25.0, 0.0])
+    values[1] = np.nan
+    table = one_at_a_time(points, values, box)
+    assert table["length"]["infeasible"] == 1 and table["length"]["low"] == pytest.approx(0.0)
+
+
+def test_sensitivity_goes_on(tmp_path):
+    config = study("oat", metrics=["bending_angle", "normal_force"])
+    result = analyse(config, tmp_path, progress=False)
+    records = (tmp_path / "evaluations.jsonl").read_bytes().splitlines(keepends=True)
+    (tmp_path / "evaluations.jsonl").write_bytes(b"".join(records[:3]) + records[3][:20])
+    assert analyse(config, tmp_path, progress=False)["indices"] == result["indices"]
+    assert (tmp_path / "evaluations.jsonl").read_bytes().count(b"\n") == 7
+    assert json.loads((tmp_path / "result.json").read_text())["indices"] == result["indices"]
+    assert (tmp_path / "sensitivity.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(ConfigError, match="another sensitivity study"):
+        analyse(study("oat"), tmp_path, progress=False)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_configurations_load(path):
+    text = path.read_text()
+    verb = text[text.index("softgym ") :].split()[1]
+    load_config(
+        path, {"sensitivity": SensitivityConfig, "optimise": OptimiseConfig, "calibrate": CalibrationConfig}[verb]
+    )
+
+
+def test_wrong_configurations():
+    with pytest.raises(ConfigError, match="must be the population of NSGA-II, population_size = 6"):
+        configured(solver={"method": "search", "sampler": SAMPLER, "trials": 20, "batch": 5})
+    with pytest.raises(ConfigError, match="power of two"):
+        study("sobol", samples=100)
+    with pytest.raises(ConfigError, match="must be even"):
+        study("morris", levels=5)
