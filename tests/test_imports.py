@@ -15,7 +15,7 @@ PACKAGES = ("softgym_envs", "agents", "codesign")
 
 # From the bottom to the top. A room imports from rooms below it and from itself.
 LAYERS = [
-    {"softgym_envs.version", "softgym_envs.errors"},
+    {"softgym_envs.version", "softgym_envs.errors", "softgym_envs._lazy"},
     {"softgym_envs.storage"},
     {"softgym_envs.designs", "softgym_envs.config", "softgym_envs.registry", "softgym_envs.executors"},
     {"softgym_envs.mechanics"},
