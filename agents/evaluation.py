@@ -2,34 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
 from agents.baselines import BASELINES, Agent, make_baseline
 from agents.config import EnvironmentConfig
 from agents.policy import Policy
-
-__all__ = ["AGENTS", "Evaluation", "evaluate", "evaluation_set", "make_agent", "sample_goals"]
+from softgym_envs.errors import DataError
 
 AGENTS = BASELINES
 """Names of agents that need no training."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Outcome of one episode per goal.
+    """Outcome of one episode per goal, and what it cost.
 
     Attributes:
         distances: effector to goal at the end of each episode [m], shape (n,).
-        mean_distances: mean of that over the steps of each episode [m], shape (n,); the tracking error of a path.
+        mean_distances: mean of that distance over the steps of each episode [m], shape (n,); on a path, the tracking
+            error.
         returns: sum of rewards, shape (n,).
-        successes: ended within the task's success distance, shape (n,).
+        successes: whether each episode ended within the task's success distance, shape (n,); in an average of several
+            evaluations the share that did.
         efforts: mean actuator effort over the episode [N, ...], shape (n,).
-        steps: environment steps spent.
+        steps: environment steps.
+        seconds: wall-clock time [s].
+        cpu_seconds: CPU time of this process [s].
     """
 
     distances: np.ndarray
@@ -38,6 +42,12 @@ class Evaluation:
     successes: np.ndarray
     efforts: np.ndarray
     steps: int
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+    def __len__(self) -> int:
+        """Number of goals."""
+        return len(self.distances)
 
     @property
     def success_rate(self) -> float:
@@ -55,24 +65,85 @@ class Evaluation:
         return float(self.distances.max())
 
     @property
+    def mean_tracking_distance(self) -> float:
+        """Mean distance over all steps of an episode [m], averaged over the episodes."""
+        return float(self.mean_distances.mean())
+
+    @property
     def mean_return(self) -> float:
         """Mean sum of rewards."""
         return float(self.returns.mean())
 
+    @property
+    def mean_effort(self) -> float:
+        """Mean actuator effort [N, ...]."""
+        return float(self.efforts.mean())
+
+    @classmethod
+    def merge(cls, parts: Sequence[Evaluation]) -> Evaluation:
+        """Join evaluations on different goals into one on all of them; costs add up."""
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _PER_GOAL}
+        return cls(**columns, **_total_cost(parts))
+
+    @classmethod
+    def average(cls, repeats: Sequence[Evaluation]) -> Evaluation:
+        """Average evaluations on the same goals, such as those of several training seeds, goal by goal; costs add up.
+
+        Raises:
+            ValueError: if the numbers of goals differ.
+        """
+        if len({len(repeat) for repeat in repeats}) != 1:
+            raise ValueError(f"numbers of goals must be equal, got {[len(repeat) for repeat in repeats]}")
+        columns = {name: np.mean([getattr(repeat, name) for repeat in repeats], axis=0) for name in _PER_GOAL}
+        return cls(**columns, **_total_cost(repeats))
+
     def to_json(self) -> dict[str, Any]:
-        """Everything as plain data."""
-        return {
-            "success_rate": self.success_rate,
-            "mean_distance": self.mean_distance,
-            "worst_distance": self.worst_distance,
-            "mean_return": self.mean_return,
-            "mean_effort": float(self.efforts.mean()),
-            "mean_tracking_distance": float(self.mean_distances.mean()),
-            "steps": self.steps,
-            "distances": self.distances.tolist(),
-            "returns": self.returns.tolist(),
-            "successes": self.successes.astype(bool).tolist(),
-        }
+        """Return everything as plain data: the summary, the values for each goal and the cost."""
+        summary = {name: getattr(self, name) for name in _SUMMARY}
+        columns = {name: getattr(self, name).tolist() for name in _PER_GOAL}
+        return {**summary, **columns, "steps": self.steps, "seconds": self.seconds, "cpu_seconds": self.cpu_seconds}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Evaluation:
+        """Return the evaluation that `to_json` wrote; the summary follows from the values for each goal.
+
+        Raises:
+            DataError: if a field is missing or not an array of numbers.
+        """
+        try:
+            columns = {name: np.asarray(data[name]) for name in _PER_GOAL}
+            cost = int(data["steps"]), float(data["seconds"]), float(data["cpu_seconds"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"stored evaluation cannot be read: {type(error).__name__} {error}") from None
+        sizes = {column.shape for column in columns.values()}
+        if len(sizes) != 1 or any(column.ndim != 1 or column.dtype.kind not in "bif" for column in columns.values()):
+            raise DataError(f"stored evaluation must hold numbers for each goal, got shapes {sorted(sizes)}")
+        return cls(**columns, steps=cost[0], seconds=cost[1], cpu_seconds=cost[2])
+
+
+_PER_GOAL = ("distances", "mean_distances", "returns", "successes", "efforts")
+_SUMMARY = (
+    "success_rate",
+    "mean_distance",
+    "worst_distance",
+    "mean_tracking_distance",
+    "mean_return",
+    "mean_effort",
+)
+
+
+class _Cost(TypedDict):
+    steps: int
+    seconds: float
+    cpu_seconds: float
+
+
+def _total_cost(evaluations: Sequence[Evaluation]) -> _Cost:
+    return {
+        "steps": sum(evaluation.steps for evaluation in evaluations),
+        "seconds": sum(evaluation.seconds for evaluation in evaluations),
+        "cpu_seconds": sum(evaluation.cpu_seconds for evaluation in evaluations),
+    }
 
 
 def sample_goals(
@@ -143,6 +214,18 @@ def evaluate(
         ConfigError: if the policy was trained for another environment, see `Policy.check_environment`.
         WeightsError: if the policy cannot be read.
     """
+    began, cpu = time.perf_counter(), time.process_time()
+    outcome = _evaluate(agent, environment, goals, design, seed)
+    return replace(outcome, seconds=time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
+
+
+def _evaluate(
+    agent: str | Path,
+    environment: EnvironmentConfig,
+    goals: np.ndarray,
+    design: dict[str, float] | Sequence[dict[str, float]] | None,
+    seed: int,
+) -> Evaluation:
     goals = np.asarray(goals, dtype=float)
     goals = goals[:, None, :] if goals.ndim == 2 else goals
     if agent in AGENTS:

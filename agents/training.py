@@ -6,7 +6,6 @@ import csv
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -308,7 +307,7 @@ def _save_checkpoint(
         "actions": model.action_space.np_random.bit_generator.state,
         "curve": curve,
         "cpu_seconds": cpu_seconds,
-        "outcome": {name: np.asarray(value).tolist() for name, value in asdict(outcome).items()},
+        "outcome": outcome.to_json(),
     }
     with atomic_write(path) as stream:
         arrays = {k: np.ascontiguousarray(v) for k, v in tensors.items()}
@@ -349,9 +348,7 @@ def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, 
     np.random.set_state(("MT19937", tensors["random/numpy"], *meta["numpy"]))  # noqa: NPY002 - as above
     model.action_space.np_random.bit_generator.state = meta["actions"]
     best = {k.removeprefix("best/"): v for k, v in tensors.items() if k.startswith("best/")}
-    columns = {name: np.asarray(value) for name, value in meta["outcome"].items() if name != "steps"}
-    outcome = Evaluation(**columns, steps=meta["outcome"]["steps"])
-    return meta["curve"], best, outcome, float(meta.get("cpu_seconds", 0.0))
+    return meta["curve"], best, Evaluation.from_json(meta["outcome"]), float(meta.get("cpu_seconds", 0.0))
 
 
 def _write_curve(path: Path, curve: list[dict[str, float]]) -> None:

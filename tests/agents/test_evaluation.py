@@ -1,0 +1,61 @@
+"""The record of an evaluation: parts, repeats and files."""
+
+import json
+
+import numpy as np
+import pytest
+
+from agents.evaluation import Evaluation
+from softgym_envs.errors import DataError
+
+
+def some(count, seed):
+    rng = np.random.default_rng(seed)
+    distances, means, returns, efforts = rng.random((4, count))
+    return Evaluation(
+        distances, means, returns, rng.random(count) < 0.5, efforts, steps=50 * count, seconds=1.5, cpu_seconds=1.25
+    )
+
+
+def test_merge_joins_goals_and_adds_costs():
+    parts = some(3, 0), some(5, 1)
+    whole = Evaluation.merge(parts)
+    assert len(whole) == 8 and whole.steps == 400 and whole.seconds == 3.0 and whole.cpu_seconds == 2.5
+    np.testing.assert_array_equal(whole.efforts[3:], parts[1].efforts)
+    assert whole.successes.dtype == bool
+    for name in ("success_rate", "mean_distance", "mean_tracking_distance", "mean_return", "mean_effort"):
+        expected = np.average([getattr(part, name) for part in parts], weights=[3, 5])
+        assert getattr(whole, name) == pytest.approx(expected, rel=1e-12)
+    assert whole.worst_distance == max(part.worst_distance for part in parts)
+
+
+def test_average_is_goal_by_goal():
+    repeats = [some(4, seed) for seed in range(3)]
+    mean = Evaluation.average(repeats)
+    assert len(mean) == 4 and mean.steps == 600
+    np.testing.assert_allclose(mean.distances, sum(repeat.distances for repeat in repeats) / 3, rtol=1e-12)
+    assert mean.success_rate == pytest.approx(np.mean([repeat.success_rate for repeat in repeats]))
+    with pytest.raises(ValueError, match=r"numbers of goals must be equal, got \[4, 5\]"):
+        Evaluation.average([some(4, 0), some(5, 0)])
+
+
+@pytest.mark.parametrize("evaluation", [some(3, 0), Evaluation.average([some(3, 0), some(3, 1)])])
+def test_files_hold_everything(evaluation):
+    data = json.loads(json.dumps(evaluation.to_json()))
+    again = Evaluation.from_json(data)
+    assert again.to_json() == evaluation.to_json()
+    assert again.successes.dtype == evaluation.successes.dtype
+
+
+def test_a_damaged_file_is_named():
+    data = some(3, 0).to_json()
+    for change, message in (
+        ({"efforts": None}, "numbers for each goal"),
+        ({"efforts": [1.0]}, "numbers for each goal"),
+        ({"steps": "many"}, "ValueError"),
+    ):
+        with pytest.raises(DataError, match=message):
+            Evaluation.from_json({**data, **change})
+    del data["returns"]
+    with pytest.raises(DataError, match="KeyError 'returns'"):
+        Evaluation.from_json(data)
