@@ -68,13 +68,6 @@ def robot_of(name: str, options: tuple[tuple[str, Any], ...] = ()) -> Robot:
     return make_robot(name, **dict(options))
 
 
-@cache
-def class_of(table: str) -> type:
-    """Return the class behind ``module:class``."""
-    module, _, name = table.partition(":")
-    return getattr(import_module(module), name)
-
-
 # -- writing --------------------------------------------------------------------------------------------------------
 
 SHOWN = {
@@ -328,7 +321,7 @@ def robot_sections(name: str) -> dict[str, Callable[[], str]]:
         "Model": model,
         "Options": lambda: (
             f'Of `make_robot("{name}", ...)`, and `robot_options` of an environment:\n\n'
-            + table(["option", "default", "meaning"], options_of(class_of(ROBOTS[name])))
+            + table(["option", "default", "meaning"], options_of(ROBOTS[name]))
         ),
         "Environments": environments,
     }
@@ -339,7 +332,7 @@ def robot_sections(name: str) -> dict[str, Callable[[], str]]:
 
 def summary(identifier: str) -> str:
     """What the task of an environment is, in a line."""
-    task = class_of(TASKS[ENVIRONMENTS[identifier].task])
+    task = TASKS[ENVIRONMENTS[identifier].task]
     text = inspect.getmodule(task).__doc__ or task.__doc__ or ""
     sentence = code(first_sentence(text.partition(":")[2].strip() or text))
     return sentence[:1].upper() + sentence[1:]
@@ -355,7 +348,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
     row = ENVIRONMENTS[identifier]
     spec = gymnasium.spec(identifier)
     robot = robot_of(row.robot, tuple(sorted(row.robot_options.items())))
-    task_class: Any = class_of(TASKS[row.task])
+    task_class: Any = TASKS[row.task]
     task: Task = task_class(robot, **row.task_options)
     moving = bool(row.backend_options.get("dynamics"))
     interface = Interface(robot, action_mode="increment", design_names=(), axes=task.axes, moving=moving)
@@ -474,7 +467,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         for argument, kind, cls in (
             ("task_options", f"task `{row.task}`", task_class),
             ("robot_options", f"robot [`{row.robot}`](../robots/{row.robot}.md)", type(robot)),
-            ("backend_options", f"backend `{row.backend}`", class_of(BACKENDS[row.backend])),
+            ("backend_options", f"backend `{row.backend}`", BACKENDS[row.backend]),
         ):
             options = options_of(cls, given.get(argument))
             if options:

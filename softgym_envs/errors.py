@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 __all__ = [
     "ConfigError",
     "ConvergenceError",
@@ -55,3 +58,17 @@ class WeightsError(DataError):
 
 class ConfigError(SoftGymError, ValueError):
     """A configuration file or command-line override is malformed."""
+
+
+def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> str:
+    """Return the message for a name that does not exist: the nearest one, if any is near, and all that are allowed.
+
+    Args:
+        kind: what the name should be: ``"robot"``, ``"option"``, ...
+        name: the name given.
+        allowed: the names that exist.
+    """
+    allowed = list(allowed)
+    near = get_close_matches(str(name), allowed, n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    return f"unknown {kind} '{name}'; {hint}allowed: {', '.join(allowed) or 'none'}"

@@ -1,37 +1,245 @@
-"""Registries: tables from a name to ``module:class``, imported when used."""
+"""Registries: classes found by name, registered by hand or by the entry points of other packages."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+import numbers
+import types
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
-__all__ = ["make_registered"]
+from softgym_envs.errors import unknown_name
 
 
-def make_registered(kind: str, table: Mapping[str, str], name: str, *arguments: object, **options: object) -> Any:
-    """Return an object of the class that ``table`` has under ``name``.
+class Registry(Mapping[str, type]):
+    """A table from names to classes, which are imported when they are first used.
+
+    Packages that are installed add their classes by entry points: the name of the entry point is the name of the class.
 
     Args:
         kind: what the table holds, for messages: ``"robot"``, ...
-        table: the registry.
-        name: a key of it.
-        *arguments: positional arguments of the class.
-        **options: keyword arguments of the class.
+        entries: name -> ``"module:class"``.
+        base: ``"module:class"`` that every entry must be derived from.
+        group: group of entry points; none by default.
+    """
+
+    def __init__(self, kind: str, entries: Mapping[str, str], *, base: str, group: str = "") -> None:
+        self.kind = kind
+        self._entries: dict[str, str | type] = dict(entries)
+        self._base = base
+        self._group = group
+        self._discovered = not group
+
+    def register(self, name_or_class: Any = None, entry: str | type | None = None) -> Any:
+        """Add a class: ``register(Arm)``, ``register("arm", Arm)``, or a decorator with or without the name.
+
+        Args:
+            name_or_class: the name, or a class whose attribute ``name`` is the name.
+            entry: the class, or ``"module:class"`` to import it when it is used.
+
+        Returns:
+            The class or path, or a decorator that still waits for the class.
+
+        Raises:
+            ValueError: for an entry of the wrong kind, without a name or with two, or a name that is taken.
+        """
+        if name_or_class is None:
+            return self.register
+        if isinstance(name_or_class, str) and entry is None:
+            return partial(self.register, name_or_class)
+        name, cls = (name_or_class, entry) if isinstance(name_or_class, str) else ("", name_or_class)
+        if isinstance(cls, str):
+            if ":" not in cls:
+                raise ValueError(f"{self.kind} '{name}': '{cls}' must look like module:class")
+        else:
+            cls = self._checked(cls)
+            name = self._name_of(cls, name)
+        present = self._entries.get(name, cls)
+        if _path(present) != _path(cls):
+            raise ValueError(f"{self.kind} '{name}' is already registered: {_path(present)}")
+        self._entries[name] = cls
+        return cls
+
+    def resolve(self, name_or_class: str | type) -> type:
+        """Return the class of a registered name or of a path ``"module:class"``; a class is returned as it is.
+
+        Raises:
+            ValueError: for an unknown name, or a class of the wrong kind.
+        """
+        if not isinstance(name_or_class, str):
+            return self._checked(name_or_class)
+        if name_or_class in self:
+            found = self._entries[name_or_class]
+        elif ":" in name_or_class:
+            found = name_or_class
+        else:
+            raise ValueError(unknown_name(self.kind, name_or_class, self))
+        return self._checked(self._import(found) if isinstance(found, str) else found)
+
+    def make(self, name_or_class: object, *arguments: object, **options: object) -> Any:
+        """Return an object of a class of this registry.
+
+        Args:
+            name_or_class: registered name, path ``"module:class"``, class, or an object, which is returned as it is.
+            *arguments: positional arguments of the class, which are not options.
+            **options: keyword arguments of the class.
+
+        Raises:
+            ValueError: for an unknown name, an option that the class does not take, or a value of the wrong type.
+        """
+        if not isinstance(name_or_class, str | type):
+            made = name_or_class
+            self._checked(type(made))
+            if options:
+                raise ValueError(
+                    f"{self.kind} '{_shown(type(made))}' is already made: it cannot take {', '.join(options)}"
+                )
+            return made
+        cls = self.resolve(name_or_class)
+        shown = name_or_class if isinstance(name_or_class, str) else _shown(cls)
+        check_options(f"{self.kind} '{shown}'", cls, len(arguments), options)
+        return cls(*arguments, **options)
+
+    # -- mapping ----------------------------------------------------------------------------------------------------
+
+    def __getitem__(self, name: str) -> type:
+        if name not in self:
+            raise KeyError(name)
+        return self.resolve(name)
+
+    def __contains__(self, name: object) -> bool:
+        if name not in self._entries:
+            self._discover()
+        return name in self._entries
+
+    def __iter__(self) -> Iterator[str]:
+        self._discover()
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        self._discover()
+        return len(self._entries)
+
+    # -- details ----------------------------------------------------------------------------------------------------
+
+    def _discover(self) -> None:
+        """Add the entry points of installed packages, once. A name that is taken keeps its class."""
+        if self._discovered:
+            return
+        from importlib.metadata import entry_points
+
+        self._discovered = True
+        for point in entry_points(group=self._group):
+            present = self._entries.setdefault(point.name, point.value)
+            if _path(present) != point.value:
+                warnings.warn(
+                    f"{self.kind} '{point.name}' of the entry point {point.value} is ignored: "
+                    f"the name belongs to {_path(present)}",
+                    stacklevel=3,
+                )
+
+    def _import(self, path: str) -> type:
+        module, _, name = path.partition(":")
+        try:
+            return getattr(import_module(module), name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+                raise  # the module exists, but one that it imports does not
+            raise ValueError(f"{self.kind} '{path}': there is no module '{module}'") from None
+        except AttributeError:
+            raise ValueError(f"{self.kind} '{path}': module '{module}' has no '{name}'") from None
+
+    def _checked(self, cls: object) -> type:
+        module, _, name = self._base.partition(":")
+        base = getattr(import_module(module), name)
+        if not (isinstance(cls, type) and issubclass(cls, base)):
+            raise ValueError(f"a {self.kind} must be a subclass of {module}.{name}, got {cls!r}")
+        return cls
+
+    def _name_of(self, cls: type, name: str) -> str:
+        """Return the name to register a class under, and give it to a class that has none of its own."""
+        own: str = vars(cls).get("name", "")
+        name = name or own or getattr(cls, "name", "")
+        if not name:
+            raise ValueError(f"{self.kind} class {_path(cls)} has no name: define its attribute 'name'")
+        if own and own != name:
+            raise ValueError(f"{self.kind} class {_path(cls)} is named '{own}': it cannot be registered as '{name}'")
+        cls.name = name  # type: ignore[attr-defined]
+        return name
+
+
+def check_options(owner: str, cls: type, positional: int, options: Mapping[str, object]) -> None:
+    """Check the options of a class against its signature and the type annotations in it.
+
+    Args:
+        owner: who takes the options, for messages: ``"robot 'finger'"``.
+        cls: the class.
+        positional: number of leading arguments that are not options.
+        options: keyword arguments.
 
     Raises:
-        ValueError: for an unknown name, an option that the class does not take, or one of the wrong type.
+        ValueError: for an unknown or missing option, or a value of the wrong type.
     """
-    if name not in table:
-        raise ValueError(f"unknown {kind} '{name}'; allowed: {', '.join(table)}")
-    module, _, name_of_class = table[name].partition(":")
-    cls = getattr(import_module(module), name_of_class)
+    parameters = list(inspect.signature(cls).parameters.values())[positional:]
+    keywords = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+    open_ended = any(p.kind is p.VAR_KEYWORD for p in parameters)
     try:
-        inspect.signature(cls).bind(*arguments, **options)
-    except TypeError as error:
-        raise ValueError(f"{kind} '{name}': {error}") from None
-    try:
-        return cls(*arguments, **options)
-    except TypeError as error:  # an option of the wrong type, somewhere inside
-        raise ValueError(f"{kind} '{name}' cannot be made with {options}: {error}") from error
+        hints = get_type_hints(cls.__init__)  # type: ignore[misc]
+    except NameError:  # an annotation that only type checkers import
+        hints = {}
+    for name, value in options.items():
+        if name not in keywords:
+            if open_ended:
+                continue
+            raise ValueError(f"{owner}: {unknown_name('option', name, keywords)}")
+        annotation = hints.get(name, Any)
+        if not _is_a(value, annotation):
+            raise ValueError(f"{owner}: option {name} = {value!r} must be {_described(annotation)}")
+    missing = [name for name, p in keywords.items() if p.default is p.empty and name not in options]
+    if missing:
+        raise ValueError(f"{owner} needs the option {' and '.join(missing)}")
+
+
+def _shown(cls: type) -> str:
+    return getattr(cls, "name", cls.__name__)
+
+
+def _path(entry: str | type) -> str:
+    return entry if isinstance(entry, str) else f"{entry.__module__}:{entry.__qualname__}"
+
+
+def _is_a(value: object, annotation: Any) -> bool:
+    """Whether a value can be of an annotated type; annotations without a plain type accept everything."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        return any(_is_a(value, each) for each in arguments)
+    if annotation is None or annotation is type(None):
+        return value is None
+    if annotation is float:
+        return isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if annotation is int:
+        return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if annotation in (bool, str):
+        return isinstance(value, annotation)
+    if origin is tuple and Ellipsis not in arguments:
+        # Lists are accepted: configuration files know no tuples.
+        return (
+            isinstance(value, Sequence)
+            and not isinstance(value, str)
+            and len(value) == len(arguments)
+            and all(map(_is_a, value, arguments))
+        )
+    return True
+
+
+def _described(annotation: Any) -> str:
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(_described, arguments))
+    if origin is tuple and set(arguments) <= {int, float}:
+        return f"{len(arguments)} numbers"
+    words = {float: "a number", int: "an integer", bool: "true or false", str: "a text", type(None): "none"}
+    return words.get(annotation, str(annotation))

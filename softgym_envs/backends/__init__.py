@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from softgym_envs.registry import make_registered
+from softgym_envs.registry import Registry
 
 if TYPE_CHECKING:
     from softgym_envs.backends.backend import Backend
@@ -12,12 +12,16 @@ if TYPE_CHECKING:
 
 __all__ = ["BACKENDS", "make_backend"]
 
-BACKENDS: dict[str, str] = {
-    "fem": "softgym_envs.backends.fem:FEMBackend",
-    "surrogate": "softgym_envs.backends.surrogate:SurrogateBackend",
-    "hybrid": "softgym_envs.backends.hybrid:HybridBackend",
-}
-"""Registry: name to ``module:class``, imported when used."""
+BACKENDS = Registry(
+    "backend",
+    {
+        "fem": "softgym_envs.backends.fem:FEMBackend",
+        "surrogate": "softgym_envs.backends.surrogate:SurrogateBackend",
+        "hybrid": "softgym_envs.backends.hybrid:HybridBackend",
+    },
+    base="softgym_envs.backends.backend:Backend",
+)
+"""Backends by name."""
 
 
 def make_backend(name: str, robot: Robot, **options: object) -> Backend:
@@ -26,4 +30,4 @@ def make_backend(name: str, robot: Robot, **options: object) -> Backend:
     Raises:
         ValueError: for an unknown name or a wrong option.
     """
-    return make_registered("backend", BACKENDS, name, robot, **options)
+    return BACKENDS.make(name, robot, **options)

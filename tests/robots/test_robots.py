@@ -56,8 +56,8 @@ def corners_of(space):
 def test_every_registered_robot_is_tested():
     """Here, or in a file named like its own."""
     here = {name for name, _ in VARIANTS}
-    for name, path in ROBOTS.items():
-        module = path.partition(":")[0].rpartition(".")[2]
+    for name, cls in ROBOTS.items():
+        module = cls.__module__.rpartition(".")[2]
         assert name in here or Path(__file__).with_name(f"test_{module}.py").exists(), name
 
 

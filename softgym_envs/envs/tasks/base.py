@@ -7,17 +7,22 @@ from collections.abc import Callable
 
 import numpy as np
 
-from softgym_envs.registry import make_registered
+from softgym_envs.registry import Registry
 from softgym_envs.robots.base import Robot
 
 __all__ = ["TASKS", "Task", "check_goals", "make_task", "tolerance"]
 
-TASKS: dict[str, str] = {
-    "reach": "softgym_envs.envs.tasks.reach:Reach",
-    "track": "softgym_envs.envs.tasks.track:Track",
-    "carry": "softgym_envs.envs.tasks.carry:Carry",
-}
-"""Registry: name to ``module:class``, imported when used."""
+TASKS = Registry(
+    "task",
+    {
+        "reach": "softgym_envs.envs.tasks.reach:Reach",
+        "track": "softgym_envs.envs.tasks.track:Track",
+        "carry": "softgym_envs.envs.tasks.carry:Carry",
+    },
+    base="softgym_envs.envs.tasks.base:Task",
+    group="softgym_envs.tasks",
+)
+"""All tasks by name."""
 
 Kinematics = Callable[[np.ndarray], np.ndarray]
 """Maps commands (B, n_a) to the effectors they lead to [m], shape (B, 3), for the present bodies."""
@@ -129,4 +134,4 @@ def make_task(name: str, robot: Robot, **options: object) -> Task:
     Raises:
         ValueError: for an unknown name or a wrong option.
     """
-    return make_registered("task", TASKS, name, robot, **options)
+    return TASKS.make(name, robot, **options)

@@ -1,0 +1,202 @@
+"""Registries: names, classes and objects; entry points; one clear line for every wrong name or option."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from softgym_envs.registry import Registry
+from softgym_envs.robots import ROBOTS, SoftFinger, make_robot
+
+
+class Shape:
+    """The base class of the registry below."""
+
+    name: str
+
+
+class Disc(Shape):
+    name = "disc"
+
+    def __init__(
+        self,
+        *,
+        radius: float = 1.0,
+        holes: int = 0,
+        label: str | None = None,
+        filled: bool = True,
+        at: tuple[float, float] = (0, 0),
+    ):
+        self.radius = radius
+
+
+class Other(Shape):
+    name = "disc"
+
+
+class Bar(Shape):
+    def __init__(self, owner, *, length: float):
+        self.owner, self.length = owner, length
+
+
+BASE = f"{__name__}:Shape"
+
+
+@pytest.fixture
+def registry():
+    return Registry("shape", {"disc": f"{__name__}:Disc"}, base=BASE)
+
+
+def test_names_paths_classes_and_objects_are_all_taken(registry):
+    disc = registry.make("disc", radius=2)
+    assert isinstance(disc, Disc)
+    assert disc.radius == 2
+    assert isinstance(registry.make(f"{__name__}:Disc"), Disc)
+    assert isinstance(registry.make(Disc, holes=3), Disc)
+    assert registry.make(disc) is disc
+    assert registry["disc"] is Disc
+    assert list(registry) == ["disc"]
+
+
+def test_registered_by_call_and_by_decorator(registry):
+    class Rod(Bar):
+        pass
+
+    assert registry.register("rod", Rod) is Rod
+    assert Rod.name == "rod"
+    assert registry.make("rod", "me", length=1.0).owner == "me"
+
+    @registry.register
+    class Square(Shape):
+        name = "square"
+
+    @registry.register("triangle")
+    class Triangle(Square):
+        pass
+
+    @registry.register()
+    class Ellipse(Shape):
+        name = "ellipse"
+
+    registry.register("late", f"{__name__}:Disc")
+    assert Triangle.name == "triangle"
+    assert Square.name == "square"
+    assert list(registry) == ["disc", "rod", "square", "triangle", "ellipse", "late"]
+    registry.register(Square)  # once more is no conflict
+
+
+def test_a_class_that_is_defined_again_takes_the_place_of_its_old_self(registry):
+    def define():
+        class Again(Shape):
+            name = "again"
+
+        return Again
+
+    registry.register(define())
+    new = define()
+    registry.register(new)
+    assert registry["again"] is new
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("disc", Other), "shape 'disc' is already registered: .*:Disc"),
+        (("round", Disc), "is named 'disc': it cannot be registered as 'round'"),
+        ((int,), r"a shape must be a subclass of .*Shape, got <class 'int'>"),
+        (("pen", "pens.Pen"), "'pens.Pen' must look like module:class"),
+    ],
+)
+def test_what_cannot_be_registered(registry, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        registry.register(*arguments)
+
+
+def test_a_class_without_a_name_is_refused(registry):
+    class Nameless(Shape):
+        pass
+
+    with pytest.raises(ValueError, match="Nameless has no name"):
+        registry.register(Nameless)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("disk", {}, r"unknown shape 'disk'; did you mean 'disc'\? allowed: disc"),
+        ("xyz", {}, "unknown shape 'xyz'; allowed: disc"),
+        ("no_such_module:Disc", {}, "there is no module 'no_such_module'"),
+        (f"{__name__}:Disk", {}, "module '.*' has no 'Disk'"),
+        ("json:JSONDecoder", {}, "a shape must be a subclass of"),
+        (Bar(0, length=1.0), {"length": 2.0}, "is already made: it cannot take length"),
+        (3, {}, "a shape must be a subclass of .*int"),
+        (
+            "disc",
+            {"raduis": 1},
+            r"'disc': unknown option 'raduis'; did you mean 'radius'\? allowed: radius, holes, label, filled, at$",
+        ),
+        ("disc", {"radius": "2"}, "shape 'disc': option radius = '2' must be a number$"),
+        ("disc", {"radius": True}, "option radius = True must be a number"),
+        ("disc", {"holes": 1.5}, "option holes = 1.5 must be an integer"),
+        ("disc", {"label": 3}, "option label = 3 must be a text or none"),
+        ("disc", {"filled": 1}, "option filled = 1 must be true or false"),
+        ("disc", {"at": [1.0]}, r"option at = \[1.0\] must be 2 numbers"),
+    ],
+    ids=str,
+)
+def test_each_mistake_has_its_line(registry, name, options, message):
+    with pytest.raises(ValueError, match=message):
+        registry.make(name, **options)
+
+
+def test_values_that_configuration_files_can_hold_are_accepted(registry):
+    registry.make("disc", radius=1, at=[1, 2.0], label=None)
+
+
+def test_a_missing_option_is_named(registry):
+    with pytest.raises(ValueError, match="shape 'Bar' needs the option length"):
+        Registry("shape", {}, base=BASE).make(type("Bar", (Bar,), {"name": "Bar"}), "me")
+
+
+def test_errors_inside_a_class_keep_their_traceback(registry):
+    @registry.register
+    class Broken(Shape):
+        name = "broken"
+
+        def __init__(self):
+            len(3)
+
+    with pytest.raises(TypeError, match="has no len"):
+        registry.make("broken")
+
+
+def test_a_missing_import_inside_a_module_is_not_hidden(registry, tmp_path, monkeypatch):
+    (tmp_path / "half_installed.py").write_text("import no_such_dependency\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match="no_such_dependency"):
+        registry.make("half_installed:Disc")
+
+
+def test_entry_points_of_installed_packages(tmp_path, monkeypatch):
+    (tmp_path / "their_shapes.py").write_text(f"from {__name__} import Disc\n\nclass Star(Disc):\n    name = 'star'\n")
+    info = tmp_path / "their_shapes-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-shapes\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[tests.shapes]\nstar = their_shapes:Star\ndisc = their_shapes:Disc\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    registry = Registry("shape", {"disc": f"{__name__}:Disc"}, base=BASE, group="tests.shapes")
+    assert registry.make("disc").radius == 1.0  # a name of our own is found without a search
+    with pytest.warns(UserWarning, match="'disc' of the entry point their_shapes:Disc is ignored: the name belongs to"):
+        assert list(registry) == ["disc", "star"]
+    assert "their_shapes" not in sys.modules
+    assert registry.make("star", radius=2.0).name == "star"
+
+
+def test_robots_of_the_suite():
+    assert ROBOTS["finger"] is SoftFinger
+    assert isinstance(make_robot(SoftFinger, cables=1), SoftFinger)
+    finger = make_robot("finger")
+    assert make_robot(finger) is finger
+    with pytest.raises(ValueError, match=r"'finger': unknown option 'cabels'; did you mean 'cables'\? allowed: c"):
+        make_robot("finger", cabels=1)
