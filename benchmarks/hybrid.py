@@ -4,66 +4,18 @@ from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 
-from softgym_envs.robots.base import Robot
+from softgym_envs.testing import sample_states, train_small_surrogate
 
 #: The surrogate knows the cables up to here [m], of 20 mm.
 KNOWN = 10e-3
 EPISODES = 40
 #: An error above this should have been flagged [m].
 BAD = 1e-3
-
-
-def sample(robot: Robot, states: int, seed: int, *, limit: float, sequence: str = "random") -> dict[str, np.ndarray]:
-    """Equilibria of the baseline body, its actuators commanded up to ``limit``."""
-    from softgym_envs.surrogate.data.sampling import SamplingPlan, sample_group
-
-    full = robot.actuators
-    robot.actuators = tuple(replace(actuator, high=limit) for actuator in full)
-    try:
-        data, _ = sample_group(robot, SamplingPlan(1, states, sequence, seed, vary=()), 0)
-    finally:
-        robot.actuators = full
-    assert data is not None
-    return data
-
-
-def make_weights(
-    folder: Path,
-    robot: Robot,
-    *,
-    limit: float = KNOWN,
-    states: int = 300,
-    members: int = 5,
-    width: int = 48,
-    steps: int = 1500,
-) -> None:
-    """Train a surrogate of the baseline body that knows displacements up to ``limit``, and write its weights."""
-    from softgym_envs.surrogate.data.sampling import learned_variables
-    from softgym_envs.surrogate.data.states import training_states
-    from softgym_envs.surrogate.model import Features, card_of
-    from softgym_envs.surrogate.online import save_model
-    from softgym_envs.surrogate.potential import model as potential
-    from softgym_envs.surrogate.training import Trainer, domain_of
-
-    training = sample(robot, states, 0, limit=limit, sequence="halton")
-    validation = sample(robot, max(states // 3, 20), 1, limit=limit)
-    card = card_of(robot, "potential")
-    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
-    options = potential.Options(width=width, body_width=width // 2, members=members, steps=steps, batch_size=128)
-    tensors, _ = potential.train(
-        robot,
-        training_states(robot, training, features),
-        training_states(robot, validation, features),
-        Trainer(options, seed=0),
-    )
-    model = potential.Model(robot, tensors, card)
-    save_model(potential.Model(robot, tensors, {**card, "domain": domain_of(model, training, validation)}), folder)
 
 
 def flagging(model, data: dict[str, np.ndarray], limit: float) -> dict[str, object]:
@@ -125,7 +77,7 @@ def hybrid() -> dict[str, object]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         start = time.perf_counter()
-        make_weights(folder / "weights", robot)
+        train_small_surrogate(folder / "weights", robot, limit=KNOWN)
         result["first training, with its data [s]"] = time.perf_counter() - start
         env = gymnasium.make(
             "SoftGym/FingerReach-v0",
@@ -163,8 +115,8 @@ def hybrid() -> dict[str, object]:
         "distance to the goal at the end: FEM alone, mean [mm]": 1e3 * float(reached.mean()),
         "distance to the goal at the end: FEM alone, worst [mm]": 1e3 * float(reached.max()),
     }
-    data = sample(robot, 600, 3, limit=float(robot.upper[0]))
-    inner = sample(robot, 200, 2, limit=KNOWN)
+    data = sample_states(robot, 600, 3, limit=float(robot.upper[0]))
+    inner = sample_states(robot, 200, 2, limit=KNOWN)
     data = {k: np.concatenate([data[k], inner[k]]) for k in data}
     for label, model in (
         ("given weights, their own limit", given),

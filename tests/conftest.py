@@ -13,6 +13,7 @@ from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
+from softgym_envs.testing import box_mesh, train_small_surrogate
 
 # The same examples on every machine, however busy it is.
 settings.register_profile("softgym", deadline=None, derandomize=True)
@@ -35,32 +36,16 @@ def rng():
     return np.random.default_rng(20240229)
 
 
-def _box(size=(1.0, 1.0, 1.0), cells=(2, 2, 2), jitter=0.0, seed=0):
-    """A box [0, size] cut into cubes of six tetrahedra each; inner nodes moved by up to ``jitter`` cells."""
-    counts = np.array(cells)
-    grid = np.stack(np.meshgrid(*(np.arange(n + 1) for n in cells), indexing="ij"), axis=-1).reshape(-1, 3)
-    spacing = np.asarray(size, dtype=float) / counts
-    inside = ((grid > 0) & (grid < counts)).all(axis=1)
-    noise = np.random.default_rng(seed).uniform(-jitter, jitter, grid.shape) * inside[:, None]
-    strides = np.array([(cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1])
-    corners = grid[(grid < counts).all(axis=1)] @ strides
-    paths = []
-    for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
-        steps = np.concatenate([[0], np.cumsum(strides[list(order)])])
-        paths.append(corners[:, None] + steps)
-    return (grid + noise) * spacing, np.concatenate(paths)
-
-
 @pytest.fixture(scope="session")
 def box():
-    """Function ``box(size, cells, jitter, seed) -> nodes, tetrahedra``."""
-    return _box
+    """The function `box_mesh`."""
+    return box_mesh
 
 
 @pytest.fixture(params=sorted(MATERIALS))
 def beam(request):
     """A soft cantilever of one material with two cables off its axis, an effector and a jittered mesh."""
-    nodes, tetrahedra = _box((0.1, 0.02, 0.02), (6, 2, 2), jitter=0.2)
+    nodes, tetrahedra = box_mesh((0.1, 0.02, 0.02), (6, 2, 2), jitter=0.2)
     model = MechanicalModel.from_mesh(
         nodes,
         tetrahedra,
@@ -128,8 +113,6 @@ def robot():
 @pytest.fixture(scope="session")
 def weights(robot, tmp_path_factory):
     """A small ensemble that knows the cable of a finger up to 8 mm."""
-    from benchmarks.hybrid import make_weights
-
     folder = tmp_path_factory.mktemp("finger_8mm")
-    make_weights(folder, robot, limit=8e-3, states=30, members=3, width=24, steps=400)
+    train_small_surrogate(folder, robot, limit=8e-3, states=30, members=3, width=24, steps=400)
     return folder

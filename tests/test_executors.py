@@ -6,28 +6,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pytest
 
 from softgym_envs.executors import EXECUTORS, run_jobs
+from softgym_envs.testing import live_processes, wait_until
 
 # Jobs are of the standard library: workers cannot import test files.
 SQUARES = [(operator.mul, (k, k)) for k in range(20)]
-
-
-def alive(session):
-    """Processes of a session that are not yet dead."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            state = (folder / "stat").read_text().rsplit(")", 1)[1].split()[0]
-            if state not in "ZX" and os.getsid(int(folder.name)) == session:
-                found.append(int(folder.name))
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-    return found
 
 
 def test_unknown_executor():
@@ -69,15 +55,14 @@ def test_workers_end_with_their_owner():
         try:
             assert process.stdout is not None
             assert [process.stdout.readline() for _ in range(2)] == [b"done\n"] * 2
-            assert len(alive(process.pid)) >= 4  # the owner, three workers; and what watches over shared memory
+            assert (
+                len(live_processes(process.pid)) >= 4
+            )  # the owner, three workers; and what watches over shared memory
             # Nobody has taken note of the death yet when the workers have to see it.
             os.kill(process.pid, signal.SIGKILL)
-            deadline = time.monotonic() + 20
-            while (left := alive(process.pid)) and time.monotonic() < deadline:
-                time.sleep(0.05)
-            assert not left
+            wait_until(lambda: not live_processes(process.pid))
         finally:
-            for left in alive(process.pid):
+            for left in live_processes(process.pid):
                 os.kill(left, signal.SIGKILL)
 
 

@@ -26,7 +26,7 @@ LAYERS = [
     {"softgym_envs.envs"},
     {"agents"},
     {"codesign"},
-    {"softgym_envs.viewer"},
+    {"softgym_envs.viewer", "softgym_envs.testing"},
     {"softgym_envs.cli"},
 ]
 LEVEL = {room: level for level, layer in enumerate(LAYERS) for room in layer}

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import softgym_envs  # noqa: F401  (registers the environments)
-from benchmarks.hybrid import make_weights
 from softgym_envs.backends import make_backend
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.hybrid import HybridBackend
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.errors import ConvergenceError, DataError, WeightsError
 from softgym_envs.robots import make_robot
+from softgym_envs.testing import train_small_surrogate
 
 LIMIT = 8e-3  # that of `weights`
 
@@ -108,7 +108,7 @@ def test_slack_cables_go_on_from_one_to_the_other(weights, tmp_path):
     """Two cables, weights that know nothing of them: everything by the finite elements and their condensed models."""
     robot = make_robot("finger")
     folder = tmp_path / "weights"
-    make_weights(folder, robot, limit=0.002, states=6, members=2, width=8, steps=4)
+    train_small_surrogate(folder, robot, limit=0.002, states=6, members=2, width=8, steps=4)
     backend, fem = HybridBackend(robot, weights=folder, tolerance=1e-9), FEMBackend(robot)
     for command in ([0.015, 0.0], [0.015005, 0.0], [0.015005, 1e-5]):
         state, expected = backend.step(np.array(command)), fem.step(np.array(command))

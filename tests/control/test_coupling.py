@@ -11,19 +11,10 @@ from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
+from softgym_envs.testing import random_condensed_model
 
 TURN = np.diag([-1.0, -1.0, 1.0])  # half a turn about z
 SHIFT = np.array([0.0, 0.08, 0.0])
-
-
-def random_model(rng, a=2, e=3, c=0, spread=0.03):
-    """A model of random positive W; compliances like a finger's."""
-    n = a + e + c
-    half = rng.standard_normal((n, 2 * n))
-    W = 1e-3 * (half @ half.T / n + 0.2 * np.eye(n))
-    effort = np.concatenate([rng.uniform(1.0, 5.0, a), np.zeros(e), 0.3 * rng.standard_normal(c)])
-    roles = (("a", a), ("e", e), ("c", c))
-    return CondensedModel(W, spread * rng.standard_normal(n), effort, tuple(r for r in roles if r[1]))
 
 
 def cube(models, rng=None, **options):
@@ -38,7 +29,7 @@ def cube(models, rng=None, **options):
 
 def test_two_tied_points_follow_the_written_out_system(rng):
     """Minimise the complementary energy under the tie: one linear system, solved whole."""
-    first, second = random_model(rng), random_model(rng, a=3)
+    first, second = random_condensed_model(rng), random_condensed_model(rng, actuators=3)
     gap = np.array([0.0, 0.04, 0.001])
     C = tie_points([first, second], (0, "e", 0), (1, "e", 0))
     coupled = couple([first, second], C, gap)
@@ -66,7 +57,11 @@ def test_two_tied_points_follow_the_written_out_system(rng):
 @pytest.mark.parametrize("free", [(True,) * 6, (True, True, True, False, False, False), (False, True) + (False,) * 4])
 def test_a_held_object_follows_the_written_out_system(rng, free):
     """Ties, balance of the object and guided motions, checked one by one, under random efforts and load."""
-    models = [random_model(rng, c=9), random_model(rng, a=1, e=6, c=9), random_model(rng, a=3, c=6)]
+    models = [
+        random_condensed_model(rng, contacts=9),
+        random_condensed_model(rng, actuators=1, effectors=6, contacts=9),
+        random_condensed_model(rng, actuators=3, contacts=6),
+    ]
     load = np.array([0.1, -0.3, 0.2, 1e-3, -2e-3, 1e-3])
     body = cube(models, rng, load=load, free=free)
     coupled = couple(models, body=body, orientation=True)
@@ -95,7 +90,7 @@ def test_a_held_object_follows_the_written_out_system(rng, free):
 
 
 def test_W_is_symmetric_and_its_object_rows_answer_loads(rng):
-    models = [random_model(rng, c=9), random_model(rng, c=9)]
+    models = [random_condensed_model(rng, contacts=9), random_condensed_model(rng, contacts=9)]
     body = cube(models)
     coupled = couple(models, body=body, orientation=True, effectors=[1])
     assert coupled.condensed.roles == (("a", 4), ("e", 9))
@@ -110,7 +105,7 @@ def test_W_is_symmetric_and_its_object_rows_answer_loads(rng):
 
 
 def test_forces_on_rows_that_are_not_tied_stay(rng):
-    first, second = random_model(rng), random_model(rng, e=6)
+    first, second = random_condensed_model(rng), random_condensed_model(rng, effectors=6)
     second.effort[5:] = [0.1, 0.2, 0.3]  # a load on the second point
     C = tie_points([first, second], (0, "e", 0), (1, "e", 0))
     parts = couple([first, second], C, np.zeros(3)).efforts(np.ones(4))
@@ -120,7 +115,7 @@ def test_forces_on_rows_that_are_not_tied_stay(rng):
 
 def test_redundant_ties_change_nothing(rng):
     """The same tie three times: two directions of each coordinate are dropped, and the answer is that of one."""
-    models = [random_model(rng), random_model(rng)]
+    models = [random_condensed_model(rng), random_condensed_model(rng)]
     C, gap = tie_points(models, (0, "e", 0), (1, "e", 0)), np.array([0.0, 0.04, 0.0])
     once = couple(models, C, gap)
     thrice = couple(models, np.concatenate([C, 2.0 * C, C]), np.concatenate([gap, 2.0 * gap, gap]))
@@ -143,7 +138,9 @@ def test_nearly_rigid_contact_triads_are_safe(rng, softness):
     for _ in range(2):
         points = rng.standard_normal((3, 3)) * 0.002 + [0.0, 0.02, -0.1]
         frame = HeldObject.around(points.mean(axis=0), points)
-        rigid = random_model(rng, a=2, e=0, c=6)  # its c rows: motion of a frame that carries the points
+        rigid = random_condensed_model(
+            rng, actuators=2, effectors=0, contacts=6
+        )  # its c rows: motion of a frame that carries the points
         scale = np.diag([1, 1, 1, 50.0, 50.0, 50.0])
         H = np.zeros((11, 8))
         H[:2, :2], H[2:, 2:] = np.eye(2), frame.jacobian @ scale
@@ -178,7 +175,7 @@ def test_nearly_rigid_contact_triads_are_safe(rng, softness):
 @pytest.mark.parametrize("units", [1e3, 1e-3])
 def test_the_answer_does_not_depend_on_units(rng, units):
     """Metres to millimetres and back, newtons kept: displacements scale, forces do not."""
-    models = [random_model(rng, c=9), random_model(rng, c=9)]
+    models = [random_condensed_model(rng, contacts=9), random_condensed_model(rng, contacts=9)]
     body = cube(models)
     scaled = [CondensedModel(units * m.compliance, units * m.free, m.effort, m.roles) for m in models]
     big = HeldObject(units * body.position, units * body.points)
@@ -191,7 +188,7 @@ def test_the_answer_does_not_depend_on_units(rng, units):
 
 
 def test_malformed_couplings_are_refused(rng):
-    models = [random_model(rng, c=3), random_model(rng, c=3)]
+    models = [random_condensed_model(rng, contacts=3), random_condensed_model(rng, contacts=3)]
     C = tie_points(models, (0, "e", 0), (1, "e", 0))
     contacts = rng.standard_normal((2, 3))
     for expected, arguments, options in [
@@ -296,7 +293,7 @@ def test_rotate_is_the_model_of_the_rotated_mesh(contact_finger):
 
 
 def test_rotate_keeps_batches_and_refuses_nonsense(rng):
-    model = random_model(rng, c=3)
+    model = random_condensed_model(rng, contacts=3)
     R = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
     batch = CondensedModel(*(np.stack([v, v]) for v in (model.compliance, model.free, model.effort)), model.roles)
     one, two = rotate(model, R, SHIFT), rotate(batch, R, SHIFT)

@@ -27,6 +27,7 @@ from softgym_envs.surrogate.data.sampling import (
     sample_group,
     select_states,
 )
+from softgym_envs.testing import live_processes, wait_until
 
 PLAN = SamplingPlan(groups=4, states=3, sequence="halton", seed=5)
 
@@ -562,26 +563,6 @@ for folder in sys.stdin:
 """
 
 
-def alive(session):
-    """Processes of a session that are not yet dead."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            state = (folder / "stat").read_text().rsplit(")", 1)[1].split()[0]
-            if state not in "ZX" and os.getsid(int(folder.name)) == session:
-                found.append(int(folder.name))
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-    return found
-
-
-def wait(condition, seconds=300.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "took too long"
-        time.sleep(0.002)
-
-
 def test_ten_kills_lose_no_finished_shard_and_repeat_none(tmp_path, rng):
     """kill -9 of the run alone or with its workers, as it starts or anywhere among its shards; then another run."""
     folder = tmp_path / "data"
@@ -612,15 +593,15 @@ def test_ten_kills_lose_no_finished_shard_and_repeat_none(tmp_path, rng):
                     time.sleep(rng.uniform(0.0, 1.0))
                 else:
                     goal = before + int(rng.integers(1, 4))
-                    wait(lambda goal=goal: sum(1 for _ in folder.glob("shard_*")) >= goal)
+                    wait_until(lambda goal=goal: sum(1 for _ in folder.glob("shard_*")) >= goal, interval=0.002)
                     time.sleep(rng.uniform(0.0, 0.03))
                 if number % 2:
                     os.killpg(session, signal.SIGKILL)
                 else:
                     os.kill(session, signal.SIGKILL)
-                    survivors += len(alive(session)) > 0
+                    survivors += len(live_processes(session)) > 0
                     if number % 4:  # the next run starts while orphans are still at their shards
-                        wait(lambda session=session: not alive(session), 20.0)
+                        wait_until(lambda session=session: not live_processes(session))
                 now = shards()
                 assert now.items() >= finished.items()
                 gained.append(len(now) - before)
@@ -629,12 +610,12 @@ def test_ten_kills_lose_no_finished_shard_and_repeat_none(tmp_path, rng):
             assert sum(n > 0 for n in gained) >= 8 and len(finished) < LONG.groups, gained
 
             start()
-            wait(lambda: (folder / "README.md").exists())
-            wait(lambda: not any(alive(session) for session in sessions), 20.0)
+            wait_until(lambda: (folder / "README.md").exists())
+            wait_until(lambda: not any(live_processes(session) for session in sessions))
         finally:
             starter.stdin.close()
             for session in sessions:
-                for process in alive(session):
+                for process in live_processes(session):
                     os.kill(process, signal.SIGKILL)
                 # A killed group has nobody left to clear its semaphores away.
                 for left in Path("/dev/shm").glob(f"*[-_]{session}[-_]*"):

@@ -19,6 +19,7 @@ from softgym_envs.surrogate.data.sampling import learned_variables
 from softgym_envs.surrogate.export import export_c, export_onnx
 from softgym_envs.surrogate.model import Features, SurrogateModel
 from softgym_envs.surrogate.potential import model as potential
+from softgym_envs.testing import random_states
 
 CC = shutil.which("cc") or shutil.which("gcc")
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler")
@@ -66,13 +67,6 @@ def random_model(case, seed=0, learned=None):
     model = potential.Model(robot, potential.stack_members(states, scales), {})
     model.features = features
     return model
-
-
-def random_states(robot, count, seed=0):
-    """Designs (B, len(space)) and displacements (B, n_a)."""
-    rng = np.random.default_rng(seed)
-    designs = np.array([list(robot.design_space.sample(rng).values()) for _ in range(count)])
-    return designs, rng.uniform(robot.lower, robot.upper, (count, len(robot.actuators)))
 
 
 def assert_same(model, designs, displacement, found, tolerance=2e-5):

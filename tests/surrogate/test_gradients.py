@@ -6,7 +6,8 @@ import torch
 
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.gradients import TorchModel
-from tests.surrogate.test_model import random_bodies, untrained_potential, untrained_residual
+from softgym_envs.testing import random_states, untrained_potential
+from tests.surrogate.test_model import untrained_residual
 
 NAMES = ("finger", "trunk", "press_finger")
 
@@ -15,7 +16,7 @@ NAMES = ("finger", "trunk", "press_finger")
 def test_torch_says_what_the_compiled_model_says(name):
     robot = make_robot(name)
     model, _ = untrained_potential(robot, members=2)
-    designs, displacement = random_bodies(robot, 10)
+    designs, displacement = random_states(robot, 10)
     context = model.context(designs)
     effort, effector, W = (
         v.numpy() for v in TorchModel(model)(torch.as_tensor(designs), torch.as_tensor(displacement))
@@ -30,7 +31,7 @@ def test_design_gradients_are_derivatives(name):
     robot = make_robot(name)
     model, _ = untrained_potential(robot, members=2)
     net = TorchModel(model)
-    designs, displacement = (torch.as_tensor(v) for v in random_bodies(robot, 4))
+    designs, displacement = (torch.as_tensor(v) for v in random_states(robot, 4))
     low = torch.as_tensor([v.low for v in robot.design_space.variables.values()], dtype=torch.float64)
     high = torch.as_tensor([v.high for v in robot.design_space.variables.values()], dtype=torch.float64)
     rng = torch.Generator().manual_seed(1)

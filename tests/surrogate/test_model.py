@@ -16,22 +16,15 @@ from softgym_envs.mechanics.solvers import complementarity
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate import online
 from softgym_envs.surrogate.baselines import residual
-from softgym_envs.surrogate.data.sampling import learned_variables
-from softgym_envs.surrogate.model import Context, Features, SurrogateModel, load_model
+from softgym_envs.surrogate.model import Context, SurrogateModel, load_model
 from softgym_envs.surrogate.networks import NETWORKS
 from softgym_envs.surrogate.potential import model as potential
-from softgym_envs.surrogate.potential.network import PotentialNet
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
 from softgym_envs.surrogate.training import FitConfig, Trainer, fit, generate
+from softgym_envs.testing import random_states, untrained_potential
 
 CABLES = (1, 2)
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "surrogate"
-
-
-def random_bodies(robot, count, seed=0):
-    rng = np.random.default_rng(seed)
-    designs = np.array([list(robot.design_space.sample(rng).values()) for _ in range(count)])
-    return designs, rng.uniform(robot.lower, robot.upper, (count, len(robot.actuators)))
 
 
 def untrained_residual(robot, seed=0):
@@ -55,29 +48,11 @@ def untrained_residual(robot, seed=0):
     return residual.Model(robot, tensors, {})
 
 
-def untrained_potential(robot, members=2, width=16, rest=True, seed=0):
-    """A potential model with random weights, and its members in torch."""
-    torch.manual_seed(seed)
-    n, e = len(robot.actuators), 3 * len(robot.effectors)
-    design = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper).design_size
-    middle, half = 0.5 * (robot.upper + robot.lower), 0.5 * (robot.upper - robot.lower)
-    at_rest = -middle / half if rest else None
-    nets = [PotentialNet(n, e, design, width, 16, at_rest, robot.convex) for _ in range(members)]
-    scales = {
-        "energy": np.array(2.0),
-        "effector_mean": np.linspace(-0.1, 0.1, e),
-        "effector": np.array(0.03),
-        "held": np.array(1e-3),
-    }
-    states = [{k: v.detach().numpy() for k, v in net.state_dict().items()} for net in nets]
-    return potential.Model(robot, potential.stack_members(states, scales), {}), nets
-
-
 @pytest.mark.parametrize("cables", CABLES)
 def test_residual_network_is_exact_at_rest_and_positive_definite_untrained(cables):
     robot = make_robot("finger", cables=cables)
     model = untrained_residual(robot)
-    designs, displacement = random_bodies(robot, 500)
+    designs, displacement = random_states(robot, 500)
     context = model.context(designs)
     W = model.compliance(context, displacement)
     assert (W == np.swapaxes(W, 1, 2)).all()
@@ -100,7 +75,7 @@ def test_potential_is_a_potential_whatever_its_weights(name, rest):
     """W is symmetric, positive definite if the robot is convex, and the derivative of its own state."""
     robot = make_robot(name)
     model, _ = untrained_potential(robot, rest=rest)
-    designs, displacement = random_bodies(robot, 200)
+    designs, displacement = random_states(robot, 200)
     context = model.context(designs)
     W = model.compliance(context, displacement)
     assert (W == np.swapaxes(W, 1, 2)).all()
@@ -126,7 +101,7 @@ def test_potential_is_a_potential_whatever_its_weights(name, rest):
 def test_compiled_potential_agrees_with_torch(name):
     robot = make_robot(name)
     model, nets = untrained_potential(robot, members=3)
-    designs, displacement = random_bodies(robot, 20)
+    designs, displacement = random_states(robot, 20)
     context = model.context(designs)
     effort, effector, spread = model.state(context, displacement)
     W = model.compliance(context, displacement)
@@ -160,9 +135,9 @@ def test_search_of_a_batch_is_that_of_its_rows(name):
     robot = make_robot(name)
     model = pretrained_model(robot)
     count, lost = 2 * potential._ROWS + 5, [3, potential._ROWS + 1]
-    designs, target = random_bodies(robot, count)
+    designs, target = random_states(robot, count)
     context = model.context(designs)
-    guess = target + 0.1 * (random_bodies(robot, count, seed=1)[1] - target)
+    guess = target + 0.1 * (random_states(robot, count, seed=1)[1] - target)
     target[0] = guess[0] = robot.upper  # taut
     guess[lost, 0] = np.nan
     unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
@@ -192,7 +167,7 @@ def test_the_search_is_compiled_anew_when_what_it_inlines_changes():
 def test_a_row_without_a_definite_compliance_is_lost_alone(monkeypatch):
     robot = make_robot("finger")
     model = untrained_residual(robot)
-    designs, target = random_bodies(robot, 16)
+    designs, target = random_states(robot, 16)
     context = model.context(designs)
     unilateral = np.ones(2, dtype=bool)
     whole = model.search(context, target, target, unilateral, 1e-4, 25)
@@ -216,7 +191,7 @@ def test_a_row_without_a_definite_compliance_is_lost_alone(monkeypatch):
 def test_members_of_an_ensemble():
     robot = make_robot("finger")
     model, _ = untrained_potential(robot, members=3)
-    designs, displacement = random_bodies(robot, 5)
+    designs, displacement = random_states(robot, 5)
     assert np.isfinite(model.state(model.context(designs), displacement)[2]).all()
     for members in (1, 2):  # whose spread is smaller than that of all, which was calibrated
         part = potential.Model(robot, model.tensors, {}, members=members)
@@ -230,7 +205,7 @@ def test_members_of_an_ensemble():
 def test_context_rows_share_and_part():
     robot = make_robot("finger")
     model, _ = untrained_potential(robot)
-    designs, displacement = random_bodies(robot, 6)
+    designs, displacement = random_states(robot, 6)
     own = model.context(designs)
     shared = Context.shared(model.context(designs[:1]), 6)
     first = model.state(shared, displacement)[1][0]
@@ -264,7 +239,7 @@ def test_trust_follows_domain_and_spread():
 def test_trust_ends_where_actuators_become_soft():
     robot = make_robot("diamond")
     model, _ = untrained_potential(robot)
-    designs, displacement = random_bodies(robot, 200)
+    designs, displacement = random_states(robot, 200)
     context = model.context(designs)
     found = model.growth(context, displacement)
     zero = np.zeros_like(displacement)
@@ -290,7 +265,7 @@ def test_trust_ends_where_actuators_become_soft():
 def test_youngs_modulus_scales_exactly(cables):
     robot = make_robot("finger", cables=cables)
     model = pretrained_model(robot)
-    designs, displacement = random_bodies(robot, 50)
+    designs, displacement = random_states(robot, 50)
     column = robot.design_space.names.index("young_modulus")
     soft, stiff = designs.copy(), designs.copy()
     soft[:, column], stiff[:, column] = 1.5e6, 6.0e6
@@ -305,7 +280,7 @@ def test_youngs_modulus_scales_exactly(cables):
 def test_condensed_model_is_consistent(cables):
     robot = make_robot("finger", cables=cables)
     model = pretrained_model(robot)
-    designs, displacement = random_bodies(robot, 20)
+    designs, displacement = random_states(robot, 20)
     condensed = model.condensed(model.context(designs), displacement)
     assert condensed.W.ea.shape == (20, 3, cables)
     assert np.allclose(condensed.delta.a, displacement, atol=1e-15)

@@ -7,13 +7,13 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.hybrid import sample
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.data.dataset import COLUMNS
 from softgym_envs.surrogate.model import load_model
 from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of, rehearsal_states, save_model
 from softgym_envs.surrogate.potential.model import Model, stack_members, unstack_members
+from softgym_envs.testing import sample_states
 
 LIMIT = 8e-3  # that of `weights`
 
@@ -28,13 +28,13 @@ def model(robot, weights):
 @pytest.fixture(scope="module")
 def full(robot):
     """The whole range."""
-    return sample(robot, 60, 5, limit=float(robot.upper[0]))
+    return sample_states(robot, 60, 5, limit=float(robot.upper[0]))
 
 
 @pytest.fixture(scope="module")
 def middle(robot):
     """States up to 14 mm, beyond what the weights know."""
-    data = sample(robot, 40, 6, limit=14e-3)
+    data = sample_states(robot, 40, 6, limit=14e-3)
     rows = (data["displacement"][:, 0] > LIMIT) | data["rest"]
     return {k: v[rows] for k, v in data.items()}
 

@@ -1,0 +1,337 @@
+"""Helpers shared by tests and benchmarks: small meshes and bodies, derivatives, quick surrogates, processes."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import csc_matrix
+from scipy.spatial.transform import Rotation
+
+from softgym_envs.mechanics.builder import ModelBuilder
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.elements.beams import Section
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.base import Robot
+
+if TYPE_CHECKING:
+    from softgym_envs.surrogate.potential.model import Model
+    from softgym_envs.surrogate.potential.network import PotentialNet
+
+# -- meshes and bodies --------------------------------------------------------------------------------------------
+
+
+def box_mesh(
+    size: Sequence[float] = (1.0, 1.0, 1.0), cells: Sequence[int] = (2, 2, 2), jitter: float = 0.0, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nodes [m] (n, 3) and tetrahedra (m, 4) of the box from the origin to ``size``.
+
+    Args:
+        size: edge lengths [m], shape (3,).
+        cells: number of cuboids along each edge; each cuboid is cut into six tetrahedra.
+        jitter: largest random shift of the inner nodes, as a fraction of a cuboid.
+        seed: of the random shifts.
+    """
+    counts = np.array(cells)
+    grid = np.stack(np.meshgrid(*(np.arange(n + 1) for n in cells), indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = np.all((grid > 0) & (grid < counts), axis=1)
+    noise = np.random.default_rng(seed).uniform(-jitter, jitter, grid.shape) * inside[:, None]
+    strides = np.array([(cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1])
+    corners = grid[np.all(grid < counts, axis=1)] @ strides
+    paths = []
+    for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
+        steps = np.concatenate([[0], np.cumsum(strides[list(order)])])
+        paths.append(corners[:, None] + steps)
+    return (grid + noise) * (np.asarray(size, dtype=float) / counts), np.concatenate(paths)
+
+
+def clamped_solid(
+    element: str = "linear", material: str = "corotational", cells: Sequence[int] = (2, 2, 2), **options: object
+) -> MechanicalModel:
+    """Return a 20 x 20 x 30 mm block of solid elements on an irregular mesh, clamped at its lower face.
+
+    Args:
+        element: name of the solid element.
+        material: name of the material.
+        cells: cuboids along each edge.
+        **options: of `ModelBuilder.add_solid`.
+    """
+    nodes, tetrahedra = box_mesh((0.02, 0.02, 0.03), cells, jitter=0.2)
+    builder = ModelBuilder()
+    options = {"young_modulus": 2e5, "poisson_ratio": 0.45, "density": 1000.0, **options}
+    fixed = nodes[:, 2] < 1e-9
+    builder.add_solid(nodes, tetrahedra, fixed=fixed, element=element, material=material, **options)
+    return builder.build()
+
+
+ASYMMETRIC_SECTION = Section(6e-4, (2e-8, 5e-8), 3e-8, (0.8, 0.7))
+"""A beam section without symmetry, so that no two of its stiffnesses can be confused."""
+
+
+def clamped_beam(order: int = 1, shape: str = "straight", elements: int = 3, **options: object) -> MechanicalModel:
+    """Return a beam clamped at one end.
+
+    Args:
+        order: order of the beam elements, 1 or 2.
+        shape: ``"straight"`` or ``"curved"``, which follows a helix with twisted sections.
+        elements: number of elements; their modulus grows along the beam.
+        **options: of `ModelBuilder.add_beam`.
+    """
+    builder = ModelBuilder()
+    frames = []
+    for k, t in enumerate(np.linspace(0.0, 1.0, order * elements + 1)):
+        if shape == "straight":
+            position, rotation = np.array([0.2 * t, 0.0, 0.0]), np.eye(3)
+        else:
+            position = 0.1 * np.array([np.sin(t), 1.0 - np.cos(t), 0.4 * t])
+            tangent = np.array([np.cos(t), np.sin(t), 0.4]) / np.sqrt(1.16)
+            normal = Rotation.from_rotvec(0.5 * t * tangent).apply([-np.sin(t), np.cos(t), 0.0])
+            rotation = np.column_stack([tangent, normal, np.cross(tangent, normal)])
+        frames.append(builder.add_frame(position, rotation, fixed=k == 0, fixed_spin=k == 0))
+    young = 1e6 * (1.0 + np.arange(elements))
+    builder.add_beam(
+        frames,
+        section=ASYMMETRIC_SECTION,
+        young_modulus=young,
+        poisson_ratio=0.4,
+        order=order,
+        **options,
+    )
+    return builder.build()
+
+
+# -- derivatives --------------------------------------------------------------------------------------------------
+
+
+def dense_tangent(model: MechanicalModel, values: np.ndarray) -> np.ndarray:
+    """Return the symmetric matrix (n, n) of lower-triangle ``values`` on the model's sparsity pattern."""
+    indptr, indices = model.tangent_pattern
+    lower = csc_matrix((values.copy(), indices, indptr), shape=2 * (len(indptr) - 1,)).toarray()
+    assert np.allclose(np.triu(lower, 1), 0.0)
+    return lower + np.tril(lower, -1).T
+
+
+@dataclass(frozen=True)
+class DerivativeErrors:
+    """Relative errors of a model's derivatives against central differences.
+
+    Attributes:
+        gradient: of the residual, the derivative of the potential.
+        tangent: of the tangent, the derivative of the residual.
+        constraints: of the second derivatives of the constraints.
+    """
+
+    gradient: float
+    tangent: float
+    constraints: float
+
+
+def derivative_errors(model: MechanicalModel, x: np.ndarray, effort: np.ndarray) -> DerivativeErrors:
+    """Compare residual and tangent at positions ``x`` [m] (n, 3) with central differences along warped steps.
+
+    The tangent is compared with the symmetric part of the differences: rotations of frames do not commute, and the
+    tangent is the second derivative along exponential maps. The contribution of bonds is subtracted.
+    """
+
+    def assembled(y: np.ndarray) -> list[np.ndarray]:
+        arrays = model.assemble(y, effort)
+        assert arrays is not None, "an element is inverted"
+        return [array.copy() for array in arrays]
+
+    residual, values, H, _ = assembled(x)
+    tangent = dense_tangent(model, values)
+    bonds = sum(c.size for c in model.constraints["b"])
+    if bonds:
+        tangent -= model.bond_stiffness * H[:, -bonds:] @ H[:, -bonds:].T
+
+    def potential(y: np.ndarray) -> float:
+        return model.energy(y) - sum(effort[rows] @ c.value(y) for c, rows in model.rows)
+
+    count = model.equations
+    slope, matrix, gradients = np.empty(count), np.empty((count, count)), np.empty_like(H)
+    for k in range(count):
+        step = np.zeros(count)
+        # Round-off of the energy demands larger steps [m] than round-off of the residual.
+        for h, quantity in ((1e-6, "energy"), (1e-7, "residual")):
+            step[k] = h / model.dof_scale[k]
+            plus, minus = x + model.warp(x, step), x + model.warp(x, -step)
+            if quantity == "energy":
+                slope[k] = (potential(plus) - potential(minus)) / (2 * step[k])
+            else:
+                after, before = assembled(plus), assembled(minus)
+                matrix[:, k] = (after[0] - before[0]) / (2 * step[k])
+                gradients[k] = (after[3] - before[3]) / (2 * step[k])
+    symmetric = 0.5 * (matrix + matrix.T)
+    # Entries of rotations and displacements differ in unit and size: scale each by its row and column.
+    unit = 1.0 / np.sqrt(np.abs(np.diag(symmetric)))
+    scaled = unit[:, None] * np.abs(symmetric - tangent) * unit
+    return DerivativeErrors(
+        gradient=float((np.abs(slope - residual) / model.dof_scale).max() / np.abs(residual / model.dof_scale).max()),
+        tangent=float(scaled.max()),
+        constraints=float(np.abs(gradients - H).max(initial=0.0) / np.abs(H).max(initial=1.0)),
+    )
+
+
+# -- condensed models and surrogates ------------------------------------------------------------------------------
+
+
+def random_condensed_model(
+    rng: np.random.Generator, actuators: int = 2, effectors: int = 3, contacts: int = 0, spread: float = 0.03
+) -> CondensedModel:
+    """Return a condensed model with a random positive definite W whose size is that of a finger's.
+
+    Args:
+        rng: random generator.
+        actuators: rows of actuators, with efforts between 1 and 5 N.
+        effectors: rows of effectors.
+        contacts: rows of contacts.
+        spread: standard deviation of the free displacement [m].
+    """
+    n = actuators + effectors + contacts
+    half = rng.standard_normal((n, 2 * n))
+    W = 1e-3 * (half @ half.T / n + 0.2 * np.eye(n))
+    effort = np.concatenate(
+        [rng.uniform(1.0, 5.0, actuators), np.zeros(effectors), 0.3 * rng.standard_normal(contacts)]
+    )
+    roles = (("a", actuators), ("e", effectors), ("c", contacts))
+    return CondensedModel(W, spread * rng.standard_normal(n), effort, tuple(role for role in roles if role[1]))
+
+
+def random_states(robot: Robot, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``count`` random designs, shape (count, n_design), and actuator displacements, shape (count, n_a)."""
+    rng = np.random.default_rng(seed)
+    designs = np.array([list(robot.design_space.sample(rng).values()) for _ in range(count)])
+    return designs, rng.uniform(robot.lower, robot.upper, (count, len(robot.actuators)))
+
+
+def untrained_potential(
+    robot: Robot, members: int = 2, width: int = 16, rest: bool = True, seed: int = 0
+) -> tuple[Model, list[PotentialNet]]:
+    """Return a potential with random weights, and its ensemble members as torch modules.
+
+    Args:
+        robot: what the potential describes.
+        members: size of the ensemble.
+        width: of the hidden layers.
+        rest: whether the effort is zero at zero displacement by construction.
+        seed: of the weights.
+    """
+    import torch
+
+    from softgym_envs.surrogate.data.sampling import learned_variables
+    from softgym_envs.surrogate.model import Features
+    from softgym_envs.surrogate.potential import model as potential
+    from softgym_envs.surrogate.potential.network import PotentialNet
+
+    torch.manual_seed(seed)
+    n, e = len(robot.actuators), 3 * len(robot.effectors)
+    design = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper).design_size
+    middle, half = 0.5 * (robot.upper + robot.lower), 0.5 * (robot.upper - robot.lower)
+    at_rest = -middle / half if rest else None
+    nets = [PotentialNet(n, e, design, width, 16, at_rest, robot.convex) for _ in range(members)]
+    scales = {
+        "energy": np.array(2.0),
+        "effector_mean": np.linspace(-0.1, 0.1, e),
+        "effector": np.array(0.03),
+        "held": np.array(1e-3),
+    }
+    states = [{k: v.detach().numpy() for k, v in net.state_dict().items()} for net in nets]
+    return potential.Model(robot, potential.stack_members(states, scales), {}), nets
+
+
+def sample_states(
+    robot: Robot, states: int, seed: int, *, limit: float, sequence: str = "random"
+) -> dict[str, np.ndarray]:
+    """Return FEM equilibria of the baseline body as columns of a dataset.
+
+    Args:
+        robot: what is sampled.
+        states: number of equilibria.
+        seed: of the commands.
+        limit: largest actuator displacement [m].
+        sequence: name of a sampling sequence.
+    """
+    from softgym_envs.surrogate.data.sampling import SamplingPlan, sample_group
+
+    full = robot.actuators
+    robot.actuators = tuple(replace(actuator, high=limit) for actuator in full)
+    try:
+        data, _ = sample_group(robot, SamplingPlan(1, states, sequence, seed, vary=()), 0)
+    finally:
+        robot.actuators = full
+    assert data is not None
+    return data
+
+
+def train_small_surrogate(
+    folder: Path,
+    robot: Robot,
+    *,
+    limit: float,
+    states: int = 300,
+    members: int = 5,
+    width: int = 48,
+    steps: int = 1500,
+) -> None:
+    """Train a surrogate of the baseline body on displacements up to ``limit`` [m] and write it to ``folder``."""
+    from softgym_envs.surrogate.data.sampling import learned_variables
+    from softgym_envs.surrogate.data.states import training_states
+    from softgym_envs.surrogate.model import Features, card_of
+    from softgym_envs.surrogate.online import save_model
+    from softgym_envs.surrogate.potential import model as potential
+    from softgym_envs.surrogate.training import Trainer, domain_of
+
+    training = sample_states(robot, states, 0, limit=limit, sequence="halton")
+    validation = sample_states(robot, max(states // 3, 20), 1, limit=limit)
+    card = card_of(robot, "potential")
+    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
+    options = potential.Options(width=width, body_width=width // 2, members=members, steps=steps, batch_size=128)
+    tensors, _ = potential.train(
+        robot,
+        training_states(robot, training, features),
+        training_states(robot, validation, features),
+        Trainer(options, seed=0),
+    )
+    model = potential.Model(robot, tensors, card)
+    save_model(potential.Model(robot, tensors, {**card, "domain": domain_of(model, training, validation)}), folder)
+
+
+# -- processes ----------------------------------------------------------------------------------------------------
+
+
+def live_processes(session: int) -> list[int]:
+    """Return the IDs of the processes of a session that are still running; zombies do not count. Linux only."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            state = (folder / "stat").read_text().rsplit(")", 1)[1].split()[0]
+            if state not in "ZX" and os.getsid(int(folder.name)) == session:
+                found.append(int(folder.name))
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    return found
+
+
+def wait_until(
+    condition: Callable[[], object], *, interval: float = 0.01, failed: Callable[[], str | None] = lambda: None
+) -> None:
+    """Wait until ``condition()`` holds, for as long as it takes: a slow machine is not an error.
+
+    Args:
+        condition: what to wait for.
+        interval: time between two checks [s].
+        failed: returns a message once the condition can no longer come true, else None.
+
+    Raises:
+        RuntimeError: with the message of ``failed``.
+    """
+    while not condition():
+        message = failed()
+        if message is not None and not condition():
+            raise RuntimeError(message)
+        time.sleep(interval)
