@@ -68,9 +68,9 @@ def optima() -> dict[str, object]:
             start = {name: box.design(corner)[name] for name in box.names}
             by_tpe = configured({"method": "search", "sampler": {"name": "tpe"}, "trials": 60, "starts": [start]})
             with tempfile.TemporaryDirectory() as folder:
-                (row,) = search(by_tpe, folder, progress=False)["front"]
-            values.append(row["metrics"][metric])
-            designs.append(row["design"])
+                (row,) = search(by_tpe, folder, progress=False).front
+            values.append(row.metrics[metric])
+            designs.append(row.design)
         fem = by_gradient.bodies.evaluator((metric,), "fem")
         for name, k in (("best", int(np.argmax(values))), ("worst", int(np.argmin(values)))):
             result[f"{metric}: TPE, 60 trials, {name} corner, design"] = _shown(designs[k])
@@ -173,23 +173,23 @@ def sensor_front() -> dict[str, object]:
             writer.writerow([*numbers, row["infeasible"].split(":")[0] or "ok"])
     feasible = [row for row in rows if not row["infeasible"]]
     values = np.array([[float(row[metric]) for metric in metrics] for row in feasible])
-    on_front = {row["trial"] for row in found["front"]}
+    on_front = {row.trial for row in found.front}
     front = np.array([k for k, row in enumerate(feasible) if int(row["trial"]) in on_front])
     references = {name: [row[metric] for metric in metrics] for name, row in built.items()}
     draw_front(folder / "front_with_built_fingers.png", metrics, values, front, references)
     result: dict[str, object] = {
-        "designs: feasible, infeasible, repeated": [found["feasible"], found["infeasible"], found["repeated"]],
-        "evaluation, over all processes [s]": round(found["busy_seconds"], 1),
+        "designs: feasible, infeasible, repeated": [found.feasible, found.infeasible, found.repeated],
+        "evaluation, over all processes [s]": round(found.busy_seconds, 1),
         "wall time of this run [s]": round(time.perf_counter() - began, 1),
-        "designs on the front": len(found["front"]),
+        "designs on the front": len(found.front),
     }
-    for end, row in (("sensing", found["front"][0]), ("bending", found["front"][-1])):
+    for end, row in (("sensing", found.front[0]), ("bending", found.front[-1])):
         design = {
             name: round(value if name == "slope" else 1e3 * value, 3)
-            for name, value in row["design"].items()
+            for name, value in row.design.items()
             if name in config.bodies.box().names
         }
-        result[f"end for {end} [mm3, deg]"] = shown(row["metrics"])
+        result[f"end for {end} [mm3, deg]"] = shown(row.metrics)
         result[f"end for {end} [mm, rad]"] = design
     for name, row in built.items():
         result[f"{name} [mm3, deg]"] = shown(row)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-import warnings
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -12,6 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from agents.config import EnvironmentConfig, SACConfig, check_hindsight, check_start
 from agents.joint import PROPOSERS
 from codesign.objectives import OBJECTIVES
+from codesign.sampling import SamplerConfig, check_options
 from softgym_envs.config import Config
 from softgym_envs.designs import DesignSpace
 from softgym_envs.envs.registration import ENVIRONMENTS
@@ -20,19 +19,16 @@ from softgym_envs.robots.base import Robot
 __all__ = [
     "JOURNAL",
     "PRUNERS",
-    "SAMPLERS",
     "STRATEGIES",
     "FinalistsConfig",
     "GoalsConfig",
     "JointConfig",
     "PrunerConfig",
-    "SamplerConfig",
     "ScreenConfig",
     "Strategy",
     "StudyConfig",
     "TrainingConfig",
     "ZoneConfig",
-    "construct",
 ]
 
 JOURNAL = "journal"
@@ -69,15 +65,6 @@ STRATEGIES: dict[str, Strategy] = {
 }
 """Registry: name to strategy."""
 
-SAMPLERS: dict[str, str] = {
-    "tpe": "TPESampler",
-    "cmaes": "CmaEsSampler",
-    "gp": "GPSampler",
-    "nsgaii": "NSGAIISampler",
-    "qmc": "QMCSampler",
-    "random": "RandomSampler",
-}
-"""Registry: name to class of `optuna.samplers`."""
 PRUNERS: dict[str, str] = {
     "none": "NopPruner",
     "median": "MedianPruner",
@@ -92,42 +79,6 @@ for strategies that train nothing in a trial, are goals, each of which is compar
 """
 
 
-def construct(cls: type, options: dict[str, Any]) -> Any:
-    """Make a sampler or a pruner of Optuna. Naming one in a configuration is consent to its being experimental."""
-    from optuna.exceptions import ExperimentalWarning
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ExperimentalWarning)
-        return cls(**options)
-
-
-def _check_options(kind: str, name: str, cls: type, options: dict[str, Any]) -> None:
-    """Raise ValueError for a keyword that the constructor of a sampler or pruner does not take."""
-    allowed = [key for key in inspect.signature(cls).parameters if key not in ("seed", "args", "kwargs")]
-    for key in options:
-        if key not in allowed:
-            raise ValueError(f"unknown option '{key}' of {kind} '{name}'; allowed: {', '.join(allowed) or 'none'}")
-    try:
-        construct(cls, options)
-    except TypeError as error:
-        raise ValueError(f"{kind} '{name}': {error}") from None
-
-
-class SamplerConfig(Config):
-    """Who proposes bodies: ``name`` of `SAMPLERS`, ``seed``, and further arguments of its class."""
-
-    name: Literal["tpe", "cmaes", "gp", "nsgaii", "qmc", "random"] = "tpe"
-    seed: int = Field(default=0, ge=0)
-    options: dict[str, Any] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _known_options(self) -> SamplerConfig:
-        import optuna
-
-        _check_options("sampler", self.name, getattr(optuna.samplers, SAMPLERS[self.name]), self.options)
-        return self
-
-
 class PrunerConfig(Config):
     """Who stops hopeless trials: ``name`` of `PRUNERS`, and further arguments of its class."""
 
@@ -138,7 +89,7 @@ class PrunerConfig(Config):
     def _known_options(self) -> PrunerConfig:
         import optuna
 
-        _check_options("pruner", self.name, getattr(optuna.pruners, PRUNERS[self.name]), self.options)
+        check_options("pruner", self.name, getattr(optuna.pruners, PRUNERS[self.name]), self.options)
         return self
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from codesign.config import JOURNAL, StudyConfig
 from codesign.goals import draw_goals
 from codesign.scheduling.storage import StudyStorage, file_lock, open_storage
-from softgym_envs.config import check_config, load_config, save_resolved
+from softgym_envs.config import check_compatible, check_config, load_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.storage import atomic_write, read_json, write_json
 
@@ -197,13 +197,6 @@ class StudyFolder:
         return [read_json(path) for path in paths]
 
 
-def _flat(config: StudyConfig) -> dict[str, Any]:
-    """Plain data of a configuration, its part ``finalists`` by dotted keys."""
-    data = config.model_dump(mode="json")
-    finalists = data.pop("finalists")
-    return {**data, **{f"finalists.{key}": value for key, value in finalists.items()}}
-
-
 def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str, made: tuple[str, ...]) -> None:
     """Raise unless a study can go on with a new configuration.
 
@@ -214,14 +207,8 @@ def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str, made: tupl
         use: what to change to begin another one.
         made: keys by which tests of finalists were made, and which must stay therefore.
     """
-    before, after = _flat(old), _flat(new)
     fixed = made if new.storage == JOURNAL else ("name", *made)
     extensible = [key for key in EXTENSIBLE if key not in fixed] + ["storage"] * (new.storage != JOURNAL)
     if (old.storage == JOURNAL) != (new.storage == JOURNAL):
         raise ConfigError(f"{where} holds a study with storage '{old.storage}', got '{new.storage}'; use another {use}")
-    for key in after:
-        if key not in extensible and before[key] != after[key]:
-            raise ConfigError(
-                f"{where} holds a study with another '{key}'; use another {use}, or change only: "
-                f"{', '.join(extensible)}"
-            )
+    check_compatible(old, new, f"{where} holds a study", may_change=extensible, use=use)

@@ -115,7 +115,7 @@ def _try_sampler(config: StudyConfig) -> None:
     space, rng = distributions(config), np.random.default_rng(0)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
-        study = optuna.create_study(directions=["maximize"] * (1 + len(config.also)), sampler=make_sampler(config, 0))
+        study = optuna.create_study(directions=["maximize"] * (1 + len(config.also)), sampler=make_sampler(sampler, 0))
         for _ in range(sampler.options.get("n_startup_trials", 10) + 1):
             params = {key: float(rng.uniform(config.space[key].low, config.space[key].high)) for key in space}
             values = rng.random(len(study.directions)).tolist()

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -488,13 +489,13 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
         click.echo(f"{len(result['descents'])} descents, {result['seconds']:.2f} s; wrote {folder}")
         return
     with _resumable():
-        result = search(study, folder, progress=not quiet)
+        found = search(study, folder, progress=not quiet)
+    ends = found.front[:1] if len(study.objectives) == 1 else [found.front[0], found.front[-1]]
+    for row in ends:
+        click.echo(json.dumps(asdict(row)))
     click.echo(
-        json.dumps([result["front"][0], result["front"][-1]] if len(study.objectives) > 1 else result["front"][0])
-    )
-    click.echo(
-        f"{len(result['front'])} designs on the front of {result['feasible']} feasible and {result['infeasible']} "
-        f"infeasible ones; wrote {folder}"
+        f"{len(found.front)} designs on the front of {found.feasible} feasible and {found.infeasible} infeasible "
+        f"ones; wrote {folder}"
     )
 
 

@@ -19,8 +19,6 @@ from softgym_envs.errors import ConfigError
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.version import __version__
 
-__all__ = ["Config", "check_config", "difference", "load_config", "read_value", "provenance", "save_resolved"]
-
 
 class Config(BaseModel):
     """Base of all configurations: unknown keys are errors, numbers are finite, values do not change."""
@@ -110,24 +108,48 @@ def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> Model
         raise ConfigError(f"{where}: {key}: {message}{more}") from None
 
 
-def difference(old: Config, new: Config) -> str | None:
-    """Tell the first value in which two configurations of one kind differ: ``"sac.gamma = 0.9, got 0.95"``.
+def difference(old: Config, new: Config, *, ignore: Sequence[str] = ()) -> str | None:
+    """Describe the first value in which two configurations of one class differ: ``"sac.gamma = 0.9, got 0.95"``.
 
     Args:
-        old: the one that holds so far.
-        new: the one that is asked for.
+        old: the configuration so far.
+        new: the requested configuration.
+        ignore: dotted keys that may differ.
 
     Returns:
         Dotted key and both values, long ones abridged; None if there is no difference.
     """
-    return _difference(old.model_dump(mode="json"), new.model_dump(mode="json"), "")
+    return _difference(old.model_dump(mode="json"), new.model_dump(mode="json"), "", frozenset(ignore))
 
 
-def _difference(old: Any, new: Any, key: str) -> str | None:
+def _difference(old: Any, new: Any, key: str, ignore: frozenset[str]) -> str | None:
+    if key in ignore:
+        return None
     if isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys():
-        parts = (_difference(old[name], new[name], f"{key}.{name}" if key else name) for name in old)
+        parts = (_difference(old[name], new[name], f"{key}.{name}" if key else name, ignore) for name in old)
         return next((part for part in parts if part is not None), None)
     return None if old == new else f"{key} = {reprlib.repr(old)}, got {reprlib.repr(new)}"
+
+
+def check_compatible(
+    old: Config, new: Config, found: str, *, may_change: Sequence[str] = (), use: str = "folder"
+) -> None:
+    """Check that stored results may be continued with a new configuration.
+
+    Args:
+        old: the configuration of the results.
+        new: the requested configuration.
+        found: where the results are and what they are, for the message: ``"folder 'x' holds a search"``.
+        may_change: dotted keys that may differ.
+        use: what to change to start again: ``"folder"`` or ``"name"``.
+
+    Raises:
+        ConfigError: one line naming the first key that differs, both values, and the keys that may differ.
+    """
+    other = difference(old, new, ignore=may_change)
+    if other is not None:
+        allowed = f", or change only: {', '.join(may_change)}" if may_change else ""
+        raise ConfigError(f"{found} with {other}; use another {use}{allowed}")
 
 
 def _allowed(model: type[BaseModel], path: list[str]) -> str:

@@ -7,9 +7,10 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["EXECUTORS", "run_jobs"]
+from softgym_envs.errors import ConfigError
 
 EXECUTORS = ("loky", "ray")
 """``"loky"``: processes on this machine; ``"ray"``: a Ray cluster (the extra ``ray``)."""
@@ -45,24 +46,39 @@ def run_jobs(jobs: Sequence[tuple[Callable, tuple]], workers: int, executor: str
             )
 
 
-def _run_on_ray(jobs: Sequence[tuple[Callable, tuple]], workers: int) -> list[Any]:
+@contextmanager
+def ray_cluster() -> Iterator[Any]:
+    """Yield the module ``ray`` connected to a cluster: a running one, that of ``RAY_ADDRESS``, or a new local one.
+
+    A cluster that this function connected to or started is left at the end.
+
+    Raises:
+        ConfigError: if Ray is not installed.
+    """
     try:
         import ray
-        from ray.util.joblib import register_ray
     except ImportError as error:
-        raise ValueError(f"executor = 'ray' needs Ray ({error}): pip install 'softgym-envs[ray]'") from None
-    from joblib import Parallel, delayed, parallel_config
-
-    if not jobs:
-        return []
-    register_ray()
+        raise ConfigError(f"executor = 'ray' needs Ray ({error}): pip install 'softgym-envs[ray]'") from None
     ours = not ray.is_initialized()
+    if ours:
+        ray.init(log_to_driver=False, configure_logging=False)
     try:
-        with parallel_config("ray", n_jobs=workers):
-            return Parallel(batch_size=1)(delayed(function)(*arguments) for function, arguments in jobs)
+        yield ray
     finally:
         if ours:
             ray.shutdown()
+
+
+def _run_on_ray(jobs: Sequence[tuple[Callable, tuple]], workers: int) -> list[Any]:
+    if not jobs:
+        return []
+    with ray_cluster():
+        from joblib import Parallel, delayed, parallel_config
+        from ray.util.joblib import register_ray
+
+        register_ray()
+        with parallel_config("ray", n_jobs=workers):
+            return Parallel(batch_size=1)(delayed(function)(*arguments) for function, arguments in jobs)
 
 
 def _follow(owner: int) -> None:

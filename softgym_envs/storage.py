@@ -17,8 +17,6 @@ from softgym_envs.errors import DataError
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["atomic_write", "cache_directory", "read_json", "read_npz", "write_json"]
-
 
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
@@ -73,6 +71,57 @@ def write_json(path: str | Path, value: object) -> None:
     with atomic_write(path, "w") as stream:
         json.dump(value, stream, indent=2)
         stream.write("\n")
+
+
+def drop_torn_line(path: str | Path) -> None:
+    """Cut off the last line of an append-only file if it has no end, as after a crash in the middle of a write.
+
+    Call this only while no other process writes to the file.
+    """
+    path = Path(path)
+    if not path.exists():
+        return
+    with path.open("rb+") as stream:
+        content = stream.read()
+        if not content.endswith(b"\n"):
+            stream.truncate(content.rfind(b"\n") + 1)
+
+
+class JsonLines:
+    """Append-only file with one JSON record per line, which survives a crash in the middle of a write.
+
+    Args:
+        path: the file; it need not exist yet. Only one process may write to it at a time.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        drop_torn_line(self.path)
+
+    def read(self) -> list[dict[str, Any]]:
+        """Return all records, in the order in which they were written.
+
+        Raises:
+            DataError: if a line is not a JSON object; the message names the line.
+        """
+        if not self.path.exists():
+            return []
+        records = []
+        for number, line in enumerate(self.path.read_bytes().splitlines(), start=1):
+            try:
+                record = json.loads(line)
+            except ValueError:
+                record = None
+            if not isinstance(record, dict):
+                raise DataError(f"'{self.path}', line {number} is damaged; remove the line to compute its record again")
+            records.append(record)
+        return records
+
+    def append(self, record: dict[str, Any]) -> None:
+        """Write one record at the end."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("a") as stream:
+            stream.write(json.dumps(record) + "\n")
 
 
 def cache_directory(name: str) -> Path:

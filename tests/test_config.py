@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from softgym_envs.config import Config, commit_of, difference
-from softgym_envs.errors import DataError
-from softgym_envs.storage import read_json
+from softgym_envs.config import Config, check_compatible, commit_of, difference
+from softgym_envs.errors import ConfigError, DataError
+from softgym_envs.storage import JsonLines, drop_torn_line, read_json
 
 
 class Inner(Config):
@@ -59,6 +59,18 @@ def test_difference_names_the_first_value_that_differs():
     assert difference(old, Outer(inner=Inner(size=1), table={"a": 3})) == "table.a = 1, got 3"
     assert difference(old, Outer(inner=Inner(size=1), table={"b": 1})) == "table = {'a': 1}, got {'b': 1}"
     assert len(difference(old, Outer(inner=Inner(size=1), table={"b": [0] * 999}))) < 80
+    assert difference(old, Outer(inner=Inner(size=2), table={"a": 3}), ignore=["inner.size"]) == "table.a = 1, got 3"
+    assert difference(old, Outer(inner=Inner(size=2), table={"b": 3}), ignore=["inner", "table"]) is None
+
+
+def test_compatible_configurations_differ_only_where_they_may():
+    old, new = Outer(inner=Inner(size=1), table={"a": 1}), Outer(inner=Inner(size=2), table={"a": 1})
+    check_compatible(old, new, "folder 'x' holds a search", may_change=["inner.size"])
+    with pytest.raises(ConfigError) as error:
+        check_compatible(old, new, "folder 'x' holds a search", may_change=["table"])
+    assert str(error.value) == (
+        "folder 'x' holds a search with inner.size = 1, got 2; use another folder, or change only: table"
+    )
 
 
 @pytest.mark.parametrize("content", [b"{", b"", b"\xff\xfe"])
@@ -71,3 +83,27 @@ def test_damaged_json_names_its_file(content, tmp_path):
         read_json(path)
     path.write_text('{"a": 1}')
     assert read_json(path) == {"a": 1}
+
+
+def test_a_torn_line_is_dropped_and_nothing_else(tmp_path):
+    path = tmp_path / "folder" / "records.jsonl"
+    lines = JsonLines(path)
+    assert lines.read() == []
+    lines.append({"number": 0})
+    lines.append({"number": 1})
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"numb')
+    assert JsonLines(path).read() == [{"number": 0}, {"number": 1}] and path.read_bytes() == whole
+    lines.append({"number": 2})
+    assert [record["number"] for record in JsonLines(path).read()] == [0, 1, 2]
+    path.write_bytes(b'{"numb')  # not even one whole line
+    drop_torn_line(path)
+    assert path.read_bytes() == b"" and JsonLines(path).read() == []
+
+
+@pytest.mark.parametrize("line", [b"{", b"3", b"\xff"])
+def test_a_damaged_line_is_named(line, tmp_path):
+    path = tmp_path / "records.jsonl"
+    path.write_bytes(b'{"number": 0}\n' + line + b"\n")
+    with pytest.raises(DataError, match=r"records\.jsonl', line 2 is damaged"):
+        JsonLines(path).read()

@@ -15,6 +15,7 @@ from codesign.config import JOURNAL, StudyConfig
 from codesign.folder import StudyFolder
 from codesign.scheduling.queue import CALL
 from softgym_envs import errors
+from softgym_envs.executors import ray_cluster
 
 __all__ = ["run_workers"]
 
@@ -103,15 +104,7 @@ def _failure(phase: str, status: int, text: str) -> errors.SoftGymError:
 
 
 def _run_on_ray(folder: StudyFolder, phase: str, count: int, tick: Callable[[], None], interval: float) -> str | None:
-    try:
-        import ray
-    except ImportError as error:
-        raise errors.ConfigError(f"executor = 'ray' needs Ray ({error}): pip install 'softgym-envs[ray]'") from None
-
-    ours = not ray.is_initialized()
-    if ours:
-        ray.init(log_to_driver=False, configure_logging=False)
-    try:
+    with ray_cluster() as ray:
         machines = len({node["NodeID"] for node in ray.nodes() if node["Alive"]})
         if machines > 1 and folder.config.storage == JOURNAL:
             raise errors.ConfigError(
@@ -138,9 +131,6 @@ def _run_on_ray(folder: StudyFolder, phase: str, count: int, tick: Callable[[], 
                     stopped = "killed"
         tick()
         return stopped
-    finally:
-        if ours:
-            ray.shutdown()
 
 
 def _task(path: str, config: dict[str, Any], phase: str) -> None:

@@ -20,10 +20,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
-
-from codesign.config import PRUNERS, SAMPLERS, StudyConfig, construct
+from codesign.config import PRUNERS, StudyConfig
 from codesign.folder import StudyFolder
+from codesign.sampling import construct, make_sampler, trial_seed
 from codesign.scheduling.storage import StudyStorage
 from softgym_envs.errors import DataError
 from softgym_envs.storage import write_json
@@ -51,21 +50,6 @@ def _reports(trials: Sequence[optuna.trial.FrozenTrial], number: int) -> dict[in
     for trial in reversed(chain):
         found |= trial.intermediate_values
     return dict(sorted(found.items()))
-
-
-def make_sampler(config: StudyConfig, number: int) -> optuna.samplers.BaseSampler:
-    """Sampler for one trial. Its seed follows from the trial's number, so it does not matter which worker draws it."""
-    import optuna
-
-    sampler = config.sampler
-    # A quasi-random sequence has one seed, and counts its points in the journal.
-    seed = sampler.seed if sampler.name == "qmc" else trial_seed(config, number)
-    return construct(getattr(optuna.samplers, SAMPLERS[sampler.name]), {"seed": seed, **sampler.options})
-
-
-def trial_seed(config: StudyConfig, number: int) -> int:
-    """Seed of the sampler for one trial."""
-    return int(np.random.SeedSequence([config.sampler.seed, number]).generate_state(1)[0])
 
 
 def make_pruner(config: StudyConfig) -> optuna.pruners.BasePruner:
@@ -106,7 +90,7 @@ def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number:
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = folder.open_storage() if storage is None else storage
-    sampler, pruner = make_sampler(folder.config, number), make_pruner(folder.config)
+    sampler, pruner = make_sampler(folder.config.sampler, number), make_pruner(folder.config)
     try:
         return optuna.load_study(study_name=storage.study, storage=storage.optuna, sampler=sampler, pruner=pruner)
     except KeyError:
@@ -256,7 +240,7 @@ class Ledger:
         trial.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
         if "origin" not in trial.user_attrs:
             trial.set_user_attr("origin", f"sampler {trial.number}")
-            trial.set_user_attr("sampler_seed", trial_seed(config, trial.number))
+            trial.set_user_attr("sampler_seed", trial_seed(config.sampler, trial.number))
         if "replaces" in trial.user_attrs:
             for step, value in _reports(study.get_trials(deepcopy=False), trial.user_attrs["replaces"]).items():
                 trial.report(value, step)

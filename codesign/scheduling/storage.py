@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from codesign.config import JOURNAL, StudyConfig
+from softgym_envs.storage import drop_torn_line
 
 if TYPE_CHECKING:
     import optuna
@@ -122,9 +123,7 @@ class JournalStorage(StudyStorage):
         lock = file_lock(self.folder, JOURNAL_LOCK)
         with lock:
             # Whoever held this lock is gone, so a line without an end was cut off by a crash and was never acted upon.
-            if path.exists() and (data := path.read_bytes()) and not data.endswith(b"\n"):
-                with path.open("rb+") as stream:
-                    stream.truncate(data.rfind(b"\n") + 1)
+            drop_torn_line(path)
         # Unlike Optuna's own lock files, these are freed by the kernel when their holder is killed.
         return storages.JournalStorage(JournalFileBackend(str(path), lock_obj=lock))  # type: ignore[arg-type]
 

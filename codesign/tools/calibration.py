@@ -15,8 +15,8 @@ from torch import Tensor
 
 from codesign.tools.bodies import Box, learned_model
 from codesign.tools.config import CalibrationConfig
+from codesign.tools.folder import run_folder
 from codesign.tools.measurements import Measurements, read_measurements
-from codesign.tools.search import claimed
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import released, settle
 from softgym_envs.config import provenance
@@ -440,7 +440,7 @@ def calibrate(
 
     Raises:
         ConfigError: for a variable that changes nothing that was measured; if the folder holds something else or
-            another process is at it, see `codesign.tools.search.claimed`.
+            another process is at it, see `codesign.tools.folder.run_folder`.
         DataError: for a malformed file of measurements.
         ConvergenceError: if a body on the way has no equilibrium.
     """
@@ -449,7 +449,7 @@ def calibrate(
     from codesign.tools.plots import draw_calibration
 
     folder = Path(folder)
-    with claimed(folder, config, "calibration"):
+    with run_folder(folder, config, "a calibration"):
         result, fits, refined = _calibrate(config, data)
         write_json(folder / "result.json", {**provenance(), **result})
         draw_calibration(folder / "calibration.png", config.box(), fits, result["interval"], refined)

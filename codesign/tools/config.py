@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from codesign.config import SamplerConfig
+from codesign.sampling import SamplerConfig
 from codesign.tools.bodies import Box, Evaluator, LearnedBodies, check_metrics, full_command
 from codesign.tools.metrics import METRICS
 from softgym_envs.config import Config

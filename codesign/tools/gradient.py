@@ -14,7 +14,7 @@ from torch import Tensor
 
 from codesign.tools.bodies import Box
 from codesign.tools.config import GradientConfig, ObjectiveConfig, OptimiseConfig
-from codesign.tools.search import claimed
+from codesign.tools.folder import run_folder
 from softgym_envs.config import provenance
 from softgym_envs.storage import write_json
 
@@ -143,7 +143,7 @@ def optimise(config: OptimiseConfig, folder: str | Path | None = None) -> dict[s
 
     Raises:
         ConfigError: if the weights have no exact gradients, the folder holds something else or another process is at
-            it, see `codesign.tools.search.claimed`.
+            it, see `codesign.tools.folder.run_folder`.
         WeightsError: if there are none.
         InfeasibleDesign: if the best design cannot be built for the check on FEM.
         ConvergenceError: if it has no equilibrium there.
@@ -153,7 +153,7 @@ def optimise(config: OptimiseConfig, folder: str | Path | None = None) -> dict[s
     from codesign.tools.plots import draw_descents
 
     folder = Path(folder)
-    with claimed(folder, config, "optimisation", free=("name", "workers")):
+    with run_folder(folder, config, "an optimisation", may_change=("name", "workers")):
         result, cost, descents = _optimise(config)
         write_json(folder / "result.json", {**provenance(), **result})
         draw_descents(folder / "descents.png", cost, descents)

@@ -5,7 +5,6 @@ Samples lie evenly in the unit coordinates of the design space: logarithmic vari
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,11 @@ import numpy as np
 
 from codesign.tools.bodies import Box, Evaluator
 from codesign.tools.config import SensitivityConfig
-from codesign.tools.search import claimed, evaluate_numbered
+from codesign.tools.evaluation import Evaluation, evaluate_each
+from codesign.tools.folder import run_folder
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
-from softgym_envs.executors import run_jobs
-from softgym_envs.storage import write_json
-
-__all__ = ["analyse", "evaluate_all", "morris", "one_at_a_time", "sobol"]
+from softgym_envs.storage import JsonLines, write_json
 
 Table = dict[str, dict[str, float]]
 """Indices of each variable."""
@@ -150,40 +147,35 @@ def evaluate_all(
     *,
     workers: int = 1,
     progress: bool = True,
-) -> list[dict[str, Any]]:
-    """Evaluate designs, those that the file holds already excepted.
+) -> list[Evaluation]:
+    """Return the evaluations of designs; those that a file holds already are not computed again.
 
     Args:
-        evaluator: of the designs.
-        designs: complete ones.
-        path: file with one JSON record a line, ``number`` and what `codesign.tools.search.evaluate` finds.
-        workers: processes.
-        progress: show a bar.
+        evaluator: evaluates one design.
+        designs: complete designs [SI].
+        path: file with one evaluation per line.
+        workers: number of processes.
+        progress: show a progress bar.
+
+    Raises:
+        DataError: if a line of the file is damaged.
     """
     import click
 
-    found: dict[int, dict[str, Any]] = {}
-    if path.exists():
-        data = path.read_bytes()
-        whole = data[: data.rfind(b"\n") + 1]  # a line without an end was cut off by a crash
-        if whole != data:
-            path.write_bytes(whole)
-        for place, line in enumerate(whole.splitlines(), start=1):
-            try:
-                record = json.loads(line)
-                found[record.pop("number")] = record
-            except (ValueError, KeyError, AttributeError) as error:
-                raise DataError(f"'{path}', line {place} is no evaluation: {error!r}; remove it to repeat it") from None
-    jobs = [(evaluate_numbered, (k, evaluator, design)) for k, design in enumerate(designs) if k not in found]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        path.open("a") as stream,
-        click.progressbar(run_jobs(jobs, workers), length=len(jobs), label="designs", hidden=not progress) as results,
-    ):
-        for number, record in results:
-            found[number] = record
-            stream.write(json.dumps({"number": number, **record}) + "\n")
-            stream.flush()
+    lines = JsonLines(path)
+    found: dict[int, Evaluation] = {}
+    for record in lines.read():
+        try:
+            number = record.pop("number")
+            found[number] = Evaluation(**record)
+        except (KeyError, TypeError) as error:
+            raise DataError(f"'{path}' holds a line that is not an evaluation: {error}") from None
+    missing = [(k, design) for k, design in enumerate(designs) if k not in found]
+    results = evaluate_each(evaluator, missing, workers)
+    with click.progressbar(results, length=len(missing), label="designs", hidden=not progress) as bar:
+        for number, evaluation in bar:
+            found[number] = evaluation
+            lines.append({"number": number, **evaluation.to_json()})
     return [found[k] for k in range(len(designs))]
 
 
@@ -202,12 +194,12 @@ def analyse(config: SensitivityConfig, folder: str | Path, *, progress: bool = T
 
     Raises:
         ConfigError: if SALib is not installed (``morris``, ``sobol``), or the folder holds something else or another
-            process is at it, see `codesign.tools.search.claimed`.
+            process is at it, see `codesign.tools.folder.run_folder`.
         DataError: if a line of ``evaluations.jsonl`` is damaged.
         ConvergenceError: if too few designs are feasible.
     """
     folder = Path(folder)
-    with claimed(folder, config, "sensitivity study", free=("name", "workers")):
+    with run_folder(folder, config, "a sensitivity study", may_change=("name", "workers")):
         return _analyse(config, folder, progress)
 
 
@@ -228,12 +220,12 @@ def _analyse(config: SensitivityConfig, folder: Path, progress: bool) -> dict[st
         workers=config.workers,
         progress=progress,
     )
-    if config.method == "oat" and "metrics" not in records[0]:
-        raise ConvergenceError(f"the reference design is not feasible: {records[0]['infeasible']}")
-    lost = np.array([0.0 if "metrics" in record else np.nan for record in records])
+    if config.method == "oat" and not records[0].feasible:
+        raise ConvergenceError(f"the reference design is not feasible: {records[0].infeasible}")
+    lost = np.array([0.0 if record.feasible else np.nan for record in records])
     tables: dict[str, Table] = {}
     for metric in config.metrics:
-        values = np.array([record["metrics"][metric] if "metrics" in record else np.nan for record in records])
+        values = np.array([record.metrics.get(metric, np.nan) for record in records])
         if config.method == "oat":
             tables[metric] = one_at_a_time(points, values, box)
         elif config.method == "morris":
@@ -244,9 +236,9 @@ def _analyse(config: SensitivityConfig, folder: Path, progress: bool) -> dict[st
         "method": config.method,
         "indices": tables,
         "designs": len(records),
-        "infeasible": sum("infeasible" in record for record in records),
+        "infeasible": sum(not record.feasible for record in records),
         "groups_kept": float(_whole(lost, GROUPS[config.method](len(box))).mean()),
-        "seconds": sum(record["seconds"] for record in records),
+        "seconds": sum(record.seconds for record in records),
     }
     write_json(folder / "result.json", {**provenance(), **result})
     draw_sensitivity(folder / "sensitivity.png", config.method, tables)

@@ -10,7 +10,7 @@ from codesign.tools import calibration, gradient
 from codesign.tools import search as module
 from codesign.tools.bodies import Box
 from codesign.tools.config import CalibrationConfig, OptimiseConfig, SensitivityConfig
-from codesign.tools.search import non_dominated, search
+from codesign.tools.search import search
 from codesign.tools.sensitivity import analyse, morris, one_at_a_time, sample, sobol
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
@@ -34,13 +34,6 @@ def configured(**changes):
         "solver": {"method": "search", "sampler": SAMPLER, "trials": 20, "batch": 6},
     }
     return check_config(OptimiseConfig, {**data, **changes}, "test")
-
-
-def test_non_dominated():
-    rng = np.random.default_rng(0)
-    costs = rng.integers(0, 8, (60, 3)).astype(float)
-    beaten = [any((b <= a).all() and (b < a).any() for b in costs) for a in costs]
-    assert non_dominated(costs).tolist() == np.flatnonzero(~np.array(beaten)).tolist()
 
 
 class Some:
@@ -68,7 +61,7 @@ def some(monkeypatch):
 
 def test_a_stopped_search_ends_as_one_that_was_not(some, monkeypatch, tmp_path):
     whole = search(configured(), tmp_path / "whole", progress=False)
-    assert whole["infeasible"] > 0 and whole["feasible"] + whole["infeasible"] == 20
+    assert whole.infeasible > 0 and whole.feasible + whole.infeasible == 20
     some.count = 0
     for stop in (4, 11):
         some.stop = stop
@@ -79,15 +72,20 @@ def test_a_stopped_search_ends_as_one_that_was_not(some, monkeypatch, tmp_path):
         stream.write('{"op_code": 5, "wor')  # what a crash leaves
     some.stop = np.inf
     parts = search(configured(), tmp_path / "parts", progress=False)
-    assert parts["front"] == whole["front"]
-    assert [(row["trial"], row["metrics"]) for row in parts["front"]] != []
+    assert parts.front == whole.front
+    rows = [line.split(",") for line in (tmp_path / "whole" / "trials.csv").read_text().splitlines()[1:]]
+    found = {(float(row[4]), float(row[5])) for row in rows if row[4]}
+    best = {(x, y) for x, y in found if not any(a >= x and b >= y and (a, b) != (x, y) for a, b in found)}
+    assert {(row.metrics["bending_angle"], row.metrics["contact_force"]) for row in whole.front} == best
     assert (tmp_path / "parts" / "trials.csv").read_text().count("\n") == 21
     assert (tmp_path / "parts" / "front.png").read_bytes().startswith(b"\x89PNG")
     more = configured(solver={"method": "search", "sampler": SAMPLER, "trials": 26, "batch": 6})
     before = some.count
     longer = search(more, tmp_path / "parts", progress=False)
-    assert longer["feasible"] + longer["infeasible"] == 26 and some.count - before <= 6
-    with pytest.raises(ConfigError, match="holds another search, with other 'objectives'"):
+    assert longer.feasible + longer.infeasible == 26 and some.count - before <= 6
+    with pytest.raises(
+        ConfigError, match="holds a search with objectives = .*, or change only: name, workers"
+    ):
         search(configured(objectives=[{"metric": "travel"}]), tmp_path / "parts", progress=False)
 
 
@@ -137,9 +135,9 @@ def test_a_search_that_was_stopped_while_it_proposed(sampler, parameters, some, 
     parts = search(config, tmp_path / "parts", progress=False)
     assert designs(tmp_path / "parts") == designs(tmp_path / "whole") and len(designs(tmp_path / "parts")) == 14
     for name in ("feasible", "infeasible", "repeated"):
-        assert parts[name] == whole[name]
-    assert parts["front"][0]["design"] == whole["front"][0]["design"]
-    assert some.count == 2 * (14 - whole["repeated"])  # nothing was evaluated again
+        assert getattr(parts, name) == getattr(whole, name)
+    assert parts.front[0].design == whole.front[0].design
+    assert some.count == 2 * (14 - whole.repeated)  # nothing was evaluated again
 
 
 def test_folders_of_others_stay_as_they_are(some, tmp_path):
@@ -149,33 +147,33 @@ def test_folders_of_others_stay_as_they_are(some, tmp_path):
     search(configured(), tmp_path, progress=False)
     before = contents()
     descent = check_config(OptimiseConfig, {**configured().model_dump(), "solver": {"method": "gradient"}}, "test")
-    with pytest.raises(ConfigError, match=f"'{tmp_path}' holds another optimisation, with other 'solver'"):
+    with pytest.raises(ConfigError, match=f"'{tmp_path}' holds an optimisation with solver"):
         gradient.optimise(descent, tmp_path)
     fit = {"name": "x", "robot": "finger", "robot_options": {"cables": 1}, "fit": ["poisson_ratio"], "data": "m.csv"}
-    with pytest.raises(ConfigError, match=f"'{tmp_path}' holds something else: its config.yaml is of no calibration"):
+    with pytest.raises(ConfigError, match=f"'{tmp_path}' does not hold a calibration: its config.yaml"):
         calibration.calibrate(check_config(CalibrationConfig, fit, "test"), tmp_path)
     assert contents() == before
     (tmp_path / "config.yaml").unlink()
-    with pytest.raises(ConfigError, match="holds a journal.log but no config.yaml"):
+    with pytest.raises(ConfigError, match="holds journal.log but no config.yaml"):
         search(configured(), tmp_path, progress=False)
 
 
 def test_two_searches_in_one_folder(some, monkeypatch, tmp_path):
     def other(self, design):
-        with pytest.raises(ConfigError, match=f"folder '{tmp_path}' is in use by another process; wait for its end"):
+        with pytest.raises(ConfigError, match=f"folder '{tmp_path}' is in use by another process; wait, or use"):
             search(configured(), tmp_path, progress=False)
         return {"bending_angle": design["length"], "contact_force": -design["length"]}
 
     monkeypatch.setattr(some, "__call__", other)
-    assert search(configured(), tmp_path, progress=False)["feasible"] == 20
-    assert search(configured(), tmp_path, progress=False)["feasible"] == 20
+    assert search(configured(), tmp_path, progress=False).feasible == 20
+    assert search(configured(), tmp_path, progress=False).feasible == 20
 
 
 def test_generations_of_nsga_are_full(some, tmp_path):
     import optuna
 
     search(configured(), tmp_path, progress=False)
-    study = module._open(tmp_path, configured())
+    study = module._Search(configured(), tmp_path)._study
     generations = [
         trial.system_attrs["NSGAIISampler:generation"]
         for trial in study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
@@ -194,8 +192,8 @@ def test_nothing_feasible(some, tmp_path):
 def test_search_on_the_surrogate_by_tpe(tmp_path):
     solver = {"method": "search", "trials": 40, "starts": [{"length": 0.042}]}
     config = configured(objectives=[{"metric": "bending_angle"}], solver=solver)
-    (best,) = search(config, tmp_path, progress=False)["front"]
-    assert best["metrics"]["bending_angle"] > 0.525
+    (best,) = search(config, tmp_path, progress=False).front
+    assert best.metrics["bending_angle"] > 0.525
     first = (tmp_path / "trials.csv").read_text().splitlines()[1].split(",")
     assert float(first[1]) == 0.042
 
@@ -258,7 +256,7 @@ def test_sensitivity_goes_on(tmp_path):
     assert (tmp_path / "evaluations.jsonl").read_bytes().count(b"\n") == 7
     assert json.loads((tmp_path / "result.json").read_text())["indices"] == result["indices"]
     assert (tmp_path / "sensitivity.png").read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(ConfigError, match="another sensitivity study"):
+    with pytest.raises(ConfigError, match="holds a sensitivity study with metrics"):
         analyse(study("oat"), tmp_path, progress=False)
 
 

@@ -1,0 +1,92 @@
+"""Samplers of Optuna: their names in configurations, their options, and the seed of each trial."""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from softgym_envs.config import Config
+
+if TYPE_CHECKING:
+    import optuna
+
+SAMPLERS: dict[str, str] = {
+    "tpe": "TPESampler",
+    "cmaes": "CmaEsSampler",
+    "gp": "GPSampler",
+    "nsgaii": "NSGAIISampler",
+    "qmc": "QMCSampler",
+    "random": "RandomSampler",
+}
+"""Registry: name to class of `optuna.samplers`."""
+
+
+class SamplerConfig(Config):
+    """Algorithm that proposes designs.
+
+    Attributes:
+        name: key of `SAMPLERS`.
+        seed: seed of the sampler; see `trial_seed`.
+        options: further arguments of its class.
+    """
+
+    name: Literal["tpe", "cmaes", "gp", "nsgaii", "qmc", "random"] = "tpe"
+    seed: int = Field(default=0, ge=0)
+    options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _known_options(self) -> SamplerConfig:
+        import optuna
+
+        check_options("sampler", self.name, getattr(optuna.samplers, SAMPLERS[self.name]), self.options)
+        return self
+
+
+def trial_seed(config: SamplerConfig, number: int) -> int:
+    """Return the seed of the sampler for one trial.
+
+    It follows from the trial's number, so the result does not depend on which worker runs the trial or where a search
+    was stopped. A quasi-random sequence has one seed for all trials and counts its points in the storage.
+    """
+    if config.name == "qmc":
+        return config.seed
+    return int(np.random.SeedSequence([config.seed, number]).generate_state(1)[0])
+
+
+def make_sampler(config: SamplerConfig, number: int, **options: Any) -> optuna.samplers.BaseSampler:
+    """Return the sampler for one trial.
+
+    Args:
+        config: the sampler.
+        number: number of the trial.
+        **options: further arguments of the sampler's class, such as ``constraints_func``.
+    """
+    import optuna
+
+    cls = getattr(optuna.samplers, SAMPLERS[config.name])
+    return construct(cls, {"seed": trial_seed(config, number), **config.options, **options})
+
+
+def construct(cls: type, options: dict[str, Any]) -> Any:
+    """Return a sampler or pruner of Optuna. Naming one in a configuration is consent to its being experimental."""
+    from optuna.exceptions import ExperimentalWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        return cls(**options)
+
+
+def check_options(kind: str, name: str, cls: type, options: dict[str, Any]) -> None:
+    """Raise ValueError for a keyword that the class of a sampler or pruner does not take."""
+    allowed = [key for key in inspect.signature(cls).parameters if key not in ("seed", "args", "kwargs")]
+    for key in options:
+        if key not in allowed:
+            raise ValueError(f"unknown option '{key}' of {kind} '{name}'; allowed: {', '.join(allowed) or 'none'}")
+    try:
+        construct(cls, options)
+    except TypeError as error:
+        raise ValueError(f"{kind} '{name}': {error}") from None

@@ -1,0 +1,65 @@
+"""Evaluations of designs: a typed record, and many of them on several processes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from codesign.tools.bodies import Evaluator
+from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.executors import run_jobs
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Metrics of one design, or the reason why it has none.
+
+    Attributes:
+        metrics: values [SI] by name; empty for an infeasible design.
+        infeasible: why the design has no metrics, or None.
+        seconds: time of the evaluation.
+        repeated: the sampler had proposed the same design before, and nothing was computed again.
+    """
+
+    metrics: dict[str, float] = field(default_factory=dict)
+    infeasible: str | None = None
+    seconds: float = 0.0
+    repeated: bool = False
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the design has metrics."""
+        return self.infeasible is None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain data for `Evaluation(**data)`."""
+        return asdict(self)
+
+
+def evaluate(evaluator: Evaluator, design: Mapping[str, float]) -> Evaluation:
+    """Evaluate one design. A geometry that cannot exist or has no equilibrium is infeasible."""
+    began = time.perf_counter()
+    metrics: dict[str, float] = {}
+    reason = None
+    try:
+        metrics = evaluator(design)
+    except (InfeasibleDesign, ConvergenceError) as error:
+        reason = f"{type(error).__name__}: {error}"
+    if not np.isfinite(list(metrics.values())).all():
+        reason, metrics = f"metrics are not finite: {metrics}", {}
+    return Evaluation(metrics, reason, time.perf_counter() - began)
+
+
+def evaluate_each(
+    evaluator: Evaluator, designs: Iterable[tuple[int, Mapping[str, float]]], workers: int
+) -> Iterator[tuple[int, Evaluation]]:
+    """Evaluate numbered designs on several processes; yields each number with its evaluation, in any order."""
+    yield from run_jobs([(_evaluate_one, (number, evaluator, design)) for number, design in designs], workers)
+
+
+def _evaluate_one(number: int, evaluator: Evaluator, design: Mapping[str, float]) -> tuple[int, Evaluation]:
+    return number, evaluate(evaluator, design)

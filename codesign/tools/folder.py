@@ -1,0 +1,67 @@
+"""Folder of a run of a design tool: one configuration, one process at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from codesign.scheduling.storage import file_lock
+from softgym_envs.config import Config, check_compatible, load_config, save_resolved
+from softgym_envs.errors import ConfigError
+
+RESULTS = ("journal.log", "evaluations.jsonl", "result.json")
+
+
+@contextmanager
+def run_folder(
+    folder: str | Path, config: Config, kind: str, *, may_change: Sequence[str] = ("name",)
+) -> Iterator[Path]:
+    """Reserve a folder for one run while the block runs, and write the resolved configuration there.
+
+    Args:
+        folder: a new one, or one with results of the same configuration.
+        config: the configuration of the run.
+        kind: what the run is, with its article, for messages: ``"a search"``, ...
+        may_change: dotted keys of the configuration that may differ from those of earlier results.
+
+    Yields:
+        The folder.
+
+    Raises:
+        ConfigError: if the folder holds results of another configuration or of another tool, or if another process
+            uses it.
+    """
+    from filelock import Timeout
+
+    folder = Path(folder)
+    _check(folder, config, kind, may_change)  # before the lock is written to a folder of something else
+    lock = file_lock(folder, "run")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ConfigError(f"folder '{folder}' is in use by another process; wait, or use another folder") from None
+    try:
+        _check(folder, config, kind, may_change)  # another process may have been faster
+        save_resolved(folder, config)
+        yield folder
+    finally:
+        lock.release()
+
+
+def _check(folder: Path, config: Config, kind: str, may_change: Sequence[str]) -> None:
+    """Raise ConfigError unless a run may use a folder; see `run_folder`."""
+    path = folder / "config.yaml"
+    results = [name for name in RESULTS if (folder / name).exists()]
+    if not path.exists():
+        if results:
+            raise ConfigError(f"folder '{folder}' holds {results[0]} but no config.yaml; use another folder")
+        return
+    try:
+        old = load_config(path, type(config))
+    except ConfigError:
+        raise ConfigError(
+            f"folder '{folder}' does not hold {kind}: its config.yaml belongs to something else; use another folder"
+        ) from None
+    if results:
+        check_compatible(old, config, f"folder '{folder}' holds {kind}", may_change=may_change)
