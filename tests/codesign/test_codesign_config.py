@@ -224,7 +224,7 @@ def test_a_judge_has_seen_what_varies(tmp_path, tiny, monkeypatch):
 
 def test_folder_keeps_its_study(study):
     first = study()
-    with pytest.raises(ConfigError, match="another 'variables'"):
+    with pytest.raises(ConfigError, match="holds a study with variables"):
         study(variables=["length"])
     assert study(trials=7).config.trials == 7
     with pytest.raises(ConfigError, match="or change only: name, title, trials, .*attempts, finalists.count, "):
@@ -238,19 +238,21 @@ def test_options_of_fem(study):
     def asked(**finalists):
         return study(finalists={"count": 1, **finalists})
 
-    with pytest.raises(ConfigError, match=r"finalists.fem_options = \{'dinamics': True\}: .*argument 'dinamics'"):
+    with pytest.raises(ConfigError, match=r"finalists.fem_options = \{'dinamics': True\}: .*option 'dinamics'"):
         asked(fem_options={"dinamics": True})
     folder = asked(fem_options={"dynamics": True})
     assert asked(fem_options={"dynamics": False}).config.finalists.fem_options == {"dynamics": False}
     (folder.path / "finalists" / "trial0000-seed1").mkdir(parents=True)
     asked()
-    with pytest.raises(ConfigError, match="another 'finalists.steps'"):
+    with pytest.raises(ConfigError, match="holds a study with finalists.steps"):
         asked(steps=9)
     write_json(folder.path / "finalists" / "trial0000-qp-fem-unseen.json", {})
     with pytest.raises(ConfigError) as caught:
         asked(fem_options={"dynamics": False})
     message = str(caught.value)
-    assert "another 'finalists.fem_options'; use another folder, or change only: name, " in message
+    assert (
+        "holds a study with finalists.fem_options" in message and "use another folder, or change only: name" in message
+    )
     assert message.endswith("finalists.count, finalists.choose, finalists.seeds")
     assert asked(count=2).config.finalists.count == 2
 

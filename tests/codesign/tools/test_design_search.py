@@ -83,9 +83,7 @@ def test_a_stopped_search_ends_as_one_that_was_not(some, monkeypatch, tmp_path):
     before = some.count
     longer = search(more, tmp_path / "parts", progress=False)
     assert longer.feasible + longer.infeasible == 26 and some.count - before <= 6
-    with pytest.raises(
-        ConfigError, match="holds a search with objectives = .*, or change only: name, workers"
-    ):
+    with pytest.raises(ConfigError, match="holds a search with objectives = .*, or change only: name, workers"):
         search(configured(objectives=[{"metric": "travel"}]), tmp_path / "parts", progress=False)
 
 
