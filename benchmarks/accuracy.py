@@ -136,8 +136,8 @@ def design_gradients(bodies: int = 12) -> dict[str, object]:
     from softgym_envs.errors import ConvergenceError, InfeasibleDesign
     from softgym_envs.mechanics.solvers.statics import Statics
     from softgym_envs.robots import make_robot
-    from softgym_envs.surrogate.data.sampling import learned_variables
-    from softgym_envs.surrogate.gradients import TorchModel
+    from softgym_envs.surrogate.features import learned_variables
+    from softgym_envs.surrogate.potential.torch import TorchModel
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
 
     result: dict[str, object] = {}

@@ -165,15 +165,14 @@ def _run(path: Path, case: str, name: str, data: dict[str, dict[str, np.ndarray]
     import torch
 
     from softgym_envs.robots import make_robot
-    from softgym_envs.surrogate.data.sampling import learned_variables
     from softgym_envs.surrogate.data.states import training_states
-    from softgym_envs.surrogate.model import Features
+    from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.networks import network_module
     from softgym_envs.surrogate.training import Trainer, test_errors
 
     torch.set_num_threads(1)
     robot = make_robot(CASES[case]["robot"], **CASES[case]["robot_options"])
-    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
+    features = Features(robot)
     # One rest state and ``size`` others, drawn anew for each seed.
     others = np.flatnonzero(~data["train"]["rest"].astype(bool))
     chosen = np.concatenate([[0], np.random.default_rng(seed).permutation(others)[:size]])
@@ -219,16 +218,17 @@ def _track(path: Path, case: str, data: dict[str, dict[str, np.ndarray]], size: 
 
     from benchmarks.robots import predicted_path
     from softgym_envs.robots import make_robot
-    from softgym_envs.surrogate.data.sampling import learned_variables, select_states
+    from softgym_envs.surrogate.data.sampling import select_states
     from softgym_envs.surrogate.data.states import stable_rows, training_states
-    from softgym_envs.surrogate.model import Features, card_of
+    from softgym_envs.surrogate.features import Features
+    from softgym_envs.surrogate.model import card_of
     from softgym_envs.surrogate.online import save_model
     from softgym_envs.surrogate.potential import model as potential
     from softgym_envs.surrogate.training import Trainer
 
     torch.set_num_threads(1)
     robot = make_robot(CASES[case]["robot"], **CASES[case]["robot_options"])
-    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
+    features = Features(robot)
     usable = np.flatnonzero(stable_rows(robot, data["train"]) & ~data["train"]["rest"].astype(bool))
     pool = {k: v[usable] for k, v in data["train"].items()}
     chosen = np.concatenate([[0], usable[select_states(pool, size - 1)]])

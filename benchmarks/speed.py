@@ -287,7 +287,7 @@ def inference() -> dict[str, object]:
     import torch
 
     from softgym_envs.robots import make_robot
-    from softgym_envs.surrogate.gradients import TorchModel
+    from softgym_envs.surrogate.potential.torch import TorchModel
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
 
     torch.set_num_threads(1)

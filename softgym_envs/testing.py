@@ -21,7 +21,7 @@ from softgym_envs.robots.base import Robot
 
 if TYPE_CHECKING:
     from softgym_envs.surrogate.potential.model import Model
-    from softgym_envs.surrogate.potential.network import PotentialNet
+    from softgym_envs.surrogate.potential.torch import PotentialNet
 
 # -- meshes and bodies --------------------------------------------------------------------------------------------
 
@@ -223,14 +223,13 @@ def untrained_potential(
     """
     import torch
 
-    from softgym_envs.surrogate.data.sampling import learned_variables
-    from softgym_envs.surrogate.model import Features
+    from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.potential import model as potential
-    from softgym_envs.surrogate.potential.network import PotentialNet
+    from softgym_envs.surrogate.potential.torch import PotentialNet
 
     torch.manual_seed(seed)
     n, e = len(robot.actuators), 3 * len(robot.effectors)
-    design = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper).design_size
+    design = Features(robot).design_size
     middle, half = 0.5 * (robot.upper + robot.lower), 0.5 * (robot.upper - robot.lower)
     at_rest = -middle / half if rest else None
     nets = [PotentialNet(n, e, design, width, 16, at_rest, robot.convex) for _ in range(members)]
@@ -279,9 +278,9 @@ def train_small_surrogate(
     steps: int = 1500,
 ) -> None:
     """Train a surrogate of the baseline body on displacements up to ``limit`` [m] and write it to ``folder``."""
-    from softgym_envs.surrogate.data.sampling import learned_variables
     from softgym_envs.surrogate.data.states import training_states
-    from softgym_envs.surrogate.model import Features, card_of
+    from softgym_envs.surrogate.features import Features
+    from softgym_envs.surrogate.model import card_of
     from softgym_envs.surrogate.online import save_model
     from softgym_envs.surrogate.potential import model as potential
     from softgym_envs.surrogate.training import Trainer, domain_of
@@ -289,7 +288,7 @@ def train_small_surrogate(
     training = sample_states(robot, states, 0, limit=limit, sequence="halton")
     validation = sample_states(robot, max(states // 3, 20), 1, limit=limit)
     card = card_of(robot, "potential")
-    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
+    features = Features(robot)
     options = potential.Options(width=width, body_width=width // 2, members=members, steps=steps, batch_size=128)
     tensors, _ = potential.train(
         robot,

@@ -18,8 +18,8 @@ from softgym_envs.designs import DesignSpace
 from softgym_envs.errors import ConfigError
 from softgym_envs.mechanics.constraints import Cavity
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.gradients import TorchModel
 from softgym_envs.surrogate.potential import model as potential
+from softgym_envs.surrogate.potential.torch import TorchModel
 from softgym_envs.surrogate.pretrained import pretrained_model
 
 __all__ = ["Box", "Evaluator", "LearnedBodies"]

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softgym_envs.backends.surrogate import TOLERANCE
+from softgym_envs.backends.torch_batch import MAX_NEWTON_STEPS, Bodies, TorchBatch, put_rows, repeat_body, take_rows
 from softgym_envs.envs.env import design_names
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.envs.spaces import Interface
@@ -26,245 +26,13 @@ from softgym_envs.envs.tasks.reach import Reach
 from softgym_envs.envs.tasks.track import Track
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots import make_robot
-from softgym_envs.surrogate.potential import model as potential
 from softgym_envs.surrogate.pretrained import pretrained_model
 
 __all__ = ["TorchVectorEnv"]
 
-#: A quarter of an actuator's range, the unit of steps and tolerances of searches, in scaled displacements.
-SPAN = 0.5
 #: Newton steps of every row, with one Hessian. With random actions 7 % of the rows of GripperPinch and 2 % of the cable
 #: trunk's need more, and none of the others'.
 STEPS = 4
-#: Bound on the Newton steps of those, with a new Hessian every fourth.
-MORE_STEPS = 25
-#: Passes of pivots in a complementarity problem: one to the last known slack set, the others to the right one.
-PASSES = 3
-
-Bodies = dict[str, Tensor]
-
-
-class _Ensemble:
-    """All members of `potential.Model` in one batch, in scaled quantities.
-
-    Constant factors are in the weights: the halves of the ramp and its derivative, and the share of a member in the
-    mean. Weights have a leading dimension M, coefficients of bodies (M, S, ...) with S bodies or one for all.
-    """
-
-    def __init__(self, model: potential.Model, device: torch.device, dtype: torch.dtype) -> None:
-        def put(array: np.ndarray) -> Tensor:
-            return torch.as_tensor(np.ascontiguousarray(array, dtype=float), dtype=dtype, device=device)
-
-        tensors = {k: np.asarray(v, dtype=float) for k, v in model.tensors.items()}
-        self.trained = model.trained
-        self.members, self.width, self.count, self.effectors = model.members, model.width, model.count, model.effectors
-        self.unilateral = tuple(actuator.unilateral for actuator in model.robot.actuators)
-        M, w, n = self.members, self.width, self.count
-        A1, A2 = tensors["energy1"].swapaxes(1, 2), tensors["energy2"].swapaxes(1, 2)
-        P = np.logaddexp(0.0, tensors["pass_on"])
-        self._layers = [
-            (put(tensors[f"body.{k}.weight"].swapaxes(1, 2)), put(tensors[f"body.{k}.bias"][:, None])) for k in range(3)
-        ]
-        self._A, self._A1, self._A2 = put(np.concatenate([A1, A2], axis=2)), put(A1[:, None]), put(A2[:, None])
-        self._P, self._PT = put(P), put(0.5 * P.swapaxes(1, 2))
-        self._E1, self._E2 = put(0.5 * tensors["energy1"]), put(tensors["energy2"])
-        self._outer = put(0.5 * np.einsum("mij,mkj->mjik", A1, A1).reshape(M, w, n * n))
-        self._B1, self._B2 = put(tensors["shape1"].swapaxes(1, 2)), put(tensors["shape2"].swapaxes(1, 2))
-        self._V = put(tensors["effector"].swapaxes(1, 2))
-        self._rest = put(tensors["rest"]) if "rest" in tensors else None
-        self._lower = torch.tril_indices(n, n, device=device)
-        self.pulls = torch.tensor(self.unilateral, device=device)
-
-    def bodies(self, features: Tensor) -> Bodies:
-        """Coefficients of bodies from features (S, d)."""
-        M, n, e = self.members, self.count, self.effectors
-        x = features if features.shape[1] else features.new_zeros(len(features), 1)
-        h = x.expand(M, *x.shape)
-        for k, (weight, bias) in enumerate(self._layers):
-            h = torch.baddbmm(bias, h, weight)
-            if k < 2:
-                h = h * torch.rsqrt(1.0 + h * h)
-        sizes = potential.body_parts(n, e, self.width)
-        part = dict(zip(sizes, torch.split(h, list(sizes.values()), dim=2), strict=True))
-        quadratic, (i, j) = part["quadratic"], self._lower
-        factor = quadratic.new_zeros(M, len(x), n, n)
-        factor[:, :, i, j] = torch.where(i == j, torch.exp(quadratic), quadratic)
-        softplus = torch.nn.functional.softplus
-        bodies = {
-            "c": torch.cat([part["c1"], part["c2"]], dim=2),
-            "a": softplus(part["a"] - 4.0) * (0.5 / M),
-            "b": softplus(part["b"] - 4.0) / M,
-            "quadratic": (factor @ factor.mT).mean(dim=0),
-            "first": factor[0] @ factor[0].mT,
-            "linear": part["linear"].mean(dim=0),
-            "d1": part["d1"].contiguous(),
-            "d2": part["d2"].contiguous(),
-            "x0": part["x0"].contiguous(),
-            "slope": part["slope"].reshape(M, -1, e, n),
-        }
-        if self._rest is not None:
-            bodies["linear"] = torch.zeros_like(bodies["linear"])
-            bodies["linear"] = -self.gradient(bodies, self._rest.expand(len(x), n))
-        return bodies
-
-    def _forward(self, bodies: Bodies, u: Tensor, m: int) -> tuple[Tensor, ...]:
-        """Sum of the gradients of the first ``m`` members' networks (B, n), and what their Hessians need."""
-        U = u.expand(m, *u.shape)
-        z1, z2 = torch.baddbmm(bodies["c"][:m], U, self._A[:m]).split(self.width, dim=2)
-        square = 1.0 + z1 * z1
-        r1 = torch.rsqrt(square)
-        ramp, slope = z1 + square * r1, 1.0 + z1 * r1  # twice the ramp and its derivative
-        z2 = torch.baddbmm(z2, ramp, self._PT[:m])
-        r2 = torch.rsqrt(1.0 + z2 * z2)
-        upper = bodies["a"][:m] * (1.0 + z2 * r2)
-        lower = torch.baddbmm(bodies["b"][:m], upper, self._P[:m])
-        gradient = torch.baddbmm(torch.bmm(upper, self._E2[:m]), slope * lower, self._E1[:m]).sum(dim=0)
-        return gradient, slope, lower, r1, r2
-
-    def _hessian(self, bodies: Bodies, slope: Tensor, lower: Tensor, r1: Tensor, r2: Tensor) -> Tensor:
-        """Sum of the Hessians of the first members' networks (B, n, n), from what `_forward` says of them."""
-        (m, B, w), n = slope.shape, self.count
-        first = (slope[:, :, None] * self._A1[:m]).reshape(m, B * n, w)
-        through = torch.bmm(first, self._PT[:m]).reshape(m, B, n, w) + self._A2[:m]
-        bent = bodies["a"][:m] * r2**3
-        hessian = torch.matmul(through * bent[:, :, None], through.mT).sum(dim=0)
-        return hessian + torch.bmm(lower * r1**3, self._outer[:m]).sum(dim=0).reshape(B, n, n)
-
-    def gradient(self, bodies: Bodies, u: Tensor) -> Tensor:
-        """Gradient of the energy (B, n) at displacements u (B, n)."""
-        return self._plus_body(bodies, u, self._forward(bodies, u, self.members)[0])
-
-    def _plus_body(self, bodies: Bodies, u: Tensor, gradient: Tensor) -> Tensor:
-        return gradient + bodies["linear"] + (bodies["quadratic"] * u[:, None, :]).sum(dim=2)
-
-    def derivatives(self, bodies: Bodies, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient (B, n) and Hessian (B, n, n) of the energy."""
-        gradient, *parts = self._forward(bodies, u, self.members)
-        return self._plus_body(bodies, u, gradient), self._hessian(bodies, *parts) + bodies["quadratic"]
-
-    def curvature(self, bodies: Bodies, u: Tensor) -> Tensor:
-        """Hessian (B, n, n) of the first member alone."""
-        _, *parts = self._forward(bodies, u, 1)
-        return self.members * self._hessian(bodies, *parts) + bodies["first"]
-
-    def effector(self, bodies: Bodies, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Effector (B, e) and its spread (B,) over the members, infinite where they are not all."""
-        U = u.expand(self.members, *u.shape)
-        z = torch.baddbmm(bodies["d1"], U, self._B1)
-        z = torch.baddbmm(bodies["d2"], z * torch.rsqrt(1.0 + z * z), self._B2)
-        plane = bodies["x0"] + (bodies["slope"] * u[:, None, :]).sum(dim=3)
-        x = torch.baddbmm(plane, z * torch.rsqrt(1.0 + z * z), self._V)
-        mean = x.mean(dim=0)
-        if self.members < self.trained:
-            return mean, torch.full_like(mean[:, 0], torch.inf)
-        square = ((x - mean) ** 2).mean(dim=0).reshape(len(u), -1, 3).sum(dim=2)
-        return mean, torch.sqrt(square.amax(dim=1))
-
-    def search(
-        self, bodies: Bodies, target: Tensor, guess: Tensor, iterations: int, *, stop: bool = False
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """As `SurrogateModel.search`, on scaled displacements (B, n).
-
-        Args:
-            bodies: their coefficients.
-            target: commanded displacements.
-            guess: where the search begins.
-            iterations: Newton steps of every row.
-            stop: ask the host before every step whether a row still moves, and end when none does.
-
-        Returns:
-            Displacements (B, n), gradients (B, n), and whether they were found (B,).
-        """
-        if not any(self.unilateral):
-            gradient = self.gradient(bodies, guess)
-            return guess, gradient, torch.isfinite(gradient).all(dim=1)
-        u = guess
-        for iteration in range(iterations):
-            # The Hessian changes slowly along the search; a simplified Newton step is cheaper than a new one.
-            if iteration % 4 == 0:
-                gradient, hessian = self.derivatives(bodies, u)
-            else:
-                gradient = self.gradient(bodies, u)
-            if iteration == 0:
-                wrong = ((gradient < 0.0) | (guess > target)) & self.pulls
-                found = torch.isfinite(gradient).all(dim=1) & ~wrong.any(dim=1)
-                effort, slack = gradient, guess > target
-            if stop and bool(found.all()):
-                break
-            # In the displacement beyond the command, z >= 0, the effort is K z + q >= 0.
-            ahead = target - u
-            q = gradient + (hessian * ahead[:, None, :]).sum(dim=2)
-            z, taut, slack, solved = _complementarity(hessian, q, slack, self.unilateral)
-            step = torch.clamp(ahead + z, -SPAN, SPAN)
-            still = (step.abs() <= TOLERANCE * SPAN).all(dim=1)
-            # A last step below the tolerance is taken without asking the model again.
-            u = torch.where(found[:, None], u, u + step)
-            effort = torch.where(found[:, None], effort, taut)
-            found = found | (still & solved)
-        return u, effort, found
-
-    def released(self, bodies: Bodies, start: Tensor) -> Tensor:
-        """Displacements (B, n) without effort, by Newton's method; asks the host."""
-        u = start
-        for _ in range(50):
-            gradient, hessian = self.derivatives(bodies, u)
-            step = -torch.linalg.solve_ex(hessian, gradient)[0]
-            moving = (step.abs() > TOLERANCE * SPAN).any(dim=1, keepdim=True)
-            if not bool(moving.any()):
-                break
-            u = torch.where(moving, u + step.clamp(-SPAN, SPAN), u)
-        return u
-
-
-def _complementarity(
-    K: Tensor, q: Tensor, slack: Tensor, unilateral: tuple[bool, ...]
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Solve ``0 <= z _|_ K z + q >= 0`` (z = 0 in bilateral rows) by principal pivots, in a fixed number of passes.
-
-    A pivot exchanges an actuator's z with its effort: a rank-one update of the tableau, masked by row of the batch.
-    The first pass exchanges those that were slack before, the others every one of a wrong sign, in turn.
-
-    Args:
-        K: symmetric positive definite, shape (B, n, n).
-        q: shape (B, n).
-        slack: guess of where z > 0, shape (B, n).
-        unilateral: n flags.
-
-    Returns:
-        z (B, n), K z + q (B, n), the slack set (B, n), and whether its signs are right (B,).
-    """
-    n = q.shape[1]
-    # With a unit diagonal the pivots are of order one: the sum that makes a rank-one update exact loses no digits.
-    scale = torch.rsqrt(torch.diagonal(K, dim1=1, dim2=2))
-    q = scale * q
-    tableau = torch.cat([K * scale[:, :, None] * scale[:, None, :], q[:, :, None]], dim=2).permute(1, 2, 0).contiguous()
-    slightly = -4.0 * torch.finfo(q.dtype).eps * q.abs().amax(dim=1)
-    unit = torch.eye(n, n + 1, dtype=q.dtype, device=q.device)[:, :, None]
-    free = list(slack.unbind(dim=1))
-    pull = [p for p in range(n) if unilateral[p]]
-    for sweep in range(PASSES):
-        for p in pull:
-            if sweep == 0:
-                exchanged = free[p]
-            else:
-                exchanged = tableau[p, n] < slightly
-                free[p] = free[p] ^ exchanged
-            inverse = torch.where(exchanged, 1.0 / tableau[p, p], 0.0)
-            column = (tableau[:, p] + unit[p, :n]) * inverse
-            tableau = torch.addcmul(tableau, column[:, None], tableau[p] - unit[p], value=-1.0)
-    value, slack = tableau[:, n].mT, torch.stack(free, dim=1)
-    right = torch.stack([value[:, p] >= slightly for p in pull]).all(dim=0)
-    return torch.where(slack, value, 0.0) * scale, torch.where(slack, 0.0, value) / scale, slack, right
-
-
-def _definite(a: Tensor) -> Tensor:
-    """Whether symmetric matrices (B, n, n) are positive definite, (B,): all pivots of the elimination are positive."""
-    found = torch.ones(len(a), dtype=torch.bool, device=a.device)
-    while a.shape[1]:
-        pivot = a[:, :1, :1]
-        found &= pivot[:, 0, 0] > 0.0
-        a = a[:, 1:, 1:] - a[:, 1:, :1] * a[:, :1, 1:] / pivot
-    return found
 
 
 class TorchVectorEnv:
@@ -337,8 +105,6 @@ class TorchVectorEnv:
         if not isinstance(task, Reach | Track):
             raise ValueError(f"task '{row.task}' is not supported; allowed: reach, track")
         model = pretrained_model(self.robot, members=members)
-        if not isinstance(model, potential.Model):
-            raise ValueError(f"network '{model.network}' is not supported; allowed: potential")
         self.task: Reach | Track = task
         self.num_envs, self.dtype = num_envs, dtype
         self.max_episode_steps = row.max_episode_steps if max_episode_steps is None else max_episode_steps
@@ -351,19 +117,11 @@ class TorchVectorEnv:
         def put(values: Any, kind: torch.dtype = dtype) -> Tensor:
             return torch.as_tensor(np.array(values, dtype=float), dtype=kind, device=self.device)
 
-        self._ensemble = _Ensemble(model, self.device, dtype)
-        self._loaded = bool(model.card.get("loaded", False))
-        self._middle, self._half = put(model.middle), put(model.half_range)
-        self._effort_scale, self._typical_effort = (
-            put(model.energy_scale / model.half_range),
-            put(self.robot.effort_scale),
-        )
-        self._effector_scale, self._effector_mean = model.effector_scale, put(model.effector_mean)
-        self._rates, self._axes = put(self.interface.rates / model.half_range), put(self.task.axes)
-        self._inflation, self._limit = model._inflation, model._limit
-        self._growth = model._growth if np.isfinite(model._growth) else None  # the compiler knows no `isfinite`
-        self._known_low, self._known_high = (
-            put((bound - model.middle) / model.half_range) for bound in (model._low, model._high)
+        self._model = TorchBatch(model, self.device, dtype)
+        self._typical_effort = put(self.robot.effort_scale)
+        self._rates, self._axes = (
+            put(2.0 * self.interface.rates / (self.robot.upper - self.robot.lower)),
+            put(self.task.axes),
         )
 
         # Bodies are kept in double precision: near 0.5 a Poisson's ratio needs its digits.
@@ -371,12 +129,6 @@ class TorchVectorEnv:
         double = torch.float64
         self._log = torch.tensor([v.log for v in variables], device=self.device)
         self._ends = put([np.log([v.low, v.high]) if v.log else [v.low, v.high] for v in variables], double).T
-        low, high = np.full(len(space), -np.inf), np.full(len(space), np.inf)
-        for name, (least, largest) in model._known.items():
-            margin = 0.01 * (largest - least) + 1e-9 * abs(largest)
-            low[space.names.index(name)], high[space.names.index(name)] = least - margin, largest + margin
-        self._box = put(low, double), put(high, double)
-        self._learned = model.features.learned
         self._sampled = [space.names.index(name) for name in design_names(space, sample_design)]
         self._shown = [space.names.index(name) for name in shown]
         self._fixed = put(list(space.complete(design).values()), double)
@@ -396,37 +148,10 @@ class TorchVectorEnv:
     # -- bodies -----------------------------------------------------------------------------------------------------
 
     def _prepare(self, designs: Tensor) -> Bodies:
-        """Coefficients, scaling, observation and rest of bodies from designs (S, len(space)) in double precision."""
+        """Bodies, with what the observation shows of them, from designs (S, len(space)) in double precision."""
         low, high = self._ends
         unit = 2.0 * (torch.where(self._log, torch.log(designs), designs) - low) / (high - low) - 1.0
-        columns = []
-        for name in self._learned:
-            index = self.design_space.names.index(name)
-            columns.append(unit[:, index])
-            if name == "poisson_ratio":
-                least, largest = torch.log(1.0 - 2.0 * self._ends[:, index])
-                columns.append(2.0 * (torch.log(1.0 - 2.0 * designs[:, index]) - least) / (largest - least) - 1.0)
-        features = torch.stack(columns, dim=1) if columns else designs[:, :0]
-        bodies = self._ensemble.bodies(features.to(self.dtype))
-        variable = self.robot.stiffness_variable
-        factor = torch.ones_like(designs[:, :1])
-        if variable is not None:
-            factor = designs[:, [self.design_space.names.index(variable)]] / self.design_space[variable].baseline
-        bodies["effort"] = factor.to(self.dtype) * self._effort_scale
-        bodies["known"] = ((designs >= self._box[0]) & (designs <= self._box[1])).all(dim=1)
-        bodies["unit"] = unit[:, self._shown].to(self.dtype)
-        zero = (-self._middle / self._half).expand(len(designs), -1)
-        if self._growth is not None:
-            bodies["unmoved"] = self._ensemble.curvature(bodies, zero)
-            bodies["known"] &= _definite(bodies["unmoved"])
-        if self._loaded:
-            u, gradient, _ = self._ensemble.search(bodies, zero, zero, MORE_STEPS, stop=True)
-        else:
-            u = self._ensemble.released(bodies, zero)
-            gradient = self._ensemble.gradient(bodies, u)
-        bodies["rest"], bodies["rest_effort"] = u, gradient * bodies["effort"]
-        bodies["rest_effector"], bodies["rest_uncertainty"], bodies["rest_trusted"] = self._measure(bodies, u)
-        return bodies
+        return self._model.prepare(designs) | {"unit": unit[:, self._shown].to(self.dtype)}
 
     def _take_bodies(self, index: Tensor, designs: Tensor) -> None:
         """Give the rows ``index`` new bodies: one for all of them (1, len(space)), or one each."""
@@ -440,34 +165,17 @@ class TorchVectorEnv:
                 self._bodies, self._hot = new, None
             return
         if len(old["rest"]) != self.num_envs:
-            self._bodies = {name: _repeat(value, _axis(name), self.num_envs) for name, value in old.items()}
+            self._bodies = repeat_body(old, self.num_envs)
             self._hot = None
-        for name, value in new.items():
-            self._bodies[name][_at(name, index)] = value
-
-    def _rows(self, index: Tensor) -> Bodies:
-        if len(self._bodies["rest"]) == 1:
-            return self._bodies
-        return {name: value[_at(name, index)] for name, value in self._bodies.items()}
-
-    def _measure(self, bodies: Bodies, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Effector [m] (B, 3), its uncertainty [m] (B,), and whether it is trusted (B,)."""
-        effector, spread = self._ensemble.effector(bodies, u)
-        effector = (effector * self._effector_scale + self._effector_mean)[:, :3]
-        uncertainty = spread * (self._effector_scale * self._inflation)
-        inside = ((u >= self._known_low) & (u <= self._known_high)).all(dim=1)
-        trusted = inside & bodies["known"] & ((uncertainty <= self._limit) | torch.isinf(uncertainty))
-        if self._growth is not None:
-            trusted &= _definite(self._growth * self._ensemble.curvature(bodies, u) - bodies["unmoved"])
-        return effector, uncertainty, trusted
+        put_rows(self._bodies, index, new)
 
     # -- episodes ---------------------------------------------------------------------------------------------------
 
     def _at_rest(self, bodies: Bodies, count: int) -> dict[str, Tensor]:
         """State of ``count`` rows at the beginning of an episode, without their goals."""
-        n = self._ensemble.count
+        n = self._model.count
         parts = {
-            "command": (-self._middle / self._half)[None],
+            "command": (-self._model.middle / self._model.half_range)[None],
             "u": bodies["rest"],
             "effort": bodies["rest_effort"],
             "effector": bodies["rest_effector"],
@@ -501,7 +209,7 @@ class TorchVectorEnv:
         elif bool(self._changed[index].any()):
             self._take_bodies(index, self._fixed[None])
             self._changed[index] = False
-        bodies = self._rows(index)
+        bodies = take_rows(self._bodies, index)
         if paths is None:
             paths = self._draw_goals(bodies, len(index))
         if paths.shape[1] > self._state["paths"].shape[1]:
@@ -526,15 +234,15 @@ class TorchVectorEnv:
         if task.fixed_goals is not None:
             chosen = torch.randint(len(task.fixed_goals), (count,), generator=self._generator, device=self.device)
             return put(task.fixed_goals)[chosen][:, None]
-        low, n = 2.0 * task.command_low - 1.0, self._ensemble.count
+        low, n = 2.0 * task.command_low - 1.0, self._model.count
         goals = torch.full((count, 3), torch.nan, dtype=self.dtype, device=self.device)
         for _ in range(51):
             lost = torch.isnan(goals[:, :1])  # commands without an equilibrium are drawn again
             if not bool(lost.any()):
                 return (goals + self._uniform(-task.spread, task.spread, count, 3))[:, None]
             target = self._uniform(low, 1.0, count, n)
-            u, _, found = self._ensemble.search(bodies, target, target, MORE_STEPS, stop=True)
-            drawn = torch.where(found[:, None], self._measure(bodies, u)[0], torch.nan)
+            u, _, found = self._model.search(bodies, target, target, MAX_NEWTON_STEPS, stop=True)
+            drawn = torch.where(found[:, None], self._model.measure(bodies, u)[0], torch.nan)
             goals = torch.where(lost, drawn, goals)
         raise ConvergenceError("50 random commands in a row have no equilibrium: no goal can be drawn", fraction=0.0)
 
@@ -608,7 +316,7 @@ class TorchVectorEnv:
         if not self._started:
             raise RuntimeError("step was called before reset")
         actions = torch.as_tensor(actions, dtype=self.dtype, device=self.device)
-        shape = (self.num_envs, self._ensemble.count)
+        shape = (self.num_envs, self._model.count)
         if actions.shape != shape:
             raise ValueError(f"actions must have shape {shape}, got {tuple(actions.shape)}")
         if self._hot is None:
@@ -667,7 +375,7 @@ class TorchVectorEnv:
         else:
             target = before + torch.minimum(torch.maximum(a - before, -self._rates), self._rates)
         target = target.clamp(-1.0, 1.0)
-        u, gradient, found = self._ensemble.search(bodies, target, _guess(state, target), STEPS)
+        u, gradient, found = self._model.search(bodies, target, _guess(state, target), STEPS)
         result = self._settle(bodies, state, target, u, gradient, found)
         questions = torch.stack([torch.isfinite(actions).all(), found.all(), result["truncated"].any()])
         return result | {"questions": questions, "search": (target, u, gradient, found)}
@@ -677,7 +385,7 @@ class TorchVectorEnv:
         target, u, gradient, found = result["search"]
         rows = torch.nonzero(~found)[:, 0]
         wanted, guess = target[rows], _guess(self._state, target)[rows]
-        parts = self._ensemble.search(self._rows(rows), wanted, guess, MORE_STEPS, stop=True)
+        parts = self._model.search(take_rows(self._bodies, rows), wanted, guess, MAX_NEWTON_STEPS, stop=True)
         u, gradient, found = (x.index_copy(0, rows, part) for x, part in zip((u, gradient, found), parts, strict=True))
         return self._settle(self._bodies, self._state, target, u, gradient, found)
 
@@ -685,14 +393,12 @@ class TorchVectorEnv:
         self, bodies: Bodies, state: dict[str, Tensor], target: Tensor, u: Tensor, gradient: Tensor, found: Tensor
     ) -> dict[str, Any]:
         """State after a search, and all that is said about it."""
-        effector, uncertainty, trusted = self._measure(bodies, u)
-        pulls = self._ensemble.pulls
-        slack = pulls & (u > target + (10.0 * TOLERANCE) * SPAN)
-        gradient = torch.where(pulls, gradient.clamp(min=0.0), gradient).masked_fill(slack, 0.0)
+        effector, uncertainty, trusted = self._model.measure(bodies, u)
+        effort, slack = self._model.efforts(bodies, target, u, gradient)
         new = {
             "command": target,
             "u": u,
-            "effort": gradient * bodies["effort"],
+            "effort": effort,
             "effector": effector,
             "slack": slack,
             "uncertainty": uncertainty,
@@ -740,7 +446,7 @@ class TorchVectorEnv:
             "distance": distance,
             "is_success": distance < self.task.success_distance,
             "reward_terms": terms,
-            "displacement": self._middle + self._half * state["u"],
+            "displacement": self._model.middle + self._model.half_range * state["u"],
             "effort": state["effort"].clone(),
             "stable": torch.ones_like(state["converged"]),
             "uncertainty": state["uncertainty"].clone(),
@@ -749,24 +455,6 @@ class TorchVectorEnv:
         }
         observation = torch.cat(parts, dim=1).clamp(-1.0, 1.0)
         return {"observation": observation, "reward": terms["distance"] * terms["effort"], "info": info}
-
-
-#: Coefficients of bodies that every member has its own of: (M, S, ...), the others are (S, ...).
-_OF_MEMBERS = frozenset({"c", "a", "b", "d1", "d2", "x0", "slope"})
-
-
-def _axis(name: str) -> int:
-    return int(name in _OF_MEMBERS)
-
-
-def _at(name: str, index: Tensor) -> Any:
-    return (slice(None), index) if _axis(name) else index
-
-
-def _repeat(value: Tensor, axis: int, count: int) -> Tensor:
-    shape = list(value.shape)
-    shape[axis] = count
-    return value.expand(shape).clone()
 
 
 def _guess(state: dict[str, Tensor], target: Tensor) -> Tensor:

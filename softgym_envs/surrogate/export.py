@@ -628,7 +628,7 @@ class _Builder:
 
 
 def _features(model: Model, g: _Builder) -> Any:
-    """Scaled design (B, d) as `softgym_envs.surrogate.model.Features.design` has it; zeros (1, 1) if there is none."""
+    """Scaled design (B, d) as `Features.design` has it; zeros (1, 1) if there is none."""
     space = model.robot.design_space
     columns: list[str] = []
 
@@ -650,7 +650,7 @@ def _features(model: Model, g: _Builder) -> Any:
 
 def _graph(model: Model, onnx: Any) -> Any:
     """The graph; values of members are (M, B, ...)."""
-    from softgym_envs.surrogate.potential.model import body_parts
+    from softgym_envs.surrogate.potential.model import coefficient_sizes
 
     g = _Builder(onnx)
     n, e, w = model.count, model.effectors, model.width
@@ -662,7 +662,7 @@ def _graph(model: Model, onnx: Any) -> Any:
         h = g("Add", g("MatMul", h, t[f"body.{k}.weight"].swapaxes(1, 2)), t[f"body.{k}.bias"][:, None])
         if k < 2:
             h = g("Mul", h, g.reciprocal_root(h))
-    sizes = list(body_parts(n, e, w).values())
+    sizes = list(coefficient_sizes(n, e, w).values())
     c1, c2, a, b, quadratic, linear, x0, slope, held, d1, d2 = g.split(h, sizes)
     a, b = (g("Softplus", g("Sub", value, 4.0)) for value in (a, b))
     factor = g.triangular(quadratic, n)

@@ -17,50 +17,17 @@ from typing import Any, ClassVar
 import numba
 import numpy as np
 
-from softgym_envs.designs import DesignSpace
 from softgym_envs.errors import WeightsError
 from softgym_envs.mechanics.condensation import CondensedModel, Roles
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.data.sampling import learned_variables
+from softgym_envs.surrogate.domain import Domain
+from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.networks import network_module
 
-__all__ = ["Context", "Features", "SurrogateModel", "card_of", "load_model"]
+__all__ = ["Context", "SurrogateModel", "card_of", "load_model"]
 
 FORMAT = 2
-
-
-class Features:
-    """Inputs of the networks, all about [-1, 1].
-
-    Args:
-        space: design space of the robot.
-        learned: design variables that are inputs, in order.
-        lower: smallest actuator displacements, shape (n_a,).
-        upper: largest actuator displacements, shape (n_a,).
-    """
-
-    def __init__(self, space: DesignSpace, learned: tuple[str, ...], lower: np.ndarray, upper: np.ndarray) -> None:
-        self.space, self.learned = space, learned
-        self.lower, self.upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
-        self.design_size = len(learned) + ("poisson_ratio" in learned)
-
-    def design(self, values: np.ndarray) -> np.ndarray:
-        """Scale design values (B, len(space)) in the order of the space; returns (B, design_size)."""
-        columns = []
-        for name in self.learned:
-            variable = self.space[name]
-            value = values[:, self.space.names.index(name)]
-            columns.append(variable.to_unit(value))
-            if name == "poisson_ratio":
-                # Near 0.5 everything depends on 1 - 2 nu, over orders of magnitude.
-                low, high = np.log(1.0 - 2.0 * variable.low), np.log(1.0 - 2.0 * variable.high)
-                columns.append(2.0 * (np.log(1.0 - 2.0 * value) - low) / (high - low) - 1.0)
-        return np.stack(columns, axis=-1) if columns else np.zeros((len(values), 0))
-
-    def actuation(self, displacement: np.ndarray) -> np.ndarray:
-        """Scale displacements (B, n_a)."""
-        return 2.0 * (displacement - self.lower) / (self.upper - self.lower) - 1.0
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -148,7 +115,7 @@ class SurrogateModel(ABC):
         self.robot = robot
         self.tensors = tensors
         self.card = dict(card)
-        self.features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
+        self.features = Features(robot)
         self.count = len(robot.actuators)
         self.effectors = 3 * len(robot.effectors)
         self.size = self.count + self.effectors
@@ -156,36 +123,15 @@ class SurrogateModel(ABC):
         #: A quarter of the actuators' ranges, the unit of steps and tolerances of searches.
         self.span = 0.25 * (robot.upper - robot.lower)
 
-        domain = self.card.get("domain", {})
-        if not isinstance(domain, dict):
-            raise ValueError(f"the domain of the card is no mapping: {domain!r}")
-        self._inflation = float(domain.get("inflation", 1.0))
-        self._limit = float(domain.get("limit", np.inf))
-        self._growth = float(domain.get("growth", np.inf))
-        box = np.array(domain.get("displacement", np.column_stack([robot.lower, robot.upper])), dtype=float)
-        if box.shape != (self.count, 2):
-            raise ValueError(f"the card's domain has displacements of shape {box.shape}, not ({self.count}, 2)")
-        slack = 0.01 * (box[:, 1] - box[:, 0])
-        self._low, self._high = box[:, 0] - slack, box[:, 1] + slack
-        self._known = {k: (float(v[0]), float(v[1])) for k, v in domain.get("design", {}).items()}
-        if strange := sorted(self._known.keys() - set(robot.design_space.names)):
-            raise ValueError(f"the card's domain has unknown design variables: {', '.join(strange)}")
+        self.domain = Domain.of_card(self.card, robot)
 
     def context(self, designs: np.ndarray) -> Context:
         """Prepare bodies: designs (B, len(space)) in the order of the space."""
-        variable = self.robot.stiffness_variable
-        names = self.robot.design_space.names
-        if variable is None:
-            stiffness = np.ones((len(designs), 1))
-        else:
-            stiffness = designs[:, [names.index(variable)]] / self.robot.design_space[variable].baseline
         arrays = self._prepare(self.features.design(designs))
-        arrays["known"] = np.ones(len(designs), dtype=bool)
-        for name, (low, high) in self._known.items():
-            value, slack = designs[:, names.index(name)], 0.01 * (high - low) + 1e-9 * abs(high)
-            arrays["known"] &= (value >= low - slack) & (value <= high + slack)
-        context = Context(stiffness, arrays, np.arange(len(designs)))
-        if np.isfinite(self._growth):
+        low, high = self.domain.design_low, self.domain.design_high
+        arrays["known"] = np.all((designs >= low) & (designs <= high), axis=1)
+        context = Context(self.features.stiffness(designs), arrays, np.arange(len(designs)))
+        if self.domain.limits_growth:
             arrays["unmoved"] = self._curvature(context, np.zeros((len(designs), self.count)))
             arrays["known"] &= definite(arrays["unmoved"])
         return context
@@ -272,12 +218,13 @@ class SurrogateModel(ABC):
             ensemble is judged by its domain alone. Where a robot can buckle (the card has a limit of the growth), the
             predicted `growth` must not be larger than in 98 % of them either: states about to buckle were no data.
         """
-        uncertainty = self._inflation * spread
-        inside = ((displacement >= self._low) & (displacement <= self._high)).all(axis=1)
-        trusted = inside & context.arrays["known"][context.slot] & ((uncertainty <= self._limit) | np.isinf(spread))
-        if np.isfinite(self._growth):
+        domain = self.domain
+        uncertainty = domain.inflation * spread
+        inside = ((displacement >= domain.low) & (displacement <= domain.high)).all(axis=1)
+        trusted = inside & context.arrays["known"][context.slot] & ((uncertainty <= domain.limit) | np.isinf(spread))
+        if domain.limits_growth:
             unmoved = context.arrays["unmoved"][context.slot]
-            trusted &= definite(self._growth * self._curvature(context, displacement) - unmoved)
+            trusted &= definite(domain.growth * self._curvature(context, displacement) - unmoved)
         return uncertainty, trusted
 
     def growth(self, context: Context, displacement: np.ndarray) -> np.ndarray:

@@ -235,7 +235,7 @@ def fine_tune(
     """
     import torch
 
-    from softgym_envs.surrogate.potential.network import PotentialNet
+    from softgym_envs.surrogate.potential.torch import PotentialNet
 
     check_ensemble(model)
     start = time.perf_counter()

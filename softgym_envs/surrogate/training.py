@@ -21,9 +21,10 @@ from softgym_envs.errors import DataError
 from softgym_envs.robots import make_robot
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.surrogate.data.dataset import generate_dataset
-from softgym_envs.surrogate.data.sampling import SamplingPlan, learned_variables
+from softgym_envs.surrogate.data.sampling import SamplingPlan
 from softgym_envs.surrogate.data.states import full_compliance, stable_rows, training_states
-from softgym_envs.surrogate.model import Features, SurrogateModel, card_of, load_model
+from softgym_envs.surrogate.features import Features
+from softgym_envs.surrogate.model import SurrogateModel, card_of, load_model
 from softgym_envs.surrogate.networks import NETWORKS, network_module
 
 __all__ = ["FitConfig", "fit", "generate", "test_errors"]
@@ -332,7 +333,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         if same and model.card["data_sha256"] == asked["data_sha256"]:
             return model.card["test"]
     torch.set_num_threads(1)
-    features = Features(robot.design_space, learned_variables(robot), robot.lower, robot.upper)
+    features = Features(robot)
     states = {split: training_states(robot, data[split], features) for split in SPLITS}
     key = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:12]
     trainer = Trainer(config.network, config.seed, folder / "parts", key, progress, config.workers)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import softgym_envs
+from softgym_envs.backends import torch_batch
 from softgym_envs.envs import torch_env
 from softgym_envs.envs.torch_env import TorchVectorEnv
 from softgym_envs.errors import DesignError, WeightsError
@@ -125,7 +126,7 @@ def test_rows_without_a_state_end_where_they_were(monkeypatch):
     env = TorchVectorEnv(FINGER, 3, device="cpu", seed=0)
     env.reset()
     _, _, _, _, before = env.step(torch.ones(3, 2))
-    search = env._ensemble.search
+    search = env._model.search
 
     def lose(bodies, target, *arguments, **options):
         u, gradient, found = search(bodies, target, *arguments, **options)
@@ -133,7 +134,7 @@ def test_rows_without_a_state_end_where_they_were(monkeypatch):
             return u, gradient, torch.tensor([True, False, True])
         return u * torch.nan, gradient, torch.zeros_like(found)
 
-    monkeypatch.setattr(env._ensemble, "search", lose)
+    monkeypatch.setattr(env._model, "search", lose)
     monkeypatch.setattr(env, "_draw_goals", lambda bodies, count: torch.zeros(count, 1, 3))
     _, reward, terminated, truncated, info = env.step(torch.ones(3, 2))
     assert truncated.tolist() == [False, True, False] and not terminated.any()
@@ -250,14 +251,14 @@ def test_a_step_is_one_graph(identifier):
 
 @pytest.mark.parametrize("n", [1, 2, 4, 6])
 def test_complementarity(n, monkeypatch):
-    monkeypatch.setattr(torch_env, "PASSES", 8)
+    monkeypatch.setattr(torch_batch, "PIVOT_PASSES", 8)
     rng = np.random.default_rng(n)
     root = rng.normal(size=(500, n, n))
     K = root @ root.swapaxes(1, 2) + 0.3 * np.eye(n)
     q = rng.normal(size=(500, n))
     unilateral = np.arange(n) != 2
     guess = torch.as_tensor((rng.random((500, n)) < 0.5) & unilateral)
-    z, effort, slack, solved = torch_env._complementarity(
+    z, effort, slack, solved = torch_batch.complementarity(
         torch.as_tensor(K), torch.as_tensor(q), guess, tuple(unilateral.tolist())
     )
     W = np.linalg.inv(K)

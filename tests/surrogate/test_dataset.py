@@ -22,11 +22,11 @@ from softgym_envs.surrogate.data.dataset import COLUMNS, generate_dataset, load_
 from softgym_envs.surrogate.data.sampling import (
     SEQUENCES,
     SamplingPlan,
-    learned_variables,
     path_order,
     sample_group,
     select_states,
 )
+from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.testing import live_processes, wait_until
 
 PLAN = SamplingPlan(groups=4, states=3, sequence="halton", seed=5)

@@ -15,9 +15,9 @@ import pytest
 from softgym_envs import cli
 from softgym_envs.errors import DesignError
 from softgym_envs.robots import make_robot
-from softgym_envs.surrogate.data.sampling import learned_variables
 from softgym_envs.surrogate.export import export_c, export_onnx
-from softgym_envs.surrogate.model import Features, SurrogateModel
+from softgym_envs.surrogate.features import Features
+from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential import model as potential
 from softgym_envs.testing import random_states
 
@@ -45,13 +45,12 @@ def random_model(case, seed=0, learned=None):
     """
     import torch
 
-    from softgym_envs.surrogate.potential.network import PotentialNet
+    from softgym_envs.surrogate.potential.torch import PotentialNet
 
     name, options, at_rest, members = CASES[case]
     robot = make_robot(name, **options)
     half = 0.5 * (robot.upper - robot.lower)
-    learned = learned_variables(robot) if learned is None else learned
-    features = Features(robot.design_space, learned, robot.lower, robot.upper)
+    features = Features(robot, learned)
     rest = (0.0 - robot.lower - half) / half if at_rest else None
     states = []
     for member in range(members):

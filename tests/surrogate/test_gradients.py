@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from softgym_envs.robots import make_robot
-from softgym_envs.surrogate.gradients import TorchModel
+from softgym_envs.surrogate.potential.torch import TorchModel
 from softgym_envs.testing import random_states, untrained_potential
 from tests.surrogate.test_model import untrained_residual
 

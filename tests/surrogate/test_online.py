@@ -63,7 +63,7 @@ def test_members_can_be_taken_apart_and_put_together(model):
 def test_members_in_torch_are_those_of_the_kernel(model, robot):
     import torch
 
-    from softgym_envs.surrogate.potential.network import PotentialNet
+    from softgym_envs.surrogate.potential.torch import PotentialNet
 
     states, scales = unstack_members(model.tensors)
     displacement = np.linspace(0.0, 0.02, 7)[:, None]

@@ -17,8 +17,9 @@ import numpy as np
 from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign
 from softgym_envs.mechanics.solvers.statics import Equilibrium, Statics
 from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.features import learned_variables
 
-__all__ = ["SEQUENCES", "SamplingPlan", "learned_variables", "path_order", "sample_group", "select_states"]
+__all__ = ["SEQUENCES", "SamplingPlan", "path_order", "sample_group", "select_states"]
 
 SEQUENCES = ("halton", "sobol", "latin", "random")
 """How points are spread: scrambled Halton and Sobol sequences, a Latin hypercube, independent draws."""
@@ -107,11 +108,6 @@ class SamplingPlan:
         points = self.unit_points(len(names), first, count, self.groups, 0)
         values = ends[:, 0] + points * (ends[:, 1] - ends[:, 0])
         return [space.complete({**self.design, **dict(zip(names, map(float, row), strict=True))}) for row in values]
-
-
-def learned_variables(robot: Robot) -> tuple[str, ...]:
-    """Design variables a surrogate learns: all but the one that only scales efforts."""
-    return tuple(name for name in robot.design_space.names if name != robot.stiffness_variable)
 
 
 def path_order(points: np.ndarray, start: np.ndarray) -> np.ndarray:

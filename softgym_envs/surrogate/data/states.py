@@ -9,7 +9,7 @@ import numpy as np
 
 from softgym_envs.errors import DataError
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.model import Features
+from softgym_envs.surrogate.features import Features
 
 __all__ = ["States", "full_compliance", "stable_rows", "training_states"]
 
@@ -92,7 +92,10 @@ def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
     if len(rest) == 0 or not rest[0]:
         raise DataError("the dataset has no rest state at its beginning")
     count = data["effort"].shape[1]
-    W = full_compliance(data["compliance"], count + data["effector"].shape[1]) * _stiffness(robot, data)[:, None, None]
+    W = (
+        full_compliance(data["compliance"], count + data["effector"].shape[1])
+        * Features(robot).stiffness(data["design"])[:, :, None]
+    )
     a, e = slice(0, count), slice(count, None)
     scale = np.sqrt(np.abs(np.einsum("bii->bi", W)).mean(axis=0))
     rest_of = np.flatnonzero(rest)[np.cumsum(rest) - 1]
@@ -112,14 +115,6 @@ def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
     return stable
 
 
-def _stiffness(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Stiffness relative to the baseline, shape (N,)."""
-    if robot.stiffness_variable is None:
-        return np.ones(len(data["rest"]))
-    variable = robot.design_space[robot.stiffness_variable]
-    return data["design"][:, robot.design_space.names.index(variable.name)] / variable.baseline
-
-
 def training_states(robot: Robot, data: Mapping[str, np.ndarray], features: Features) -> States:
     """Return the stable states of a dataset as matrices.
 
@@ -128,15 +123,14 @@ def training_states(robot: Robot, data: Mapping[str, np.ndarray], features: Feat
     """
     stable = stable_rows(robot, data)
     data = {name: column[stable] for name, column in data.items()}
-    factor = _stiffness(robot, data)
+    factor = features.stiffness(data["design"])
     rest = np.flatnonzero(data["rest"])
     return States(
         design=features.design(data["design"]),
         actuation=features.actuation(data["displacement"]),
         displacement=data["displacement"],
-        effort=data["effort"] / factor[:, None],
+        effort=data["effort"] / factor,
         effector=data["effector"],
-        W=full_compliance(data["compliance"], data["effort"].shape[1] + data["effector"].shape[1])
-        * factor[:, None, None],
+        W=full_compliance(data["compliance"], data["effort"].shape[1] + data["effector"].shape[1]) * factor[:, :, None],
         rest_of=rest[np.cumsum(data["rest"]) - 1],
     )

@@ -58,7 +58,7 @@ class Options(Config):
     learning_rate: float = Field(default=1e-2, gt=0)
 
 
-def body_parts(n: int, e: int, w: int) -> dict[str, int]:
+def coefficient_sizes(n: int, e: int, w: int) -> dict[str, int]:
     """Names and sizes of the coefficients that the design layers give to a body, in their order."""
     entries_a, entries_e = n * (n + 1) // 2, e * (e + 1) // 2
     sizes = (w, w, w, w, entries_a, n, e, e * n, entries_e, w, w)
@@ -512,7 +512,7 @@ class Model(SurrogateModel):
             h = h @ weight.transpose(0, 2, 1) + bias
             if k < 2:
                 h = h / np.sqrt(1.0 + h * h)
-        sizes = body_parts(n, e, w)
+        sizes = coefficient_sizes(n, e, w)
         parts = np.split(h.transpose(1, 0, 2), np.cumsum(list(sizes.values()))[:-1], axis=2)
         body = {k: np.ascontiguousarray(v) for k, v in zip(sizes, parts, strict=True)}
         for name in ("a", "b"):
@@ -639,7 +639,7 @@ def _train_member(
     """Number, state and history of one member."""
     import torch
 
-    from softgym_envs.surrogate.potential.network import PotentialNet
+    from softgym_envs.surrogate.potential.torch import PotentialNet
 
     torch.set_num_threads(1)
     options: Options = trainer.options
@@ -659,32 +659,17 @@ def _train_member(
 
 
 def stack_members(states: list[dict[str, np.ndarray]], scales: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Weights of `Model` from the states of its members in torch."""
-    tensors = {k: np.stack([state[k] for state in states]) for k in states[0] if k != "rest"}
-    linear = sorted({k.split(".")[1] for k in tensors if k.startswith("body.")}, key=int)
-    for k, layer in enumerate(linear):  # numbered without the activations between them
-        for part in ("weight", "bias"):
-            tensors[f"body.{k}.{part}"] = tensors.pop(f"body.{layer}.{part}")
-    if "rest" in states[0]:
-        tensors["rest"] = states[0]["rest"]
+    """Return the weights of `Model` from the states of its members in torch."""
+    tensors = {k: states[0][k] if k == "rest" else np.stack([state[k] for state in states]) for k in states[0]}
     return tensors | {f"scale.{k}": v for k, v in scales.items()}
 
 
 def unstack_members(tensors: Mapping[str, np.ndarray]) -> tuple[list[dict[str, np.ndarray]], dict[str, np.ndarray]]:
-    """States of the members in torch and the scales, from the weights of `Model`: the inverse of `stack_members`."""
+    """Return the states of the members in torch and the scales: the inverse of `stack_members`."""
     scales = {k.removeprefix("scale."): np.asarray(v) for k, v in tensors.items() if k.startswith("scale.")}
-    states: list[dict[str, np.ndarray]] = []
-    for member in range(len(tensors["energy1"])):
-        state = {}
-        for k, v in tensors.items():
-            if k.startswith("scale."):
-                continue
-            if k.startswith("body."):  # in torch the activations between the layers are numbered too
-                _, layer, part = k.split(".")
-                k = f"body.{2 * int(layer)}.{part}"
-            state[k] = v if k == "rest" else v[member]
-        states.append(state)
-    return states, scales
+    weights = {k: v for k, v in tensors.items() if not k.startswith("scale.")}
+    members = range(len(tensors["energy1"]))
+    return [{k: v if k == "rest" else v[member] for k, v in weights.items()} for member in members], scales
 
 
 def _scales(robot: Robot, states: States) -> dict[str, np.ndarray]:

@@ -1,0 +1,246 @@
+"""The potential model over a hundred thousand bodies at once, wholly in torch: nothing leaves the device.
+
+A search takes a fixed sequence of batched matrix products over all rows and all members of the ensemble: every row
+takes the same few Newton steps, whether it needs them or not, and none of them waits for the host. It can therefore be
+captured as a CUDA graph or compiled.
+
+Displacements are scaled to [-1, 1] over the actuators' ranges.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from softgym_envs.backends.surrogate import TOLERANCE
+from softgym_envs.surrogate.model import SurrogateModel
+from softgym_envs.surrogate.potential.model import Model
+from softgym_envs.surrogate.potential.torch import PotentialEnsemble
+
+#: A quarter of an actuator's range, the unit of steps and tolerances of searches, in scaled displacements.
+SPAN = 0.5
+#: Bound on the Newton steps of a row that takes more than the fixed few.
+MAX_NEWTON_STEPS = 25
+#: Passes of pivots in a complementarity problem: the first to the last known slack set, the others to the right one.
+PIVOT_PASSES = 3
+
+Bodies = dict[str, Tensor]
+"""Arrays of S bodies by name, or of one body for all rows."""
+
+#: Arrays of which every member of the ensemble has its own, (M, S, ...); the others are (S, ...).
+_PER_MEMBER = frozenset({"c", "a", "b", "d1", "d2", "x0", "slope", "held"})
+
+
+class TorchBatch:
+    """States of many bodies under commanded displacements, as `solve_displacements` finds them.
+
+    Args:
+        model: a trained ensemble of potential networks.
+        device: where everything is.
+        dtype: of the networks and all results.
+
+    Raises:
+        ValueError: for a model of another network.
+    """
+
+    def __init__(self, model: SurrogateModel, device: torch.device, dtype: torch.dtype) -> None:
+        if not isinstance(model, Model):
+            raise ValueError(f"network '{model.network}' is not supported; allowed: potential")
+
+        def put(values: np.ndarray, kind: torch.dtype = dtype) -> Tensor:
+            return torch.as_tensor(np.array(values, dtype=float), dtype=kind, device=device)
+
+        self.dtype, self.count = dtype, model.count
+        self.middle, self.half_range = put(model.middle), put(model.half_range)
+        self.unilateral = tuple(actuator.unilateral for actuator in model.robot.actuators)
+        self._pulls = torch.tensor(self.unilateral, device=device)
+        self._ensemble = PotentialEnsemble.of_model(model, device, dtype)
+        self._features, self._loaded = model.features, bool(model.card.get("loaded", False))
+        self._calibrated = model.members >= model.trained
+        self._effort_scale = put(model.energy_scale / model.half_range)
+        self._effector_scale, self._effector_mean = model.effector_scale, put(model.effector_mean)
+        domain = model.domain
+        self._inflation, self._limit = domain.inflation, domain.limit
+        self._growth = domain.growth if domain.limits_growth else None
+        self._low, self._high = (put((bound - model.middle) / model.half_range) for bound in (domain.low, domain.high))
+        self._design_low, self._design_high = (put(b, torch.float64) for b in (domain.design_low, domain.design_high))
+
+    def prepare(self, designs: Tensor) -> Bodies:
+        """Return what is known of bodies before they are actuated, and their states at rest; asks the host.
+
+        Args:
+            designs: values in the order of the design space, in double precision (near 0.5 a Poisson's ratio needs its
+                digits), shape (S, len(space)).
+
+        Returns:
+            Arrays of the bodies, among them ``rest`` (S, n_a), ``rest_effort`` (S, n_a), ``rest_effector`` [m] (S, 3),
+            ``rest_uncertainty`` [m] (S,) and ``rest_trusted`` (S,).
+        """
+        bodies = self._ensemble.coefficients(self._features.design(designs).to(self.dtype))
+        bodies["effort"] = self._features.stiffness(designs).to(self.dtype) * self._effort_scale
+        bodies["known"] = ((designs >= self._design_low) & (designs <= self._design_high)).all(dim=1)
+        zero = (-self.middle / self.half_range).expand(len(designs), -1)
+        if self._growth is not None:
+            bodies["unmoved"] = self._ensemble.curvature(bodies, zero)
+            bodies["known"] &= _definite(bodies["unmoved"])
+        if self._loaded:
+            u, gradient, _ = self.search(bodies, zero, zero, MAX_NEWTON_STEPS, stop=True)
+        else:
+            u = self._without_effort(bodies, zero)
+            gradient = self._ensemble.gradient(bodies, u)
+        bodies["rest"], bodies["rest_effort"] = u, gradient * bodies["effort"]
+        bodies["rest_effector"], bodies["rest_uncertainty"], bodies["rest_trusted"] = self.measure(bodies, u)
+        return bodies
+
+    def measure(self, bodies: Bodies, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """First effector [m] (B, 3), its uncertainty [m] (B,), and whether it is trusted (B,), at displacements u."""
+        x = self._ensemble.effectors(bodies, u)
+        mean = x.mean(dim=0)
+        effector = (mean * self._effector_scale + self._effector_mean)[:, :3]
+        if self._calibrated:
+            square = ((x - mean) ** 2).mean(dim=0).reshape(len(u), -1, 3).sum(dim=2)
+            uncertainty = torch.sqrt(square.amax(dim=1)) * (self._effector_scale * self._inflation)
+        else:
+            uncertainty = torch.full_like(mean[:, 0], torch.inf)
+        inside = ((u >= self._low) & (u <= self._high)).all(dim=1)
+        trusted = inside & bodies["known"] & ((uncertainty <= self._limit) | torch.isinf(uncertainty))
+        if self._growth is not None:
+            trusted &= _definite(self._growth * self._ensemble.curvature(bodies, u) - bodies["unmoved"])
+        return effector, uncertainty, trusted
+
+    def efforts(self, bodies: Bodies, target: Tensor, u: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        """Efforts [N, ...] (B, n_a) and slack actuators (B, n_a) of the results of `search`."""
+        slack = self._pulls & (u > target + (10.0 * TOLERANCE) * SPAN)
+        gradient = torch.where(self._pulls, gradient.clamp(min=0.0), gradient).masked_fill(slack, 0.0)
+        return gradient * bodies["effort"], slack
+
+    def search(
+        self, bodies: Bodies, target: Tensor, guess: Tensor, iterations: int, *, stop: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Find the displacements that real cables reach: `SurrogateModel.search`, on scaled displacements (B, n).
+
+        Args:
+            bodies: from `prepare`.
+            target: commanded displacements.
+            guess: where the search begins.
+            iterations: Newton steps of every row.
+            stop: ask the host before every step whether a row still moves, and stop when none does.
+
+        Returns:
+            Displacements (B, n), gradients (B, n), and whether they were found (B,).
+        """
+        if not any(self.unilateral):
+            gradient = self._ensemble.gradient(bodies, guess)
+            return guess, gradient, torch.isfinite(gradient).all(dim=1)
+        u = guess
+        for iteration in range(iterations):
+            # The Hessian changes slowly along the search; a simplified Newton step is cheaper than a new one.
+            if iteration % 4 == 0:
+                gradient, hessian = self._ensemble.derivatives(bodies, u)
+            else:
+                gradient = self._ensemble.gradient(bodies, u)
+            if iteration == 0:
+                wrong = ((gradient < 0.0) | (guess > target)) & self._pulls
+                found = torch.isfinite(gradient).all(dim=1) & ~wrong.any(dim=1)
+                effort, slack = gradient, guess > target
+            if stop and bool(found.all()):
+                break
+            # In the displacement beyond the command, z >= 0, the effort is K z + q >= 0.
+            ahead = target - u
+            q = gradient + (hessian * ahead[:, None, :]).sum(dim=2)
+            z, taut, slack, solved = complementarity(hessian, q, slack, self.unilateral)
+            step = torch.clamp(ahead + z, -SPAN, SPAN)
+            still = (step.abs() <= TOLERANCE * SPAN).all(dim=1)
+            # A last step below the tolerance is taken without asking the model again.
+            u = torch.where(found[:, None], u, u + step)
+            effort = torch.where(found[:, None], effort, taut)
+            found = found | (still & solved)
+        return u, effort, found
+
+    def _without_effort(self, bodies: Bodies, start: Tensor) -> Tensor:
+        """Find displacements (B, n) without effort by Newton's method; asks the host."""
+        u = start
+        for _ in range(50):
+            gradient, hessian = self._ensemble.derivatives(bodies, u)
+            step = -torch.linalg.solve_ex(hessian, gradient)[0]
+            moving = (step.abs() > TOLERANCE * SPAN).any(dim=1, keepdim=True)
+            if not bool(moving.any()):
+                break
+            u = torch.where(moving, u + step.clamp(-SPAN, SPAN), u)
+        return u
+
+
+def complementarity(
+    K: Tensor, q: Tensor, slack: Tensor, unilateral: tuple[bool, ...]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Solve ``0 <= z _|_ K z + q >= 0`` (z = 0 in bilateral rows) by principal pivots, in a fixed number of passes.
+
+    A pivot exchanges an actuator's z with its effort: a rank-one update of the tableau, masked by row of the batch.
+    The first pass exchanges those that were slack before, the others every one of a wrong sign, in turn.
+
+    Args:
+        K: symmetric positive definite, shape (B, n, n).
+        q: shape (B, n).
+        slack: guess of where z > 0, shape (B, n).
+        unilateral: n flags.
+
+    Returns:
+        z (B, n), K z + q (B, n), the slack set (B, n), and whether its signs are right (B,).
+    """
+    n = q.shape[1]
+    # With a unit diagonal the pivots are of order one: the sum that makes a rank-one update exact loses no digits.
+    scale = torch.rsqrt(torch.diagonal(K, dim1=1, dim2=2))
+    q = scale * q
+    tableau = torch.cat([K * scale[:, :, None] * scale[:, None, :], q[:, :, None]], dim=2).permute(1, 2, 0).contiguous()
+    slightly = -4.0 * torch.finfo(q.dtype).eps * q.abs().amax(dim=1)
+    unit = torch.eye(n, n + 1, dtype=q.dtype, device=q.device)[:, :, None]
+    free = list(slack.unbind(dim=1))
+    pull = [p for p in range(n) if unilateral[p]]
+    for sweep in range(PIVOT_PASSES):
+        for p in pull:
+            if sweep == 0:
+                exchanged = free[p]
+            else:
+                exchanged = tableau[p, n] < slightly
+                free[p] = free[p] ^ exchanged
+            inverse = torch.where(exchanged, 1.0 / tableau[p, p], 0.0)
+            column = (tableau[:, p] + unit[p, :n]) * inverse
+            tableau = torch.addcmul(tableau, column[:, None], tableau[p] - unit[p], value=-1.0)
+    value, slack = tableau[:, n].mT, torch.stack(free, dim=1)
+    right = torch.stack([value[:, p] >= slightly for p in pull]).all(dim=0)
+    return torch.where(slack, value, 0.0) * scale, torch.where(slack, 0.0, value) / scale, slack, right
+
+
+def _definite(a: Tensor) -> Tensor:
+    """Whether symmetric matrices (B, n, n) are positive definite, (B,): all pivots of the elimination are positive."""
+    found = torch.ones(len(a), dtype=torch.bool, device=a.device)
+    while a.shape[1]:
+        pivot = a[:, :1, :1]
+        found &= pivot[:, 0, 0] > 0.0
+        a = a[:, 1:, 1:] - a[:, 1:, :1] * a[:, :1, 1:] / pivot
+    return found
+
+
+def take_rows(bodies: Bodies, index: Tensor) -> Bodies:
+    """Return the bodies of some rows; one body for all rows stays one."""
+    if len(bodies["rest"]) == 1:
+        return bodies
+    return {name: value[_rows(name, index)] for name, value in bodies.items()}
+
+
+def put_rows(bodies: Bodies, index: Tensor, new: Bodies) -> None:
+    """Overwrite the bodies of some rows."""
+    for name, value in new.items():
+        bodies[name][_rows(name, index)] = value
+
+
+def repeat_body(bodies: Bodies, count: int) -> Bodies:
+    """Return ``count`` copies of a single body."""
+    return {name: value.repeat_interleave(count, dim=1 if name in _PER_MEMBER else 0) for name, value in bodies.items()}
+
+
+def _rows(name: str, index: Tensor) -> Any:
+    return (slice(None), index) if name in _PER_MEMBER else index
