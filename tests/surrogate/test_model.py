@@ -380,7 +380,7 @@ def test_weights_that_are_not_finite(copied):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ([], "no mapping"),
+        ([], "not a mapping"),
         ({"displacement": [[0.0, 0.01]]}, r"displacements of shape \(1, 2\), not \(2, 2\)"),
         ({"design": {"weight": [0.0, 1.0]}}, "unknown design variables: weight"),
     ],
