@@ -77,7 +77,7 @@ class Registry(Mapping[str, type]):
             found = name_or_class
         else:
             raise ValueError(unknown_name(self.kind, name_or_class, self))
-        return self._checked(self._import(found) if isinstance(found, str) else found)
+        return self._checked(import_object(self.kind, found) if isinstance(found, str) else found)
 
     def make(self, name_or_class: object, *arguments: object, **options: object) -> Any:
         """Return an object of a class of this registry.
@@ -141,17 +141,6 @@ class Registry(Mapping[str, type]):
                     stacklevel=3,
                 )
 
-    def _import(self, path: str) -> type:
-        module, _, name = path.partition(":")
-        try:
-            return getattr(import_module(module), name)
-        except ModuleNotFoundError as error:
-            if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-                raise  # the module exists, but one that it imports does not
-            raise ValueError(f"{self.kind} '{path}': there is no module '{module}'") from None
-        except AttributeError:
-            raise ValueError(f"{self.kind} '{path}': module '{module}' has no '{name}'") from None
-
     def _checked(self, cls: object) -> type:
         module, _, name = self._base.partition(":")
         base = getattr(import_module(module), name)
@@ -169,6 +158,28 @@ class Registry(Mapping[str, type]):
             raise ValueError(f"{self.kind} class {_path(cls)} is named '{own}': it cannot be registered as '{name}'")
         cls.name = name  # type: ignore[attr-defined]
         return name
+
+
+def import_object(kind: str, path: str) -> Any:
+    """Return the object at a path ``"module:name"``.
+
+    Args:
+        kind: what the object should be, for messages: ``"robot"``, ...
+        path: the path.
+
+    Raises:
+        ValueError: if there is no such module, or no such name in it.
+    """
+    name_of_module, _, name = path.partition(":")
+    try:
+        module = import_module(name_of_module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{name_of_module}.".startswith(f"{error.name}."):
+            raise  # the module exists, but one that it imports does not
+        raise ValueError(f"{kind} '{path}': there is no module '{name_of_module}'") from None
+    if not hasattr(module, name):
+        raise ValueError(f"{kind} '{path}': module '{name_of_module}' has no '{name}'")
+    return getattr(module, name)
 
 
 def check_options(owner: str, cls: type, positional: int, options: Mapping[str, object]) -> None:
