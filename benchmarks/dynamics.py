@@ -106,7 +106,7 @@ def rigid_box(**options) -> MechanicalModel:
 
 def waves(model: MechanicalModel, spin: float) -> np.ndarray:
     """Velocities of the equations (N,) of a bar or rod along x: two waves of bending, and a spin [rad/s] about z."""
-    free = model.free_dofs // 3, model.free_dofs % 3
+    free = model.kinematics.free_dofs // 3, model.kinematics.free_dofs % 3
     points = np.flatnonzero(np.bincount(free[0], minlength=len(model.nodes)))
     length = np.ptp(model.nodes[points, 0])
     s = model.nodes[:, 0] / length - 0.5
@@ -115,15 +115,15 @@ def waves(model: MechanicalModel, spin: float) -> np.ndarray:
     )
     slope_y, slope_z = spin - 0.4 * np.pi * np.sin(2 * np.pi * s), -0.1 * np.pi * np.sin(np.pi * s)
     velocity = np.zeros(model.equations)
-    velocity[: len(model.free_dofs)] = across[free]
+    velocity[: len(model.kinematics.free_dofs)] = across[free]
     rows = model.frames.rows
-    velocity[len(model.free_dofs) :] = np.column_stack([0 * rows, -slope_z[rows], slope_y[rows]]).ravel()
+    velocity[len(model.kinematics.free_dofs) :] = np.column_stack([0 * rows, -slope_z[rows], slope_y[rows]]).ravel()
     return velocity
 
 
 def momenta(solver: Dynamics) -> tuple[np.ndarray, np.ndarray]:
     """Linear and angular momentum of the present state [kg m/s, kg m2/s], each (3,)."""
-    flow = solver.model.mass_matrix() @ solver.velocity
+    flow = solver.model.assembly.mass_matrix().rows @ solver.velocity
     directors = (solver.model.frames.rows[:, None] + np.arange(1, 4)).ravel()
     linear = np.delete(flow, directors, axis=0).sum(axis=0)
     return linear, np.cross(solver.x, flow).sum(axis=0)
@@ -143,7 +143,7 @@ def conservation(steps: int = 1000) -> list[Row]:
         solver = Dynamics(model, step=step, scheme="generalised_alpha", spectral_radius=1.0)
         # A drift sideways, so that the linear momentum is not zero.
         velocity = waves(model, spin)
-        velocity[: len(model.free_dofs)] += 0.1 * (model.free_dofs % 3 == 0)
+        velocity[: len(model.kinematics.free_dofs)] += 0.1 * (model.kinematics.free_dofs % 3 == 0)
         solver.launch(velocity)
         energy, (linear, angular) = sum(solver.energies()), momenta(solver)
         worst = np.zeros(3)
@@ -242,14 +242,15 @@ def order(levels: Sequence[int] = (64, 128, 256), fine: int = 2048) -> list[Row]
 
 def eigenmodes(model: MechanicalModel, lumped: bool, count: int = 20) -> tuple[np.ndarray, np.ndarray]:
     """Lowest angular frequencies [rad/s] (count,) about rest and the modes (N, count), by tangent and mass matrix."""
-    model.prepare()
-    tangent = model.assemble(model.nodes, np.zeros(model.size))[1].copy()  # type: ignore[index]
-    indptr, indices = model.tangent_pattern
+    assembly = model.assembly
+    assembled = assembly.evaluate(model.nodes, np.zeros(assembly.size), model.loads)
+    assert assembled is not None
+    tangent, indptr, indices = assembled.tangent.copy(), assembly.indptr, assembly.indices
     lower = csc_matrix((tangent, indices, indptr)).toarray()
     stiffness = lower + np.tril(lower, -1).T
     # Each equation moves rows; the mass matrix is one of the rows.
-    motions = np.array([model.row_velocity(model.nodes, unit) for unit in np.eye(model.equations)])
-    matrix = model.mass_matrix(lumped)
+    motions = np.array([model.kinematics.row_velocity(model.nodes, unit) for unit in np.eye(model.equations)])
+    matrix = model.assembly.mass_matrix(lumped).rows
     mass = np.einsum("and,bnd->ab", motions, np.array([matrix @ motion for motion in motions]))
     squares, modes = eigh(stiffness, mass, subset_by_index=[0, count - 1])
     return np.sqrt(squares), modes
@@ -339,7 +340,7 @@ def pendulum(count: int, spin: Sequence[float], *, joint: str = "bond", **option
     model.add("e", Point("end", EmbeddedPoints.in_frame(bars[-1], -end, model.nodes)))
     solver = Dynamics(model, tolerance=1e-12, **options)
     velocity = np.cross(spin, model.nodes)
-    solver.launch(model.equation_velocity(model.nodes, velocity))
+    solver.launch(model.kinematics.equation_velocity(model.nodes, velocity))
     return solver
 
 
@@ -626,7 +627,7 @@ def hanging() -> list[Row]:
             torque = float(np.abs(backend.state.effort).max())
             rows.append(Row("Tetrapod: servo torque at rest [N m]", f"{1e3 * payload:g} g at its centre", torque))
     solver = tetrapod_at_rest(step=0.01, stiffness_damping=0.02)
-    still = float(solver._rows_delta()[6])
+    still = float(solver.model.constraints["e"][0].value(solver.x)[2])
     lifted = Statics(solver.model)
     lifted.restore(solver.x, solver.effort)
     force = np.array([0.0, 0.0, 3.0])

@@ -20,6 +20,7 @@ from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.mechanics.solvers.statics import Statics
 
 __all__ = ["CASES", "Row", "validation"]
@@ -150,11 +151,11 @@ def traction(model: MechanicalModel, selected: Callable[[np.ndarray], np.ndarray
 
 def linear_response(model: MechanicalModel, loads: np.ndarray) -> np.ndarray:
     """Displacements [m] (n, 3) under small loads [N] (n, 3): one solve with the tangent at rest."""
-    model.prepare()
-    tangent = model.assemble(model.nodes, np.zeros(model.size))[1]  # type: ignore[index]
-    assert model.solver.factorise(tangent)
+    tangent = Linearisation(model)
+    assert tangent.update(model.nodes, np.zeros(model.assembly.size))
+    free = model.kinematics.free_dofs
     moved = np.zeros(model.nodes.size)
-    moved[model.free_dofs] = model.solver.solve(loads.ravel()[model.free_dofs][:, None])[:, 0]
+    moved[free] = tangent.solve(loads.ravel()[free])
     return moved.reshape(-1, 3)
 
 
@@ -386,7 +387,6 @@ def bend(
             across = along // 16
             model = solid(box((along, across, across)), "quadratic", lambda x: x[:, 0] == 0.0, _bend_of_box, **options)
             model.nodal_loads[:] = traction(model, _is_end_of_bend, np.array([0.0, 0.0, load]))
-            model.refresh_loads()
             x = Statics(model, tolerance=1e-7).solve([]).x
             tip = model.nodal_loads[:, 2] @ x / load
             level = f"{along} x {across} x {across} cells"

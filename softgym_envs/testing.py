@@ -110,7 +110,7 @@ def clamped_beam(order: int = 1, shape: str = "straight", elements: int = 3, **o
 
 def dense_tangent(model: MechanicalModel, values: np.ndarray) -> np.ndarray:
     """Return the symmetric matrix (n, n) of lower-triangle ``values`` on the model's sparsity pattern."""
-    indptr, indices = model.tangent_pattern
+    indptr, indices = model.assembly.indptr, model.assembly.indices
     lower = csc_matrix((values.copy(), indices, indptr), shape=2 * (len(indptr) - 1,)).toarray()
     assert np.allclose(np.triu(lower, 1), 0.0)
     return lower + np.tril(lower, -1).T
@@ -138,32 +138,32 @@ def derivative_errors(model: MechanicalModel, x: np.ndarray, effort: np.ndarray)
     tangent is the second derivative along exponential maps. The contribution of bonds is subtracted.
     """
 
-    def assembled(y: np.ndarray) -> list[np.ndarray]:
-        arrays = model.assemble(y, effort)
-        assert arrays is not None, "an element is inverted"
-        return [array.copy() for array in arrays]
+    def evaluate(y: np.ndarray) -> list[np.ndarray]:
+        assembled = model.assembly.evaluate(y, effort, model.loads)
+        assert assembled is not None, "an element is inverted"
+        return [array.copy() for array in assembled]
 
-    residual, values, H, _ = assembled(x)
+    residual, values, H, _ = evaluate(x)
     tangent = dense_tangent(model, values)
     bonds = sum(c.size for c in model.constraints["b"])
     if bonds:
-        tangent -= model.bond_stiffness * H[:, -bonds:] @ H[:, -bonds:].T
+        tangent -= model.assembly.bond_stiffness * H[:, -bonds:] @ H[:, -bonds:].T
 
     def potential(y: np.ndarray) -> float:
         return model.energy(y) - sum(effort[rows] @ c.value(y) for c, rows in model.rows)
 
-    count = model.equations
+    count, scale = model.equations, model.kinematics.dof_scale
     slope, matrix, gradients = np.empty(count), np.empty((count, count)), np.empty_like(H)
     for k in range(count):
         step = np.zeros(count)
         # Round-off of the energy demands larger steps [m] than round-off of the residual.
         for h, quantity in ((1e-6, "energy"), (1e-7, "residual")):
-            step[k] = h / model.dof_scale[k]
-            plus, minus = x + model.warp(x, step), x + model.warp(x, -step)
+            step[k] = h / scale[k]
+            plus, minus = x + model.warping.displacement(x, step), x + model.warping.displacement(x, -step)
             if quantity == "energy":
                 slope[k] = (potential(plus) - potential(minus)) / (2 * step[k])
             else:
-                after, before = assembled(plus), assembled(minus)
+                after, before = evaluate(plus), evaluate(minus)
                 matrix[:, k] = (after[0] - before[0]) / (2 * step[k])
                 gradients[k] = (after[3] - before[3]) / (2 * step[k])
     symmetric = 0.5 * (matrix + matrix.T)
@@ -171,7 +171,7 @@ def derivative_errors(model: MechanicalModel, x: np.ndarray, effort: np.ndarray)
     unit = 1.0 / np.sqrt(np.abs(np.diag(symmetric)))
     scaled = unit[:, None] * np.abs(symmetric - tangent) * unit
     return DerivativeErrors(
-        gradient=float((np.abs(slope - residual) / model.dof_scale).max() / np.abs(residual / model.dof_scale).max()),
+        gradient=float((np.abs(slope - residual) / scale).max() / np.abs(residual / scale).max()),
         tangent=float(scaled.max()),
         constraints=float(np.abs(gradients - H).max(initial=0.0) / np.abs(H).max(initial=1.0)),
     )

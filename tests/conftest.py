@@ -100,7 +100,6 @@ def finger(request, fingers):
     robot, model = fingers(*request.param)
     model.nodal_loads[:] = 0.0
     model.set_gravity((0.0, 0.0, 0.0))
-    model.refresh_loads()
     return SimpleNamespace(robot=robot, model=model, statics=Statics(model, tolerance=1e-12))
 
 

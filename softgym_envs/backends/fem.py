@@ -22,7 +22,7 @@ def _let_fall(model: MechanicalModel, statics: Statics, command: np.ndarray, mod
     fall = Dynamics(model, step=0.02, stiffness_damping=0.02, tolerance=1e-8)
     for _ in range(200):
         motion = fall.advance(command, mode)
-        if np.abs(motion.velocity).max() * model.dof_scale.max() < 1e-3:
+        if np.abs(motion.velocity).max() * model.kinematics.dof_scale.max() < 1e-3:
             break
     statics.restore(fall.x, fall.effort)
     return statics.solve(command, mode)

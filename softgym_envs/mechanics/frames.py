@@ -14,12 +14,11 @@ the symmetric one) and ``c`` 1 for points, 0 for directors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from scipy.sparse import csr_matrix
-
-__all__ = ["Frames", "KinematicMap", "frame_rows", "rotation_of", "rotation_vector_matrix"]
 
 
 def frame_rows(position: np.ndarray | Sequence[float], rotation: np.ndarray | None = None) -> np.ndarray:
@@ -114,46 +113,28 @@ def _add_curvature(values, owner, count, arms, gradient, target):
 
 
 @njit(cache=True)
-def _expand(values, count, low, high, start, column, coefficient, target):
-    """Add entries of the tangent that touch carried rows to the entries of the degrees of freedom behind them."""
-    k = 0
-    for m in range(low.shape[0]):
-        v = values[count + m]
-        i, j = low[m], high[m]
-        for p in range(start[i], start[i + 1]):
-            for q in range(start[j], start[j + 1]):
-                if i == j and column[q] > column[p]:
-                    continue
-                w = v * coefficient[p] * coefficient[q]
-                if i != j and column[p] == column[q]:
-                    w *= 2.0  # the entry and its mirror image meet on the diagonal
-                values[target[k]] += w
-                k += 1
+def _expand(values, offset, source, first, second, factor, target, coefficient):
+    for t in range(source.shape[0]):
+        v = values[offset + source[t]]
+        values[target[t]] += v * coefficient[first[t]] * coefficient[second[t]] * factor[t]
 
 
-@njit(cache=True)
-def _expansion_pairs(low, high, start, column):
-    """Low and high degree of freedom of every term of `_expand`, in its order."""
-    count = 0
-    for m in range(low.shape[0]):
-        i, j = low[m], high[m]
-        for p in range(start[i], start[i + 1]):
-            for q in range(start[j], start[j + 1]):
-                if i == j and column[q] > column[p]:
-                    continue
-                count += 1
-    pairs = np.empty((count, 2), dtype=np.int64)
-    k = 0
-    for m in range(low.shape[0]):
-        i, j = low[m], high[m]
-        for p in range(start[i], start[i + 1]):
-            for q in range(start[j], start[j + 1]):
-                if i == j and column[q] > column[p]:
-                    continue
-                pairs[k, 0] = min(column[p], column[q])
-                pairs[k, 1] = max(column[p], column[q])
-                k += 1
-    return pairs
+class Expansion(NamedTuple):
+    """How tangent entries of carried rows add to entries of the equations, as a list of products.
+
+    Attributes:
+        source: entry that is expanded, shape (t,).
+        first: term of the kinematic map for its low index, shape (t,).
+        second: term for its high index, shape (t,).
+        factor: 2 where the entry and its mirror image meet on the diagonal, else 1, shape (t,).
+        pairs: low and high equation that the product adds to, shape (t, 2).
+    """
+
+    source: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    factor: np.ndarray
+    pairs: np.ndarray
 
 
 class Frames:
@@ -265,9 +246,9 @@ class KinematicMap:
         #: Its transpose, on the same data.
         self.transposed = self.matrix.T
         # The same with the identity of the free equations before it.
-        self.start = np.concatenate([np.arange(size), size + pointers])
-        self.column = np.concatenate([np.arange(size), np.array(columns, dtype=np.int64)])
-        self._coefficient = np.ones(len(self.column))
+        self._start = np.concatenate([np.arange(size), size + pointers])
+        self._column = np.concatenate([np.arange(size), np.array(columns, dtype=np.int64)])
+        self._coefficient = np.ones(len(self._column))
         # Spin block of each frame that gets the second derivative of its carried rows.
         pairs = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
         self._spin = spin
@@ -288,23 +269,35 @@ class KinematicMap:
         self._coefficient[self.size :] = data
         return arms
 
-    def plan(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Pairs of equations (t, 2) that tangent entries between rows ``low`` and ``high`` lead to.
+    def plan(self, low: np.ndarray, high: np.ndarray) -> Expansion:
+        """Find what tangent entries between rows ``low`` and ``high`` add to entries of the equations.
 
         Rows are numbered as equations, then components of carried rows.
         """
-        self._low, self._high = low, high
-        return _expansion_pairs(low, high, self.start, self.column)
+        counts = np.diff(self._start)
+        products = counts[low] * counts[high]
+        source = np.repeat(np.arange(len(low)), products)
+        within = np.arange(len(source)) - np.repeat(np.cumsum(products) - products, products)
+        i, j = low[source], high[source]
+        first, second = self._start[i] + within // counts[j], self._start[j] + within % counts[j]
+        one, other = self._column[first], self._column[second]
+        lower = (i != j) | (other <= one)  # of an entry on the diagonal, both halves would be listed
+        factor = np.where((i != j) & (one == other), 2.0, 1.0)
+        pairs = np.sort(np.stack([one, other], axis=1), axis=1)
+        return Expansion(source[lower], first[lower], second[lower], factor[lower], pairs[lower])
 
-    def set_targets(self, target: np.ndarray, spin_target: np.ndarray) -> None:
-        """Give the place in the tangent's values of each pair of `plan` and of `spin_pairs` (-1: nowhere)."""
-        self._target = target
-        self._spin_target = spin_target
+    def expand(self, values: np.ndarray, offset: int, expansion: Expansion, target: np.ndarray) -> None:
+        """Add entries ``values[offset:]`` of carried rows to the places ``target`` of the expansion's pairs."""
+        source, first, second, factor, _ = expansion
+        _expand(values, offset, source, first, second, factor, target, self._coefficient)
 
-    def expand(self, values: np.ndarray, count: int) -> None:
-        """Bring entries ``values[count:]`` of carried rows to the entries ``values[:count]`` of the equations."""
-        _expand(values, count, self._low, self._high, self.start, self.column, self._coefficient, self._target)
+    def add_curvature(self, values: np.ndarray, arms: np.ndarray, gradient: np.ndarray, target: np.ndarray) -> None:
+        """Add the second derivative of the map to the tangent.
 
-    def add_curvature(self, values: np.ndarray, arms: np.ndarray, gradient: np.ndarray) -> None:
-        """Add the second derivative of the map under the gradient (c, 3) of the carried rows to the tangent."""
-        _add_curvature(values, self.frames.owner, len(self.frames), arms, gradient, self._spin_target)
+        Args:
+            values: values of the tangent.
+            arms: result of `linearise`, shape (c, 3).
+            gradient: energy gradient of the carried rows, shape (c, 3).
+            target: places of `spin_pairs` in the values, -1 for pairs that are fixed.
+        """
+        _add_curvature(values, self.frames.owner, len(self.frames), arms, gradient, target)

@@ -220,7 +220,6 @@ class PressFinger(FingerRobot):
         assert frame is not None
         self.tie_contacts(model, frame)
         model.nodal_loads[frame, 1] = -self.button_force
-        model.refresh_loads()
         model.add("e", Point("button", EmbeddedPoints.in_frame(frame, np.zeros(3), model.nodes)))
         model.skins.append(box_skin(frame, self.half_extents, model.nodes))
 

@@ -248,7 +248,6 @@ class SensorizedFinger(MeshedRobot):
         if self.cavities == 4:
             point = model.embed(np.array(_LATERAL_POINT) * 1e-3)
             model.nodal_loads[point.node_ids[0], 0] += lateral_force * point.weights[0]
-            model.refresh_loads()
             statics.reset()
             pushed = volumes + statics.solve([0.0]).condensed.delta.s
             sensitivity = min(change / float(pulled[0]), abs(float(pushed[0] - rest[0])) / float(pushed[0]))

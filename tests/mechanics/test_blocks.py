@@ -35,7 +35,9 @@ def moved(model, rng, amplitude=2e-4):
     """Positions after a large bend with noise of 0.2 mm, by warping random steps."""
     x = model.nodes
     for _ in range(3):
-        x = x + model.warp(x, amplitude * rng.standard_normal(model.equations) / model.dof_scale)
+        x = x + model.warping.displacement(
+            x, amplitude * rng.standard_normal(model.equations) / model.kinematics.dof_scale
+        )
     assert np.isfinite(model.energy(x))
     return x
 
@@ -199,13 +201,13 @@ def test_weight_of_a_beam(make_beam, order):
 
 def test_warping_equals_a_small_step_and_keeps_rigid_turns(body, rng):
     x = moved(body, rng)
-    step = rng.standard_normal(body.equations) / body.dof_scale
+    step = rng.standard_normal(body.equations) / body.kinematics.dof_scale
     ratios = []
     for size in (1e-5, 1e-6):
-        warped = body.warp(x, size * step).ravel()[body.free_dofs]
-        ratios.append(np.abs(warped - size * step[: len(body.free_dofs)]).max() / size)
+        warped = body.warping.displacement(x, size * step).ravel()[body.kinematics.free_dofs]
+        ratios.append(np.abs(warped - size * step[: len(body.kinematics.free_dofs)]).max() / size)
     assert ratios[1] < 0.15 * ratios[0] + 1e-9  # the difference is quadratic
-    assert not body.warp(x, step)[body.fixed].any()
+    assert not body.warping.displacement(x, step)[body.fixed].any()
 
 
 # -- patch tests ----------------------------------------------------------------------------------------------------
@@ -266,7 +268,6 @@ def test_patch_under_tension_on_its_faces(box, element, material):
     assert pull[end, 0].sum() == pytest.approx(0.03 * 0.02, rel=1e-12)
     stress = 3e4
     model.nodal_loads[end, 0] = stress * pull[end, 0]
-    model.refresh_loads()
     x = Statics(model, tolerance=1e-14).solve([]).x
     stretch = x[end, 0].mean() / size[0]
     F = np.linalg.lstsq(model.nodes, x, rcond=None)[0].T

@@ -101,7 +101,9 @@ def test_mass_damping_slows_a_free_body_exponentially(alpha):
     for _ in range(200):
         motion = solver.advance([])
     expected = np.exp(-alpha) * np.array([1.0, 0.0, 0.0, 0.0, 0.0, 2.0])
-    np.testing.assert_allclose(solver.model.equation_velocity(solver.x, solver.velocity), expected, atol=2e-5)
+    np.testing.assert_allclose(
+        solver.model.kinematics.equation_velocity(solver.x, solver.velocity), expected, atol=2e-5
+    )
     start = 0.5 * 2.0 + 0.5 * 0.008 * 4.0
     assert motion.dissipated == pytest.approx(start - motion.kinetic, rel=0.02)
 
@@ -160,16 +162,16 @@ def test_frequencies_in_time():
 def test_masses(lumped):
     """Translation has the mass of the body; a turn about an axis has its moment of inertia."""
     for model in (cases.solid_bar(clamped=False), cases.rod(clamped=False), cases.rigid_box()):
-        matrix = model.mass_matrix(lumped)
+        matrix = model.assembly.mass_matrix(lumped).rows
         shift = np.zeros(model.equations)
-        shift[: len(model.free_dofs)] = model.free_dofs % 3 == 1
-        velocity = model.row_velocity(model.nodes, shift)
+        shift[: len(model.kinematics.free_dofs)] = model.kinematics.free_dofs % 3 == 1
+        velocity = model.kinematics.row_velocity(model.nodes, shift)
         assert np.vdot(velocity, matrix @ velocity) == pytest.approx(model.mass, rel=1e-12)
     inertia = {}
     for lumped_ in (False, True):
         rod = cases.rod(clamped=False, elements=10)
         velocity = np.cross([0.0, 0.0, 1.0], rod.nodes)
-        inertia[lumped_] = np.vdot(velocity, rod.mass_matrix(lumped_) @ velocity)
+        inertia[lumped_] = np.vdot(velocity, rod.assembly.mass_matrix(lumped_).rows @ velocity)
     radius = 0.01
     exact = rod.mass * (1.0 / 3.0 + 0.25 * radius**2)
     assert inertia[False] == pytest.approx(exact, rel=1e-10)
@@ -253,7 +255,7 @@ def test_a_step_that_cannot_be_cut_further_leaves_the_state():
     assert caught.value.fraction == 0.0
     for part, old in zip([p for p in solver.snapshot if p is not None], before, strict=True):
         np.testing.assert_array_equal(part, old)
-    assert solver.model.inertia is None
+    assert solver.linearisation.inertia is None
     motion = solver.advance(0.02 * JUMP)  # and goes on
     np.testing.assert_allclose(motion.equilibrium.delta[:4], 0.02 * JUMP, rtol=0, atol=1e-10)
 
@@ -380,7 +382,7 @@ def test_bad_commands_and_launches():
     ):
         with pytest.raises(ValueError, match=message):
             solver.advance(target, **options)
-        assert solver.model.inertia is None
+        assert solver.linearisation.inertia is None
         np.testing.assert_array_equal(solver.x, start)
     with pytest.raises(ValueError, match=r"velocity must have shape \(1,\), got \(3,\)"):
         solver.launch(np.zeros(3))
@@ -393,7 +395,7 @@ def test_an_impossible_start_is_said():
     solver.restore(x, solver.effort)
     with pytest.raises(ConvergenceError, match="no motion over 0.01 s"):
         solver.advance([0.0])
-    assert solver.model.inertia is None
+    assert solver.linearisation.inertia is None
 
 
 def test_every_case_is_in_the_benchmark():

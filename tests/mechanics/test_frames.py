@@ -72,7 +72,9 @@ def constrain(model, plate, part):
 def moved(model, rng, amplitude=1.5e-4):
     x = model.nodes
     for _ in range(4):
-        x = x + model.warp(x, amplitude * rng.standard_normal(model.equations) / model.dof_scale)
+        x = x + model.warping.displacement(
+            x, amplitude * rng.standard_normal(model.equations) / model.kinematics.dof_scale
+        )
     assert np.isfinite(model.energy(x))
     return x
 
@@ -85,10 +87,9 @@ def moved(model, rng, amplitude=1.5e-4):
 def test_derivatives_through_carried_nodes_frames_and_bonds(capped, derivatives, rng, element, material):
     model, plate, part = capped(element, material)
     constrain(model, plate, part)
-    model.prepare()
     model.set_gravity((1.0, -2.0, -9.81))
     unit = {"Pa": 1e3, "N": 0.2, "N m": 2e-3}
-    effort = rng.standard_normal(model.size) * [unit[c.unit[1]] for c, _ in model.rows for _ in range(c.size)]
+    effort = rng.standard_normal(model.assembly.size) * [unit[c.unit[1]] for c, _ in model.rows for _ in range(c.size)]
     # Element boundaries of the quadratic mesh are half as far apart.
     errors = derivatives(model, moved(model, rng, 0.7e-4 if element == "quadratic" else 1.5e-4), effort)
     print(f"gradient {errors.gradient:.1e}, tangent {errors.tangent:.1e}, constraints {errors.constraints:.1e}")
@@ -101,15 +102,14 @@ def test_each_constraint_contributes_its_curvature_through_frames(capped, full_t
     """One effort at a time, so large that a missing term could not hide."""
     model, plate, part = capped()
     constrain(model, plate, part)
-    model.prepare()
     x = moved(model, rng)
-    none = full_tangent(model, model.assemble(x, np.zeros(model.size))[1])
+    none = full_tangent(model, model.assembly.evaluate(x, np.zeros(model.assembly.size), model.loads)[1])
     for constraint, rows in model.rows:
-        effort = np.zeros(model.size)
+        effort = np.zeros(model.assembly.size)
         effort[rows] = {"Pa": 3e4, "N": 5.0, "N m": 0.05}[constraint.unit[1]]
         errors = derivatives(model, x, effort)
         assert errors.tangent < 1e-6, constraint.name
-        change = np.abs(full_tangent(model, model.assemble(x, effort)[1]) - none).max()
+        change = np.abs(full_tangent(model, model.assembly.evaluate(x, effort, model.loads)[1]) - none).max()
         # All touch a frame or a carried node, which turn. Bonds do only where their force has an arm.
         assert change > 1e-4, constraint.name
 
@@ -122,7 +122,7 @@ def test_spins_and_origins_can_be_held_one_by_one(derivatives, rng, box):
     body.carry(hinge, cap(nodes))
     model = body.build()
     assert model.equations == 27 + 2 + 1  # nine free nodes, two translations, one spin
-    assert (model.dof_scale[:-1] == 1.0).all() and model.dof_scale[-1] < 1.0
+    assert (model.kinematics.dof_scale[:-1] == 1.0).all() and model.kinematics.dof_scale[-1] < 1.0
     x = moved(model, rng, 1e-4)
     errors = derivatives(model, x, np.empty(0))
     assert errors.gradient < 1e-6 and errors.tangent < 1e-7
@@ -199,7 +199,9 @@ def test_what_a_frame_carries_stays_rigid_in_equilibrium(capped):
     # Their forces and those on the frame balance: moment about the plate's origin, by hand.
     forces = np.zeros_like(found.x)
     model.blocks[0].add(found.x, forces, None, None)
-    np.testing.assert_allclose(model.assemble(found.x, found.effort)[0], 0.0, atol=1e-6 * np.abs(forces).max())
+    np.testing.assert_allclose(
+        model.assembly.evaluate(found.x, found.effort, model.loads)[0], 0.0, atol=1e-6 * np.abs(forces).max()
+    )
 
 
 def test_a_clamped_frame_is_a_clamp(box):

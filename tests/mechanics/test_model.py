@@ -20,10 +20,15 @@ ONE_TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 
 def full_tangent(model, values):
     """The symmetric matrix of lower-triangle values on the model's pattern."""
-    indptr, indices = model.tangent_pattern
+    indptr, indices = model.assembly.indptr, model.assembly.indices
     lower = csc_matrix((values.copy(), indices, indptr), shape=2 * (len(indptr) - 1,)).toarray()
     assert np.allclose(np.triu(lower, 1), 0.0)
     return lower + np.tril(lower, -1).T
+
+
+def evaluate(model, x, effort):
+    """The equilibrium equations of a model under its present loads."""
+    return model.assembly.evaluate(x, effort, model.loads)
 
 
 @pytest.fixture
@@ -44,16 +49,15 @@ def bent(beam, rng):
 def test_residual_is_the_derivative_of_the_energy_less_the_work_of_the_efforts(beam, bent):
     beam.set_gravity((1.0, -2.0, -9.81))
     beam.nodal_loads[-1] = [0.1, 0.2, -0.3]
-    beam.refresh_loads()
     effort = np.array([2.0, 1.5, 0.2, -0.1, 0.3])
 
     def potential(x):
-        return beam.energy(x) - effort @ beam.assemble(x, effort)[3]
+        return beam.energy(x) - effort @ evaluate(beam, x, effort)[3]
 
-    residual = beam.assemble(bent, effort)[0].copy()
+    residual = evaluate(beam, bent, effort)[0].copy()
     h = 1e-7
     expected = np.empty_like(residual)
-    for k, dof in enumerate(beam.free_dofs):
+    for k, dof in enumerate(beam.kinematics.free_dofs):
         plus, minus = bent.copy(), bent.copy()
         plus.ravel()[dof] += h
         minus.ravel()[dof] -= h
@@ -65,15 +69,15 @@ def test_residual_is_the_derivative_of_the_energy_less_the_work_of_the_efforts(b
 
 def test_tangent_is_the_derivative_of_the_residual_with_cable_tension(beam, bent):
     effort = np.array([20.0, 15.0, 0.0, 0.0, 0.0])
-    tangent = full_tangent(beam, beam.assemble(bent, effort)[1])
-    without = full_tangent(beam, beam.assemble(bent, np.zeros(5))[1])
+    tangent = full_tangent(beam, evaluate(beam, bent, effort)[1])
+    without = full_tangent(beam, evaluate(beam, bent, np.zeros(5))[1])
     h = 1e-8
     expected = np.empty_like(tangent)
-    for k, dof in enumerate(beam.free_dofs):
+    for k, dof in enumerate(beam.kinematics.free_dofs):
         plus, minus = bent.copy(), bent.copy()
         plus.ravel()[dof] += h
         minus.ravel()[dof] -= h
-        expected[:, k] = (beam.assemble(plus, effort)[0] - beam.assemble(minus, effort)[0]) / (2 * h)
+        expected[:, k] = (evaluate(beam, plus, effort)[0] - evaluate(beam, minus, effort)[0]) / (2 * h)
     size = np.abs(expected).max()
     np.testing.assert_allclose(tangent, expected, atol=1e-6 * size)
     # The tension's own term is far above that tolerance.
@@ -81,13 +85,13 @@ def test_tangent_is_the_derivative_of_the_residual_with_cable_tension(beam, bent
 
 
 def test_constraint_gradients_and_values_of_the_assembly(beam, bent):
-    _, _, H, delta = beam.assemble(bent, np.zeros(5))
+    _, _, H, delta = evaluate(beam, bent, np.zeros(5))
     h = 1e-7
-    for k, dof in enumerate(beam.free_dofs):
+    for k, dof in enumerate(beam.kinematics.free_dofs):
         plus, minus = bent.copy(), bent.copy()
         plus.ravel()[dof] += h
         minus.ravel()[dof] -= h
-        difference = (beam.assemble(plus, np.zeros(5))[3] - beam.assemble(minus, np.zeros(5))[3]) / (2 * h)
+        difference = (evaluate(beam, plus, np.zeros(5))[3] - evaluate(beam, minus, np.zeros(5))[3]) / (2 * h)
         np.testing.assert_allclose(H[k], difference, atol=1e-7)
     assert [letter for letter, _ in beam.roles] == ["a", "e"]
     assert dict(beam.roles) == {"a": 2, "e": 3}
@@ -97,18 +101,18 @@ def test_constraint_gradients_and_values_of_the_assembly(beam, bent):
 
 def test_inverted_elements_are_reported_not_assembled(beam, bent):
     bent[-1, 0] -= 0.2
-    assert beam.assemble(bent, np.zeros(5)) is None
+    assert evaluate(beam, bent, np.zeros(5)) is None
     assert beam.energy(bent) == np.inf
     bent[-1, 0] = np.nan
-    assert beam.assemble(bent, np.zeros(5)) is None
+    assert evaluate(beam, bent, np.zeros(5)) is None
 
 
 def test_warping_a_step_equals_it_to_first_order_and_keeps_fixed_nodes(beam, bent, rng):
-    step = 1e-6 * rng.standard_normal(len(beam.free_dofs))
-    warped = beam.warp(bent, step)
+    step = 1e-6 * rng.standard_normal(len(beam.kinematics.free_dofs))
+    warped = beam.warping.displacement(bent, step)
     np.testing.assert_array_equal(warped[beam.fixed], 0.0)
     # Second order: (1e-6 / element size 1e-2)^2 times the beam's length.
-    np.testing.assert_allclose(warped.ravel()[beam.free_dofs], step, atol=1e-9)
+    np.testing.assert_allclose(warped.ravel()[beam.kinematics.free_dofs], step, atol=1e-9)
 
 
 def test_two_blocks_of_one_material_equal_one(box):
@@ -119,7 +123,7 @@ def test_two_blocks_of_one_material_equal_one(box):
     parts = [Tetrahedra(nodes, part, **options) for part in (tetrahedra[::2], tetrahedra[1::2])]
     two = MechanicalModel(nodes, parts, fixed=fixed)
     x = nodes + 0.1 * np.sin(5.0 * nodes) * nodes[:, 2:]
-    for a, b in zip(one.assemble(x, np.zeros(0)), two.assemble(x, np.zeros(0)), strict=True):
+    for a, b in zip(evaluate(one, x, np.zeros(0)), evaluate(two, x, np.zeros(0)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9 * max(1.0, np.abs(a).max(initial=0.0)))
     assert one.volume == pytest.approx(two.volume, rel=1e-12)
 
@@ -167,7 +171,6 @@ def test_malformed_gravity_is_refused(beam, gravity):
 def test_reactions_balance_the_weight(beam):
     """At equilibrium the internal forces of the clamped nodes carry all of the dead loads."""
     beam.set_gravity((0.0, 0.0, -9.81))
-    beam.refresh_loads()
     x = Statics(beam, tolerance=1e-12).solve([0.0, 0.0], "effort").x
     forces = np.zeros_like(x)
     beam.blocks[0].add(x, forces, None, None)
@@ -231,7 +234,7 @@ def test_mask_and_indices_of_fixed_nodes_are_the_same(box):
     by_mask, by_index = (
         MechanicalModel.from_mesh(nodes, tetrahedra, fixed=f) for f in (mask, np.flatnonzero(mask).tolist())
     )
-    np.testing.assert_array_equal(by_mask.free_dofs, by_index.free_dofs)
+    np.testing.assert_array_equal(by_mask.kinematics.free_dofs, by_index.kinematics.free_dofs)
 
 
 @pytest.mark.parametrize(

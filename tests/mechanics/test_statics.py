@@ -9,8 +9,8 @@ import pytest
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solvers.linear import CholmodSolver
-from softgym_envs.mechanics.solvers.statics import Statics, _NotFound
+from softgym_envs.mechanics.solvers.linear import CholmodSolver, make_solver
+from softgym_envs.mechanics.solvers.statics import NewtonFailure, Statics
 
 # -- reference ------------------------------------------------------------------------------------------------------
 
@@ -54,8 +54,8 @@ def test_an_indefinite_tangent_falls_back_to_lu(notched, monkeypatch):
     statics = Statics(model)
     expected = statics.solve([0.002])
     refused = []
-    monkeypatch.setattr(type(model.solver), "factorise", lambda self, values: bool(refused.append(1)))
-    model._make_poisson = None  # the mesh's Laplacian is definite and factorised already
+    # The mesh's Laplacian is factorised already.
+    monkeypatch.setattr(CholmodSolver, "factorise", lambda self, values: bool(refused.append(1)))
     statics.reset()
     found = statics.solve([0.002])
     assert refused
@@ -130,7 +130,6 @@ def test_without_actuators_only_loads_act(box):
     found = Statics(model).solve([])
     np.testing.assert_allclose(found.x, nodes, atol=1e-15)
     model.nodal_loads[-1, 2] = -0.5
-    model.refresh_loads()
     assert Statics(model).solve([]).x[-1, 2] < nodes[-1, 2] - 1e-3
 
 
@@ -140,7 +139,7 @@ def test_equilibrium_is_a_minimum_of_the_potential(beam, rng):
     assert np.abs(found.x - beam.nodes).max() > 0.01
 
     def potential(x):
-        return beam.energy(x) - found.effort @ beam.assemble(x, np.zeros(5))[3]
+        return beam.energy(x) - found.effort @ beam.assembly.evaluate(x, np.zeros(5), beam.loads)[3]
 
     least = potential(found.x)
     for _ in range(20):
@@ -273,7 +272,7 @@ def test_continuation_towards_a_limit_ends(fingers, monkeypatch):
         if len(calls) > 3000:
             raise AssertionError("endless continuation")
         if target[0] - position[0] > 0.3 * (limit - position[0]):
-            raise _NotFound
+            raise NewtonFailure
         position[0] = target[0]
         return 1
 
@@ -286,7 +285,7 @@ def test_continuation_towards_a_limit_ends(fingers, monkeypatch):
 def test_starting_from_an_inverted_shape_is_an_error(finger):
     x = finger.model.nodes.copy()
     x[~finger.model.fixed] *= -1.0
-    finger.statics.restore(x, np.zeros(finger.model.size))
+    finger.statics.restore(x, np.zeros(finger.model.assembly.size))
     with pytest.raises(ConvergenceError, match="starting state"):
         finger.statics.solve(np.zeros(len(finger.robot.actuators)))
 
@@ -327,14 +326,14 @@ def test_heavy_dead_loads_are_found_from_rest(fingers):
     statics = Statics(model)
     for gravity in np.linspace(20.0, 200.0, 10):  # the equilibrium exists
         model.set_gravity((0.0, gravity, gravity))
-        model.refresh_loads()
         statics.restore(statics.x, statics.effort)
         ramped = statics.solve([0.0, 0.0], "effort")
     np.testing.assert_allclose(Statics(model).solve([0.0, 0.0], "effort").x, ramped.x, rtol=0, atol=1e-8)
 
 
 def test_cholmod_is_the_default_where_it_is_installed(notched):
-    assert isinstance(notched_beam(notched).solver, CholmodSolver)
+    assembly = notched_beam(notched).assembly
+    assert isinstance(make_solver("auto", assembly.indptr, assembly.indices), CholmodSolver)
 
 
 def test_loads_that_change_after_a_solve_are_brought_on_in_steps(fingers):
@@ -392,3 +391,24 @@ def test_a_column_beyond_its_buckling_load_is_not_stable(box, solver):
     statics = Statics(model)
     assert statics.solve([0.2 * euler], "effort").stable
     assert not statics.solve([20.0 * euler], "effort").stable
+
+
+def test_constraints_that_change_under_a_solver_are_noticed(fingers):
+    robot, _ = fingers(2, "corotational")
+    model = robot.build()
+    statics = Statics(model)
+    statics.solve([0.0, 0.0])
+    model.add_effector("late", model.nodes.mean(axis=0))
+    with pytest.raises(ValueError, match="the model's constraints changed after this Statics was made; make a new one"):
+        statics.solve([0.0, 0.0])
+    assert len(Statics(model).solve([0.0, 0.0]).delta) == 2 + 3 + 3
+
+
+def test_a_changed_elasticity_is_noticed(fingers):
+    robot, _ = fingers(2, "corotational")
+    model = robot.build({"young_modulus": 1.0e6, "poisson_ratio": 0.45})
+    statics = Statics(model)
+    before = statics.solve([0.005, 0.0])
+    model.solids[0].set_elasticity(2.0e6, 0.45)
+    after = statics.solve([0.005, 0.0])
+    np.testing.assert_allclose(after.effort[0], 2.0 * before.effort[0], rtol=1e-6)

@@ -26,12 +26,14 @@ class ElementBlock(ABC):
         volume: rest volume [m3].
         mass: mass [kg].
         stiffness: a typical stiffness against displacements [N/m], for scaling.
+        elasticity_version: grows with every change of the elasticity, so that solvers notice it.
     """
 
     nodes_used: np.ndarray
     volume: float
     mass: float
     stiffness: float
+    elasticity_version: int = 0
 
     @abstractmethod
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:

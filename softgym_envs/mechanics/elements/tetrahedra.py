@@ -291,10 +291,7 @@ class SolidBlock(ElementBlock):
         return self.connectivity[:, :4]
 
     def set_elasticity(self, young_modulus: float | np.ndarray, poisson_ratio: float | np.ndarray) -> None:
-        """Set Young's modulus [Pa] and Poisson's ratio, scalars or shape (m,).
-
-        A model in use learns of it by its `refresh_loads`.
-        """
+        """Set Young's modulus [Pa] and Poisson's ratio, scalars or shape (m,)."""
         m = len(self.connectivity)
         young = np.broadcast_to(np.asarray(young_modulus, dtype=float), (m,))
         poisson = np.broadcast_to(np.asarray(poisson_ratio, dtype=float), (m,))
@@ -303,6 +300,7 @@ class SolidBlock(ElementBlock):
             np.array([lame_parameters(e, nu) for e, nu in pairs])[which.ravel()], self.points, axis=0
         )
         self.mu, self.lame = np.ascontiguousarray(parameters[:, 0]), np.ascontiguousarray(parameters[:, 1])
+        self.elasticity_version += 1
 
     def embed(self, points: np.ndarray, nodes: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
         """Embed points [m] (p, 3) of the rest shape ``nodes`` [m] (n, 3) in the elements."""

@@ -15,87 +15,18 @@ condensed model is that of the thesis' dynamic case (eq. 2.5-2.13), where ``A`` 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Unpack
 
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.model import Inertia, MechanicalModel
-from softgym_envs.mechanics.solvers.statics import Equilibrium, Statics, _NotFound
-
-__all__ = ["SCHEMES", "Dynamics", "Motion"]
-
-SCHEMES = ("euler", "generalised_alpha")
-"""Names of the time integration schemes."""
-
-
-class _Euler(Inertia):
-    """Implicit Euler from rows ``x`` with velocities ``v`` over ``h``."""
-
-    def __init__(self, x: np.ndarray, v: np.ndarray, h: float) -> None:
-        self._x, self._v, self._h = x, v, h
-        self.step = h
-        self.velocity_factor, self.acceleration_factor = 1.0 / h, 1.0 / h**2
-
-    def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        velocity = (x - self._x) / self._h
-        return velocity, (velocity - self._v) / self._h
-
-
-class _Start(Inertia):
-    """The start of a motion, at rows ``x`` with velocities of the equations ``v``: a step of ``h^2`` accelerations."""
-
-    def __init__(self, model: MechanicalModel, x: np.ndarray, v: np.ndarray, h: float) -> None:
-        self._motion = model.row_velocity(x, v), model.row_acceleration(x, v, np.zeros_like(v))
-        self.velocity_factor, self.acceleration_factor = 0.0, 1.0 / h**2
-
-    def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._motion
-
-
-class _Alpha(Inertia):
-    """Generalised alpha; histories are kept in the equations, in which frames have spins instead of directors.
-
-    Args:
-        model: the body.
-        x: rows at the start of the step [m], shape (n, 3).
-        v: velocities of the equations, shape (N,).
-        true: their derivatives at the start, shape (N,).
-        a: the scheme's auxiliary accelerations, shape (N,).
-        h: step [s].
-        radius: spectral radius at infinite frequency, 0 to 1.
-    """
-
-    def __init__(
-        self,
-        model: MechanicalModel,
-        x: np.ndarray,
-        v: np.ndarray,
-        true: np.ndarray,
-        a: np.ndarray,
-        h: float,
-        radius: float,
-    ) -> None:
-        self._model, self._x, self._v, self._true, self._a, self._h = model, x, v, true, a, h
-        self._am, self._af = (2.0 * radius - 1.0) / (radius + 1.0), radius / (radius + 1.0)
-        self._gamma = 0.5 - self._am + self._af
-        self._beta = 0.25 * (self._gamma + 0.5) ** 2
-        self.step = h
-        self.velocity_factor = self._gamma / (self._beta * h)
-        self.acceleration_factor = (1.0 - self._am) / ((1.0 - self._af) * self._beta * h**2)
-
-    def equations(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Velocities, their derivatives and auxiliary accelerations of the equations at the end, each (N,)."""
-        h, step = self._h, self._model.increment(self._x, x)
-        a = ((step - h * self._v) / h**2 - (0.5 - self._beta) * self._a) / self._beta
-        v = self._v + h * ((1.0 - self._gamma) * self._a + self._gamma * a)
-        true = ((1.0 - self._am) * a + self._am * self._a - self._af * self._true) / (1.0 - self._af)
-        return v, true, a
-
-    def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        v, true, _ = self.equations(x)
-        return self._model.row_velocity(x, v), self._model.row_acceleration(x, v, true)
+from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.schemes import SCHEMES, GeneralisedAlpha, ImplicitEuler, Start
+from softgym_envs.mechanics.solvers.statics import AppliedLoads, Equilibrium, NewtonFailure, Statics
 
 
 @dataclass(frozen=True)
@@ -181,8 +112,7 @@ class Dynamics(Statics):
         self.stiffness_damping = float(stiffness_damping)
         self.max_cuts = max_cuts
         super().__init__(model, tolerance=tolerance, max_iterations=max_iterations, max_halvings=2)
-        self._mass = model.mass_matrix(lumped)
-        self._lumped = lumped
+        self._mass = self._assembly.mass_matrix(lumped)
 
     def reset(self) -> None:
         super().reset()
@@ -208,7 +138,7 @@ class Dynamics(Statics):
         velocity = np.asarray(velocity, dtype=float)
         if velocity.shape != (self.model.equations,):
             raise ValueError(f"velocity must have shape ({self.model.equations},), got {velocity.shape}")
-        self.velocity = self.model.row_velocity(self.x, velocity)
+        self.velocity = self.model.kinematics.row_velocity(self.x, velocity)
         self._history = None
 
     @property
@@ -227,7 +157,7 @@ class Dynamics(Statics):
     @snapshot.setter
     def snapshot(self, kept: tuple) -> None:
         self.x, self.effort, self.velocity, self.time, self._history, self._work, self._dissipated = kept
-        self._fresh = False
+        self.linearisation.current = False
 
     def effector_velocity(self) -> np.ndarray:
         """Velocity of the effector rows [m/s], shape (n_e,)."""
@@ -236,27 +166,23 @@ class Dynamics(Statics):
 
     def energies(self) -> tuple[float, float]:
         """Kinetic and potential energy [J] of the present state."""
-        return 0.5 * float(np.vdot(self.velocity, self._mass @ self.velocity)), self.model.energy(self.x)
+        return 0.5 * float(np.vdot(self.velocity, self._mass.rows @ self.velocity)), self.model.energy(self.x)
 
     def advance(
         self,
         target: Sequence[float] | np.ndarray,
         mode: str | Sequence[str] = "displacement",
-        *,
-        effector_force: Sequence[float] | np.ndarray | None = None,
-        contact: Sequence[float] | np.ndarray | None = None,
-        contact_mode: str = "effort",
+        **applied: Unpack[AppliedLoads],
     ) -> Motion:
-        """Go one time step further; arguments as for `Statics.solve`, reached at the end of the step.
+        """Advance by one time step; arguments as for `Statics.solve`, reached at the end of the step.
 
-        A step that cannot be solved is cut into halves, along which commands are ramped.
+        A step that cannot be solved is divided into halves, along which commands are ramped.
 
         Raises:
             ConvergenceError: if that does not help either; the state at the start of the step is kept.
             ValueError: as `Statics.solve`.
         """
         target = np.asarray(target, dtype=float)
-        options = {"effector_force": effector_force, "contact": contact, "contact_mode": contact_mode}
         start = self.snapshot
         first = self._present_command(mode)
         for cut in range(self.max_cuts + 1):
@@ -265,7 +191,7 @@ class Dynamics(Statics):
                 for k in range(count):
                     # The last one takes the target itself: no round-off.
                     part = target if k == count - 1 else first + (k + 1) / count * (target - first)
-                    found = self._advance(part, mode, self.step / count, options)
+                    found = self._advance(part, mode, self.step / count, applied)
                 break
             except ConvergenceError:
                 self.snapshot = start
@@ -284,106 +210,106 @@ class Dynamics(Statics):
         )
 
     def _displacement_rows(self, mode: str | Sequence[str]) -> np.ndarray:
+        """Actuator rows that are driven in displacement."""
         modes = [mode] * self._actuators if isinstance(mode, str) else list(mode)
         return np.array([i for i, m in enumerate(modes) if m == "displacement"], dtype=int)
 
-    def _move(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+    def _displacement(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         # Steps in time are short: warping them costs more than it saves.
-        return self.model.displace(x, step)
+        return self.model.kinematics.displacement(x, step)
 
     def _present_command(self, mode: str | Sequence[str]) -> np.ndarray:
         command, rows = self.effort[: self._actuators].copy(), self._displacement_rows(mode)
-        command[rows] = self._rows_delta()[rows]
+        command[rows] = self._values(self.x)[rows]
         return command
 
-    def _advance(self, target: np.ndarray, mode: str | Sequence[str], h: float, options: dict) -> Equilibrium:
+    def _advance(self, target: np.ndarray, mode: str | Sequence[str], h: float, applied: AppliedLoads) -> Equilibrium:
+        """Take one time step of ``h`` [s]; after an exception the caller restores the state."""
         x, v, effort = self.x, self.velocity, self.effort
-        terms: _Euler | _Alpha
+        body = self._mass_and_damping()
+        inertia: ImplicitEuler | GeneralisedAlpha
         if self.scheme == "euler":
-            terms = _Euler(x, v, h)
+            inertia = ImplicitEuler(x, v, h, body)
         else:
             if self._history is None:
                 acceleration = self._starting_acceleration(target, mode)
-                self._history = self.model.equation_velocity(x, v), acceleration, acceleration
-            terms = _Alpha(self.model, x, *self._history, h, self.spectral_radius)
-        terms.mass_damping, terms.stiffness_damping = self.mass_damping, self.stiffness_damping
-        if self.stiffness_damping:
-            terms.stiffness = self.model.viscosity(x)
-        kept = self._rows_delta()
-        found = self._solve_with(terms, target, mode, options)
-        self.velocity = terms.motion(self.x)[0]
-        if isinstance(terms, _Alpha):
-            self._history = terms.equations(self.x)
+                self._history = self.model.kinematics.equation_velocity(x, v), acceleration, acceleration
+            inertia = GeneralisedAlpha(self.model.kinematics, x, *self._history, h, self.spectral_radius, body)
+        before = self._values(x)
+        found = self._solve_with(inertia, h, target, mode, applied)
+        self.velocity = inertia.motion(self.x)[0]
+        if isinstance(inertia, GeneralisedAlpha):
+            self._history = inertia.equations(self.x)
         self.time += h
-        rows = self._moving
-        self._work += float(0.5 * (effort + self.effort)[rows] @ (found.delta - kept)[rows])
-        drag = self.mass_damping * (self._mass @ self.velocity)
+        rows = np.concatenate([np.arange(self._actuators), self._effectors, self._contacts])
+        self._work += float(0.5 * (effort + self.effort)[rows] @ (found.delta - before)[rows])
+        drag = self.mass_damping * (self._mass.rows @ self.velocity)
         if self.stiffness_damping:
-            drag = drag + self.model.damping_force(terms, self.velocity)
+            drag = drag + self._assembly.damping_force(body, self.velocity)
         self._dissipated += float(np.vdot(drag, self.x - x))
         return found
 
+    def _mass_and_damping(self) -> MassAndDamping:
+        """Mass and damping of a step that starts at the present state."""
+        viscosity = self._assembly.viscosity(self.x) if self.stiffness_damping else None
+        return MassAndDamping(self._mass, self.mass_damping, self.stiffness_damping, viscosity)
+
     def _solve_with(
-        self, terms: _Euler | _Alpha, target: np.ndarray, mode: str | Sequence[str], options: dict
+        self, inertia: Inertia, h: float, target: np.ndarray, mode: str | Sequence[str], applied: AppliedLoads
     ) -> Equilibrium:
-        self._fresh = False
-        # Dead loads act in full: their ramp belongs to statics.
-        self._carried = self.model.loads
-        self.model.mass_matrix(self._lumped)
-        self.model.inertia = terms
+        kinematics, start = self.model.kinematics, self.x
         # What moves is likely to move on; where that inverts an element, the step starts where it is.
-        kept = self.x
-        drift = terms.step * self.model.equation_velocity(kept, self.velocity)
-        self.x = kept + self.model.displace(kept, drift)
+        drift = h * kinematics.equation_velocity(start, self.velocity)
+        self.x = start + kinematics.displacement(start, drift)
         try:
-            if not self._linearise():
-                self.x = kept
-            return self.solve(target, mode, **options)
+            with self._moving(inertia):
+                if not self._linearise():
+                    self.x = start
+                return self.solve(target, mode, **applied)
         except ConvergenceError:
-            self.x = kept
+            self.x = start
             raise
+
+    @contextmanager
+    def _moving(self, inertia: Inertia) -> Iterator[None]:
+        """Add inertia to the equilibrium, and let dead loads act in full: their ramp belongs to statics."""
+        self._carried = self.linearisation.loads = self.model.loads
+        self.linearisation.inertia = inertia
+        self.linearisation.current = False
+        try:
+            yield
         finally:
-            self.model.inertia = None
-            self._fresh = False
+            self.linearisation.inertia = None
+            self.linearisation.current = False
 
     def _starting_acceleration(self, target: np.ndarray, mode: str | Sequence[str]) -> np.ndarray:
-        """Accelerations of the equations at the start, (N,): efforts as they are, driven rows move on steadily."""
+        """Accelerations of the equations (N,) at the start: efforts stay as they are, driven rows move steadily."""
+        kinematics = self.model.kinematics
         h = 1e-3 * self.step
-        speed = self.model.equation_velocity(self.x, self.velocity)
-        terms = _Start(self.model, self.x, speed, h)
-        terms.mass_damping, terms.stiffness_damping = self.mass_damping, self.stiffness_damping
-        if self.stiffness_damping:
-            terms.stiffness = self.model.viscosity(self.x)
-        delta = self._rows_delta()
+        speed = kinematics.equation_velocity(self.x, self.velocity)
+        delta = self._values(self.x)
         rows = self._displacement_rows(mode)
-        # A cable that hangs slack goes on doing so.
+        # A cable that hangs slack continues to do so.
         slack = self.unilateral[rows] & (self.effort[rows] <= 0.0) & (delta[rows] > target[rows])
         driven = np.concatenate([rows[~slack], self._bonds])
         # Along a steady motion a driven value changes by h^2 times this; the acceleration makes up for it.
         before, after = (
-            self._rows_delta(self.x + self.model.displace(self.x, s * self.step * speed)) for s in (-0.01, 0.01)
+            self._values(self.x + kinematics.displacement(self.x, s * self.step * speed)) for s in (-0.01, 0.01)
         )
         change = (before - 2.0 * delta + after) / (0.01 * self.step) ** 2
         goal = self.effort.copy()
         goal[driven] = -(h**2) * change[driven]
-        self.model.mass_matrix(self._lumped)
-        self.model.applied_loads = self.model.loads
-        self.model.inertia = terms
-        try:
+        with self._moving(Start(kinematics, self.x, speed, h, self._mass_and_damping())):
             if not self._linearise():
                 raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
-            step, _ = self._correction(self._Ar, np.zeros_like(delta), self.effort, goal, driven)
-        except _NotFound:
-            raise ConvergenceError("the starting state has no single acceleration", fraction=0.0) from None
-        finally:
-            self.model.inertia = None
-            self._fresh = False
+            try:
+                step, _ = self._correction(
+                    self.linearisation.correction, np.zeros_like(delta), self.effort, goal, driven
+                )
+            except NewtonFailure:
+                raise ConvergenceError("the starting state has no unique acceleration", fraction=0.0) from None
         return step / h**2
 
-    @property
-    def _moving(self) -> np.ndarray:
-        return np.concatenate([np.arange(self._actuators), self._effectors, self._contacts])
-
-    def _rows_delta(self, x: np.ndarray | None = None) -> np.ndarray:
-        x = self.x if x is None else x
+    def _values(self, x: np.ndarray) -> np.ndarray:
+        """Values of all constraints (size,) at rows ``x`` (n, 3)."""
         return np.concatenate([np.zeros(0), *(c.value(x) for c, _ in self.model.rows)])

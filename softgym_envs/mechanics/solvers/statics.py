@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 
@@ -19,9 +20,7 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
-from softgym_envs.mechanics.solvers.linear import SuperLUSolver
-
-__all__ = ["Equilibrium", "Statics"]
+from softgym_envs.mechanics.solvers.linearisation import Linearisation
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,16 @@ class Equilibrium:
     increments: int
 
 
-class _NotFound(Exception):
-    """Newton's method failed on one increment."""
+class AppliedLoads(TypedDict, total=False):
+    """Loads besides the actuators, keyword arguments of `Statics.solve`, where they are explained."""
+
+    effector_force: Sequence[float] | np.ndarray | None
+    contact: Sequence[float] | np.ndarray | None
+    contact_mode: str
+
+
+class NewtonFailure(Exception):
+    """Newton's method did not converge on one increment; solvers catch it."""
 
 
 def _complementary_step(W: np.ndarray, gap: np.ndarray, effort: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
@@ -89,6 +96,7 @@ class Statics:
         x: present node positions [m], shape (n, 3).
         effort: present efforts of all rows, shape (size,).
         unilateral: actuator rows that cannot push, shape (n_a,); may be changed between solves.
+        linearisation: the equations linearised where the last iteration ended.
     """
 
     def __init__(
@@ -103,137 +111,126 @@ class Statics:
         self.tolerance = tolerance
         self.max_iterations = max_iterations
         self.max_halvings = max_halvings
-        model.prepare()
+        self.linearisation = Linearisation(model)
+        self._assembly = model.assembly
         sizes = dict(model.roles)
         self._actuators = sizes.get("a", 0)
         self._effectors = self._actuators + np.arange(sizes.get("e", 0))
         self._contacts = self._actuators + sizes.get("e", 0) + np.arange(sizes.get("c", 0))
-        self._bonds = model.size - sizes.get("b", 0) + np.arange(sizes.get("b", 0))
+        self._bonds = self._assembly.size - sizes.get("b", 0) + np.arange(sizes.get("b", 0))
         self.unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
-        self._fallback: SuperLUSolver | None = None
-        self._version = model.version
+        self._elasticity_version = model.elasticity_version
         self.reset()
 
     def reset(self) -> None:
         """Go back to the undeformed shape with no effort. The equilibrium under loads is found by `solve`."""
         self.x = self.model.nodes.copy()
-        self.effort = np.zeros(self.model.size)
+        self.effort = np.zeros(self._assembly.size)
         self._carried = np.zeros_like(self.x)  # dead loads that the present state carries
-        self._fresh = False
+        self.linearisation.current = False
 
     def restore(self, x: np.ndarray, effort: np.ndarray) -> None:
         """Start the next solve from node positions ``x`` (n, 3) and efforts (size,) of all rows."""
         self.x = x.copy()
         self.effort = effort.copy()
         self._carried = self.model.loads
-        self._fresh = False
+        self.linearisation.current = False
 
-    # -- one linearisation ------------------------------------------------------------------------------------------
+    # -- Newton -----------------------------------------------------------------------------------------------------
 
     def _linearise(self) -> bool:
-        """Assemble and factorise at the current state. False if elements are inverted or the tangent is singular."""
-        assembled = self.model.assemble(self.x, self.effort)
-        if assembled is None:
-            return False
-        return self._factorise(assembled)
-
-    def _factorise(self, assembled: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]) -> bool:
-        self._residual, values, self._H, self._delta = assembled
-        solver = self.model.solver
-        self.model.factor_owner = self
-        if solver.factorise(values):
-            self._active = solver
-        else:
-            # Cholesky fails on a tangent that is indefinite though the constrained problem is stable.
-            if self._fallback is None:
-                self._fallback = SuperLUSolver(solver.indptr, solver.indices)
-            if not self._fallback.factorise(values):
-                return False
-            self._active = self._fallback
-        self._Ar = self._active.solve(self._residual[:, None])[:, 0]
-        self._W, self._half = self._active.condense(self._H)
-        if not np.isfinite(self._W).all():
-            return False
-        self._W = 0.5 * (self._W + self._W.T)
-        self._fresh = True
-        return True
+        """Linearise at the present state. False if elements are inverted or the tangent is singular."""
+        return self.linearisation.update(self.x, self.effort)
 
     def _correction(
         self, Ar: np.ndarray, delta: np.ndarray, effort: np.ndarray, target: np.ndarray, driven: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Solve the linearised KKT system; returns the step of the free dofs and of the efforts."""
+        """Solve the linearised KKT system for the steps of the equations (N,) and of the efforts (size,).
+
+        Args:
+            Ar: ``A^-1 residual``, shape (N,).
+            delta: values of the constraints, shape (size,).
+            effort: their efforts, shape (size,).
+            target: commanded values of driven rows and efforts of all others, shape (size,).
+            driven: rows whose values are commanded.
+        """
+        linear = self.linearisation
         step_effort = np.zeros_like(effort)
         # Effort-driven rows: the residual already holds their current effort; move it to the commanded value.
         forced = np.ones(len(effort), dtype=bool)
         forced[driven] = False
         step_effort[forced] = target[forced] - effort[forced]
         if len(driven):
-            gap = (delta - target - Ar @ self._H + self._W @ step_effort)[driven]
-            W = self._W[driven[:, None], driven]
-            loose = np.zeros(len(effort), dtype=bool)
-            loose[: self._actuators] = self.unilateral
+            gap = (delta - target - Ar @ linear.H + linear.W @ step_effort)[driven]
+            W = linear.W[driven[:, None], driven]
+            unilateral = np.zeros(len(effort), dtype=bool)
+            unilateral[: self._actuators] = self.unilateral
             try:
-                step_effort[driven] = _complementary_step(W, gap, effort[driven], loose[driven])
-            except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (actuators that do the same)
-                raise _NotFound from None
-        step_q = self._active.expand(self._half @ step_effort) - Ar
+                step_effort[driven] = _complementary_step(W, gap, effort[driven], unilateral[driven])
+            except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (two actuators do the same)
+                raise NewtonFailure from None
+        step_q = linear.response(step_effort) - Ar
         if len(self._bonds):
             # The tangent holds `bond_stiffness` H_b H_b^T, which already carries its share of the force.
-            step_effort[self._bonds] += self.model.bond_stiffness * (delta[self._bonds] - target[self._bonds])
+            open_by = delta[self._bonds] - target[self._bonds]
+            step_effort[self._bonds] += self._assembly.bond_stiffness * open_by
         return step_q, step_effort
 
     def _norm(self, step: np.ndarray) -> float:
         """Largest displacement [m] of a step of the equations."""
-        return float(np.abs(step * self.model.dof_scale).max(initial=0.0))
+        return float(np.abs(step * self.model.kinematics.dof_scale).max(initial=0.0))
 
-    def _move(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Displacement of the rows (n, 3) that a step of the equations (N,) stands for."""
-        return self.model.warp(x, step)
-
-    # -- Newton -----------------------------------------------------------------------------------------------------
+    def _displacement(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Displacement of the rows (n, 3) for a step of the equations (N,) from ``x`` (n, 3)."""
+        return self.model.warping.displacement(x, step)
 
     def _newton(self, target: np.ndarray, driven: np.ndarray) -> int:
-        """Converge at one load level; returns the iterations. After `_NotFound` the caller restores the state."""
-        if not self._fresh and not self._linearise():
-            raise _NotFound
-        step_q, step_effort = self._correction(self._Ar, self._delta, self.effort, target, driven)
+        """Converge at one load level and return the iterations.
+
+        Raises:
+            NewtonFailure: if it does not converge; the caller restores the state.
+        """
+        linear = self.linearisation
+        if not linear.current and not self._linearise():
+            raise NewtonFailure
+        step_q, step_effort = self._correction(linear.correction, linear.delta, self.effort, target, driven)
         length = 1.0
         for iteration in range(1, self.max_iterations + 1):
             norm = self._norm(step_q)
             if not np.isfinite(norm):
-                raise _NotFound
+                raise NewtonFailure
             while True:
-                x = self.x + self._move(self.x, length * step_q)
+                x = self.x + self._displacement(self.x, length * step_q)
                 effort = self.effort + length * step_effort
-                assembled = self.model.assemble(x, effort)
+                assembled = linear.assemble(x, effort)
                 if assembled is not None:
-                    Ar = self._active.solve(assembled[0][:, None])[:, 0]
-                    next_q, next_effort = self._correction(Ar, assembled[3], effort, target, driven)
+                    Ar = linear.solve(assembled.residual)
+                    next_q, next_effort = self._correction(Ar, assembled.delta, effort, target, driven)
                     remaining = self._norm(next_q)
-                    # At the last digits round-off decides, not Newton.
+                    # Near convergence round-off decides, not Newton.
                     if remaining <= (1.0 - 0.25 * length) * norm or remaining <= self.tolerance:
                         break
                 length *= 0.5
                 if length < 1e-3:
-                    raise _NotFound
+                    raise NewtonFailure
             contraction = remaining / norm if norm > 0.0 else 0.0
             if length == 1.0 and remaining > self.tolerance and remaining * contraction <= 0.1 * self.tolerance:
                 # The simplified correction alone reaches the tolerance: take it and save a factorisation.
-                closer = x + self._move(x, next_q)
-                finished = self.model.assemble(closer, effort + next_effort)
+                closer = x + self._displacement(x, next_q)
+                finished = linear.assemble(closer, effort + next_effort)
                 if finished is not None:
                     x, effort, assembled = closer, effort + next_effort, finished
-                else:  # the failed assembly has used the buffers
-                    assembled = self.model.assemble(x, effort)
+                else:  # the failed assembly has overwritten the buffers
+                    assembled = linear.assemble(x, effort)
                     assert assembled is not None
             self.x, self.effort = x, effort
-            if not self._factorise(assembled):
-                raise _NotFound
-            step_q, step_effort = self._correction(self._Ar, self._delta, effort, target, driven)
+            if not linear.factorise(assembled):
+                raise NewtonFailure
+            step_q, step_effort = self._correction(linear.correction, linear.delta, effort, target, driven)
             if length == 1.0 and self._norm(step_q) <= self.tolerance:
                 return iteration
             length = min(1.0, 2.0 * length)
-        raise _NotFound
+        raise NewtonFailure
 
     def solve(
         self,
@@ -280,22 +277,27 @@ class Statics:
         for row in forced[self.unilateral[forced]] if len(forced) else forced:
             if target[row] < 0.0:
                 raise ValueError(f"effort {target[row]:g} on actuator row {row} must not be negative: it cannot push")
-        goal = np.zeros(self.model.size)
+        goal = np.zeros(self._assembly.size)
         goal[:count] = target
         if effector_force is not None:
             goal[self._effectors] = _checked("effector_force", effector_force, len(self._effectors))
         if contact is not None:
             goal[self._contacts] = _checked("contact", contact, len(self._contacts))
-        if self._version != self.model.version or self.model.factor_owner is not self:
-            self._version = self.model.version
-            self._fresh = False
-        self.model.applied_loads = self._carried
-        if not self._fresh and not self._linearise():
+        if self.model.assembly is not self._assembly:
+            raise ValueError(
+                f"the model's constraints changed after this {type(self).__name__} was made; make a new one"
+            )
+        linear = self.linearisation
+        if self._elasticity_version != self.model.elasticity_version:
+            self._elasticity_version = self.model.elasticity_version
+            linear.current = False
+        linear.loads = self._carried
+        if not linear.current and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
         # The path goes from the present values.
         start = self.effort.copy()
-        start[driven] = self._delta[driven]
+        start[driven] = linear.delta[driven]
         done, size, iterations, increments = 0.0, 1.0, 0, 0
         loads, start_loads = self.model.loads, self._carried
         ramped = bool((loads != start_loads).any())
@@ -303,16 +305,16 @@ class Statics:
             level = min(1.0, done + size)
             kept = self.x, self.effort
             if ramped:
-                self.model.applied_loads = start_loads + level * (loads - start_loads)
-                self._fresh = False
+                linear.loads = start_loads + level * (loads - start_loads)
+                linear.current = False
             try:
                 iterations += self._newton(start + level * (goal - start), driven)
             except BaseException as problem:
-                # Whatever stopped it, also Ctrl-C, the last equilibrium stands.
+                # Whatever stopped it, even Ctrl-C, the last equilibrium stays.
                 self.x, self.effort = kept
-                self.model.applied_loads = self._carried
-                self._fresh = False
-                if not isinstance(problem, _NotFound):
+                linear.loads = self._carried
+                linear.current = False
+                if not isinstance(problem, NewtonFailure):
                     raise
                 size = 0.5 * (level - done)
                 if size < 0.5**self.max_halvings or not (ramped or self._linearise()):
@@ -325,36 +327,35 @@ class Statics:
                     ) from None
                 continue
             increments += 1
-            done, self._carried = level, self.model.applied_loads
+            done, self._carried = level, linear.loads
             size *= 1.5
         return self._state(target, driven, iterations, increments)
 
     def _state(self, target: np.ndarray, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
-        effort = self.effort.copy()
+        effort, delta, W = self.effort.copy(), self.linearisation.delta, self.linearisation.W.copy()
         slack = np.zeros(self._actuators, dtype=bool)
         rows = driven[driven < self._actuators]
         rows = rows[self.unilateral[rows]] if len(rows) else rows
-        # At rest round-off would decide by the effort alone.
-        slack[rows] = (effort[rows] <= 0.0) & (self._delta[rows] > target[rows] + 1e-9)
-        W = self._W.copy()
-        count = self.model.size - len(self._bonds)
+        # At rest the effort alone would be a matter of round-off.
+        slack[rows] = (effort[rows] <= 0.0) & (delta[rows] > target[rows] + 1e-9)
+        count = len(effort) - len(self._bonds)
         if len(self._bonds):
             across = W[:count, count:]
             W = W[:count, :count] - across @ np.linalg.solve(W[count:, count:], across.T)
             W = 0.5 * (W + W.T)
         condensed = CondensedModel(
             compliance=W,
-            free=self._delta[:count] - W @ effort[:count],
+            free=delta[:count] - W @ effort[:count],
             effort=effort[:count],
             roles=tuple(role for role in self.model.roles if role[0] != "b"),
         )
         return Equilibrium(
             x=self.x.copy(),
             condensed=condensed,
-            delta=self._delta.copy(),
+            delta=delta.copy(),
             effort=effort,
             slack=slack,
-            stable=self._active.positive_definite,
+            stable=self.linearisation.positive_definite,
             iterations=iterations,
             increments=increments,
         )

@@ -1,0 +1,336 @@
+"""Assembly: the equilibrium equations of a body and their derivative, on a sparsity pattern that is found once."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from scipy.sparse import coo_matrix, csr_matrix
+
+from softgym_envs.mechanics.constraints import Constraint
+from softgym_envs.mechanics.elements.block import ElementBlock
+from softgym_envs.mechanics.frames import KinematicMap
+from softgym_envs.mechanics.kinematics import Kinematics
+
+
+@njit(cache=True)
+def _subtract_entries(values, places, entries):
+    for k in range(places.shape[0]):
+        if places[k] >= 0:
+            values[places[k]] -= entries[k]
+
+
+@njit(cache=True)
+def _symmetric_product(low, high, values, vector):
+    out = np.zeros_like(vector)
+    for k in range(low.shape[0]):
+        out[low[k]] += values[k] * vector[high[k]]
+        if low[k] != high[k]:
+            out[high[k]] += values[k] * vector[low[k]]
+    return out
+
+
+@njit(cache=True)
+def _find_entries(keys, total, indptr, indices, out):
+    """Write the places of keys ``column * total + row`` in a CSC pattern; leave ``out`` alone for all other keys."""
+    for k in range(keys.shape[0]):
+        column = keys[k] // total
+        if keys[k] < 0 or column >= indptr.shape[0] - 1:
+            continue
+        row = keys[k] - column * total
+        low, high = indptr[column], indptr[column + 1]
+        while low < high:
+            middle = (low + high) // 2
+            if indices[middle] < row:
+                low = middle + 1
+            else:
+                high = middle
+        if low < indptr[column + 1] and indices[low] == row:
+            out[k] = low
+
+
+def _distinct(keys: np.ndarray) -> np.ndarray:
+    """Sorted distinct values, as `numpy.unique` returns them; for integers, sorting alone is far faster."""
+    keys = np.sort(keys)
+    return keys[np.append(True, keys[1:] != keys[:-1])] if len(keys) else keys
+
+
+class Assembled(NamedTuple):
+    """Equilibrium equations at one state.
+
+    Attributes:
+        residual: ``grad E - sum effort_i grad delta_i`` over the equations, shape (N,).
+        tangent: lower-triangle values of its derivative, a buffer that the next call overwrites.
+        gradients: constraint gradients ``H``, shape (N, size), Fortran order.
+        delta: constraint values, shape (size,).
+    """
+
+    residual: np.ndarray
+    tangent: np.ndarray
+    gradients: np.ndarray
+    delta: np.ndarray
+
+
+class MassMatrix(NamedTuple):
+    """Mass matrix of a body.
+
+    Attributes:
+        rows: masses between rows [kg], the same for every axis, shape (n, n).
+        entries: the same masses in the layout of the tangent's values.
+    """
+
+    rows: csr_matrix
+    entries: np.ndarray
+
+
+class MassAndDamping(NamedTuple):
+    """What resists the motion of a body: its mass and Rayleigh damping.
+
+    Attributes:
+        mass: mass matrix.
+        mass_damping: Rayleigh's alpha [1/s].
+        stiffness_damping: Rayleigh's beta [s].
+        viscosity: values that beta acts on, see `Assembly.viscosity`; needed where beta is not zero.
+    """
+
+    mass: MassMatrix
+    mass_damping: float = 0.0
+    stiffness_damping: float = 0.0
+    viscosity: np.ndarray | None = None
+
+
+class Inertia(ABC):
+    """What one implicit time step adds to the equilibrium: inertia and damping at its end.
+
+    Attributes:
+        body: mass and damping of the body.
+        acceleration_factor: derivative of accelerations with respect to displacements [1/s2].
+        velocity_factor: derivative of velocities with respect to displacements [1/s].
+    """
+
+    body: MassAndDamping
+    acceleration_factor: float
+    velocity_factor: float
+
+    @abstractmethod
+    def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return velocities [m/s] and accelerations [m/s2] of the rows (n, 3) if the step ends at rows ``x`` (n, 3)."""
+
+
+class Assembly:
+    """Evaluates the equilibrium equations of a body on a fixed sparsity pattern.
+
+    Values of the tangent are listed entry by entry of the lower triangle (CSC, see `indptr` and `indices`). While they
+    are being added up, entries that touch carried rows follow behind; the kinematic map then moves them to the
+    equations.
+
+    Args:
+        nodes: rest rows [m], shape (n, 3).
+        kinematics: degrees of freedom.
+        blocks: element blocks.
+        rows: constraints and their rows.
+        bonds: those of the constraints that are bonds.
+
+    Attributes:
+        size: number of constraint rows.
+        indptr: CSC column pointers of the tangent's lower triangle over the equations, shape (N + 1,).
+        indices: its row indices.
+        bond_stiffness: stiffness [N/m] of the term ``bond_stiffness H_b H_b^T`` that bonds add to the tangent. Without
+            it a part that only bonds hold would make the tangent singular; on motions that keep the bonds it changes
+            nothing, so that any positive value gives the same equilibrium. It is high compared with the elements, so
+            that the tangent is positive definite where the bonded body is stable.
+    """
+
+    def __init__(
+        self,
+        nodes: np.ndarray,
+        kinematics: Kinematics,
+        blocks: Sequence[ElementBlock],
+        rows: Sequence[tuple[Constraint, slice]],
+        bonds: Sequence[Constraint],
+    ) -> None:
+        self.kinematics = kinematics
+        self.blocks = list(blocks)
+        self._rows = list(rows)
+        self._bonds = list(bonds)
+        self.size = sum(constraint.size for constraint, _ in self._rows)
+        stiffness = [block.stiffness for block in self.blocks if block.stiffness > 0.0]
+        self.bond_stiffness = 100.0 * float(np.mean(stiffness)) if stiffness else 1.0
+        self._known_dofs = np.flatnonzero(kinematics.number >= 0)
+        self._targets = []
+        for constraint, _ in self._rows:
+            equations = kinematics.number[constraint.dofs]
+            keep = np.flatnonzero(equations >= 0)
+            self._targets.append((keep, equations[keep]))
+        self._make_pattern()
+        self._values = np.empty(len(self._low))
+        self._gradient = np.empty_like(nodes)
+
+    def _make_pattern(self) -> None:
+        """Find the sparsity pattern and, for each block and constraint, where its entries go."""
+        kinematics = self.kinematics
+        number, n, total = kinematics.number, kinematics.equations, kinematics.total
+        stencils = [block.stencils() for block in self.blocks]
+        curved = [c for c, _ in self._rows if type(c).hessian is not Constraint.hessian]
+        # Of constraints both halves are listed; the upper one is left out.
+        halves = [c.hessian_pattern() for c in curved]
+        halves += [(np.repeat(c.dofs, len(c.dofs)), np.tile(c.dofs, len(c.dofs))) for c in self._bonds]
+        # Keys of entries: column-major in the lower triangle; those that touch a carried row come last.
+        keys = []
+        for pairs, lower_only in ((sum(stencils, []), False), (halves, True)):
+            for rows, columns in pairs:
+                first, second = number[rows], number[columns]
+                key = np.minimum(first, second) * total + np.maximum(first, second)
+                key[(first < 0) | (second < 0) | (lower_only & (first < second))] = -1
+                keys.append(key)
+        seen = _distinct(np.concatenate([key.ravel() for key in keys] + [np.arange(n) * (total + 1)]))
+        seen = seen[seen >= 0]
+        high = seen % total
+        direct, extra = seen[high < n], seen[high >= n]
+        if kinematics.map is not None:
+            direct = self._plan_expansion(kinematics.map, direct, extra)
+        self._entries = len(direct)
+        self.indptr = np.searchsorted(direct, np.arange(n + 1, dtype=np.int64) * total)
+        self.indices = direct % total
+        maps: list[np.ndarray] = []
+        for key in keys:
+            place = np.full(key.shape, -1, dtype=np.int32)
+            _find_entries(key.ravel(), total, self.indptr, self.indices, place.reshape(-1))
+            if len(extra):
+                touches = (key >= 0) & (key % total >= n)
+                place[touches] = self._entries + np.searchsorted(extra, key[touches])
+            maps.append(place)
+        following = iter(maps)
+        self._block_maps = [[next(following) for _ in parts] for parts in stencils]
+        self._hessian_maps = [next(following) if c in curved else None for c, _ in self._rows]
+        self._bond_maps = [next(following) for _ in self._bonds]
+        self._keys = np.concatenate([direct, extra])
+        self._low, self._high = self._keys // total, self._keys % total
+
+    def _plan_expansion(self, kinematic_map: KinematicMap, direct: np.ndarray, extra: np.ndarray) -> np.ndarray:
+        """Add to the keys of direct entries those that entries of carried rows lead to, and keep where these go."""
+        total = self.kinematics.total
+        self._expansion = kinematic_map.plan(extra // total, extra % total)
+        spins = kinematic_map.spin_pairs
+        expanded_keys, spin_keys = (pairs @ [total, 1] for pairs in (self._expansion.pairs, spins))
+        held = spins[:, 0] < 0
+        direct = _distinct(np.concatenate([direct, expanded_keys, spin_keys[~held]]))
+        self._expansion_target = np.searchsorted(direct, expanded_keys)
+        self._spin_target = np.where(held, -1, np.searchsorted(direct, spin_keys))
+        return direct
+
+    def evaluate(
+        self, x: np.ndarray, effort: np.ndarray, loads: np.ndarray, inertia: Inertia | None = None
+    ) -> Assembled | None:
+        """Return the equilibrium equations at one state, or None if an element is inverted there.
+
+        Args:
+            x: positions of the rows [m], shape (n, 3).
+            effort: efforts of all constraint rows, shape (size,).
+            loads: dead loads [N], shape (n, 3).
+            inertia: what a time step adds; none in statics.
+        """
+        gradient, values = self._gradient, self._values
+        np.negative(loads, out=gradient)
+        values[:] = 0.0
+        for block, scatter in zip(self.blocks, self._block_maps, strict=True):
+            if block.add(x, gradient, values, scatter)[1]:
+                return None
+        if inertia is not None:
+            self._add_inertia(inertia, x, gradient, values)
+        kinematics = self.kinematics
+        n, carried = kinematics.equations, kinematics.frames.carried
+        H = np.zeros((kinematics.total, self.size), order="F")
+        delta = np.empty(self.size)
+        for (constraint, rows), (keep, equations), mapping in zip(
+            self._rows, self._targets, self._hessian_maps, strict=True
+        ):
+            part = effort[rows]
+            if mapping is not None and part.any():
+                hessian = constraint.hessian(x, part)
+                assert hessian is not None
+                _subtract_entries(values, mapping, hessian.ravel())
+            delta[rows], jacobian = constraint.linearise(x)
+            H[equations, rows] = jacobian[:, keep].T
+        residual = np.zeros(n)
+        residual[: len(kinematics.free_dofs)] = gradient.ravel()[kinematics.free_dofs]
+        for bond, places in zip(self._bonds, self._bond_maps, strict=True):
+            jacobian = bond.jacobian(x)
+            _subtract_entries(values, places, (-self.bond_stiffness * (jacobian.T @ jacobian)).ravel())
+        if kinematics.map is not None:
+            arms = kinematics.map.linearise(x)
+            pull = gradient[carried]
+            if effort.any():
+                pull = pull - (H[n:] @ effort).reshape(-1, 3)
+            turning = kinematics.map.transposed
+            residual += turning @ gradient[carried].ravel()
+            H = np.asfortranarray(H[:n] + turning @ H[n:])
+            kinematics.map.expand(values, self._entries, self._expansion, self._expansion_target)
+            kinematics.map.add_curvature(values, arms, pull, self._spin_target)
+        if effort.any():
+            residual -= H @ effort
+        return Assembled(residual, values[: self._entries], H, delta)
+
+    # -- dynamics ---------------------------------------------------------------------------------------------------
+
+    def mass_matrix(self, lumped: bool = False) -> MassMatrix:
+        """Return the mass matrix, consistent or lumped."""
+        parts = [block.mass_entries(lumped) for block in self.blocks]
+        rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+        off = rows != columns
+        n = len(self._gradient)
+        matrix = coo_matrix(
+            (
+                np.concatenate([values, values[off]]),
+                (np.concatenate([rows, columns[off]]), np.concatenate([columns, rows[off]])),
+            ),
+            shape=(n, n),
+        ).tocsr()
+        number, total = self.kinematics.number, self.kinematics.total
+        entries = np.zeros(len(self._values))
+        for axis in range(3):
+            first, second = number[3 * rows + axis], number[3 * columns + axis]
+            keep = (first >= 0) & (second >= 0)
+            low, high = np.minimum(first, second)[keep], np.maximum(first, second)[keep]
+            key, direct = low * total + high, self._keys[: self._entries]
+            place = np.where(
+                high < self.kinematics.equations,
+                np.searchsorted(direct, key),
+                self._entries + np.searchsorted(self._keys[self._entries :], key),
+            )
+            entries += np.bincount(place, weights=values[keep], minlength=len(entries))
+        return MassMatrix(matrix, entries)
+
+    def viscosity(self, x: np.ndarray) -> np.ndarray:
+        """Stiffness of the elements against strain rates at rows ``x`` (n, 3), see `ElementBlock.add_viscosity`.
+
+        The values are in the layout of the tangent before the kinematic map is applied.
+        """
+        values = np.zeros_like(self._values)
+        for block, scatter in zip(self.blocks, self._block_maps, strict=True):
+            block.add_viscosity(x, values, scatter)
+        return values
+
+    def damping_force(self, body: MassAndDamping, velocity: np.ndarray) -> np.ndarray:
+        """Force [N] (n, 3) of the stiffness-proportional damping at velocities of the rows (n, 3)."""
+        assert body.viscosity is not None
+        moved = np.zeros(self.kinematics.total)
+        numbers = self.kinematics.number[self._known_dofs]
+        moved[numbers] = velocity.ravel()[self._known_dofs]
+        force = _symmetric_product(self._low, self._high, body.viscosity, moved)
+        out = np.zeros_like(velocity)
+        out.ravel()[self._known_dofs] = body.stiffness_damping * force[numbers]
+        return out
+
+    def _add_inertia(self, inertia: Inertia, x: np.ndarray, gradient: np.ndarray, values: np.ndarray) -> None:
+        body = inertia.body
+        velocity, acceleration = inertia.motion(x)
+        gradient += body.mass.rows @ (acceleration + body.mass_damping * velocity)
+        values += (inertia.acceleration_factor + body.mass_damping * inertia.velocity_factor) * body.mass.entries
+        if body.stiffness_damping:
+            assert body.viscosity is not None
+            values += (body.stiffness_damping * inertia.velocity_factor) * body.viscosity
+            gradient += self.damping_force(body, velocity)
