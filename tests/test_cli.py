@@ -163,7 +163,7 @@ def test_a_stopped_verb_says_so_and_goes_on_only_where_it_can(
     arguments = [str(ROOT / a) if a.startswith("configs/") else a for a in arguments]
     status, _, err = run(monkeypatch, capsys, *arguments)
     assert status == 130 and "stopped" in err
-    assert ("goes on where it was" in err) == resumes
+    assert ("again to continue" in err) == resumes
 
 
 def test_console_module_runs():

@@ -1,0 +1,5 @@
+"""The command line without its script: ``python -m softgym_envs.cli``."""
+
+from softgym_envs.cli.main import main
+
+main()

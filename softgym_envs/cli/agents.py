@@ -1,0 +1,111 @@
+"""Verbs for agents: train, evaluate, results, deploy-policy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from softgym_envs.cli import options
+from softgym_envs.cli.environments import AGENT_HELP
+from softgym_envs.errors import ConfigError
+
+
+@click.command()
+@options.run_options
+@options.folder
+@click.option("--initial", type=options.PATH, help="Policy to start from.")
+def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
+    """Train a SAC policy; continues from its last checkpoint."""
+    from agents.config import TrainConfig
+    from agents.training import train as run
+    from softgym_envs.config import load_config
+
+    with options.resumable():
+        path = run(load_config(config, TrainConfig, overrides), folder, initial=initial, progress=not quiet)
+    click.echo(f"wrote {path}")
+
+
+@click.command()
+@options.config
+@click.option(
+    "--agent", "agents", multiple=True, default=("qp", "random"), show_default=True, help=AGENT_HELP + " Repeatable."
+)
+@click.option("--backend", "backends", multiple=True, help="surrogate or fem (default: the environment's). Repeatable.")
+@options.design
+@click.option("--goals", default=200, show_default=True, help="Number of unseen goals.")
+@click.option("--seed", default=2_000_003, show_default=True, help="Seed of the goals.")
+@click.option("--output", type=options.PATH, help="Write all results as JSON to this file.")
+@options.overrides
+def evaluate(
+    config: Path,
+    agents: tuple[str, ...],
+    backends: tuple[str, ...],
+    design: tuple[str, ...],
+    goals: int,
+    seed: int,
+    output: Path | None,
+    overrides: tuple[str, ...],
+) -> None:
+    """Evaluate agents on the same unseen goals; CONFIG is the file of their training."""
+    from agents.config import TrainConfig
+    from agents.evaluation import AGENTS, sample_goals
+    from agents.evaluation import evaluate as run
+    from agents.policy import Policy
+    from softgym_envs.config import load_config, provenance
+    from softgym_envs.storage import write_json
+
+    environment = load_config(config, TrainConfig, overrides).environment
+    chosen = options.design_of(design) or None
+    if goals < 1:
+        raise ConfigError(f"--goals {goals} must be at least 1")
+    for agent in agents:  # reject a wrong policy before the others are evaluated
+        if agent not in AGENTS:
+            Policy(agent).check_environment(environment)
+    points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
+    results: list[dict[str, Any]] = []
+    click.echo(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean mm':>9s} {'worst mm':>9s} {'return':>8s}")
+    for backend in backends or (environment.backend,):
+        for agent in agents:
+            outcome = run(agent, environment.on(backend), points, design=chosen, seed=seed)
+            results.append({"agent": agent, "backend": backend, **outcome.to_json()})
+            click.echo(
+                f"{agent[-34:]:34s} {backend:10s} {outcome.success_rate:8.1%} {1e3 * outcome.mean_distance:9.3f} "
+                f"{1e3 * outcome.worst_distance:9.3f} {outcome.mean_return:8.2f}"
+            )
+    if output is not None:
+        inputs = {"environment": environment.model_dump(mode="json"), "goals": goals, "seed": seed, "design": chosen}
+        write_json(output, {**inputs, **provenance(), "results": results})
+        click.echo(f"wrote {output}")
+
+
+@click.command()
+@click.option("--folder", type=options.PATH, help="Folder of stored runs (default: the shipped runs).")
+@click.option("--output", type=options.PATH, help="Write the table to this Markdown file instead of printing it.")
+@click.option("--curves", type=options.PATH, help="Draw the learning curves to this file (.png, .svg or .pdf).")
+def results(folder: Path | None, output: Path | None, curves: Path | None) -> None:
+    """Print the table of stored training runs and draw their learning curves."""
+    from agents.results import RESULTS, draw_curves, load_runs, table
+    from softgym_envs.storage import atomic_write
+
+    runs = load_runs(folder or RESULTS)
+    text = table(runs)
+    if output is None:
+        click.echo(text)
+    else:
+        with atomic_write(output, "w") as stream:
+            stream.write(text)
+        click.echo(f"wrote {output}")
+    if curves is not None:
+        click.echo(f"wrote {draw_curves(runs, curves)}")
+
+
+@click.command("deploy-policy")
+@click.argument("policy")
+@click.argument("file", type=options.PATH)
+def deploy_policy(policy: str, file: Path) -> None:
+    """Write POLICY (a file or the name of a shipped policy) to FILE (.onnx): sensor values in SI to commands."""
+    from agents.export import export_policy_onnx
+
+    click.echo(f"wrote {export_policy_onnx(policy, file)}")

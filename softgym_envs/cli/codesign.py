@@ -1,0 +1,118 @@
+"""Verbs for design: codesign, optimise, sensitivity, calibrate."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from softgym_envs.cli import options
+
+
+@click.command()
+@options.run_options
+@options.results_folder
+@click.option("--workers", type=int, help="Number of worker processes (default: the config's).")
+@click.option("--storage", help="PostgreSQL database that several machines share (default: the config's).")
+def codesign(
+    config: Path,
+    folder: Path | None,
+    workers: int | None,
+    storage: str | None,
+    quiet: bool,
+    overrides: tuple[str, ...],
+) -> None:
+    """Optimise body and controller together and write a report; continues an interrupted study."""
+    from codesign.config import StudyConfig
+    from codesign.report.page import write_report
+    from codesign.study import run_study
+    from softgym_envs.config import load_config
+
+    study = load_config(config, StudyConfig, (*overrides, *([f"storage={storage}"] if storage else [])))
+    folder = Path("results") / study.name if folder is None else folder
+    with options.resumable():
+        run_study(study, folder, workers=workers, progress=not quiet)
+        report = write_report(folder)
+    click.echo(f"report: {report}")
+
+
+@click.command()
+@options.run_options
+@options.results_folder
+def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
+    """Rank design variables by their effect: one at a time, Morris or Sobol; continues an interrupted run."""
+    from codesign.tools.config import SensitivityConfig
+    from codesign.tools.sensitivity import analyse
+    from softgym_envs.config import load_config
+
+    study = load_config(config, SensitivityConfig, overrides)
+    folder = Path("results") / study.name if folder is None else folder
+    with options.resumable():
+        result = analyse(study, folder, progress=not quiet)
+    for metric, table in result["indices"].items():
+        keys = list(next(iter(table.values())))
+        click.echo(f"\n{metric:24s} " + " ".join(f"{key:>16s}" for key in keys))
+        for variable, row in table.items():
+            click.echo(f"  {variable:22s} " + " ".join(f"{row[key]:16.5g}" for key in keys))
+    kept = f" ({100 * result['groups_kept']:.0f} % of the sample groups remain)" if result["infeasible"] else ""
+    click.echo(f"\n{result['designs']} designs, {result['infeasible']} infeasible{kept}; wrote {folder}")
+
+
+@click.command()
+@options.run_options
+@options.results_folder
+def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
+    """Search for the best bodies without a controller, with Optuna (can be continued) or along gradients."""
+    from codesign.tools import gradient
+    from codesign.tools.config import OptimiseConfig
+    from codesign.tools.search import search
+    from softgym_envs.config import load_config
+
+    study = load_config(config, OptimiseConfig, overrides)
+    folder = Path("results") / study.name if folder is None else folder
+    if study.solver.method == "gradient":
+        result = gradient.optimise(study, folder)
+        click.echo(json.dumps(result["best"], indent=2))
+        click.echo(f"{len(result['descents'])} descents, {result['seconds']:.2f} s; wrote {folder}")
+        return
+    with options.resumable():
+        found = search(study, folder, progress=not quiet)
+    ends = found.front[:1] if len(study.objectives) == 1 else [found.front[0], found.front[-1]]
+    for row in ends:
+        click.echo(json.dumps(asdict(row)))
+    click.echo(
+        f"{len(found.front)} designs on the front of {found.feasible} feasible and {found.infeasible} infeasible "
+        f"designs; wrote {folder}"
+    )
+
+
+@click.command()
+@options.config
+@options.results_folder
+@options.overrides
+def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> None:
+    """Fit design variables to measured states in a CSV or JSON file."""
+    from codesign.tools.calibration import calibrate as run
+    from codesign.tools.config import CalibrationConfig
+    from softgym_envs.config import load_config
+
+    study = load_config(config, CalibrationConfig, overrides)
+    folder = Path("results") / study.name if folder is None else folder
+    result = run(study, folder)
+    for name in study.fit:
+        value, ends = result["design"][name], (result["interval"] or {}).get(name)
+        text = f"{name} = {value:.6g}"
+        if ends is not None and ends[1] > ends[0]:
+            # Enough digits to distinguish the ends.
+            digits = max(6, 2 - math.floor(math.log10((ends[1] - ends[0]) / (abs(value) or 1.0))))
+            text += f", {100 * result['level']:g} % interval {ends[0]:.{digits}g} to {ends[1]:.{digits}g}"
+        elif ends is not None:
+            text += ", no interval: the model fits the data exactly"
+        if name in result["at_bound"]:
+            text += "; at its bound: the best fit may lie outside the bounds"
+        click.echo(text)
+    errors = ", ".join(f"{name} {value:.3g}" for name, value in result["errors"].items())
+    click.echo(f"root mean square errors: {errors} [SI]; {result['seconds']:.1f} s; wrote {folder}")

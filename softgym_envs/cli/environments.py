@@ -1,0 +1,85 @@
+"""Verbs for environments: list, rollout, view."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import click
+
+from softgym_envs.cli import options
+from softgym_envs.errors import ConfigError
+
+AGENT_HELP = "qp, qp_static, qp_model, qp_pi, random, or a policy (a file or the name of a shipped policy)."
+
+
+@click.command("list")
+def list_() -> None:
+    """List environments, robots, backends and tasks."""
+    from softgym_envs.backends import BACKENDS
+    from softgym_envs.envs.registration import ENVIRONMENTS
+    from softgym_envs.envs.tasks.base import TASKS
+    from softgym_envs.robots import ROBOTS
+
+    click.echo("environments:")
+    for identifier, row in ENVIRONMENTS.items():
+        click.echo(f"  {identifier:28s} robot {row.robot}, task {row.task}, {row.max_episode_steps} steps")
+    for title, table in (("robots", ROBOTS), ("backends", BACKENDS), ("tasks", TASKS)):
+        click.echo(f"{title}: {', '.join(table)}")
+
+
+@click.command()
+@click.argument("environment")
+@click.option("--agent", default="qp", show_default=True, help=AGENT_HELP)
+@click.option("--backend", help="surrogate or fem (default: the environment's).")
+@options.design
+@click.option("--seed", default=0, show_default=True, help="Seed of the episode.")
+@click.option("--record", type=options.PATH, help="Write a rerun recording (.rrd) to this file.")
+def rollout(
+    environment: str, agent: str, backend: str | None, design: tuple[str, ...], seed: int, record: Path | None
+) -> None:
+    """Run one episode and print its result."""
+    import softgym_envs  # noqa: F401 - registers the IDs
+    from agents.config import EnvironmentConfig
+    from agents.evaluation import AGENTS, make_agent
+    from agents.policy import Policy
+    from softgym_envs.config import check_config
+
+    chosen = options.design_of(design)
+    # A policy needs the observations and actions of its training.
+    policy = None if agent in AGENTS else Policy(agent)
+    trained = {} if policy is None else policy.environment.model_dump()
+    config = check_config(EnvironmentConfig, {**trained, "id": environment}, "rollout")
+    if policy is not None:
+        policy.check_environment(config)
+    if backend is not None:
+        config = config.on(backend)
+    act = make_agent(agent, seed)
+    env = config.make(**({"design": chosen} if chosen else {}))
+    if record is not None:
+        from softgym_envs.viewer.recording import record_rollout
+
+        summary = record_rollout(env, act, record, seed=seed)
+        click.echo(json.dumps(summary, indent=2))
+        click.echo(f"wrote {record}; open it with 'softgym view {record}'")
+        return
+    observation, info = env.reset(seed=seed)
+    total, step, ended = 0.0, 0, False
+    while not ended:
+        observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
+        total, step, ended = total + float(reward), step + 1, terminated or truncated
+    click.echo(f"{environment} on {config.backend}, agent {agent}: {step} steps, return {total:.2f}")
+    click.echo(f"final distance {1e3 * info['distance']:.3f} mm, success {info['is_success']}")
+    env.close()
+
+
+@click.command()
+@click.argument("recording", type=options.PATH)
+def view(recording: Path) -> None:
+    """Open a recording of 'softgym rollout --record' in the rerun viewer."""
+    import subprocess
+
+    if not recording.is_file():
+        raise ConfigError(f"recording '{recording}' does not exist; make one with 'softgym rollout ... --record'")
+    sys.exit(subprocess.call([sys.executable, "-m", "rerun", str(recording)]))

@@ -1,0 +1,90 @@
+"""Entry point of the command line: its verbs, and errors as one line with status 2."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import NoReturn
+
+import click
+
+from softgym_envs.cli import agents, bench, codesign, environments, robots, surrogates
+from softgym_envs.cli.options import Resumable
+from softgym_envs.errors import SoftGymError, unknown_name
+from softgym_envs.version import __version__
+
+SECTIONS = {
+    "Environments": (environments.list_, environments.rollout, environments.view),
+    "Robots": (robots.show, robots.export),
+    "Surrogates": (surrogates.dataset, surrogates.fit, surrogates.deploy),
+    "Agents": (agents.train, agents.evaluate, agents.results, agents.deploy_policy),
+    "Design and control": (codesign.codesign, codesign.optimise, codesign.sensitivity, codesign.calibrate),
+    "Development": (bench.bench,),
+}
+
+
+class _Verbs(click.Group):
+    """A group whose help lists the verbs by section, and whose errors suggest the nearest verb."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        width = max(map(len, self.commands))
+        for title, verbs in SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl([(f"{verb.name:{width}}", verb.get_short_help_str(90)) for verb in verbs])
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] not in self.commands and not args[0].startswith("-"):
+            raise click.UsageError(unknown_name("verb", args[0], self.commands), ctx)
+        return super().resolve_command(ctx, args)
+
+
+@click.group(
+    cls=_Verbs,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+)
+@click.version_option(__version__, prog_name="softgym")
+@click.pass_context
+def cli(ctx: click.Context) -> None:
+    """Optimise the body and the controller of a soft robot together."""
+    if ctx.invoked_subcommand is None:
+        click.echo(ctx.get_help())
+
+
+for _verbs in SECTIONS.values():
+    for _verb in _verbs:
+        cli.add_command(_verb)
+
+
+def main() -> None:
+    """Run the command line; an error of the user's input ends it with one line and status 2."""
+    import gymnasium
+    from threadpoolctl import threadpool_limits
+
+    # One thread per process: more slow these small problems down. The variables reach libraries that are loaded later
+    # and worker processes; the limit reaches the libraries that are loaded already.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    threadpool_limits(1)
+    try:
+        cli(standalone_mode=False)
+    except click.exceptions.Exit as leave:
+        sys.exit(leave.exit_code)
+    except (click.Abort, KeyboardInterrupt) as stop:
+        hint = "; run the same command again to continue" if isinstance(stop, Resumable) else ""
+        click.echo(f"stopped{hint}", err=True)
+        sys.exit(130)
+    except click.ClickException as error:
+        _fail(error.format_message())
+    except (SoftGymError, ValueError, OSError, gymnasium.error.Error) as error:
+        _fail(str(error))
+
+
+def _fail(message: str) -> NoReturn:
+    click.echo(f"softgym: error: {' '.join(message.split())}", err=True)
+    sys.exit(2)

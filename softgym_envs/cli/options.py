@@ -1,0 +1,86 @@
+"""Options and arguments that several verbs share, and how their values are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from softgym_envs.errors import ConfigError
+
+if TYPE_CHECKING:
+    from softgym_envs.robots.base import Robot
+
+PATH: Any = click.Path(path_type=Path)
+
+config = click.option("--config", type=PATH, required=True, help="YAML file of the run.")
+folder = click.option("--folder", type=PATH, required=True, help="Folder of the results.")
+results_folder = click.option("--folder", type=PATH, help="Folder of the results (default: results/NAME of the config).")
+overrides = click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
+quiet = click.option("--quiet", is_flag=True, help="Hide progress bars.")
+design = click.option(
+    "--design", multiple=True, metavar="NAME=VALUE", help="Design variable in SI units; repeat for several."
+)
+robot_option = click.option(
+    "--option", "options_", multiple=True, metavar="NAME=VALUE", help="Robot option; repeat for several."
+)
+
+
+def run_options(command: Callable) -> Callable:
+    """Add the options of a verb that runs a configuration: ``--config``, ``--quiet`` and overrides."""
+    return config(quiet(overrides(command)))
+
+
+class Resumable(click.Abort):
+    """Ctrl-C stopped a verb that continues where it stopped when the same command is run again."""
+
+
+@contextmanager
+def resumable() -> Iterator[None]:
+    """Mark a block that loses no finished work when Ctrl-C stops it.
+
+    Raises:
+        Resumable: instead of KeyboardInterrupt.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Resumable from None
+
+
+def design_of(pairs: tuple[str, ...]) -> dict[str, float]:
+    """Return the design variables of ``--design name=value``.
+
+    Raises:
+        ConfigError: if a value is not a number.
+    """
+    values = {}
+    for name, text in _split("design", pairs):
+        try:
+            values[name] = float(text)
+        except ValueError:
+            raise ConfigError(f"--design {name}={text}: the value must be a number in SI units") from None
+    return values
+
+
+def robot_of(name: str, pairs: tuple[str, ...]) -> Robot:
+    """Return a robot made with the options of ``--option name=value``.
+
+    Raises:
+        ValueError: for an unknown robot or a wrong option.
+    """
+    from softgym_envs.config import read_value
+    from softgym_envs.robots import make_robot
+
+    return make_robot(name, **{key: read_value(text) for key, text in _split("option", pairs)})
+
+
+def _split(option: str, pairs: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+    for pair in pairs:
+        name, separator, text = pair.partition("=")
+        if not separator or not name:
+            raise ConfigError(f"--{option} '{pair}' must look like name=value")
+        yield name, text
