@@ -8,6 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from softgym_envs.config import Config
 from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.errors import unknown_name
 from softgym_envs.robots import make_robot
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class EnvironmentConfig(Config):
     @classmethod
     def _known(cls, value: str) -> str:
         if value not in ENVIRONMENTS:
-            raise ValueError(f"unknown environment '{value}'; allowed: {', '.join(ENVIRONMENTS)}")
+            raise ValueError(unknown_name("environment", value, ENVIRONMENTS))
         return value
 
     def on(self, backend: str) -> EnvironmentConfig:

@@ -14,20 +14,21 @@ from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
-from softgym_envs.errors import ConfigError
+from softgym_envs.errors import ConfigError, unknown_name
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.version import __version__
 
 
 class Config(BaseModel):
-    """Base of all configurations: unknown keys are errors, numbers are finite, values do not change."""
+    """Base of all configurations: immutable, without unknown keys and with finite numbers only."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=False, allow_inf_nan=False)
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML whose numbers are those of YAML 1.2 and JSON: ``1e-3`` is a number here, in PyYAML a word."""
+    """YAML with the numbers of YAML 1.2 and JSON: ``1e-3`` is a number, although PyYAML reads it as a string."""
 
 
 _Loader.add_implicit_resolver(
@@ -38,26 +39,30 @@ _Loader.add_implicit_resolver(
 
 
 def read_value(text: str) -> Any:
-    """Read YAML text; raises `yaml.YAMLError`."""
+    """Return the value of YAML text.
+
+    Raises:
+        yaml.YAMLError: if the text is not valid YAML.
+    """
     return yaml.load(text, Loader=_Loader)
 
 
 _PASSWORD = re.compile(r"(?<=[^/]):[^/@:\s]*@")
-"""The password of an address, which must not end up in a log."""
+"""The password in a database address, which must not appear in a message or log."""
 
 ModelT = TypeVar("ModelT", bound=Config)
 
 
 def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequence[str] = ()) -> ModelT:
-    """Read a YAML file, apply ``a.b=value`` overrides, and check the result.
+    """Return the configuration in a YAML file, with overrides.
 
     Args:
-        path: the file, or None for defaults alone.
-        model: what it must be.
-        overrides: assignments; values are read as YAML.
+        path: the file, or None to start from the defaults.
+        model: class of the configuration.
+        overrides: assignments ``a.b=value``, whose values are YAML.
 
     Raises:
-        ConfigError: one line naming the key, its value and what is allowed.
+        ConfigError: one line with the key, its value and what is allowed.
     """
     data: Any = {}
     if path is not None:
@@ -72,7 +77,7 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
             raise ConfigError(f"config '{path}' is not valid YAML{place}: {getattr(error, 'problem', error)}") from None
         data = {} if data is None else data
         if not isinstance(data, dict):
-            raise ConfigError(f"config '{path}' must hold keys and values, got {type(data).__name__}")
+            raise ConfigError(f"config '{path}' must be a mapping of keys to values, got a {type(data).__name__}")
     for override in overrides:
         key, separator, text = override.partition("=")
         if not separator or not key:
@@ -91,21 +96,47 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
 
 
 def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> ModelT:
-    """Validate plain data, with a one-line `ConfigError` for the first problem."""
+    """Return plain data as a configuration.
+
+    Args:
+        model: class of the configuration.
+        data: keys and values.
+        where: where the data come from, for the message: ``"config 'x.yaml'"``.
+
+    Raises:
+        ConfigError: one line that describes the first problem.
+    """
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"]) or "(top level)"
-        message = first["msg"].removeprefix("Value error, ").replace("\n", " ")
-        if first["type"] == "extra_forbidden":
-            allowed = _allowed(model, [part for part in first["loc"][:-1] if isinstance(part, str)])
-            message = f"unknown key; allowed: {allowed}" if allowed else "unknown key"
-        elif first["type"] != "missing" and not isinstance(first["input"], dict):
-            message += f", got {_PASSWORD.sub(r':***@', repr(first['input']))}"
-        others = error.error_count() - 1
-        more = f" (and {others} more)" if others else ""
-        raise ConfigError(f"{where}: {key}: {message}{more}") from None
+        problems = error.errors(include_url=False)
+        missing = [_dotted(problem) for problem in problems if problem["type"] == "missing"]
+        if missing:
+            plural = "s" if len(missing) > 1 else ""
+            message, count = f"missing required key{plural} {', '.join(missing)}", len(missing)
+        else:
+            message, count = _describe(problems[0], model), 1
+        others = len(problems) - count
+        more = f" (and {others} more problem{'s' if others > 1 else ''})" if others else ""
+        raise ConfigError(f"{where}: {message}{more}") from None
+
+
+def _dotted(problem: ErrorDetails) -> str:
+    return ".".join(map(str, problem["loc"])) or "(top level)"
+
+
+def _describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
+    key = _dotted(problem)
+    if problem["type"] == "extra_forbidden":
+        *parents, last = problem["loc"]
+        allowed = _allowed(model, [part for part in parents if isinstance(part, str)])
+        known = unknown_name("key", str(last), allowed) if allowed else f"unknown key '{last}'"
+        return f"{'.'.join(map(str, parents))}: {known}" if parents else known
+    message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("\n", " ")
+    shown = _PASSWORD.sub(r":***@", repr(problem["input"]))
+    if isinstance(problem["input"], dict) or shown in message:
+        return f"{key}: {message}"
+    return f"{key}: {message}, got {shown}"
 
 
 def difference(old: Config, new: Config, *, ignore: Sequence[str] = ()) -> str | None:
@@ -152,20 +183,21 @@ def check_compatible(
         raise ConfigError(f"{found} with {other}; use another {use}{allowed}")
 
 
-def _allowed(model: type[BaseModel], path: list[str]) -> str:
+def _allowed(model: type[BaseModel], path: list[str]) -> list[str]:
+    """Return the keys of the group of keys at ``path``; none if the group is not a configuration."""
     for name in path:
         field = model.model_fields.get(name)
         inner = None if field is None else field.annotation
         if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
-            return ""
+            return []
         model = inner
-    return ", ".join(model.model_fields)
+    return list(model.model_fields)
 
 
 def commit_of(root: Path) -> str | None:
-    """Commit of a source tree, with ``-dirty`` where files differ from it; None where it cannot be known.
+    """Return the git commit of a source tree, with ``-dirty`` if files differ from it, or None if it is unknown.
 
-    A clone is asked by git; a source archive (``git archive``, a download of a tag) carries it in a file.
+    In a clone git knows the commit; a source archive (``git archive``, a downloaded tag) stores it in a file.
     """
     archived = root / ".git_archival.txt"
     if (root / ".git").exists():
@@ -174,7 +206,7 @@ def commit_of(root: Path) -> str | None:
                 ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"],
                 capture_output=True,
                 text=True,
-                timeout=10,
+                timeout=60,
                 check=False,
             )
         except (OSError, subprocess.TimeoutExpired):
@@ -187,7 +219,7 @@ def commit_of(root: Path) -> str | None:
 
 
 def provenance() -> dict[str, Any]:
-    """What made a result: versions, git commit, time, machine."""
+    """Return the origin of a result: versions, git commit, time and machine."""
     versions = {"softgym-envs": __version__, "python": platform.python_version()}
     for package in ("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "optuna", "gmsh", "proxsuite"):
         try:
@@ -204,7 +236,7 @@ def provenance() -> dict[str, Any]:
 
 
 def save_resolved(folder: str | Path, config: Config) -> None:
-    """Write the resolved configuration and its provenance next to a result."""
+    """Write a configuration and its provenance to the folder of a result."""
     folder = Path(folder)
     with atomic_write(folder / "config.yaml", "w") as stream:
         yaml.safe_dump(config.model_dump(mode="json"), stream, sort_keys=False)

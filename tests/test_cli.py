@@ -1,6 +1,7 @@
 """The command line: every verb, and one clear line with status 2 for bad input."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from softgym_envs import cli
+from softgym_envs.cli import app
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -88,7 +90,7 @@ STRENGTH = "configs/design/finger_strength.yaml"
         (["show", "octopus"], ["octopus", "finger"]),
         (["show", "finger", "--design", "length=1"], ["length", "0.038", "0.042"]),
         (["show", "finger", "--design", "size=1"], ["size", "length"]),
-        (["show", "finger", "--design", "length"], ["length", "name=number"]),
+        (["show", "finger", "--design", "length"], ["length", "name=value"]),
         (["show", "finger", "--option", "cables=9"], ["cables", "1, 2"]),
         (["rollout", "SoftGym/Nothing-v0"], ["Nothing", "FingerReach"]),
         (
@@ -119,7 +121,8 @@ STRENGTH = "configs/design/finger_strength.yaml"
             ["environment.action_mode = absolute", "finger_reach", "increment"],
         ),
         (["fit", "--config", CONFIG, "--folder", "x"], ["robot", "required"]),
-        (["frobnicate"], ["frobnicate"]),
+        (["frobnicate"], ["frobnicate", "rollout"]),
+        (["rolout"], ["unknown verb 'rolout'; did you mean 'rollout'?"]),
         (["bench", "nothing"], ["nothing"]),
     ],
 )
@@ -164,6 +167,21 @@ def test_a_stopped_verb_says_so_and_goes_on_only_where_it_can(
     status, _, err = run(monkeypatch, capsys, *arguments)
     assert status == 130 and "stopped" in err
     assert ("again to continue" in err) == resumes
+
+
+def test_help_without_a_verb(monkeypatch, capsys):
+    status, out, err = run(monkeypatch, capsys)
+    assert status == 0 and not err
+    for words in ("Usage: softgym", "Environments:", "Design and control:", "rollout", "calibrate"):
+        assert words in out
+
+
+@pytest.mark.parametrize("verb", app.cli.commands)
+def test_every_verb_has_help_in_a_section(verb, monkeypatch, capsys):
+    _, listed, _ = run(monkeypatch, capsys)
+    status, out, _ = run(monkeypatch, capsys, verb, "--help")
+    assert status == 0 and f"softgym {verb}" in out
+    assert re.search(rf"^  {verb} +[A-Z]", listed, re.MULTILINE)
 
 
 def test_console_module_runs():

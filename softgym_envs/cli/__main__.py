@@ -1,5 +1,5 @@
 """The command line without its script: ``python -m softgym_envs.cli``."""
 
-from softgym_envs.cli.main import main
+from softgym_envs.cli.app import main
 
 main()

@@ -17,7 +17,10 @@ from softgym_envs.errors import ConfigError
 @options.folder
 @click.option("--initial", type=options.PATH, help="Policy to start from.")
 def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
-    """Train a SAC policy; continues from its last checkpoint."""
+    """Train a SAC policy.
+
+    An interrupted run continues from its last checkpoint.
+    """
     from agents.config import TrainConfig
     from agents.training import train as run
     from softgym_envs.config import load_config
@@ -48,7 +51,10 @@ def evaluate(
     output: Path | None,
     overrides: tuple[str, ...],
 ) -> None:
-    """Evaluate agents on the same unseen goals; CONFIG is the file of their training."""
+    """Evaluate agents on the same unseen goals.
+
+    CONFIG is the file of their training.
+    """
     from agents.config import TrainConfig
     from agents.evaluation import AGENTS, sample_goals
     from agents.evaluation import evaluate as run
@@ -85,7 +91,7 @@ def evaluate(
 @click.option("--output", type=options.PATH, help="Write the table to this Markdown file instead of printing it.")
 @click.option("--curves", type=options.PATH, help="Draw the learning curves to this file (.png, .svg or .pdf).")
 def results(folder: Path | None, output: Path | None, curves: Path | None) -> None:
-    """Print the table of stored training runs and draw their learning curves."""
+    """Print a table of training runs and draw their learning curves."""
     from agents.results import RESULTS, draw_curves, load_runs, table
     from softgym_envs.storage import atomic_write
 
@@ -105,7 +111,11 @@ def results(folder: Path | None, output: Path | None, curves: Path | None) -> No
 @click.argument("policy")
 @click.argument("file", type=options.PATH)
 def deploy_policy(policy: str, file: Path) -> None:
-    """Write POLICY (a file or the name of a shipped policy) to FILE (.onnx): sensor values in SI to commands."""
+    """Write a policy as an ONNX graph.
+
+    POLICY is a file or the name of a shipped policy. The graph in FILE (.onnx) maps sensor values in SI units to
+    commands.
+    """
     from agents.export import export_policy_onnx
 
     click.echo(f"wrote {export_policy_onnx(policy, file)}")

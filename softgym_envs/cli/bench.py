@@ -16,7 +16,10 @@ from softgym_envs.errors import ConfigError
 )
 @click.argument("names", nargs=-1)
 def bench(output: Path, names: tuple[str, ...]) -> None:
-    """Measure speed and accuracy (default: all benchmarks); needs a source checkout."""
+    """Measure speed and accuracy.
+
+    Runs the benchmarks NAMES, or all of them. Needs a source checkout.
+    """
     try:
         from benchmarks.run import run
     except ImportError:

@@ -25,7 +25,10 @@ def codesign(
     quiet: bool,
     overrides: tuple[str, ...],
 ) -> None:
-    """Optimise body and controller together and write a report; continues an interrupted study."""
+    """Optimise body and controller together and write a report.
+
+    An interrupted study continues where it stopped.
+    """
     from codesign.config import StudyConfig
     from codesign.report.page import write_report
     from codesign.study import run_study
@@ -43,7 +46,10 @@ def codesign(
 @options.run_options
 @options.results_folder
 def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
-    """Rank design variables by their effect: one at a time, Morris or Sobol; continues an interrupted run."""
+    """Rank design variables by their effect.
+
+    The method is one at a time, Morris or Sobol. An interrupted run continues where it stopped.
+    """
     from codesign.tools.config import SensitivityConfig
     from codesign.tools.sensitivity import analyse
     from softgym_envs.config import load_config
@@ -65,7 +71,10 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
 @options.run_options
 @options.results_folder
 def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
-    """Search for the best bodies without a controller, with Optuna (can be continued) or along gradients."""
+    """Search for the best bodies without a controller.
+
+    The solver is an Optuna sampler, whose interrupted runs continue where they stopped, or descent along gradients.
+    """
     from codesign.tools import gradient
     from codesign.tools.config import OptimiseConfig
     from codesign.tools.search import search

@@ -77,7 +77,10 @@ def rollout(
 @click.command()
 @click.argument("recording", type=options.PATH)
 def view(recording: Path) -> None:
-    """Open a recording of 'softgym rollout --record' in the rerun viewer."""
+    """Open a recording in the rerun viewer.
+
+    'softgym rollout ENVIRONMENT --record FILE' makes one.
+    """
     import subprocess
 
     if not recording.is_file():

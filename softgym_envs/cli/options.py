@@ -18,7 +18,9 @@ PATH: Any = click.Path(path_type=Path)
 
 config = click.option("--config", type=PATH, required=True, help="YAML file of the run.")
 folder = click.option("--folder", type=PATH, required=True, help="Folder of the results.")
-results_folder = click.option("--folder", type=PATH, help="Folder of the results (default: results/NAME of the config).")
+results_folder = click.option(
+    "--folder", type=PATH, help="Folder of the results (default: results/NAME of the config)."
+)
 overrides = click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
 quiet = click.option("--quiet", is_flag=True, help="Hide progress bars.")
 design = click.option(

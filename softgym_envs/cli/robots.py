@@ -57,7 +57,10 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
 def export(
     robot: str, files: tuple[Path, ...], options_: tuple[str, ...], design: tuple[str, ...], moulds: Path | None
 ) -> None:
-    """Write a body to FILES (.step or .stl, in millimetres), or the moulds to cast it in."""
+    """Write a body to STEP or STL files, or the moulds to cast it in.
+
+    FILES end with .step or .stl; all lengths are in millimetres.
+    """
     from softgym_envs.robots.geometry.export import export_body
     from softgym_envs.robots.geometry.moulds import export_moulds
 

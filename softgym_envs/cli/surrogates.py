@@ -15,7 +15,10 @@ from softgym_envs.errors import ConfigError
 @options.run_options
 @options.folder
 def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...]) -> None:
-    """Generate the datasets of a surrogate (train, validation, test); continues an interrupted run."""
+    """Generate the datasets of a surrogate.
+
+    The datasets are train, validation and test. An interrupted run continues where it stopped.
+    """
     from softgym_envs.config import load_config
     from softgym_envs.surrogate.training import FitConfig, generate
 
@@ -30,7 +33,10 @@ def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...])
 @options.folder
 @click.option("--data", type=options.PATH, help="Folder of the datasets (default: FOLDER/data).")
 def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
-    """Generate data, train a surrogate and test it; continues an interrupted run."""
+    """Generate data, train a surrogate and test it.
+
+    An interrupted run continues where it stopped.
+    """
     from softgym_envs.config import load_config
     from softgym_envs.surrogate.training import FitConfig
     from softgym_envs.surrogate.training import fit as run
@@ -57,7 +63,10 @@ def deploy(
     members: int | None,
     name: str,
 ) -> None:
-    """Write a surrogate to FILES: a C header of one body (.h), or an ONNX graph with the design as an input (.onnx)."""
+    """Write a surrogate as a C header or an ONNX graph.
+
+    FILES end with .h (a C header of one body) or .onnx (a graph that takes the design as an input).
+    """
     from softgym_envs.surrogate.export import FORMATS, export_c, export_onnx
     from softgym_envs.surrogate.pretrained import pretrained_model
 

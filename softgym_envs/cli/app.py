@@ -26,14 +26,11 @@ SECTIONS = {
 class _Verbs(click.Group):
     """A group whose help lists the verbs by section, and whose errors suggest the nearest verb."""
 
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self.commands)
-
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        width = max(map(len, self.commands))
+        width = max(map(len, self.commands))  # all sections in one pair of columns
         for title, verbs in SECTIONS.items():
             with formatter.section(title):
-                formatter.write_dl([(f"{verb.name:{width}}", verb.get_short_help_str(90)) for verb in verbs])
+                formatter.write_dl([(f"{verb.name:{width}}", verb.get_short_help_str(80)) for verb in verbs])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
