@@ -214,7 +214,7 @@ def test_robots_can_be_copied_and_pickled():
         robot = make_robot(name)
         for again in (copy.deepcopy(robot), pickle.loads(pickle.dumps(robot))):
             assert again.design_space.variables == robot.design_space.variables
-            assert again.signature == robot.mechanics_key
+            assert again.mechanics_key == robot.mechanics_key
 
 
 def test_names_must_differ():

@@ -69,7 +69,7 @@ def main() -> None:
         os.environ.setdefault(variable, "1")
     threadpool_limits(1)
     try:
-        cli(standalone_mode=False)
+        cli(prog_name="softgym", standalone_mode=False)
     except click.exceptions.Exit as leave:
         sys.exit(leave.exit_code)
     except (click.Abort, KeyboardInterrupt) as stop:
