@@ -27,13 +27,7 @@ alone leaves 0.7^k of an error after k steps; the gains of the thesis (0.01 and 
 
 def make_controller(robot: Robot, task: Task) -> InverseQP:
     """Return the inverse QP of a robot with one effector for the goals of a task, along the task's axes."""
-    return InverseQP(
-        robot.lower,
-        robot.upper,
-        robot.rates,
-        np.array([actuator.unilateral for actuator in robot.actuators]),
-        goal_weights=None if task.axes.all() else task.axes,
-    )
+    return InverseQP.for_robot(robot, goal_weights=task.axes)
 
 
 class InverseQPAgent:

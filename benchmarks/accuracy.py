@@ -215,7 +215,7 @@ def trajectories() -> dict[str, object]:
         rest = fem.state.effector[0]
         goals = [fem.step(np.array([d])).effector[0] for d in np.linspace(0.0, 0.02, 25)]
         fem.reset()
-        controller = InverseQP(robot.lower, robot.upper, robot.rates, np.array([True]))
+        controller = InverseQP.for_robot(robot)
         errors, moves = [], []
         for goal in goals:
             for _ in range(6):

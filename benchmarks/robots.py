@@ -79,8 +79,7 @@ def _follow(
 
     robot = make_robot(robot_name, **dict(options or {}))
     backend = FEMBackend(robot)
-    unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
-    controller = InverseQP(robot.lower, robot.upper, robot.rates, unilateral, goal_weights=np.asarray(weights))
+    controller = InverseQP.for_robot(robot, goal_weights=np.asarray(weights))
     path = goals if isinstance(goals, np.ndarray) else robot.reference_path(*([] if goals is None else [goals]))
     start = backend.step(np.zeros(len(robot.actuators))).effector[0]
     lead = np.linspace(start, path[0], approach + 1)[1:]
@@ -129,11 +128,9 @@ def _embedded_trunk(
     baseline = robot.design_space.baseline
     model = FEMBackend(robot)
     plant = FEMBackend(robot, {key: stiffness * baseline[key] for key in ("base_modulus", "tip_modulus")})
-    controller = InverseQP(
-        robot.lower,
-        robot.upper,
-        np.full(count, np.inf),
-        np.ones(count, dtype=bool),
+    controller = InverseQP.for_robot(
+        robot,
+        rates=np.full(count, np.inf),
         max_effort=np.full(count, 200e3),
         effort_rates=np.full(count, 5e3),
         mode="effort",
@@ -206,9 +203,8 @@ def predicted_path(
 
     robot = make_robot(robot_name, **dict(options or {}))
     fem, surrogate = FEMBackend(robot), SurrogateBackend(robot, weights=weights)  # type: ignore[arg-type]
-    unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
     axes = np.asarray(robot.goal_axes, dtype=float)
-    controller = InverseQP(robot.lower, robot.upper, robot.rates, unilateral, goal_weights=axes)
+    controller = InverseQP.for_robot(robot, goal_weights=axes)
     path = robot.reference_path()
     path = np.concatenate([np.linspace(surrogate.state.effector[0], path[0], 10, endpoint=False), path])
     gaps, misses = [], []
@@ -281,8 +277,7 @@ def shared_finger(bodies: int = 5, commands: int = 12) -> dict[str, object]:
         "W, median [%]": 1e2 * float(np.median(compliances)),
     }
     fem, learned = FEMBackend(gripper), CoupledFingers.like(gripper, SurrogateFingers(model))
-    unilateral = np.array([actuator.unilateral for actuator in gripper.actuators])
-    controller = InverseQP(gripper.lower, gripper.upper, gripper.rates, unilateral)
+    controller = InverseQP.for_robot(gripper)
     path = gripper.reference_path()
     path = np.concatenate([np.linspace(learned.centre, path[0], 10, endpoint=False), path])
     command, state, solve, gaps, misses = np.zeros(6), learned.solve(np.zeros(6)), _Timer(), [], []

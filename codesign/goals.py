@@ -30,7 +30,7 @@ def family_goals(config: StudyConfig, count: int) -> np.ndarray:
     low = robot.lower + goals.command_low * (robot.upper - robot.lower)
     commands = rng.uniform(low, robot.upper, (count, len(low)))
     model = pretrained_model(robot, config.environment.backend_options.get("weights"))
-    unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
+    unilateral = robot.unilateral
     settled = settle(model, model.context(np.array(designs)), commands, np.zeros_like(commands), unilateral)
     return settled.effector[:, :3]
 

@@ -10,8 +10,7 @@ robot = make_robot("finger")
 fem = make_backend("fem", robot, design={"joint_height": 0.007})
 goal = fem.probe(np.array([0.012, 0.010])).effector  # somewhere it can reach [m]
 
-unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
-controller = InverseQP(robot.lower, robot.upper, robot.rates, unilateral)
+controller = InverseQP.for_robot(robot)
 state = fem.state
 for _ in range(20):
     state = fem.step(controller.solve(state.condensed, goal, state.command, state.slack))

@@ -182,6 +182,29 @@ def import_object(kind: str, path: str) -> Any:
     return getattr(module, name)
 
 
+def options_of(cls: type) -> dict[str, tuple[inspect.Parameter, Any]]:
+    """Return the keyword arguments of a class by name, each with its resolved type.
+
+    A constructor that takes ``**options`` hands them on to the next base class with a constructor of its own.
+    """
+    found: dict[str, tuple[inspect.Parameter, Any]] = {}
+    for base in cls.__mro__:
+        if "__init__" not in vars(base) or base is object:
+            continue
+        init = vars(base)["__init__"]
+        try:
+            types_of = get_type_hints(init)
+        except NameError:  # an annotation that only type checkers import
+            types_of = {}
+        parameters = list(inspect.signature(init).parameters.values())[1:]
+        for p in parameters:
+            if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY):
+                found.setdefault(p.name, (p, types_of.get(p.name, Any)))
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+            break
+    return found
+
+
 def check_options(owner: str, cls: type, positional: int, options: Mapping[str, object]) -> None:
     """Check the options of a class against its signature and the type annotations in it.
 
@@ -194,22 +217,14 @@ def check_options(owner: str, cls: type, positional: int, options: Mapping[str, 
     Raises:
         ValueError: for an unknown or missing option, or a value of the wrong type.
     """
-    parameters = list(inspect.signature(cls).parameters.values())[positional:]
-    keywords = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
-    open_ended = any(p.kind is p.VAR_KEYWORD for p in parameters)
-    try:
-        hints = get_type_hints(cls.__init__)  # type: ignore[misc]
-    except NameError:  # an annotation that only type checkers import
-        hints = {}
+    allowed = dict(list(options_of(cls).items())[positional:])
     for name, value in options.items():
-        if name not in keywords:
-            if open_ended:
-                continue
-            raise ValueError(f"{owner}: {unknown_name('option', name, keywords)}")
-        annotation = hints.get(name, Any)
+        if name not in allowed:
+            raise ValueError(f"{owner}: {unknown_name('option', name, allowed)}")
+        _, annotation = allowed[name]
         if not _is_a(value, annotation):
             raise ValueError(f"{owner}: option {name} = {value!r} must be {_described(annotation)}")
-    missing = [name for name, p in keywords.items() if p.default is p.empty and name not in options]
+    missing = [name for name, (p, _) in allowed.items() if p.default is p.empty and name not in options]
     if missing:
         raise ValueError(f"{owner} needs the option {' and '.join(missing)}")
 

@@ -162,7 +162,7 @@ class LearnedMisfit(Misfit):
     def __init__(self, robot: Robot, box: Box, data: Measurements, weights: str | Path | None = None) -> None:
         super().__init__(robot, box, data)
         self.net = learned_model(robot, weights)
-        self._unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
+        self._unilateral = robot.unilateral
         self._reached = np.zeros(data.command.shape)
 
     def predict(self, values: Tensor) -> Tensor:

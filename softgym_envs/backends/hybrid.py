@@ -97,7 +97,7 @@ class HybridBackend(SurrogateBackend):
         elif not (np.isfinite(tolerance) and tolerance > 0.0):
             raise ValueError(f"tolerance = {tolerance} m must be positive and finite")
         self.robot = robot
-        self._unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
+        self._unilateral = robot.unilateral
         self._max_effort = np.array([actuator.max_effort for actuator in robot.actuators])
         self._retrain_after, self._steps, self._seed = retrain_after, steps, seed
         given = check_ensemble(pretrained_model(robot, weights, members))

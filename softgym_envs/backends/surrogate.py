@@ -127,7 +127,7 @@ class SurrogateBackend(Backend):
             )
         self.robot = robot
         self.model = pretrained_model(robot, weights, members)
-        self._unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
+        self._unilateral = robot.unilateral
         self.design = {}
         self.reset(robot.design_space.complete(design))
 

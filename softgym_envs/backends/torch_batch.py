@@ -55,7 +55,7 @@ class TorchBatch:
 
         self.dtype, self.count = dtype, model.count
         self.middle, self.half_range = put(model.middle), put(model.half_range)
-        self.unilateral = tuple(actuator.unilateral for actuator in model.robot.actuators)
+        self.unilateral = tuple(model.robot.unilateral.tolist())
         self._pulls = torch.tensor(self.unilateral, device=device)
         self._ensemble = PotentialEnsemble.of_model(model, device, dtype)
         self._features, self._loaded = model.features, bool(model.card.get("loaded", False))

@@ -289,7 +289,7 @@ class CoupledFingers:
         centre = robot.object_frame(robot.design_space.complete(design))
         if centre is None:
             raise ValueError(f"the fingers of '{robot.name}' hold no rigid object")
-        return cls(fingers, robot.placements, centre, **{"unilateral": robot.unilateral, **options})
+        return cls(fingers, robot.placements, centre, **{"unilateral": bool(robot.finger.unilateral.all()), **options})
 
     def reset(self) -> None:
         """Go back to the undeformed shape with no load. The equilibrium under the load is found by `solve`."""

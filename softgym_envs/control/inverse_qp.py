@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 
-__all__ = ["InverseQP"]
+if TYPE_CHECKING:
+    from softgym_envs.robots.base import Robot
 
 #: Stands for "no bound", in units of a problem scaled to order one.
 FAR = 1e6
@@ -124,6 +125,23 @@ class InverseQP:
                 raise ValueError(f"bounds of {word} must be {count} pairs, low <= high, got {low} and {high}")
         self._proxqp = proxqp
         self._qp: Any = None
+
+    @classmethod
+    def for_robot(cls, robot: Robot, **options: Any) -> InverseQP:
+        """Return the controller of a robot, with the ranges and rates of its actuators.
+
+        Args:
+            robot: the robot. The goal weights of a robot with one effector are its goal axes.
+            **options: arguments of the class, which replace those of the robot.
+        """
+        arguments = {
+            "lower": robot.lower,
+            "upper": robot.upper,
+            "rates": robot.rates,
+            "unilateral": robot.unilateral,
+            "goal_weights": None if len(robot.effectors) > 1 or np.all(robot.goal_axes) else robot.goal_axes,
+        }
+        return cls(**{**arguments, **options})
 
     def _make_qp(self) -> Any:
         """A new solver; one that failed would warm-start from its bad result."""

@@ -101,7 +101,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
-        self._unilateral = np.array([actuator.unilateral for actuator in self.robot.actuators])
+        self._unilateral = self.robot.unilateral
         n = len(self.robot.actuators)
         baseline = np.tile(list(self._fixed_design.values()), (num_envs, 1))
         self.designs = baseline.astype(float)

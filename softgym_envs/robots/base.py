@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import PurePath
+from typing import Any, TypeVar
 
 import numpy as np
 
 from softgym_envs.designs import DesignSpace
-from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.constraints import EmbeddedPoints
-from softgym_envs.mechanics.materials import MATERIALS
+from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature, Morpher
 
-__all__ = ["Actuator", "Drawing", "MeshedRobot", "Robot"]
+F = TypeVar("F", bound=Callable[..., None])
 
 Drawing = tuple[Callable[..., None], dict]
 """A module-level function that draws one volume with gmsh in millimetres, and its parameters (JSON-serialisable)."""
+
+LARGEST = 10.0
+"""No robot, stroke or dimension is longer than this [m]; larger ones were probably given in millimetres."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +51,37 @@ class Actuator:
     max_effort: float = np.inf
 
 
+def _recording_options(init: F) -> F:
+    """Return a robot's constructor that also records its arguments as options, and checks the finished robot."""
+    signature = inspect.signature(init)
+    extra = next((p.name for p in signature.parameters.values() if p.kind is p.VAR_KEYWORD), None)
+
+    @functools.wraps(init)
+    def wrapper(self: Robot, *args: object, **kwargs: object) -> None:
+        bound = signature.bind(self, *args, **kwargs)
+        bound.apply_defaults()
+        options = dict(list(bound.arguments.items())[1:])
+        options |= options.pop(extra, {}) if extra else {}
+        outermost = "_options" not in vars(self)
+        recorded = vars(self).setdefault("_options", {})
+        # A constructor runs before those of its bases: an option keeps the value that the class itself was given.
+        for name, value in options.items():
+            recorded.setdefault(name, value)
+        init(self, *args, **kwargs)
+        if outermost:
+            self._check_attributes()
+
+    return wrapper  # type: ignore[return-value]
+
+
 class Robot(ABC):
     """A family of bodies; one file per robot.
 
+    A subclass defines the attributes without a default below, as class attributes or in its ``__init__``, and the
+    method `assemble`. All arguments of its ``__init__`` are options; they become part of `mechanics_key`.
+
     Attributes:
-        name: registry name, also of its options when weights or meshes are looked up.
+        name: registry name, also used to look up weights and meshes.
         design_space: variables of the body with bounds and baseline.
         actuators: in the order of the commands.
         effectors: names, in the order of the effector rows of the condensed model.
@@ -65,6 +97,7 @@ class Robot(ABC):
             loads), or None. Surrogates use it exactly instead of learning it.
         convex: the elastic energy is convex in the displacements of the actuators: the body keeps its state also when
             they are driven by efforts. Surrogates are built so; where it is False they learn unstable states too.
+        non_mechanical_options: options that leave the condensed model as it is.
     """
 
     name: str
@@ -80,12 +113,15 @@ class Robot(ABC):
     rest_mode: str = "effort"
     stiffness_variable: str | None = None
     convex: bool = True
+    non_mechanical_options: tuple[str, ...] = ("unilateral",)
+    _options: dict[str, object]
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
-        if "size" in vars(cls) and "workspace_scale" not in vars(cls):
-            cls.workspace_scale = 0.25 * cls.size
+        if "__init__" in vars(cls):
+            cls.__init__ = _recording_options(cls.__init__)  # type: ignore[method-assign]
 
+    @_recording_options
     def __init__(self, *, gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         if len(gravity) != 3 or not np.isfinite(gravity).all():
             raise ValueError(f"gravity must be three finite numbers [m/s2], got {gravity!r}")
@@ -93,22 +129,21 @@ class Robot(ABC):
 
     # -- what a robot defines ---------------------------------------------------------------------------------------
 
-    @property
-    @abstractmethod
-    def weights_name(self) -> str:
-        """Name of this kind of the robot, as used for pretrained weights."""
-
-    @property
-    @abstractmethod
-    def mechanics_key(self) -> dict[str, object]:
-        """The options that change its mechanics, JSON-serialisable; weights are valid for one signature."""
-
     @abstractmethod
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
-        """Make the model of a complete design: bodies, boundary conditions, actuators, effectors, contacts."""
+        """Return the model of a complete design: bodies, boundary conditions, actuators, effectors, contacts.
+
+        Raises:
+            InfeasibleDesign: if the geometry cannot exist. All other exceptions count as errors in the robot's code.
+        """
+
+    @property
+    def weights_name(self) -> str:
+        """Name of the pretrained weights, one for each variant of the robot that has its own."""
+        return self.name
 
     def drawing(self, design: Mapping[str, float]) -> Drawing:
-        """Return what draws the exact shape of a complete design.
+        """Return the function that draws the exact shape of a complete design, and its parameters.
 
         Raises:
             InfeasibleDesign: if the shape cannot exist.
@@ -117,7 +152,7 @@ class Robot(ABC):
         raise ValueError(f"robot '{self.name}' has no exact shape to write as STEP; write its triangles: .stl")
 
     def reference_path(self, count: int = 30) -> np.ndarray:
-        """Published trajectory of the first effector [m], shape (count, 3), where tracking is compared.
+        """Return the published trajectory of the first effector [m], shape (count, 3), on which tracking is compared.
 
         Raises:
             ValueError: if the robot has none.
@@ -125,9 +160,9 @@ class Robot(ABC):
         raise ValueError(f"robot '{self.name}' has no reference path: give a path of your own")
 
     def displacements(self, fractions: np.ndarray) -> np.ndarray:
-        """Commands that points of the unit cube (N, n_a) stand for when states are sampled, shape (N, n_a).
+        """Return the commands, shape (N, n_a), at which states are sampled, for points of the unit cube (N, n_a).
 
-        A robot whose actuators never move independently keeps to what occurs.
+        Robots whose actuators never move independently override this to sample only commands that occur.
         """
         return self.lower + fractions * (self.upper - self.lower)
 
@@ -140,12 +175,20 @@ class Robot(ABC):
             DesignError: for a malformed design.
             InfeasibleDesign: if the geometry cannot exist.
         """
-        complete = self.design_space.complete(design)
-        try:
-            return self.assemble(complete)
-        except ValueError as error:
-            shown = {name: round(value, 9) for name, value in complete.items()}
-            raise InfeasibleDesign(f"robot '{self.name}' cannot be built for {shown}: {error}") from error
+        return self.assemble(self.design_space.complete(design))
+
+    @property
+    def mechanics_key(self) -> dict[str, Any]:
+        """All options that change the mechanics, JSON-serialisable. Weights are valid for one key.
+
+        The options are the arguments of the constructor, defaults included. Where the robot has an attribute of the
+        same name, as for a default that depends on other options, its value counts.
+        """
+        return {
+            name: _json_value(vars(self).get(name, value), f"option '{name}' of robot '{self.name}'")
+            for name, value in self._options.items()
+            if name not in self.non_mechanical_options
+        }
 
     @property
     def lower(self) -> np.ndarray:
@@ -161,6 +204,85 @@ class Robot(ABC):
     def rates(self) -> np.ndarray:
         """Largest change of the command per control step, shape (n_a,)."""
         return np.array([actuator.rate for actuator in self.actuators])
+
+    @property
+    def unilateral(self) -> np.ndarray:
+        """Actuators that cannot push, shape (n_a,)."""
+        return np.array([actuator.unilateral for actuator in self.actuators], dtype=bool)
+
+    def check_point(self, name: str, point: Any) -> np.ndarray:
+        """Return points [m] as an array (..., 3) after a check that they are near the robot.
+
+        Args:
+            name: what the point is, for messages: ``"goal"``.
+            point: one or more points [m], shape (..., 3).
+
+        Raises:
+            ValueError: for a point farther from the effector at rest than three times the robot's size.
+        """
+        array = np.asarray(point, dtype=float)
+        distance = np.linalg.norm(array - self.effector_rest, axis=-1)
+        if (distance > 3.0 * self.size).any():
+            worst = array.reshape(-1, 3)[int(np.nanargmax(distance))]
+            raise ValueError(
+                f"{name} = {worst.tolist()} m is {np.nanmax(distance):.4g} m away from the effector of robot "
+                f"'{self.name}', whose size is {self.size:g} m; did you mean metres?"
+            )
+        return array
+
+    def _check_attributes(self) -> None:
+        """Complete and check a new robot.
+
+        Raises:
+            TypeError: naming the attributes that the class does not define.
+            ValueError: for arrays of a wrong shape, or lengths that are probably not in metres.
+        """
+        required = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
+        missing = [name for name in required if not hasattr(self, name)]
+        if missing:
+            raise TypeError(f"robot class '{type(self).__name__}' lacks: {', '.join(missing)} (see Robot)")
+        if isinstance(self.effectors, str):
+            raise TypeError(f"robot '{self.name}': effectors must be a tuple of names, got {self.effectors!r}")
+        if not hasattr(self, "workspace_scale"):
+            self.workspace_scale = 0.25 * self.size
+        for name, count in (("effector_rest", 3), ("effort_scale", len(self.actuators))):
+            value = np.asarray(getattr(self, name), dtype=float)
+            if value.shape != (count,):
+                raise ValueError(f"robot '{self.name}': {name} must have shape ({count},), got {value.shape}")
+            setattr(self, name, value)
+        lengths = {"size": self.size}
+        bounded = [(a.name, a.high, a.unit) for a in self.actuators]
+        bounded += [(v.name, v.high, v.unit) for v in self.design_space.variables.values()]
+        lengths |= {f"high of '{name}'": high for name, high, unit in bounded if unit == "m"}
+        for label, length in lengths.items():
+            if length > LARGEST:
+                raise ValueError(f"robot '{self.name}': {label} = {length:g} m; did you mean {1e-3 * length:g} m?")
+
+
+def _json_value(value: Any, label: str) -> Any:
+    """Return an option as plain JSON data.
+
+    Raises:
+        TypeError: for an option that has no such form.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [_json_value(item, label) for item in value]
+    if isinstance(value, Mapping):
+        return {str(key): _json_value(item, label) for key, item in value.items()}
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, Robot):
+        return {"robot": value.name, **value.mechanics_key}
+    if callable(value) and hasattr(value, "__qualname__"):
+        return f"{value.__module__}:{value.__qualname__}"
+    raise TypeError(
+        f"{label} = {value!r} cannot be compared with that of trained weights: use numbers, texts, lists or mappings, "
+        "or list it in 'non_mechanical_options'"
+    )
 
 
 class MeshedRobot(Robot):
@@ -187,9 +309,8 @@ class MeshedRobot(Robot):
         if meshing not in ("morph", "remesh"):
             raise ValueError(f"meshing = {meshing!r} is unknown; allowed: 'morph', 'remesh'")
         if not (isinstance(mesh_size, int | float) and 0.0 < mesh_size < np.inf):
-            raise ValueError(f"robot '{self.name}': mesh_size = {mesh_size!r} m must be positive: a finite number")
-        if material not in MATERIALS:
-            raise ValueError(f"unknown material '{material}'; allowed: {', '.join(MATERIALS)}")
+            raise ValueError(f"robot '{self.name}': mesh_size = {mesh_size!r} m must be positive and finite")
+        resolve_material(material)
         super().__init__(gravity=gravity)
         self.material = material
         self.mesh_size = float(mesh_size)
@@ -212,10 +333,10 @@ class MeshedRobot(Robot):
 
     @abstractmethod
     def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
-        """Make the model of a meshed body: material, boundary conditions, actuators, effectors, contacts."""
+        """Return the model of a meshed body: material, boundary conditions, actuators, effectors, contacts."""
 
     @property
-    def reference_design(self) -> dict[str, float]:
+    def reference_design(self) -> Mapping[str, float]:
         """The design whose mesh is moved to all others: the baseline, or one nearer the middle of the box."""
         return self.design_space.baseline
 
@@ -247,10 +368,32 @@ class MeshedRobot(Robot):
             return self.unfold(replace(base, nodes=nodes, origin="morphed"))
         return self.unfold(replace(self.mesh(complete), origin="remeshed"))
 
-    def reference_nodes(self, mesh: BodyMesh) -> np.ndarray:
-        """Positions [m] (n, 3) that the nodes have in the reference body, or in ``mesh`` if it is no moved one.
+    def solid(
+        self, mesh: BodyMesh, design: Mapping[str, float], *, fixed: np.ndarray, density: float = 1100.0
+    ) -> MechanicalModel:
+        """Return the clamped body of a design, without actuators and effectors.
 
-        What is chosen by them stays the same as the mesh moves.
+        Args:
+            mesh: the meshed body.
+            design: has the variables ``young_modulus`` [Pa] and ``poisson_ratio``.
+            fixed: clamped nodes, boolean, shape (n,).
+            density: [kg/m3]; the default is that of silicone.
+        """
+        return MechanicalModel.from_mesh(
+            mesh.nodes,
+            mesh.tetrahedra,
+            fixed=fixed,
+            material=self.material,
+            young_modulus=design["young_modulus"],
+            poisson_ratio=design["poisson_ratio"],
+            density=density,
+            gravity=self.gravity,
+        )
+
+    def reference_nodes(self, mesh: BodyMesh) -> np.ndarray:
+        """Positions [m] (n, 3) of the nodes in the reference body if ``mesh`` was moved from it, else in ``mesh``.
+
+        A set of nodes that is chosen by them stays the same as the mesh moves.
         """
         if mesh.origin != "morphed" or self._morpher is None:
             return mesh.nodes
@@ -260,7 +403,7 @@ class MeshedRobot(Robot):
         """Element nearest to a point [m] (3,) of the reference body, as a hint for points outside a moved mesh.
 
         Returns:
-            Its index, shape (1,), or None if ``mesh`` is not the reference mesh moved.
+            Its index, shape (1,), or None if ``mesh`` was not moved from the reference mesh.
         """
         if mesh.origin != "morphed" or self._morpher is None:
             return None

@@ -11,11 +11,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.mechanics.materials import MATERIALS
+from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Robot
-
-__all__ = ["CableTrunk"]
 
 MASS = 0.042  # of the published body [kg]
 TIP_FRACTION = 0.4  # radius of the long cables at the tip over the half-width there
@@ -109,8 +107,7 @@ class CableTrunk(Robot):
     ) -> None:
         if not (isinstance(layers, int) and layers >= 1 and isinstance(rings, int) and rings >= 1):
             raise ValueError(f"layers = {layers!r} and rings = {rings!r} must be positive integers")
-        if material not in MATERIALS:
-            raise ValueError(f"unknown material '{material}'; allowed: {', '.join(MATERIALS)}")
+        resolve_material(material)
         if len(strokes) != 2 or not all(0.0 < stroke < np.inf for stroke in strokes):
             raise ValueError(f"strokes must be two positive lengths [m], got {strokes!r}")
         super().__init__(gravity=gravity)
@@ -118,7 +115,6 @@ class CableTrunk(Robot):
         self.rings = rings
         self.material = material
         self.strokes = (float(strokes[0]), float(strokes[1]))
-        self.unilateral = unilateral
         self.design_space = DesignSpace(
             DesignVariable("length", 0.160, 0.230, 0.195, "m", "length of the trunk"),
             DesignVariable("base_half_width", 0.011, 0.016, 0.013, "m", "half the width of the section at the base"),
@@ -141,22 +137,6 @@ class CableTrunk(Robot):
             for length, stroke in zip(("long", "short"), self.strokes, strict=True)
             for side in ("north", "west", "south", "east")
         )
-
-    @property
-    def weights_name(self) -> str:
-        """``cable_trunk``."""
-        return "cable_trunk"
-
-    @property
-    def mechanics_key(self) -> dict[str, object]:
-        """Options that change the condensed model (a cable that may push has the same one)."""
-        return {
-            "layers": self.layers,
-            "rings": self.rings,
-            "strokes": list(self.strokes),
-            "material": self.material,
-            "gravity": list(self.gravity),
-        }
 
     @staticmethod
     def volume(design: Mapping[str, float]) -> float:
@@ -192,7 +172,8 @@ class CableTrunk(Robot):
             radius, height = base + share * (tip - base), share * design["length"]
             for x, y in ((0, 1), (-1, 0), (0, -1), (1, 0)):
                 points = np.column_stack([x * radius, y * radius, height])
-                model.add_cable(next(actuators).name, points[1:], points[0], unilateral=self.unilateral)
+                actuator = next(actuators)
+                model.add_cable(actuator.name, points[1:], points[0], unilateral=actuator.unilateral)
         model.add_effector("tip", np.array([0.0, 0.0, design["length"]]))
         return model
 

@@ -14,6 +14,7 @@ have a ``W`` between actuators that is not positive definite.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -21,8 +22,6 @@ from softgym_envs.mechanics.constraints import Point, Pose
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator
 from softgym_envs.robots.grippers import STRAIGHT, FingerRobot
-
-__all__ = ["ContactFinger"]
 
 
 class ContactFinger(FingerRobot):
@@ -33,7 +32,8 @@ class ContactFinger(FingerRobot):
     ranges hold 99 % of what the block of the three-finger gripper does under random commands of its cables, over its
     design space; the finger that presses a button turns further (up to 90 degrees). The effector is the tip.
 
-    Args: as for `FingerRobot`.
+    Args:
+        **options: options of `FingerRobot`.
     """
 
     name = "contact_finger"
@@ -67,18 +67,8 @@ class ContactFinger(FingerRobot):
     #: nearly uncorrelated in a gripper, and a box of independent coordinates holds few poses that never occur.
     origin = (0.0, 0.0, 0.030)
 
-    def __init__(
-        self,
-        *,
-        mesh_size: float = 8.0e-3,
-        meshing: str = "morph",
-        material: str = "corotational",
-        unilateral: bool = True,
-        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> None:
-        super().__init__(
-            mesh_size=mesh_size, meshing=meshing, material=material, unilateral=unilateral, gravity=gravity
-        )
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
         pose = tuple(
             Actuator(name, low, high, 0.05 * (high - low), unit, unilateral=False)
             for name, low, high, unit in self.pose_ranges

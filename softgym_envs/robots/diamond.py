@@ -17,8 +17,6 @@ from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature, Plane
 from softgym_envs.robots.geometry.symmetry import mirrored
 
-__all__ = ["Diamond"]
-
 # Contours of one leg (r, z) from the base to the top [mm], inset by a few tenths towards the published volume.
 OUTER = (
     *((0, -37), (35, -37), (50, -29.6), (62, -23.6), (70, -17.6), (76, -11.6), (81.6, 0), (86.6, 12), (94.7, 36)),
@@ -98,7 +96,6 @@ class Diamond(MeshedRobot):
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity)
-        self.unilateral = unilateral
         self.design_space = DesignSpace(
             DesignVariable("leg_width", 0.8, 1.2, 1.0, "1", "width of the legs over that of the published body"),
             DesignVariable("top_height", 0.115, 0.140, 0.126, "m", "height of the top above the origin"),
@@ -116,21 +113,6 @@ class Diamond(MeshedRobot):
             Actuator(name, -0.010, 0.030, 0.0015, unilateral=unilateral)
             for name in ("north", "west", "south", "east")
         )
-
-    @property
-    def weights_name(self) -> str:
-        """``diamond``."""
-        return "diamond"
-
-    @property
-    def mechanics_key(self) -> dict[str, object]:
-        """Options that change the condensed model (a cable that may push has the same one)."""
-        return {
-            "mesh_size": self.mesh_size,
-            "meshing": self.meshing,
-            "material": self.material,
-            "gravity": list(self.gravity),
-        }
 
     @staticmethod
     def _top(design: Mapping[str, float]) -> np.ndarray:
@@ -222,22 +204,14 @@ class Diamond(MeshedRobot):
         """Clamp the middle of the base, tie a cable to each elbow, put the effector just below the top."""
         # Chosen on the reference mesh, so that no node joins or leaves the clamp as the mesh moves.
         nodes = self.reference_nodes(mesh)
-        model = MechanicalModel.from_mesh(
-            mesh.nodes,
-            mesh.tetrahedra,
-            fixed=(np.abs(nodes[:, :2]) <= 15.0e-3).all(axis=1) & (nodes[:, 2] <= 10.0e-3),
-            material=self.material,
-            young_modulus=design["young_modulus"],
-            poisson_ratio=design["poisson_ratio"],
-            density=MASS / VOLUME,
-            gravity=self.gravity,
-        )
+        fixed = (np.abs(nodes[:, :2]) <= 15.0e-3).all(axis=1) & (nodes[:, 2] <= 10.0e-3)
+        model = self.solid(mesh, design, fixed=fixed, density=MASS / VOLUME)
         elbow, height = design["elbow_radius"], design["elbow_height"]
         for actuator, (x, y) in zip(self.actuators, ((0, 1), (-1, 0), (0, -1), (1, 0)), strict=True):
             # The elbow's outermost point is a node of every mesh.
             anchor = np.array([[x * elbow, y * elbow, height]])
             pull_point = np.array([x * 10.0e-3, y * 10.0e-3, 30.0e-3])
-            model.add_cable(actuator.name, anchor, pull_point, unilateral=self.unilateral)
+            model.add_cable(actuator.name, anchor, pull_point, unilateral=actuator.unilateral)
         model.add_effector("top", self._top(design))
         return model
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +19,8 @@ from softgym_envs.mechanics.constraints import Bond, EmbeddedPoints, Point
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.geometry.finger_shape import in_flange
 from softgym_envs.robots.soft_finger import SoftFinger
-
-__all__ = ["FingerRobot", "PressFinger", "ThreeFingerGripper", "TwoFingerGripper"]
 
 STRAIGHT = np.eye(3)
 TURNED = np.diag([-1.0, -1.0, 1.0])
@@ -61,7 +61,6 @@ class FingerRobot(Robot):
             cables=2, mesh_size=mesh_size, meshing=meshing, material=material, unilateral=unilateral
         )
         self.mesh_size = self.finger.mesh_size
-        self.unilateral = unilateral
         self.design_space = DesignSpace(*self.variables())
         self.actuators = tuple(
             Actuator(f"finger_{k + 1}_{cable.name}", *self.cable_range, self.cable_rate, unilateral=unilateral)
@@ -71,16 +70,6 @@ class FingerRobot(Robot):
         self.effort_scale = np.full(len(self.actuators), 20.0)
         self.effector_rest = self.object_rest(self.design_space.baseline)
         self.stiffness_variable = "young_modulus" if self.scales and not any(gravity) else None
-
-    @property
-    def weights_name(self) -> str:
-        """Name of the gripper."""
-        return self.name
-
-    @property
-    def mechanics_key(self) -> dict[str, object]:
-        """Options that change the condensed model."""
-        return {"finger": self.finger.mechanics_key, "gravity": list(self.gravity)}
 
     def variables(self) -> tuple[DesignVariable, ...]:
         """Design variables: those of the finger, and more if there are any."""
@@ -103,7 +92,7 @@ class FingerRobot(Robot):
         names = self.finger.design_space.names
         self._shape = {name: design[name] for name in names}
         mesh = self.finger.body(self._shape)
-        fixed = self.finger.clamped(mesh)
+        fixed = in_flange(mesh.nodes)
         assembly = ModelBuilder(gravity=self.gravity)
         for turn, shift in self.placements:
             assembly.add_solid(
@@ -117,14 +106,15 @@ class FingerRobot(Robot):
         position = self.object_frame(design)
         frame = None if position is None else assembly.add_frame(position)
         model = assembly.build()
-        names_left = iter(self.actuators)
+        cables = iter(self.actuators)
         for k, (turn, shift) in enumerate(self.placements):
             for pull_point, points in self.finger.routes(self._shape):
+                cable = next(cables)
                 model.add_cable(
-                    next(names_left).name,
+                    cable.name,
                     points @ turn.T + shift,
                     turn @ pull_point + shift,
-                    unilateral=self.unilateral,
+                    unilateral=cable.unilateral,
                     block=k,
                 )
         self._mesh = mesh
@@ -163,7 +153,7 @@ class PressFinger(FingerRobot):
     Args:
         button_force: force of the button [N]. The published "10 N" pushes this finger back by 66 mm with cables held
             at zero and leaves it no stable way forward; 2 N is a fifth of it, and well inside its strength.
-        mesh_size, meshing, material, unilateral, gravity: as for `FingerRobot`.
+        **options: options of `FingerRobot`.
     """
 
     name = "press_finger"
@@ -174,27 +164,11 @@ class PressFinger(FingerRobot):
     goal_tolerance = 5e-4
     scales = False  # the button's force stays what it is
 
-    def __init__(
-        self,
-        *,
-        button_force: float = 2.0,
-        mesh_size: float = 8.0e-3,
-        meshing: str = "morph",
-        material: str = "corotational",
-        unilateral: bool = True,
-        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> None:
+    def __init__(self, *, button_force: float = 2.0, **options: Any) -> None:
         if not (np.isfinite(button_force) and button_force >= 0.0):
             raise ValueError(f"button_force = {button_force} N must be finite and not negative")
         self.button_force = float(button_force)
-        super().__init__(
-            mesh_size=mesh_size, meshing=meshing, material=material, unilateral=unilateral, gravity=gravity
-        )
-
-    @property
-    def mechanics_key(self) -> dict[str, object]:
-        """Options that change the condensed model."""
-        return {**super().mechanics_key, "button_force": self.button_force}
+        super().__init__(**options)
 
     def variables(self) -> tuple[DesignVariable, ...]:
         """Those of the finger, without bodies so soft that the button folds them."""
@@ -306,6 +280,6 @@ class ThreeFingerGripper(FingerRobot):
         """
         angle = 2.0 * np.pi * np.arange(count) / count
         circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
-        if not self.unilateral:
+        if not self.unilateral.any():
             return self.effector_rest + 1.5e-3 * circle
         return self.effector_rest + np.array([0.0, -0.7e-3, 4.0e-3]) + 1.0e-3 * circle

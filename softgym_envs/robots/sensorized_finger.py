@@ -19,11 +19,15 @@ from softgym_envs.mechanics.constraints import Cavity
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Actuator, MeshedRobot
-from softgym_envs.robots.geometry.finger_shape import FLANGE, THICKNESS, check_finger, draw_finger, finger_features
+from softgym_envs.robots.geometry.finger_shape import (
+    THICKNESS,
+    check_finger,
+    draw_finger,
+    finger_features,
+    in_flange,
+)
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature
-
-__all__ = ["SensorReadings", "SensorizedFinger"]
 
 # Fixed dimensions [mm].
 LENGTH = 40.0
@@ -99,7 +103,6 @@ class SensorizedFinger(MeshedRobot):
             raise ValueError(f"cavities = {cavities!r} is unknown; allowed: 2, 4")
         super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity)
         self.cavities = cavities
-        self.unilateral = unilateral
         mm = 1e-3
         shape = [
             DesignVariable(
@@ -133,19 +136,6 @@ class SensorizedFinger(MeshedRobot):
     def weights_name(self) -> str:
         """``sensorized_finger_2cavities`` or ``sensorized_finger_4cavities``."""
         return f"sensorized_finger_{self.cavities}cavities"
-
-    @property
-    def mechanics_key(self) -> dict[str, object]:
-        """Options that change the condensed model (a cable that may push has the same one)."""
-        return {
-            "cavities": self.cavities,
-            "mesh_size": self.mesh_size,
-            "meshing": self.meshing,
-            "material": self.material,
-            "gravity": list(self.gravity),
-            "tip_height": self.tip_height,
-            "cable_clearance": self.cable_clearance,
-        }
 
     # -- shape ------------------------------------------------------------------------------------------------------
 
@@ -197,22 +187,14 @@ class SensorizedFinger(MeshedRobot):
 
     def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Clamp the flange, route the cable past the notches, put the effector at the tip, make cavities sensors."""
-        model = MechanicalModel.from_mesh(
-            mesh.nodes,
-            mesh.tetrahedra,
-            fixed=mesh.nodes[:, 2] >= -(FLANGE + 1e-3) * 1e-3,
-            material=self.material,
-            young_modulus=design["young_modulus"],
-            poisson_ratio=design["poisson_ratio"],
-            density=1100.0,
-            gravity=self.gravity,
-        )
+        model = self.solid(mesh, design, fixed=in_flange(mesh.nodes))
         length = LENGTH * 1e-3
         height = self.cable_height(design)
         offset = (height - design["joint_height"]) * math.tan(design["slope"])
         stations = [s for k in range(3) for s in (-k * length - offset, -(k + 1) * length + offset)]
         points = np.array([[0.0, height, s] for s in stations])
-        model.add_cable("cable", points, np.array([0.0, height, 0.0]), unilateral=self.unilateral)
+        (cable,) = self.actuators
+        model.add_cable(cable.name, points, np.array([0.0, height, 0.0]), unilateral=cable.unilateral)
         # Above the joint's height the effector floats in front of the slanted end.
         hint = self.reference_element(mesh, self.effector_rest)
         model.add_effector("tip", self.effector_rest, hint=hint)

@@ -15,11 +15,9 @@ from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.constraints import Point
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
-from softgym_envs.robots.geometry.finger_shape import FLANGE, check_finger, draw_finger, finger_features
+from softgym_envs.robots.geometry.finger_shape import check_finger, draw_finger, finger_features, in_flange
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature
-
-__all__ = ["SoftFinger"]
 
 BELLOWS = {
     "outer_radius": 14.75,
@@ -70,7 +68,6 @@ class SoftFinger(MeshedRobot):
             mesh_size = 8.0e-3 if cables == 2 else 7.9e-3
         super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity)
         self.cables = cables
-        self.unilateral = unilateral
         self.contacts = contacts
         self.slope = math.radians(45.0 if cables == 2 else 30.0)
         self.cable_height = 15.33e-3 if cables == 2 else 17.75e-3
@@ -101,19 +98,6 @@ class SoftFinger(MeshedRobot):
         """``finger_1cable`` or ``finger_2cables``."""
         return "finger_1cable" if self.cables == 1 else "finger_2cables"
 
-    @property
-    def mechanics_key(self) -> dict[str, object]:
-        """Options that change the condensed model (a cable that may push has the same one)."""
-        return {
-            "cables": self.cables,
-            "mesh_size": self.mesh_size,
-            "meshing": self.meshing,
-            "material": self.material,
-            "gravity": list(self.gravity),
-            # Weights from before there were contacts hold no such key.
-            **({"contacts": True} if self.contacts else {}),
-        }
-
     def lengths(self, design: Mapping[str, float]) -> dict[str, float]:
         """Return the parameters of `draw_finger` [mm, rad] for a complete design."""
         lengths = {name: round(design[name] * 1e3, 9) for name in ("length", "height", "joint_height")}
@@ -132,11 +116,6 @@ class SoftFinger(MeshedRobot):
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
         """Surfaces of the shape of a complete design."""
         return finger_features(self.lengths(design))
-
-    @staticmethod
-    def clamped(mesh: BodyMesh) -> np.ndarray:
-        """Nodes of the flange, shape (n,)."""
-        return mesh.nodes[:, 2] >= -(FLANGE + 1e-3) * 1e-3
 
     @staticmethod
     def tip(design: Mapping[str, float]) -> np.ndarray:
@@ -168,18 +147,9 @@ class SoftFinger(MeshedRobot):
 
     def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Clamp the flange, route the cables past the notches, put the effector at the middle of the tip."""
-        model = MechanicalModel.from_mesh(
-            mesh.nodes,
-            mesh.tetrahedra,
-            fixed=self.clamped(mesh),
-            material=self.material,
-            young_modulus=design["young_modulus"],
-            poisson_ratio=design["poisson_ratio"],
-            density=1100.0,
-            gravity=self.gravity,
-        )
+        model = self.solid(mesh, design, fixed=in_flange(mesh.nodes))
         for actuator, (pull_point, points) in zip(self.actuators, self.routes(design), strict=True):
-            model.add_cable(actuator.name, points, pull_point, unilateral=self.unilateral)
+            model.add_cable(actuator.name, points, pull_point, unilateral=actuator.unilateral)
         # The effector floats in front of the slanted tip, outside the body.
         hint = self.reference_element(mesh, self.tip(self.reference_design))
         model.add_effector("tip", self.tip(design), hint=hint)

@@ -20,8 +20,6 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import tube_skin
 from softgym_envs.robots.base import Actuator, Robot
 
-__all__ = ["StiffFlop"]
-
 STIFF_MODULUS = 1.875e6
 """Young's modulus of the end pieces [Pa]."""
 STIFF_LENGTH = 5e-3
@@ -68,7 +66,6 @@ class StiffFlop(Robot):
         if not isinstance(elements, int) or elements < 1:
             raise ValueError(f"elements = {elements!r} is out of bounds; allowed: integers from 1")
         self.elements = elements
-        self.unilateral = unilateral
         self.design_space = DesignSpace(
             DesignVariable("module_length", 0.045, 0.065, 0.055, "m", "length of one of the two modules"),
             DesignVariable("outer_radius", 0.0052, 0.0065, 0.00575, "m", "radius of the body; its wall scales along"),
@@ -87,16 +84,6 @@ class StiffFlop(Robot):
             for module in ("base", "tip")
             for pair in range(3)
         )
-
-    @property
-    def weights_name(self) -> str:
-        """``trunk``."""
-        return "trunk"
-
-    @property
-    def mechanics_key(self) -> dict[str, object]:
-        """Options that change the condensed model."""
-        return {"elements": self.elements, "gravity": list(self.gravity)}
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Lay out the frames along the axis, the beam elements, the chambers and the tip."""
@@ -125,15 +112,16 @@ class StiffFlop(Robot):
         beam = model.blocks[0]
         assert isinstance(beam, Beam)
         area = 2.0 * math.pi * design["chamber_radius"] ** 2
-        names = iter(self.actuators)
+        actuators = iter(self.actuators)
         for first in (0, self.elements + 1):
             for pair in range(3):
                 # The first pair lies on +z, so that filling it bends the tip towards -z.
                 angle = 2.0 * math.pi / 3.0 * pair
                 offset = (design["chamber_offset"] * math.sin(angle), design["chamber_offset"] * math.cos(angle))
                 line = beam.line(range(first, first + self.elements), offset, model.nodes)
-                chamber = Chamber(next(names).name, [line], area)
-                chamber.unilateral = self.unilateral
+                actuator = next(actuators)
+                chamber = Chamber(actuator.name, [line], area)
+                chamber.unilateral = actuator.unilateral
                 model.add("a", chamber)
         model.add("e", Point("tip", EmbeddedPoints.in_frame(frames[-1], np.zeros(3), model.nodes)))
         turn = 2.0 * np.pi * np.arange(24) / 24

@@ -21,8 +21,6 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.robots.base import Actuator, Robot
 
-__all__ = ["Tetrapod"]
-
 HORN = 22.5e-3
 """Distance of a leg's root from its servo's axis, outwards [m]."""
 CENTRE_RADIUS = 13e-3
@@ -92,16 +90,6 @@ class Tetrapod(Robot):
             )
             for k in range(4)
         )
-
-    @property
-    def weights_name(self) -> str:
-        """``tetrapod``."""
-        return "tetrapod"
-
-    @property
-    def mechanics_key(self) -> dict[str, object]:
-        """Options that change the condensed model."""
-        return {"payload": self.payload, "elements": self.elements, "gravity": list(self.gravity)}
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Lay out servos, legs and centre, bent as a first guess; the equilibrium is found by the solver."""

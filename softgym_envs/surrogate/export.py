@@ -768,7 +768,7 @@ def _finished(model: Model, g: _Builder) -> Any:
     properties = {
         "robot": robot.name,
         "variant": robot.weights_name,
-        "signature": json.dumps(robot.mechanics_key),
+        "mechanics_key": json.dumps(robot.mechanics_key),
         "design": json.dumps(variables),
         "displacement": json.dumps(_actuators(model)),
         "effector": json.dumps({"names": robot.effectors, "coordinates": "xyz", "unit": "m"}),

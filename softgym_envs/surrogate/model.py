@@ -282,7 +282,7 @@ def card_of(robot: Robot, network: str) -> dict[str, Any]:
         "format": FORMAT,
         "network": network,
         "robot": robot.name,
-        "signature": robot.mechanics_key,
+        "mechanics_key": robot.mechanics_key,
         "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
         "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
     }
@@ -318,9 +318,9 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
         module = network_module(str(card.get("network")))
     except ValueError as error:
         raise WeightsError(f"'{card_path}': {error}") from None
-    if card.get("robot") != robot.name or card.get("signature") != robot.mechanics_key:
+    if card.get("robot") != robot.name or card.get("mechanics_key") != robot.mechanics_key:
         wanted = {"robot": robot.name, **robot.mechanics_key}
-        found = {"robot": card.get("robot"), **card.get("signature", {})}
+        found = {"robot": card.get("robot"), **card.get("mechanics_key", {})}
         different = sorted(k for k in wanted if wanted[k] != found.get(k))
         raise WeightsError(
             f"weights '{folder.name}' were trained for another robot: "

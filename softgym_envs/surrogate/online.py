@@ -106,7 +106,7 @@ class StateStore:
         self._parts: list[dict[str, np.ndarray]] = []
         if self.folder is None:
             return
-        asked = json.loads(json.dumps({"format": _FORMAT, "robot": robot.name, "signature": robot.mechanics_key}))
+        asked = json.loads(json.dumps({"format": _FORMAT, "robot": robot.name, "mechanics_key": robot.mechanics_key}))
         path = self.folder / "manifest.json"
         if path.exists():
             try:

@@ -124,7 +124,7 @@ def test_the_inverse_controller_moves_the_object(parts):
     """With the coupled model alone; the gripper as one model goes where it says."""
     robot = make_robot("three_finger_gripper", mesh_size=MESH_SIZE)
     coupled = CoupledFingers.like(robot, FEMFingers(parts))
-    controller = InverseQP(robot.lower, robot.upper, robot.rates, coupled.unilateral)
+    controller = InverseQP.for_robot(robot)
     goal = coupled.centre + [0.0005, -0.0005, 0.004]
     command = np.zeros(6)
     state = coupled.solve(command)

@@ -143,7 +143,7 @@ def test_bounds_time_limit_and_info(identifier, options, episodes, action_mode):
     assert info["is_success"] == (info["distance"] < env.unwrapped.task.success_distance)
     assert info["converged"]
     assert reward == pytest.approx(np.prod(list(info["reward_terms"].values())))
-    unilateral = np.array([actuator.unilateral for actuator in env.unwrapped.robot.actuators])
+    unilateral = env.unwrapped.robot.unilateral
     assert (info["effort"][unilateral] >= 0.0).all()
 
 

@@ -142,7 +142,7 @@ def test_cables_reach_their_stroke():
 def test_follows_its_circle(trunk):
     """Measured: 0.02 mm at most, two steps a goal."""
     fem = make_backend("fem", trunk)
-    controller = InverseQP(trunk.lower, trunk.upper, trunk.rates, np.ones(8, dtype=bool))
+    controller = InverseQP.for_robot(trunk)
     path, state, distances = trunk.reference_path(), fem.state, []
     assert path.shape == (30, 3)
     for goal in [path[0]] * 14 + [goal for goal in path[1:10] for _ in range(2)]:

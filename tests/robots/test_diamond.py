@@ -133,8 +133,7 @@ def test_the_soft_heavy_body_of_the_published_scene_sags():
 def follow(robot, laps, hold):
     """Distances [m] from the goals of the reference path, after the approach."""
     fem = make_backend("fem", robot)
-    unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
-    controller = InverseQP(robot.lower, robot.upper, robot.rates, unilateral)
+    controller = InverseQP.for_robot(robot)
     path, state, distances = robot.reference_path(), fem.state, []
     for goal in [path[0]] * 12 + [goal for goal in np.tile(path, (laps, 1)) for _ in range(hold)]:
         state = fem.step(controller.solve(state.condensed, goal, state.command, state.slack))

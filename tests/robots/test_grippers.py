@@ -71,7 +71,7 @@ def single_finger(robot):
     finger = SoftFinger(
         cables=2,
         mesh_size=robot.finger.mesh_size,
-        unilateral=robot.unilateral,
+        unilateral=bool(robot.unilateral.all()),
         contacts=robot.name != "two_finger_gripper",
     ).build()
     if robot.name == "two_finger_gripper":

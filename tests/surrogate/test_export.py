@@ -181,7 +181,7 @@ def test_the_graph_computes_what_the_model_does(case, tmp_path):
         assert_same(model, designs, displacement, run_graph(runtime, path, designs, displacement), 1e-4)
     properties = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
     assert properties["robot"] == model.robot.name
-    assert json.loads(properties["signature"]) == json.loads(json.dumps(model.robot.mechanics_key))
+    assert json.loads(properties["mechanics_key"]) == json.loads(json.dumps(model.robot.mechanics_key))
     assert [variable["name"] for variable in json.loads(properties["design"])] == list(model.robot.design_space.names)
     efforts = {actuator["effort_unit"] for actuator in json.loads(properties["displacement"])}
     assert efforts == ({"Pa"} if case == "six" else {"N"})

@@ -140,7 +140,7 @@ def test_search_of_a_batch_is_that_of_its_rows(name):
     guess = target + 0.1 * (random_states(robot, count, seed=1)[1] - target)
     target[0] = guess[0] = robot.upper  # taut
     guess[lost, 0] = np.nan
-    unilateral = np.array([actuator.unilateral for actuator in robot.actuators])
+    unilateral = robot.unilateral
     for iterations in (0, 1, 12):
         found = model.search(context, target, guess, unilateral, 2e-4, iterations)
         assert not found[2][lost].any()

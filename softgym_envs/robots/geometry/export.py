@@ -15,8 +15,6 @@ from softgym_envs.robots.base import Drawing, MeshedRobot, Robot
 from softgym_envs.robots.geometry.meshing import BodyMesh, run_gmsh
 from softgym_envs.storage import atomic_write
 
-__all__ = ["FORMATS", "export_body", "write_drawing", "write_stl"]
-
 FORMATS = (".step", ".stl")
 """Endings of the files that can be written."""
 

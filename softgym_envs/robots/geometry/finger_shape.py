@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
+
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.robots.geometry.morphing import Cone, Cylinder, Feature, Plane
-
-__all__ = ["FLANGE", "THICKNESS", "check_finger", "draw_finger", "finger_features"]
 
 # Fixed dimensions [mm]. Where bellows end along z they are as wide as the segments: TEETH_RADIUS = THICKNESS / 2.
 THICKNESS = 17.5
@@ -142,6 +142,11 @@ def check_finger(lengths: Mapping[str, float]) -> None:
             f"the cavity opens into the notch: it is {inner:.2f} mm high at its ends, the segment beside it "
             f"{closed:.2f} mm"
         )
+
+
+def in_flange(nodes: np.ndarray) -> np.ndarray:
+    """Nodes [m] (n, 3) of the flange, which is clamped, shape (n,)."""
+    return nodes[:, 2] >= -(FLANGE + 1e-3) * 1e-3
 
 
 def finger_features(lengths: Mapping[str, float]) -> dict[str, Feature]:

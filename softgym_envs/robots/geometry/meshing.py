@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import textwrap
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,10 +28,9 @@ import numpy as np
 from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
 from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
-__all__ = ["BodyMesh", "mesh_geometry", "run_gmsh"]
-
 _FORMAT = 2
-_BROKEN = 3  # exit status of the meshing process when gmsh itself is missing or does not load
+# Exit statuses of the meshing process: gmsh is missing or does not load; gmsh refuses the shape; the drawing has a bug.
+_NO_GMSH, _NO_SHAPE, _BUG = 3, 4, 5
 _SHIPPED = Path(__file__).parents[1] / "meshes"
 
 
@@ -129,8 +129,8 @@ def mesh_geometry(
         time_limit: wall-clock limit of the meshing process [s].
 
     Raises:
-        InfeasibleDesign: if the geometry cannot be drawn or meshed, or takes too long.
-        MeshingError: if gmsh cannot be imported.
+        InfeasibleDesign: if gmsh cannot draw or mesh the geometry, or takes too long.
+        MeshingError: if gmsh cannot be imported, or the drawing function fails.
     """
     name = f"{build.__module__}:{build.__qualname__}"
     parameters = {key: float(value) for key, value in sorted(parameters.items())}
@@ -188,8 +188,8 @@ def run_gmsh(request: dict, *, time_limit: float) -> None:
         time_limit: wall-clock limit of the process [s].
 
     Raises:
-        InfeasibleDesign: if the geometry cannot be drawn or meshed, or takes too long.
-        MeshingError: if gmsh cannot be imported.
+        InfeasibleDesign: if gmsh cannot draw or mesh the geometry, or takes too long.
+        MeshingError: if gmsh cannot be imported, or the drawing function fails.
     """
     command = [sys.executable, "-m", "softgym_envs.robots.geometry.meshing", json.dumps(request)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
@@ -198,11 +198,17 @@ def run_gmsh(request: dict, *, time_limit: float) -> None:
         done = subprocess.run(command, capture_output=True, text=True, timeout=time_limit, env=environment, check=False)
     except subprocess.TimeoutExpired:
         raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s for {parameters}") from None
-    if done.returncode == _BROKEN:
-        raise MeshingError(f"gmsh cannot be used: {done.stderr.strip().splitlines()[-1]}")
-    if done.returncode != 0:
-        reason = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
+    if done.returncode == 0:
+        return
+    text = done.stderr.strip()
+    reason = text.splitlines()[-1] if text else "no message"
+    if done.returncode == _NO_GMSH:
+        raise MeshingError(f"gmsh cannot be used: {reason}")
+    if done.returncode == _NO_SHAPE:
         raise InfeasibleDesign(f"the geometry cannot be meshed for {parameters}: {reason}")
+    if done.returncode < 0:  # OpenCASCADE crashes on some shapes
+        raise InfeasibleDesign(f"gmsh crashed with signal {-done.returncode} for {parameters}")
+    raise MeshingError(f"the drawing function {request['build']} failed for {parameters}:\n{text}")
 
 
 def _draw_here(request: dict) -> None:
@@ -229,7 +235,7 @@ def _draw_here(request: dict) -> None:
         gmsh.model.occ.synchronize()
         volumes = gmsh.model.getEntities(3)
         if len(volumes) != 1:
-            raise ValueError(f"the geometry has {len(volumes)} volumes, expected one")
+            raise InfeasibleDesign(f"the geometry has {len(volumes)} volumes, expected one")
         output = Path(request["output"])
         if output.suffix != ".npz":
             if output.suffix == ".stl":
@@ -251,7 +257,7 @@ def _draw_here(request: dict) -> None:
             triangles.append(found)
             surfaces.append(np.full(len(found), surface))
         if len(tetrahedra) == 0:
-            raise ValueError("gmsh made no tetrahedra")
+            raise InfeasibleDesign("gmsh made no tetrahedra")
         nodes = coordinates.reshape(-1, 3) * 1e-3
         used, renumbered = np.unique(tetrahedra, return_inverse=True)
         back = np.full(len(nodes), -1)
@@ -266,10 +272,22 @@ def _draw_here(request: dict) -> None:
         gmsh.finalize()
 
 
-if __name__ == "__main__":
-    arguments = json.loads(sys.argv[1])
+def _main() -> int:
+    """Run as the meshing process; return its exit status."""
     try:
-        _draw_here(arguments)
+        _draw_here(json.loads(sys.argv[1]))
     except (ImportError, OSError) as problem:  # OSError: a system library that gmsh needs is missing
         print(problem, file=sys.stderr)
-        sys.exit(_BROKEN)
+        return _NO_GMSH
+    except Exception as problem:
+        # What gmsh reports is a plain Exception; any other type comes from the code of the drawing.
+        if type(problem) is not Exception and not isinstance(problem, InfeasibleDesign):
+            traceback.print_exc()
+            return _BUG
+        print(problem, file=sys.stderr)
+        return _NO_SHAPE
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(_main())

@@ -15,8 +15,6 @@ import numpy as np
 
 from softgym_envs.robots.geometry.meshing import BodyMesh
 
-__all__ = ["Cone", "Cylinder", "Feature", "Morpher", "Plane", "mean_ratio"]
-
 
 class Feature:
     """A surface given by a signed distance: ``evaluate(x) -> (distance [m] (k,), gradient (k, 3))``."""

@@ -24,8 +24,6 @@ from softgym_envs.robots.geometry.finger_shape import FLANGE, THICKNESS, draw_fi
 from softgym_envs.robots.sensorized_finger import SensorizedFinger
 from softgym_envs.robots.soft_finger import SoftFinger
 
-__all__ = ["MOULD_PARTS", "draw_box", "draw_clamp", "draw_cork", "draw_lid", "export_moulds", "mould_parts"]
-
 MOULD_PARTS = ("box", "lid", "cork", "clamp")
 """Parts of a mould."""
 

@@ -10,8 +10,6 @@ import numpy as np
 
 from softgym_envs.robots.geometry.meshing import BodyMesh
 
-__all__ = ["mirrored"]
-
 
 def mirrored(part: BodyMesh, normal: tuple[float, float, float]) -> BodyMesh:
     """Return a part and its mirror image, joined at the plane through the origin with a ``normal`` of any length.

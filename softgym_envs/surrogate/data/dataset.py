@@ -122,7 +122,7 @@ def generate_dataset(
         "format": _FORMAT,
         "robot": robot,
         "robot_options": options,
-        "signature": body.mechanics_key,
+        "mechanics_key": body.mechanics_key,
         "plan": asdict(plan),
         "groups_per_shard": groups_per_shard,
         "columns": {

@@ -1,0 +1,223 @@
+"""The Robot base class: what a robot of one's own must define, its options, and the errors that name what is wrong."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softgym_envs.control import InverseQP
+from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots import ROBOTS, Actuator, Robot, make_robot
+
+CORNERS = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 1.0]])
+
+
+class Spike(Robot):
+    """One tetrahedron that a cable bends."""
+
+    name = "spike"
+    effectors = ("tip",)
+    size = 0.05
+    effector_rest = [0.0, 0.0, 0.05]
+    effort_scale = [1.0]
+    design_space = DesignSpace(DesignVariable("length", 0.03, 0.07, 0.05, "m", "height of the spike"))
+    actuators = (Actuator("cable", 0.0, 0.005, 0.001),)
+
+    def assemble(self, design):
+        if design["length"] > 0.06:
+            raise InfeasibleDesign("the spike breaks")
+        nodes = CORNERS * [1.0, 1.0, design["length"]]
+        fixed = np.array([True, True, True, False])
+        model = MechanicalModel.from_mesh(nodes, np.array([[0, 1, 2, 3]]), fixed=fixed, young_modulus=1e5)
+        model.add_cable("cable", nodes[3:], pull_point=np.array([0.02, 0.0, 0.0]))
+        model.add_effector("tip", nodes[3])
+        return model
+
+
+class Optioned(Spike):
+    """A robot whose options come through two constructors."""
+
+    name = "optioned"
+    non_mechanical_options = ("unilateral", "colour")
+
+    def __init__(self, layers=None, *, colour="red", file=Path("a/b.msh"), **options):
+        super().__init__(**options)
+        self.layers = 3 if layers is None else layers
+
+
+def test_class_attributes_and_one_method_are_enough():
+    robot = Spike()
+    assert robot.workspace_scale == 0.25 * 0.05
+    assert robot.weights_name == "spike"
+    assert robot.mechanics_key == {"gravity": [0.0, 0.0, 0.0]}
+    assert robot.effector_rest.shape == (3,)
+    assert robot.effort_scale.dtype == float
+    np.testing.assert_array_equal(robot.unilateral, [True])
+    assert robot.build().equations == 3
+
+
+# -- options --------------------------------------------------------------------------------------------------------
+
+
+def test_the_key_holds_every_option_with_its_default():
+    robot = Optioned(gravity=(0, 0, -9.81))
+    assert robot.mechanics_key == {"layers": 3, "file": "a/b.msh", "gravity": [0, 0, -9.81]}
+    assert json.loads(json.dumps(robot.mechanics_key)) == robot.mechanics_key
+
+
+def test_equal_options_have_equal_keys_however_they_are_given():
+    base = Optioned().mechanics_key
+    assert Optioned(3).mechanics_key == base
+    assert Optioned(layers=3, gravity=np.zeros(3)).mechanics_key == base
+    assert Optioned(layers=np.int64(3), colour="blue").mechanics_key == base
+    for other in (Optioned(4), Optioned(file="c.msh"), Optioned(gravity=(0.0, 0.0, 1.0))):
+        assert other.mechanics_key != base
+
+
+def test_an_option_that_no_key_can_hold_is_named():
+    robot = Optioned(layers=object())
+    with pytest.raises(TypeError, match=r"option 'layers' of robot 'optioned' = .*'non_mechanical_options'"):
+        robot.mechanics_key  # noqa: B018
+
+
+def test_options_that_are_robots_or_functions():
+    key = Optioned(layers=Spike(), file=np.linspace).mechanics_key
+    assert key["layers"] == {"robot": "spike", "gravity": [0.0, 0.0, 0.0]}
+    assert key["file"] == "numpy:linspace"
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda robot: pickle.loads(pickle.dumps(robot))])
+def test_copies_keep_their_options(copied):
+    robot = copied(Optioned(5))
+    assert robot.mechanics_key == Optioned(5).mechanics_key
+
+
+def test_registry_knows_options_that_pass_through():
+    with pytest.raises(ValueError, match=r"'optioned': unknown option 'colur'; did you mean 'colour'\? .*gravity"):
+        make_robot(Optioned, colur="red")
+    with pytest.raises(ValueError, match="option gravity = 'down' must be 3 numbers"):
+        make_robot(Optioned, gravity="down")
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_every_option_of_the_suite_is_in_the_key_or_left_out_on_purpose(name):
+    robot = make_robot(name)
+    assert set(robot.mechanics_key) | set(robot.non_mechanical_options) >= set(robot._options)
+    assert json.loads(json.dumps(robot.mechanics_key)) == robot.mechanics_key
+
+
+# -- what a class may lack ------------------------------------------------------------------------------------------
+
+
+def test_missing_attributes_are_named():
+    class Bar(Robot):
+        name = "bar"
+
+        def assemble(self, design):
+            raise NotImplementedError
+
+    with pytest.raises(TypeError, match=r"'Bar' lacks: effectors, size, design_space, .*effort_scale \(see Robot\)"):
+        Bar()
+
+
+def test_attributes_may_be_set_after_the_base_constructor():
+    class Late(Spike):
+        name = "late"
+
+        def __init__(self):
+            super().__init__()
+            self.actuators = (Actuator("a", 0.0, 1.0, 0.1), Actuator("b", 0.0, 1.0, 0.1, unilateral=False))
+            self.effort_scale = np.ones(2)
+
+    np.testing.assert_array_equal(Late().unilateral, [True, False])
+
+
+@pytest.mark.parametrize(
+    ("attributes", "error", "message"),
+    [
+        ({"effectors": "tip"}, TypeError, "effectors must be a tuple of names, got 'tip'"),
+        ({"effort_scale": [1.0, 2.0]}, ValueError, r"effort_scale must have shape \(1,\), got \(2,\)"),
+        ({"effector_rest": [0.0, 1.0]}, ValueError, r"effector_rest must have shape \(3,\), got \(2,\)"),
+        ({"size": 50.0}, ValueError, "robot 'odd': size = 50 m; did you mean 0.05 m?"),
+        (
+            {"actuators": (Actuator("cable", 0.0, 20.0, 1.0),)},
+            ValueError,
+            "'cable' = 20 m; did you mean 0.02 m",
+        ),
+        (
+            {"design_space": DesignSpace(DesignVariable("length", 30.0, 70.0, 50.0, "m", "in millimetres"))},
+            ValueError,
+            "high of 'length' = 70 m; did you mean 0.07 m",
+        ),
+    ],
+    ids=["effectors", "effort_scale", "effector_rest", "size", "stroke", "variable"],
+)
+def test_malformed_attributes(attributes, error, message):
+    with pytest.raises(error, match=message):
+        type("Odd", (Spike,), {"name": "odd", **attributes})()
+
+
+# -- what means infeasible ------------------------------------------------------------------------------------------
+
+
+def test_a_bug_in_a_robot_surfaces_as_itself():
+    class Buggy(Spike):
+        name = "buggy"
+
+        def assemble(self, design):
+            return np.zeros((2, 3)) @ np.zeros((2, 3))
+
+    with pytest.raises(ValueError, match="matmul") as caught:
+        Buggy().build()
+    assert not isinstance(caught.value, InfeasibleDesign)
+    assert caught.traceback[-1].name == "assemble"
+
+
+def test_only_a_robot_says_that_a_design_is_infeasible():
+    assert Spike().build({"length": 0.04}).nodes[3, 2] == pytest.approx(0.04)
+    with pytest.raises(InfeasibleDesign, match="the spike breaks"):
+        Spike().build({"length": 0.065})
+
+
+# -- points and controllers -----------------------------------------------------------------------------------------
+
+
+def test_points_in_millimetres_are_refused():
+    robot = make_robot("finger")
+    np.testing.assert_array_equal(robot.check_point("goal", [0.0, 0.05, -0.09]), [0.0, 0.05, -0.09])
+    assert robot.check_point("goal", robot.reference_path()).shape == (25, 3)
+    with pytest.raises(ValueError, match=r"goal = \[0.0, 66.0, -72.0\] m is 97.* m away from .*did you mean metres\?"):
+        robot.check_point("goal", [0, 66, -72])
+    with pytest.raises(ValueError, match=r"path = \[0.0, 50.0, -0.1\] m"):
+        robot.check_point("path", [[0.0, 0.05, -0.1], [0.0, 50.0, -0.1]])
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_reference_paths_are_near_their_robots(name):
+    robot = make_robot(name)
+    try:
+        path = robot.reference_path()
+    except ValueError:
+        pytest.skip("has no reference path")
+    robot.check_point("path", path)
+
+
+@pytest.mark.parametrize("name", ["finger", "press_finger", "contact_finger"])
+def test_controllers_of_robots(name):
+    robot = make_robot(name)
+    controller = InverseQP.for_robot(robot, effort_weight=1e-3)
+    for attribute in ("lower", "upper", "rates", "unilateral"):
+        np.testing.assert_array_equal(getattr(controller, attribute), getattr(robot, attribute))
+    assert controller.effort_weight == 1e-3
+    assert (controller.goal_weights is None) == bool(np.all(robot.goal_axes))
+    if controller.goal_weights is not None:
+        np.testing.assert_array_equal(controller.goal_weights, robot.goal_axes)
+    faster = InverseQP.for_robot(robot, rates=2.0 * robot.rates)
+    np.testing.assert_array_equal(faster.rates, 2.0 * robot.rates)
