@@ -1,9 +1,10 @@
-"""The exception tree of the suite: every error names the thing, its value and what is allowed."""
+"""Exceptions of the suite. Every message names the thing, its value and what is allowed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from os.path import commonprefix
 
 __all__ = [
     "ConfigError",
@@ -18,7 +19,7 @@ __all__ = [
 
 
 class SoftGymError(Exception):
-    """Base of all errors raised on purpose by softgym-envs."""
+    """Base of all errors that softgym-envs raises for its users."""
 
 
 class DesignError(SoftGymError, ValueError):
@@ -26,9 +27,9 @@ class DesignError(SoftGymError, ValueError):
 
 
 class InfeasibleDesign(SoftGymError):
-    """A design inside its box whose geometry cannot exist or cannot be meshed in time.
+    """A design within its bounds whose geometry cannot exist or cannot be meshed in time.
 
-    This is a result for an optimiser, never a crash.
+    An optimiser treats it as a result and continues.
     """
 
 
@@ -40,7 +41,7 @@ class ConvergenceError(SoftGymError):
     """No equilibrium was found.
 
     Attributes:
-        fraction: part of the requested load increment that was reached, in [0, 1).
+        fraction: reached share of the requested load increment, in [0, 1).
     """
 
     def __init__(self, message: str, *, fraction: float = 0.0) -> None:
@@ -60,8 +61,14 @@ class ConfigError(SoftGymError, ValueError):
     """A configuration file or command-line override is malformed."""
 
 
+MAX_NAMES = 12
+"""Most allowed names that a message lists besides the nearest one."""
+
+
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> str:
-    """Return the message for a name that does not exist: the nearest one, if any is near, and all that are allowed.
+    """Return the message for a name that does not exist: the nearest name, if there is one, and the allowed names.
+
+    A long list of allowed names is left out if there is a near one.
 
     Args:
         kind: what the name should be: ``"robot"``, ``"option"``, ...
@@ -69,6 +76,16 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> str:
         allowed: the names that exist.
     """
     allowed = list(allowed)
-    near = get_close_matches(str(name), allowed, n=1)
-    hint = f"did you mean '{near[0]}'? " if near else ""
+    # Names that all begin or end alike, as IDs do, are compared without those parts.
+    start = commonprefix(allowed) if len(allowed) > 1 else ""
+    end = commonprefix([each[::-1] for each in allowed])[::-1] if len(allowed) > 1 else ""
+
+    def core(text: str) -> str:
+        return text.removeprefix(start).removesuffix(end).lower()
+
+    cores = {core(each): each for each in allowed}
+    near = get_close_matches(core(str(name)), cores, n=1)
+    hint = f"did you mean '{cores[near[0]]}'? " if near else ""
+    if near and len(allowed) > MAX_NAMES:
+        return f"unknown {kind} '{name}'; {hint}".rstrip()
     return f"unknown {kind} '{name}'; {hint}allowed: {', '.join(allowed) or 'none'}"
