@@ -26,7 +26,7 @@ from agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.config import check_config, difference, load_config, provenance
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
-from softgym_envs.executors import run_jobs
+from softgym_envs.executors import parallel_map
 from softgym_envs.storage import read_json, write_json
 
 __all__ = ["evaluate_baselines", "sweep", "train_and_evaluate", "unseen_goals"]
@@ -233,7 +233,7 @@ def sweep(
         print(f"{before} jobs were finished before", flush=True)
     jobs.sort(key=lambda job: -job[0])
     begun, failed = time.perf_counter(), 0
-    finished = run_jobs([(_attempt, job[1:]) for job in jobs], processes)
+    finished = parallel_map(_attempt, [job[1:] for job in jobs], processes)
     for done, (label, error) in enumerate(finished, 1):
         failed += error is not None
         print(f"{time.perf_counter() - begun:7.1f} s  {done}/{len(jobs)}  {label}  {error or 'done'}", flush=True)

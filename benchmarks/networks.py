@@ -246,7 +246,7 @@ def _track(path: Path, case: str, data: dict[str, dict[str, np.ndarray]], size: 
 
 def main(folder: Path, workers: int = 1) -> None:
     """Make what is missing, and write all runs to ``benchmarks/data/networks.json``, also when it is stopped."""
-    from softgym_envs.executors import run_jobs
+    from softgym_envs.executors import parallel_map
 
     runs = folder / "runs"
     jobs: list[tuple[Any, tuple]] = []
@@ -259,11 +259,11 @@ def main(folder: Path, workers: int = 1) -> None:
         for case in CASES:
             stem = f"{case.replace(' ', '')}_{name.replace(' ', '').replace(',', '_')}"
             jobs += [
-                (_run, (runs / f"{stem}_{size}_{seed}.json", case, name, data[case], size, seed))
+                (runs / f"{stem}_{size}_{seed}.json", case, name, data[case], size, seed)
                 for size, seed in row.runs(case)
             ]
     try:
-        for path in run_jobs([job for job in jobs if not job[1][0].exists()], workers):
+        for path in parallel_map(_run, [job for job in jobs if not job[0].exists()], workers):
             last = json.loads(path.read_text())
             if "network" in last:
                 print(

@@ -17,6 +17,7 @@ from __future__ import annotations
 import itertools
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -191,9 +192,13 @@ def _run_study(path: Path, name: str, repeat: int) -> Path:
     return path
 
 
+def _call(function: Callable[..., Path], arguments: tuple) -> Path:
+    return function(*arguments)
+
+
 def main(folder: Path, workers: int = 1) -> None:
     """Make what is missing, and write all to ``benchmarks/data/strategies.json``, also when it is stopped."""
-    from softgym_envs.executors import run_jobs
+    from softgym_envs.executors import parallel_map
 
     folder = folder.resolve()
     jobs: list[tuple[Any, tuple]] = []
@@ -206,7 +211,7 @@ def main(folder: Path, workers: int = 1) -> None:
             jobs.append((_run_study, (place / "regret.json", name, repeat)))
     missing = [job for job in jobs if not job[1][0].exists()]
     try:
-        for done, path in enumerate(run_jobs(missing, workers), 1):
+        for done, path in enumerate(parallel_map(_call, missing, workers), 1):
             print(f"[{done}/{len(missing)}] {path.relative_to(folder)}", flush=True)
     finally:
         collect(folder)

@@ -1,4 +1,4 @@
-"""Independent jobs on several processes, or on a Ray cluster: one call for both, by joblib."""
+"""Parallel evaluation of a function, on processes of this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -15,42 +15,50 @@ from softgym_envs.errors import ConfigError
 EXECUTORS = ("loky", "ray")
 """``"loky"``: processes on this machine; ``"ray"``: a Ray cluster (the extra ``ray``)."""
 
-_WATCH = 0.2  # seconds between two looks of a worker at its owner
+PARENT_CHECK_INTERVAL = 0.2
+"""Time between two checks of a worker process whether its parent still lives [s]."""
 
 
-def run_jobs(jobs: Sequence[tuple[Callable, tuple]], workers: int, executor: str = "loky") -> Iterator[Any]:
-    """Run ``function(*arguments)`` of each job and yield the results.
+def parallel_map(function: Callable, arguments: Sequence[tuple], workers: int, executor: str = "loky") -> Iterator[Any]:
+    """Yield ``function(*row)`` for each row of ``arguments``.
 
-    Processes of this machine give them as they come, in any order, and end when this process does, however it does; a
-    cluster gives them together at the end. One worker on this machine is this very process. The cluster is that of
-    ``RAY_ADDRESS``, or one that is started here and stopped at the end.
+    Processes of this machine yield results in the order in which they finish, and end when this process ends, even if
+    it is killed. A Ray cluster yields all results at the end. One local worker is this process itself.
+
+    Args:
+        function: importable in a worker process.
+        arguments: one tuple per call.
+        workers: number of processes.
+        executor: one of `EXECUTORS`.
 
     Raises:
-        ValueError: for an unknown executor, or Ray where it is not installed.
+        ValueError: for an unknown executor.
+        ConfigError: if the executor is ``"ray"`` and Ray is not installed.
     """
     if executor not in EXECUTORS:
         raise ValueError(f"executor = {executor!r} is unknown; allowed: {', '.join(map(repr, EXECUTORS))}")
     if executor == "ray":
-        yield from _run_on_ray(jobs, workers)
-    elif workers <= 1 or len(jobs) <= 1:
-        for function, arguments in jobs:
-            yield function(*arguments)
+        yield from _map_on_ray(function, arguments, workers)
+    elif workers <= 1 or len(arguments) <= 1:
+        for row in arguments:
+            yield function(*row)
     else:
         from joblib import Parallel, delayed, parallel_config
 
-        # loky ends workers that were idle for minutes or grew large, and starts others: nothing to act on.
+        # loky replaces workers that were idle for minutes or use much memory: the user need not act.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
-        with parallel_config("loky", n_jobs=workers, initializer=_follow, initargs=(os.getpid(),)):
+        with parallel_config("loky", n_jobs=workers, initializer=_end_with_parent, initargs=(os.getpid(),)):
             yield from Parallel(return_as="generator_unordered", batch_size=1)(
-                delayed(function)(*arguments) for function, arguments in jobs
+                delayed(function)(*row) for row in arguments
             )
 
 
 @contextmanager
 def ray_cluster() -> Iterator[Any]:
-    """Yield the module ``ray`` connected to a cluster: a running one, that of ``RAY_ADDRESS``, or a new local one.
+    """Yield the module ``ray``, connected to a cluster.
 
-    A cluster that this function connected to or started is left at the end.
+    The cluster is the one that this process is connected to already, else the one of ``RAY_ADDRESS``, else a new local
+    one. A connection or cluster that this function made is closed at the end.
 
     Raises:
         ConfigError: if Ray is not installed.
@@ -59,18 +67,18 @@ def ray_cluster() -> Iterator[Any]:
         import ray
     except ImportError as error:
         raise ConfigError(f"executor = 'ray' needs Ray ({error}): pip install 'softgym-envs[ray]'") from None
-    ours = not ray.is_initialized()
-    if ours:
+    connect = not ray.is_initialized()
+    if connect:
         ray.init(log_to_driver=False, configure_logging=False)
     try:
         yield ray
     finally:
-        if ours:
+        if connect:
             ray.shutdown()
 
 
-def _run_on_ray(jobs: Sequence[tuple[Callable, tuple]], workers: int) -> list[Any]:
-    if not jobs:
+def _map_on_ray(function: Callable, arguments: Sequence[tuple], workers: int) -> list[Any]:
+    if not arguments:
         return []
     with ray_cluster():
         from joblib import Parallel, delayed, parallel_config
@@ -78,18 +86,19 @@ def _run_on_ray(jobs: Sequence[tuple[Callable, tuple]], workers: int) -> list[An
 
         register_ray()
         with parallel_config("ray", n_jobs=workers):
-            return Parallel(batch_size=1)(delayed(function)(*arguments) for function, arguments in jobs)
+            return Parallel(batch_size=1)(delayed(function)(*row) for row in arguments)
 
 
-def _follow(owner: int) -> None:
-    """Make this worker end soon after the process ``owner`` that started it, of whose death nobody tells it.
+def _end_with_parent(parent: int) -> None:
+    """End this process soon after its parent process ends, which may be killed without a chance to stop it.
 
-    Its parent is asked, not whether ``owner`` lives: a dead process may wait long for somebody to take note of it.
+    The thread compares the parent's ID instead of checking whether ``parent`` exists, because a killed process exists
+    as a zombie until its own parent collects it.
     """
 
     def watch() -> None:
-        while os.getppid() == owner:
-            time.sleep(_WATCH)
+        while os.getppid() == parent:
+            time.sleep(PARENT_CHECK_INTERVAL)
         os._exit(1)
 
-    threading.Thread(target=watch, name="owner", daemon=True).start()
+    threading.Thread(target=watch, name="parent-watch", daemon=True).start()

@@ -1,4 +1,4 @@
-"""Jobs on processes and on Ray: results, errors, and no process left behind."""
+"""Parallel calls on processes and on Ray: results, errors, and no process left behind."""
 
 import math
 import operator
@@ -9,45 +9,44 @@ import sys
 
 import pytest
 
-from softgym_envs.executors import EXECUTORS, run_jobs
+from softgym_envs.executors import EXECUTORS, parallel_map
 from softgym_envs.testing import live_processes, wait_until
 
-# Jobs are of the standard library: workers cannot import test files.
-SQUARES = [(operator.mul, (k, k)) for k in range(20)]
+# Functions of the standard library: workers cannot import test files.
+SQUARES = [(k, k) for k in range(20)]
 
 
 def test_unknown_executor():
     with pytest.raises(ValueError, match=r"'threads' is unknown; allowed: 'loky', 'ray'"):
-        list(run_jobs(SQUARES, 2, "threads"))
+        list(parallel_map(operator.mul, SQUARES, 2, "threads"))
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_every_job_is_done_once(workers):
-    assert sorted(run_jobs(SQUARES, workers)) == [k * k for k in range(20)]
-    assert list(run_jobs([], workers)) == []
+def test_every_call_is_made_once(workers):
+    assert sorted(parallel_map(operator.mul, SQUARES, workers)) == [k * k for k in range(20)]
+    assert list(parallel_map(operator.mul, [], workers)) == []
 
 
 def test_one_worker_is_this_process():
     here = os.getpid()
-    assert set(run_jobs([(os.getpid, ())] * 3, 1)) == {here}
-    assert set(run_jobs([(os.getpid, ())], 2)) == {here}
-    assert here not in set(run_jobs([(os.getpid, ())] * 3, 2))
+    assert set(parallel_map(os.getpid, [()] * 3, 1)) == {here}
+    assert set(parallel_map(os.getpid, [()], 2)) == {here}
+    assert here not in set(parallel_map(os.getpid, [()] * 3, 2))
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_errors_arrive(workers):
     with pytest.raises(ValueError, match="math domain error"):
-        list(run_jobs([(math.sqrt, (4.0,)), (math.sqrt, (-1.0,)), (math.sqrt, (9.0,))], workers))
+        list(parallel_map(math.sqrt, [(4.0,), (-1.0,), (9.0,)], workers))
 
 
 def test_workers_end_with_their_owner():
-    """Busy and idle ones, when nobody was left to tell them."""
+    """Busy and idle workers end after their owner was killed."""
     code = (
-        "import time; from softgym_envs.executors import run_jobs\n"
-        "jobs = [(time.sleep, (0,)), (time.sleep, (0,)), (time.sleep, (600,))]\n"
-        "for _ in run_jobs(jobs, 3): print('done', flush=True)"
+        "import time; from softgym_envs.executors import parallel_map\n"
+        "arguments = [(0,), (0,), (600,)]\n"
+        "for _ in parallel_map(time.sleep, arguments, 3): print('done', flush=True)"
     )
-    # What a worker says of its owner's death is of no interest.
     command = [sys.executable, "-c", code]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
@@ -58,7 +57,7 @@ def test_workers_end_with_their_owner():
             assert (
                 len(live_processes(process.pid)) >= 4
             )  # the owner, three workers; and what watches over shared memory
-            # Nobody has taken note of the death yet when the workers have to see it.
+            # The owner is a zombie while the workers have to notice its end.
             os.kill(process.pid, signal.SIGKILL)
             wait_until(lambda: not live_processes(process.pid))
         finally:
@@ -69,17 +68,18 @@ def test_workers_end_with_their_owner():
 def test_ray_that_is_not_installed(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ValueError, match=r"executor = 'ray' needs Ray \(.*\): pip install 'softgym-envs\[ray\]'"):
-        list(run_jobs(SQUARES, 2, "ray"))
+        list(parallel_map(operator.mul, SQUARES, 2, "ray"))
 
 
-# Ray leaves files and sockets of its cluster to the garbage collector.
+# Ray leaves open files and sockets to the garbage collector.
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_ray():
-    ray = pytest.importorskip("ray")
+    import ray
+
     assert "ray" in EXECUTORS
-    assert list(run_jobs([], 2, "ray")) == []
-    assert sorted(run_jobs(SQUARES, 2, "ray")) == [k * k for k in range(20)]
-    assert not ray.is_initialized()  # the cluster that was started for the jobs is gone
+    assert list(parallel_map(operator.mul, [], 2, "ray")) == []
+    assert sorted(parallel_map(operator.mul, SQUARES, 2, "ray")) == [k * k for k in range(20)]
+    assert not ray.is_initialized()  # the cluster of the call has been stopped
     with pytest.raises(ValueError, match="math domain error"):
-        list(run_jobs([(math.sqrt, (4.0,)), (math.sqrt, (-1.0,))], 2, "ray"))
+        list(parallel_map(math.sqrt, [(4.0,), (-1.0,)], 2, "ray"))
     assert not ray.is_initialized()

@@ -11,7 +11,7 @@ import numpy as np
 
 from codesign.tools.bodies import Evaluator
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
-from softgym_envs.executors import run_jobs
+from softgym_envs.executors import parallel_map
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def evaluate_each(
     evaluator: Evaluator, designs: Iterable[tuple[int, Mapping[str, float]]], workers: int
 ) -> Iterator[tuple[int, Evaluation]]:
     """Evaluate numbered designs on several processes; yields each number with its evaluation, in any order."""
-    yield from run_jobs([(_evaluate_one, (number, evaluator, design)) for number, design in designs], workers)
+    yield from parallel_map(_evaluate_one, [(number, evaluator, design) for number, design in designs], workers)
 
 
 def _evaluate_one(number: int, evaluator: Evaluator, design: Mapping[str, float]) -> tuple[int, Evaluation]:

@@ -233,7 +233,8 @@ def test_ray_that_is_not_installed(study, monkeypatch):
 # Ray leaves files and sockets of its cluster to the garbage collector.
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_ray(tmp_path, tiny):
-    ray = pytest.importorskip("ray")
+    import ray
+
     config = StudyConfig.model_validate(tiny(trials=4, goals=SMALL, executor="ray", workers=2))
     results = run_study(config, tmp_path / "study", progress=False)
     assert results["trials"]["complete"] == 4

@@ -511,7 +511,6 @@ def test_two_workers_make_the_same_data(tmp_path, made):
 
 
 def test_ray_makes_the_same_data(tmp_path, trunk):
-    pytest.importorskip("ray")
     data = generate_dataset(tmp_path, "trunk", PLAN, groups_per_shard=2, workers=2, executor="ray", progress=False)
     assert equal(data, trunk[1])
     for shard in tmp_path.glob("shard_*"):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.errors import DataError
-from softgym_envs.executors import run_jobs
+from softgym_envs.executors import parallel_map
 from softgym_envs.robots import make_robot
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write, read_npz, write_json
@@ -178,11 +178,11 @@ def _make_missing(
                 print(f"{error}; set aside as '{aside.name}' and made again")
         first = number * manifest["groups_per_shard"]
         missing.append((first, min(first + manifest["groups_per_shard"], plan.groups), str(shard)))
-    jobs = [(_make_shard, (manifest["robot"], manifest["robot_options"], plan, *job)) for job in missing]
+    arguments = [(manifest["robot"], manifest["robot_options"], plan, *shard_range) for shard_range in missing]
     with tqdm(
         total=len(shards), initial=len(shards) - len(missing), unit="shard", desc=folder.name, disable=not progress
     ) as bar:
-        for _ in run_jobs(jobs, workers, executor):
+        for _ in parallel_map(_make_shard, arguments, workers, executor):
             bar.update()
 
 

@@ -36,7 +36,7 @@ from numba import njit
 from pydantic import Field
 
 from softgym_envs.config import Config
-from softgym_envs.executors import run_jobs
+from softgym_envs.executors import parallel_map
 from softgym_envs.mechanics.solvers.complementarity import _solve_row
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.data.states import States
@@ -628,8 +628,8 @@ def train(
     if training.unloaded:
         middle = 0.5 * (robot.upper + robot.lower)
         rest = (0.0 - middle) / (robot.upper - middle)
-    jobs = [(_train_member, (trainer, member, data, rest, robot.convex)) for member in range(options.members)]
-    found = sorted(run_jobs(jobs, trainer.workers), key=lambda result: result[0])
+    arguments = [(trainer, member, data, rest, robot.convex) for member in range(options.members)]
+    found = sorted(parallel_map(_train_member, arguments, trainer.workers), key=lambda result: result[0])
     return stack_members([state for _, state, _ in found], scales), {f"member {k}": rows for k, _, rows in found}
 
 
