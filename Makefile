@@ -1,15 +1,17 @@
-# Every target does its own set-up, in the local virtual environment $(VENV).
+# Every target sets up what it needs in the local virtual environment $(VENV).
 #
-#   make demo     a co-design study of the Soft Finger, with a report to look at
-#   make test     all tests               make lint    ruff            make types   mypy
-#   make bench    speed and accuracy      make clean   remove caches and build leftovers
-#   make docs     the site, in site/      make docs-images    its pictures, in docs/images/
-#   make setup    the set-up alone        make lock    write requirements.lock anew
+#   make demo     co-design study of the Soft Finger, with a report
+#   make check    lint, types and fast tests (a minute)
+#   make test     all tests                        make slow-tests    all tests, and update the list of slow ones
+#   make lint     ruff                             make types         mypy
+#   make bench    speed and accuracy               make clean         remove caches and build leftovers
+#   make docs     site, in site/                   make docs-images   pictures of the site, in docs/images/
+#   make setup    set-up only                      make lock          renew requirements.lock
 #
-# PYTHON=python3.12      another interpreter (3.11 to 3.13; requirements.lock is made for 3.11)
-# PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"    a small torch, without CUDA
-# ARGS="-k cable -x"     further arguments of pytest (make test), softgym bench (make bench), docs/make_images.py (make
-#                        docs-images) or pip (make lock)
+# PYTHON=python3.12      use another interpreter (3.11 to 3.13; requirements.lock is made for 3.11)
+# PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"    install the small torch without CUDA
+# ARGS="-k cable -x"     pass more arguments to pytest (make check, make test), softgym bench (make bench),
+#                        docs/make_images.py (make docs-images) or pip (make lock)
 
 VENV ?= .venv
 WORKERS ?= 2
@@ -19,19 +21,21 @@ SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
 PYTHON ?= $(shell for python in python3.11 python3 python3.12 python3.13; do \
 	$$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
 
-# What the wheels of gmsh (at import) and vtk (off-screen pictures) load from the system, by Debian package.
+# System libraries, as Debian packages, that the wheels of gmsh (at import) and vtk (off-screen pictures) load.
 SYSTEM_PACKAGES := libegl1 libfontconfig1 libgl1 libglu1-mesa libgomp1 libx11-6 libxcursor1 libxext6 libxfixes3 \
 	libxft2 libxinerama1 libxrender1
 SYSTEM_CHECK := import gmsh, pyvista; plotter = pyvista.Plotter(off_screen=True, window_size=(64, 64)); \
 	plotter.add_mesh(pyvista.Sphere()); sys = __import__("sys"); \
 	sys.exit(not plotter.screenshot(return_img=True).std() > 0)
 
-# Tests of studies in a database start a PostgreSQL server of their own. Debian keeps its programs off the search path.
+# Tests of studies in a database start their own PostgreSQL server; tests of reports open them in Chromium. Debian keeps
+# the programs of PostgreSQL off the search path.
 POSTGRES_CHECK := ls /usr/lib/postgresql/*/bin/initdb || command -v initdb
+CHROMIUM_CHECK := command -v chromium || command -v chromium-browser || command -v google-chrome
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: setup postgres demo test lint types bench docs docs-images lock clean
+.PHONY: setup test-programs demo check test slow-tests lint types bench docs docs-images lock clean
 
 setup: $(VENV)/.stamp-system
 
@@ -42,7 +46,7 @@ $(VENV)/.stamp: requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --no-deps --no-build-isolation -e .
 	@touch $@
 
-# The stamp is left only when gmsh imports and a picture can be drawn: a machine without is told each time.
+# The stamp is written only when gmsh imports and a picture can be drawn, so that the message below is repeated until then.
 $(VENV)/.stamp-system: $(VENV)/.stamp
 	@check() { $(BIN)/python -c '$(SYSTEM_CHECK)' >/dev/null 2>&1; }; \
 	if ! check && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
@@ -54,35 +58,44 @@ $(VENV)/.stamp-system: $(VENV)/.stamp
 		echo "setup: gmsh or off-screen pictures do not work here; install (Debian names): $(SYSTEM_PACKAGES)" >&2; \
 	fi
 
-# The package would make and start a server of the system's own, which the tests do not use: NO_CLUSTER keeps it from that.
+# The Debian package of PostgreSQL would create and start a system server, which the tests do not use: NO_CLUSTER prevents it.
 NO_CLUSTER := /etc/postgresql-common/createcluster.d/softgym-setup.conf
-postgres:
-	@check() { { $(POSTGRES_CHECK); } >/dev/null 2>&1; }; \
-	if ! check && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
-		echo "setup: installing PostgreSQL, for the tests of shared studies"; \
+test-programs:
+	@postgres() { { $(POSTGRES_CHECK); } >/dev/null 2>&1; }; chromium() { { $(CHROMIUM_CHECK); } >/dev/null 2>&1; }; \
+	missing="$$(postgres || echo postgresql) $$(chromium || echo chromium)"; \
+	if [ "$$missing" != " " ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "setup: installing programs of the tests: $$missing"; \
 		mkdir -p $(dir $(NO_CLUSTER)) && echo "create_main_cluster = false" > $(NO_CLUSTER); \
-		{ apt-get update && DEBIAN_FRONTEND=noninteractive \
-			apt-get install -y --no-install-recommends postgresql; } </dev/null || true; \
+		{ apt-get update && for package in $$missing; do DEBIAN_FRONTEND=noninteractive \
+			apt-get install -y --no-install-recommends $$package; done; } </dev/null || true; \
 		rm -f $(NO_CLUSTER); \
 	fi; \
-	check || echo "setup: PostgreSQL is missing, its tests are skipped; install (Debian name): postgresql" >&2
+	postgres || echo "setup: without PostgreSQL, tests of shared studies are skipped; install (Debian name): postgresql" >&2; \
+	chromium || echo "setup: without Chromium, tests of reports in a browser are skipped; install (Debian name): chromium" >&2
 
 demo: setup
 	$(BIN)/softgym codesign --config configs/codesign/finger_reach.yaml --folder $(DEMO)
 
-# One thread in each process: the matrices are small, and the test workers fill the cores.
-test bench docs docs-images: export OMP_NUM_THREADS = 1
-test bench docs docs-images: export OPENBLAS_NUM_THREADS = 1
-test bench docs docs-images: export MKL_NUM_THREADS = 1
-test bench docs docs-images: export NUMBA_NUM_THREADS = 1
+# One thread per process: the matrices are small, and the test workers occupy the cores.
+check test slow-tests bench docs docs-images: export OMP_NUM_THREADS = 1
+check test slow-tests bench docs docs-images: export OPENBLAS_NUM_THREADS = 1
+check test slow-tests bench docs docs-images: export MKL_NUM_THREADS = 1
+check test slow-tests bench docs docs-images: export NUMBA_NUM_THREADS = 1
 
-test: setup postgres
+check: lint types setup
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -q -m "not slow" $(ARGS)
+
+test: setup test-programs
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
+
+# Run this on an idle machine.
+slow-tests: setup test-programs
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --update-slow-tests
 
 bench: setup
 	$(BIN)/softgym bench $(ARGS)
 
-# A notice of the theme about its successor is no warning of this build.
+# The theme prints a notice about its successor, which would look like a warning of this build.
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "site: $(CURDIR)/site/index.html"
@@ -96,8 +109,8 @@ lint: $(VENV)/.stamp
 types: $(VENV)/.stamp
 	$(BIN)/mypy
 
-# The newest set that pyproject.toml allows, under the comment at the head of the present lock. The CUDA packages of torch
-# are left out: pip adds them where the build of torch in use asks for them.
+# Freeze the newest versions that pyproject.toml allows, below the comment at the head of the present lock. The CUDA
+# packages of torch are left out: pip adds them if the installed build of torch requires them.
 lock:
 	rm -rf build/lock
 	$(PYTHON) -m venv build/lock

@@ -1,12 +1,15 @@
-"""Fixtures shared by the tests: reference data, small meshes and solved fingers."""
+"""Slow tests, tests that hang, and shared fixtures: reference data, small meshes and solved fingers."""
 
 from __future__ import annotations
 
+import os
+from collections import defaultdict
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from _pytest.faulthandler import fault_handler_stderr_fd_key
 from hypothesis import settings
 
 from softgym_envs.mechanics.materials import MATERIALS
@@ -14,12 +17,69 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import make_robot
 from softgym_envs.testing import box_mesh, train_small_surrogate
+from tests.hang_guard import end_if_hung
 
 # The same examples on every machine, however busy it is.
 settings.register_profile("softgym", deadline=None, derandomize=True)
 settings.load_profile("softgym")
 
 DATA = Path(__file__).parent / "data"
+
+# -- slow tests ---------------------------------------------------------------------------------------------------
+
+SLOW_TESTS = Path(__file__).parent / "slow_tests.txt"
+SLOW = 0.4
+"""A test function whose cases take longer than this together is slow [s]."""
+
+
+def pytest_addoption(parser):
+    parser.addoption("--update-slow-tests", action="store_true", help=f"write {SLOW_TESTS.name} from this run's times")
+
+
+def pytest_configure(config):
+    if config.getoption("update_slow_tests") and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(SlowTestsWriter())
+
+
+class SlowTestsWriter:
+    """Writes the list of slow tests at the end of a complete run."""
+
+    def __init__(self):
+        self.seconds = defaultdict(float)
+
+    def pytest_runtest_logreport(self, report):
+        path, _, function = report.nodeid.partition("[")[0].partition("::")
+        if report.when == "setup" and report.duration > SLOW:
+            function = ""  # a fixture is slow, which any test of the file may be the first to need
+        self.seconds[f"{path}::{function}" if function else path] += report.duration
+
+    def pytest_sessionfinish(self):
+        slow = {test for test, seconds in self.seconds.items() if seconds > SLOW}
+        lines = sorted(test for test in slow if test.partition("::")[0] not in slow or "::" not in test)
+        head = f"# Files and functions marked as slow: they took longer than {SLOW} s. Written by `make slow-tests`."
+        SLOW_TESTS.write_text("\n".join([head, *lines]) + "\n")
+
+
+def pytest_collection_modifyitems(items):
+    slow = set(SLOW_TESTS.read_text().splitlines())
+    for item in items:
+        function = item.nodeid.partition("[")[0]
+        if function in slow or function.partition("::")[0] in slow:
+            item.add_marker(pytest.mark.slow)
+
+
+# -- tests that hang ----------------------------------------------------------------------------------------------
+
+
+@pytest.hookimpl(wrapper=True, trylast=True)
+def pytest_runtest_protocol(item):
+    if item.config.option.usepdb:
+        return (yield)
+    with end_if_hung(item.config.stash[fault_handler_stderr_fd_key]):
+        return (yield)
+
+
+# -- fixtures -----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -29,6 +89,20 @@ def cache_folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOFTGYM_CACHE", str(folder))
         yield folder
+
+
+@pytest.fixture(scope="session")
+def require_program():
+    """Function ``require_program(found, package)``: skip a test if a program is missing, or fail it in CI."""
+
+    def require(found, package):
+        if not found:
+            reason = f"{package} is not installed (Debian: apt-get install {package})"
+            if os.environ.get("CI_REQUIRES_PROGRAMS"):
+                pytest.fail(f"{reason}, and CI_REQUIRES_PROGRAMS is set")
+            pytest.skip(reason)
+
+    return require
 
 
 @pytest.fixture

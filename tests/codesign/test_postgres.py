@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import threading
 import time
@@ -29,12 +28,8 @@ GRACE = 2.0
 
 
 @pytest.fixture(scope="module")
-def server():
-    if find_programs() is None:
-        reason = "PostgreSQL is not installed (Debian: apt-get install postgresql)"
-        if os.environ.get("CI_REQUIRES_POSTGRES"):
-            pytest.fail(f"{reason}, and CI_REQUIRES_POSTGRES is set")
-        pytest.skip(reason)
+def server(require_program):
+    require_program(find_programs(), "postgresql")
     with temporary_server() as running:
         yield running
 
