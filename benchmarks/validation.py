@@ -14,12 +14,13 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ellipeinc, ellipk, ellipkinc
 
-from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints import Cavity, Chamber, EmbeddedPoints, Point
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.mechanics.solvers.statics import Statics
 

@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.block import ElementBlock
-from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, add_midside_nodes
 from softgym_envs.mechanics.elements.rigid import RigidBody
-from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
-
-__all__ = ["SOLIDS", "ModelBuilder"]
-
-SOLIDS: dict[str, type[SolidBlock]] = {
-    "linear": Tetrahedra,
-    "averaged": AveragedTetrahedra,
-    "quadratic": QuadraticTetrahedra,
-}
-"""Solid elements by name."""
+from softgym_envs.mechanics.solids import Fixed, solid_part
 
 
 class ModelBuilder:
@@ -56,34 +46,11 @@ class ModelBuilder:
         self.size += len(rows)
         return start
 
-    def add_solid(
-        self, nodes: np.ndarray, tetrahedra: np.ndarray, *, fixed: np.ndarray, element: str = "linear", **material
-    ) -> int:
-        """Add a solid body.
-
-        Args:
-            nodes: [m], shape (n, 3).
-            tetrahedra: corner indices (m, 4), or with midside nodes (m, 10) for ``"quadratic"``, which is given them
-                otherwise: new midside nodes come after the old nodes and are fixed where both ends are.
-            fixed: boolean mask (n,) or (n, 3) of clamped nodes.
-            element: a name of `SOLIDS`.
-            **material: options of the element block: material, young_modulus, poisson_ratio, density.
-        """
-        if element not in SOLIDS:
-            raise ValueError(f"unknown element '{element}'; allowed: {', '.join(SOLIDS)}")
-        nodes, tetrahedra = np.asarray(nodes, dtype=float), np.asarray(tetrahedra)
-        mask = np.zeros((len(nodes), 3), dtype=bool)
-        flags = np.asarray(fixed)
-        mask[flags if flags.size else flags.astype(int)] = True
-        if element == "quadratic" and tetrahedra.shape[1] == 4:
-            count = len(nodes)
-            nodes, tetrahedra = add_midside_nodes(nodes, tetrahedra)
-            ends = np.zeros((len(nodes) - count, 2), dtype=np.int64)
-            for slot, (a, b) in enumerate([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]):
-                ends[tetrahedra[:, 4 + slot] - count] = tetrahedra[:, [a, b]]
-            mask = np.vstack([mask, mask[ends[:, 0]] & mask[ends[:, 1]]])
-        start = self._append(nodes, mask)
-        self._parts.append((SOLIDS[element], tetrahedra + start, dict(material)))
+    def add_solid(self, nodes: np.ndarray, tetrahedra: np.ndarray, *, fixed: Fixed, **options: Any) -> int:
+        """Add a solid body; arguments as for `MechanicalModel.from_mesh`, without gravity and solver."""
+        part = solid_part(nodes, tetrahedra, fixed=fixed, **options)
+        start = self._append(part.nodes, part.fixed)
+        self._parts.append((part.kind, part.connectivity + start, part.options))
         return start
 
     def add_frame(

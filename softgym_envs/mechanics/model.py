@@ -9,22 +9,19 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.mechanics.assembly import Assembly
-from softgym_envs.mechanics.constraints import Cable, Constraint, EmbeddedPoints, Point
+from softgym_envs.mechanics.constraints import Cable, Cavity, Constraint, EmbeddedPoints, Point
+from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.mechanics.elements.block import ElementBlock
-from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra
+from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, quadratic_triangles
+from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, check_nodes
 from softgym_envs.mechanics.frames import Frames
 from softgym_envs.mechanics.io import read_mesh
 from softgym_envs.mechanics.kinematics import Kinematics
 from softgym_envs.mechanics.materials import Material
 from softgym_envs.mechanics.skins import Skin
+from softgym_envs.mechanics.solids import MAX_BODY_SIZE, Fixed, PerElement, check_size, solid_part
+from softgym_envs.mechanics.surfaces import encloses, inner_surfaces
 from softgym_envs.mechanics.warping import Warping
-
-
-def _check_nodes(nodes: np.ndarray) -> np.ndarray:
-    nodes = np.ascontiguousarray(nodes, dtype=float)
-    if nodes.ndim != 2 or nodes.shape[1] != 3 or not np.isfinite(nodes).all():
-        raise ValueError(f"nodes must be finite with shape (n, 3), got shape {nodes.shape}")
-    return nodes
 
 
 class MechanicalModel:
@@ -70,7 +67,7 @@ class MechanicalModel:
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         solver: str = "auto",
     ) -> None:
-        self.nodes = _check_nodes(nodes)
+        self.nodes = check_nodes(nodes)
         self.blocks = list(blocks)
         n = len(self.nodes)
         body_frames = Frames(self.nodes, np.asarray(frames), carried, mounted)
@@ -112,54 +109,130 @@ class MechanicalModel:
         nodes: np.ndarray,
         tetrahedra: np.ndarray,
         *,
-        fixed: np.ndarray,
+        fixed: Fixed,
+        element: str = "linear",
         material: str | Material = "corotational",
-        young_modulus: float = 3.0e6,
-        poisson_ratio: float = 0.3,
+        young_modulus: PerElement = 3.0e6,
+        poisson_ratio: PerElement = 0.3,
         density: float = 1100.0,
+        total_mass: float | None = None,
+        regions: Mapping[str, np.ndarray] | None = None,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         solver: str = "auto",
+        max_size: float = MAX_BODY_SIZE,
     ) -> MechanicalModel:
-        """Make a model of one material from any tetrahedral mesh: nodes [m] (n, 3), tetrahedra (m, 4)."""
-        nodes = _check_nodes(nodes)
-        block = Tetrahedra(
+        """Make a model of one material from any tetrahedral mesh.
+
+        Args:
+            nodes: [m], shape (n, 3).
+            tetrahedra: corner indices (m, 4), or with midside nodes (m, 10) for ``"quadratic"``. Quadratic elements
+                get their midside nodes otherwise: these come after the other nodes, fixed where both ends are.
+            fixed: clamped nodes: indices, a mask (n,), a mask (n, 3) by axis, or a function of the nodes that returns
+                one of them.
+            element: ``"linear"``, ``"averaged"`` (no locking near a Poisson's ratio of 0.5) or ``"quadratic"``.
+            material: a `Material` or its name.
+            young_modulus: [Pa]; one number, an array (m,), a mapping of region names to numbers, or a function of the
+                elements' centroids [m] (m, 3).
+            poisson_ratio: inside (-1, 0.5), in the same forms.
+            density: [kg/m3].
+            total_mass: mass of the body [kg], instead of the density.
+            regions: elements of each region by name, see `read_mesh`.
+            gravity: acceleration [m/s2], shape (3,).
+            solver: name of the linear solver, see `make_solver`.
+            max_size: a body with a longer side [m] is refused as a mistake of units.
+        """
+        part = solid_part(
             nodes,
             tetrahedra,
+            fixed=fixed,
+            element=element,
             material=material,
             young_modulus=young_modulus,
             poisson_ratio=poisson_ratio,
             density=density,
+            total_mass=total_mass,
+            regions=regions,
+            max_size=max_size,
         )
-        return cls(nodes, [block], fixed=fixed, gravity=gravity, solver=solver)
+        block = part.kind(part.nodes, part.connectivity, **part.options)
+        return cls(part.nodes, [block], fixed=part.fixed, gravity=gravity, solver=solver)
 
     @classmethod
     def from_file(
-        cls, path: str | Path, *, fixed_box: Sequence[float], scale: float = 1.0, **options
+        cls,
+        path: str | Path,
+        *,
+        fixed: Fixed | None = None,
+        fixed_box: Sequence[float] | None = None,
+        scale: float | None = None,
+        unit: str | None = None,
+        mesh_size: float | None = None,
+        time_limit: float = 60.0,
+        **options: Any,
     ) -> MechanicalModel:
-        """Make a model from a mesh file.
+        """Make a model from a file: a tetrahedral mesh, or a closed surface (STL) that gmsh fills with tetrahedra.
 
         Args:
             path: any file meshio reads.
+            fixed: clamped nodes, as for `from_mesh`; or
             fixed_box: nodes inside (xmin, xmax, ymin, ymax, zmin, zmax) [m] are clamped.
-            scale: factor from the file's unit to metres.
+            scale: factor from the file's unit to metres, default 1.
+            unit: unit of the file instead of ``scale``: ``"m"``, ``"cm"``, ``"mm"`` or ``"in"``.
+            mesh_size: length of the edges [m] that a surface is filled with; default a twentieth of its diagonal.
+            time_limit: of meshing a surface [s].
             **options: as for `from_mesh`.
+
+        Raises:
+            DataError: if the file is missing or unreadable, or its surface is open or intersects itself.
+            MeshingError: if gmsh cannot be used, or takes too long.
+            ValueError: if nothing is fixed, or the body is larger than ``max_size``.
         """
-        nodes, tetrahedra = read_mesh(path, scale=scale)
-        box = np.asarray(fixed_box, dtype=float)
-        if box.shape != (6,):
-            raise ValueError(f"fixed_box must be xmin, xmax, ymin, ymax, zmin, zmax, got {fixed_box!r}")
-        box = box.reshape(3, 2)
-        fixed = np.all((nodes >= box[:, 0]) & (nodes <= box[:, 1]), axis=1)
-        return cls.from_mesh(nodes, tetrahedra, fixed=fixed, **options)
+        mesh = read_mesh(path, scale=scale, unit=unit, mesh_size=mesh_size, time_limit=time_limit)
+        check_size(mesh.nodes, options.get("max_size", MAX_BODY_SIZE), "for a file in millimetres pass unit='mm'")
+        if (fixed is None) == (fixed_box is None):
+            raise ValueError("pass either 'fixed' or 'fixed_box': the nodes that are clamped")
+        if fixed_box is not None:
+            fixed = _nodes_in_box(mesh.nodes, fixed_box)
+        assert fixed is not None
+        return cls.from_mesh(mesh.nodes, mesh.tetrahedra, fixed=fixed, regions=mesh.regions, **options)
 
     @property
     def solids(self) -> list[SolidBlock]:
         """The blocks of solid elements."""
         return [block for block in self.blocks if isinstance(block, SolidBlock)]
 
-    def embed(self, points: np.ndarray, hint: np.ndarray | None = None, *, block: int = 0) -> EmbeddedPoints:
-        """Embed points [m], shape (p, 3), in a solid block (its number among `solids`)."""
+    def embed(
+        self, points: np.ndarray, hint: np.ndarray | None = None, *, block: int = 0, name: str = "point"
+    ) -> EmbeddedPoints:
+        """Embed points in a solid block.
+
+        Args:
+            points: [m], shape (p, 3).
+            hint: elements from which points outside the mesh are extrapolated, shape (p,).
+            block: its number among `solids`.
+            name: what the points are, for messages.
+
+        Raises:
+            ValueError: if a point lies more than the size of the body away from it.
+        """
+        self._check_distance(points, name, 1.0)
         return self.solids[block].embed(points, self.nodes, hint)
+
+    def _check_distance(self, points: np.ndarray, name: str, sizes: float) -> None:
+        """Refuse points [m] (p, 3) that lie more than so many body sizes outside the box around all solids."""
+        corners = np.unique(np.concatenate([solid.corners.ravel() for solid in self.solids]))
+        low, high = self.nodes[corners].min(axis=0), self.nodes[corners].max(axis=0)
+        size = float(np.linalg.norm(high - low))
+        points = np.atleast_2d(np.asarray(points, dtype=float))
+        if points.shape[1] != 3:
+            raise ValueError(f"{name} must have coordinates of shape (p, 3), got {points.shape}")
+        away = np.linalg.norm(points - np.clip(points, low, high), axis=1)
+        if away.max(initial=0.0) > sizes * size:
+            worst = int(np.argmax(away))
+            raise ValueError(
+                f"{name} at {points[worst].tolist()} m lies {away[worst]:.3g} m outside the body, "
+                f"which is {size:.3g} m long; did you mean metres?"
+            )
 
     def add(self, role: str, constraint: Constraint) -> Constraint:
         """Add a constraint under a role letter: a actuator, e effector, c contact, s sensor, b bond."""
@@ -179,16 +252,77 @@ class MechanicalModel:
         hint: np.ndarray | None = None,
         block: int = 0,
     ) -> Cable:
-        """Add a cable actuator through ``points`` [m] (p, 3) of a solid, ordered from the pull point to the anchor."""
-        cable = Cable(name, self.embed(points, hint, block=block), pull_point, unilateral=unilateral)
+        """Add a cable actuator.
+
+        Args:
+            name: identifier.
+            points: guides in a solid [m], ordered from the pull point to the anchor, shape (p, 3).
+            pull_point: fixed point where the cable leaves the body [m], shape (3,).
+            unilateral: a real cable cannot push.
+            hint: elements from which guides outside the mesh are extrapolated, shape (p,).
+            block: number of the solid among `solids`.
+
+        Raises:
+            ValueError: if a guide lies more than the size of the body away from it, or the pull point ten times that.
+        """
+        self._check_distance(pull_point, f"the pull point of cable '{name}'", 10.0)
+        embedding = self.embed(points, hint, block=block, name=f"a guide of cable '{name}'")
+        cable = Cable(name, embedding, pull_point, unilateral=unilateral)
         self.add("a", cable)
         return cable
 
-    def add_effector(self, name: str, point: np.ndarray, *, hint: np.ndarray | None = None) -> Point:
-        """Add an effector at a material point [m] (3,)."""
-        effector = Point(name, self.embed(point, hint))
+    def add_cavity(
+        self,
+        name: str,
+        *,
+        surface: np.ndarray | None = None,
+        inside: Sequence[float] | np.ndarray | None = None,
+        block: int = 0,
+    ) -> Cavity:
+        """Add a pneumatic actuator: a closed cavity of a solid, whose pressure follows the surface.
+
+        Args:
+            name: identifier.
+            surface: triangles of corner nodes, shape (k, 3); quadratic elements add their midside nodes. Or
+            inside: a point [m] (3,) within the cavity, whose surface is then found.
+            block: number of the solid among `solids`.
+
+        Raises:
+            ValueError: if no closed cavity encloses the point, or the surface is not closed.
+        """
+        if (surface is None) == (inside is None):
+            raise ValueError(f"cavity '{name}' needs either its 'surface' or a point 'inside' it")
+        solid = self.solids[block]
+        triangles = np.asarray(surface) if surface is not None else self._cavity_around(name, np.array(inside), solid)
+        if isinstance(solid, QuadraticTetrahedra) and triangles.ndim == 2 and triangles.shape[1] == 3:
+            triangles = quadratic_triangles(triangles, solid.connectivity)
+        cavity = Cavity(name, triangles, self.nodes)
+        self.add("a", cavity)
+        return cavity
+
+    def _cavity_around(self, name: str, point: np.ndarray, solid: SolidBlock) -> np.ndarray:
+        """Surface (k, 3) of the cavity of a solid that encloses a point [m] (3,)."""
+        self._check_distance(point, f"the point inside cavity '{name}'", 1.0)
+        found = inner_surfaces(self.nodes, solid.corners)
+        around = [piece for piece in found if encloses(self.nodes, piece, point)]
+        if not around:
+            middles = [np.round(self.nodes[np.unique(piece)].mean(axis=0), 4).tolist() for piece in found]
+            known = f"its cavities lie around {middles} m" if found else "it has none, or they are open to the outside"
+            raise ValueError(f"no closed cavity of the body encloses {point.tolist()} m for '{name}'; {known}")
+        # An island in a cavity may have a cavity of its own: the smallest one is meant.
+        return min(around, key=lambda piece: abs(enclosed_volume(self.nodes, piece)))
+
+    def add_effector(self, name: str, point: np.ndarray, *, hint: np.ndarray | None = None, block: int = 0) -> Point:
+        """Add an effector at a material point [m] (3,) of a solid."""
+        effector = Point(name, self.embed(point, hint, block=block, name=f"effector '{name}'"))
         self.add("e", effector)
         return effector
+
+    def add_contact(self, name: str, point: np.ndarray, *, hint: np.ndarray | None = None, block: int = 0) -> Point:
+        """Add a contact point at a material point [m] (3,) of a solid."""
+        contact = Point(name, self.embed(point, hint, block=block, name=f"contact '{name}'"))
+        self.add("c", contact)
+        return contact
 
     # -- loads ------------------------------------------------------------------------------------------------------
 
@@ -277,3 +411,18 @@ class MechanicalModel:
         gradient = np.zeros_like(self.nodes)
         total = sum(block.add(x, gradient, None, None)[0] for block in self.blocks)
         return total - float(np.vdot(self.loads, x - self.nodes))
+
+
+def _nodes_in_box(nodes: np.ndarray, box: Sequence[float]) -> np.ndarray:
+    """Mask (n,) of the nodes inside (xmin, xmax, ymin, ymax, zmin, zmax) [m]."""
+    limits = np.asarray(box, dtype=float)
+    if limits.shape != (6,):
+        raise ValueError(f"fixed_box must be xmin, xmax, ymin, ymax, zmin, zmax, got {box!r}")
+    low, high = limits.reshape(3, 2).T
+    inside = np.all((nodes >= low) & (nodes <= high), axis=1)
+    if not inside.any():
+        spans = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(nodes.min(axis=0), nodes.max(axis=0), strict=True))
+        raise ValueError(
+            f"no node is fixed: none lies in fixed_box {limits.tolist()} m; the body spans {spans} m along x, y and z"
+        )
+    return inside

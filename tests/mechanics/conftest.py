@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from softgym_envs.mechanics.builder import SOLIDS
 from softgym_envs.mechanics.materials import MATERIALS
+from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.testing import clamped_beam, clamped_solid, dense_tangent, derivative_errors
 
 BODIES = [f"{element}-{material}" for element in SOLIDS for material in MATERIALS] + [

@@ -7,11 +7,12 @@ import pickle
 import numpy as np
 import pytest
 
-from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints import Bond, EmbeddedPoints, Point
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.mechanics.solvers.statics import Statics
 
 SIZE = (0.04, 0.01, 0.01)

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from scipy.sparse import coo_matrix
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints import Point
 from softgym_envs.mechanics.elements import averaged, beams, quadratic, tetrahedra
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
@@ -21,6 +21,7 @@ from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.mechanics.solvers.statics import Statics
 
 KINDS = {

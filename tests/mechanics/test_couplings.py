@@ -7,12 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints import Bond, Cavity, Chamber, EmbeddedPoints, Point
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.quadratic import quadratic_triangles
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.mechanics.solvers.statics import Statics
 
 

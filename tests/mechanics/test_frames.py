@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.mechanics.builder import SOLIDS, ModelBuilder
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints import Bond, Cable, Cavity, Chamber, EmbeddedPoints, Point, Servo
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.frames import Frames, frame_rows, rotation_of, rotation_vector_matrix
 from softgym_envs.mechanics.materials import MATERIALS
+from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.mechanics.solvers.statics import Statics
 
 

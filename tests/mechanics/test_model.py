@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import signal
-
-import meshio
 import numpy as np
 import pytest
 from scipy.sparse import csc_matrix
 
-from softgym_envs.errors import DataError
 from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.materials import MATERIALS
-from softgym_envs.mechanics.model import MechanicalModel, read_mesh
+from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 
 ONE_TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -288,127 +284,3 @@ def test_malformed_fixed_nodes_are_refused(fixed):
 def test_unknown_role_is_refused(beam):
     with pytest.raises(ValueError, match="unknown role 'x'"):
         beam.add("x", beam.constraints["a"][0])
-
-
-# -- files ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def mesh_in_millimetres(box):
-    nodes, tetrahedra = box((100, 20, 20), (4, 1, 1))
-    # A node of no tetrahedron, and cells that are not solid, as gmsh writes them.
-    return meshio.Mesh(np.vstack([nodes, [[1e3, 1e3, 1e3]]]), [("triangle", [[0, 1, 2]]), ("tetra", tetrahedra)])
-
-
-# File names, and the format meshio writes where the name leaves a choice.
-FORMATS = [("beam.vtk", None), ("beam.msh", "gmsh22"), ("beam.vtu", None), ("beam.mesh", None)]
-
-
-@pytest.mark.parametrize(("name", "written_as"), FORMATS)
-def test_model_from_a_file(tmp_path, mesh_in_millimetres, name, written_as):
-    path = tmp_path / name
-    mesh_in_millimetres.write(path, file_format=written_as)
-    box = (-1e-6, 1e-6, -1, 1, -1, 1)
-    model = MechanicalModel.from_file(path, fixed_box=box, scale=1e-3, density=1000.0)
-    assert model.volume == pytest.approx(0.1 * 0.02 * 0.02, rel=1e-9)
-    assert model.mass == pytest.approx(0.04, rel=1e-9)
-    assert len(model.nodes) == 20
-    assert model.fixed.sum() == 4
-    # The same as from the arrays, node by node.
-    nodes, tetrahedra = read_mesh(path)
-    np.testing.assert_allclose(nodes, mesh_in_millimetres.points[:-1], atol=1e-9)
-    np.testing.assert_array_equal(tetrahedra, mesh_in_millimetres.cells_dict["tetra"])
-
-
-@pytest.mark.parametrize("binary", [0, 1])
-def test_model_from_a_file_of_gmsh(tmp_path, binary):
-    """A file as gmsh itself writes it (format 4.1), with nodes of curves and a surface mesh beside the solid one."""
-    gmsh = pytest.importorskip("gmsh")
-    gmsh.initialize(interruptible=False)
-    try:
-        gmsh.option.setNumber("General.Terminal", 0)
-        gmsh.option.setNumber("Mesh.Binary", binary)
-        gmsh.option.setNumber("Mesh.MeshSizeMax", 20.0)
-        gmsh.model.occ.addBox(0, 0, 0, 100, 20, 20)
-        gmsh.model.occ.synchronize()
-        gmsh.model.mesh.generate(3)
-        gmsh.write(str(tmp_path / "beam.msh"))
-    finally:
-        gmsh.finalize()
-    model = MechanicalModel.from_file(tmp_path / "beam.msh", fixed_box=(-1e-6, 1e-6, -1, 1, -1, 1), scale=1e-3)
-    assert model.volume == pytest.approx(0.1 * 0.02 * 0.02, rel=1e-9)
-    assert 4 <= model.fixed.sum() < len(model.nodes)
-
-
-def test_a_box_that_fixes_nothing_is_refused(tmp_path, mesh_in_millimetres):
-    mesh_in_millimetres.write(tmp_path / "beam.vtk")
-    with pytest.raises(ValueError, match="no node is fixed"):
-        MechanicalModel.from_file(tmp_path / "beam.vtk", fixed_box=(-9, -8, -1, 1, -1, 1))
-
-
-def test_missing_file(tmp_path):
-    with pytest.raises(DataError, match=r"nothing\.msh.*does not exist"):
-        read_mesh(tmp_path / "nothing.msh")
-    with pytest.raises(DataError, match="does not exist"):
-        read_mesh(tmp_path)
-
-
-class EndlessReading(BaseException):
-    """Not an Exception, which `read_mesh` would take for a fault of the file."""
-
-
-@pytest.fixture
-def no_endless_reading():
-    """Break off a reader that never ends (it would need milliseconds)."""
-
-    def stop(*_):
-        raise EndlessReading
-
-    previous = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(10)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, previous)
-
-
-@pytest.mark.parametrize(("name", "written_as"), FORMATS)
-@pytest.mark.parametrize("kept", [0.0, 0.02, 0.4, 0.7, 0.95])
-def test_truncated_file(tmp_path, no_endless_reading, mesh_in_millimetres, name, written_as, kept):
-    path = tmp_path / name
-    mesh_in_millimetres.write(path, file_format=written_as)
-    content = path.read_bytes()
-    path.write_bytes(content[: int(kept * len(content))])
-    with pytest.raises(DataError, match=name):
-        read_mesh(path)
-
-
-@pytest.mark.parametrize("kept", [0.4, 0.44, 0.985])
-def test_truncated_ansys_file(tmp_path, no_endless_reading, mesh_in_millimetres, kept):
-    """``.msh`` is a suffix of Ansys, too: meshio tries that reader first, and on such files it never ends."""
-    path = tmp_path / "ansys.msh"
-    mesh_in_millimetres.write(path, file_format="ansys")
-    content = path.read_bytes()
-    path.write_bytes(content[: int(kept * len(content))])
-    with pytest.raises(DataError, match=r"ansys\.msh"):
-        read_mesh(path)
-
-
-@pytest.mark.parametrize("name", ["noise.msh", "noise.vtk", "noise.unknown"])
-def test_file_that_is_no_mesh(tmp_path, name, rng):
-    (tmp_path / name).write_bytes(rng.bytes(2000))
-    with pytest.raises(DataError, match=name):
-        read_mesh(tmp_path / name)
-
-
-def test_file_without_tetrahedra(tmp_path, box):
-    nodes, _ = box()
-    meshio.Mesh(nodes, [("triangle", [[0, 1, 2]])]).write(tmp_path / "shell.vtk")
-    with pytest.raises(DataError, match=r"no tetrahedra.*triangle"):
-        read_mesh(tmp_path / "shell.vtk")
-
-
-@pytest.mark.parametrize("wrong", [99, -1], ids=["beyond the nodes", "negative"])
-def test_file_whose_tetrahedra_refer_to_no_node(tmp_path, wrong):
-    meshio.Mesh(ONE_TETRAHEDRON, [("tetra", [[0, 1, 2, wrong]])]).write(tmp_path / "broken.vtk", binary=False)
-    with pytest.raises(DataError, match=r"broken\.vtk"):
-        read_mesh(tmp_path / "broken.vtk")

@@ -13,13 +13,13 @@ from softgym_envs.mechanics.materials import Material
 
 __all__ = ["QuadraticTetrahedra", "add_midside_nodes", "quadratic_triangles", "split_triangles"]
 
-# Midside nodes 4..9 lie on these edges.
-_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
+EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
+"""Corners at the ends of the edges on which midside nodes 4 to 9 lie."""
 
 
 def add_midside_nodes(nodes: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Make quadratic elements of linear ones: nodes (n, 3) and tetrahedra (m, 4) -> (n + edges, 3) and (m, 10)."""
-    pairs = np.sort(tetrahedra[:, _EDGES], axis=2).reshape(-1, 2)
+    pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
     edges, which = np.unique(pairs, axis=0, return_inverse=True)
     middle = 0.5 * (nodes[edges[:, 0]] + nodes[edges[:, 1]])
     return np.vstack([nodes, middle]), np.column_stack([tetrahedra, len(nodes) + which.reshape(-1, 6)])
@@ -28,11 +28,17 @@ def add_midside_nodes(nodes: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.nda
 def quadratic_triangles(triangles: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """Add the midside nodes of tetrahedra (m, 10) to triangles (k, 3) of their corners: (k, 6), edges 01, 12, 20."""
     middle: dict[tuple[int, int], int] = {}
-    for slot, (a, b) in enumerate(_EDGES):
+    for slot, (a, b) in enumerate(EDGES):
         low = np.minimum(tetrahedra[:, a], tetrahedra[:, b])
         high = np.maximum(tetrahedra[:, a], tetrahedra[:, b])
         middle.update(zip(zip(low.tolist(), high.tolist(), strict=True), tetrahedra[:, 4 + slot].tolist(), strict=True))
-    middles = [[middle[min(p, q), max(p, q)] for p, q in ((a, b), (b, c), (c, a))] for a, b, c in triangles.tolist()]
+    try:
+        middles = [
+            [middle[min(p, q), max(p, q)] for p, q in ((a, b), (b, c), (c, a))] for a, b, c in triangles.tolist()
+        ]
+    except KeyError as error:
+        first, second = error.args[0]
+        raise ValueError(f"from node {first} to {second} is not an edge of the quadratic elements") from None
     return np.hstack([triangles, np.array(middles, dtype=np.int64).reshape(-1, 3)])
 
 
@@ -49,14 +55,14 @@ def split_triangles(triangles: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray
 def _shape(barycentric: np.ndarray) -> np.ndarray:
     """Shape functions (..., 10) at barycentric coordinates (..., 4)."""
     corner = barycentric * (2.0 * barycentric - 1.0)
-    return np.concatenate([corner, 4.0 * barycentric[..., _EDGES[:, 0]] * barycentric[..., _EDGES[:, 1]]], axis=-1)
+    return np.concatenate([corner, 4.0 * barycentric[..., EDGES[:, 0]] * barycentric[..., EDGES[:, 1]]], axis=-1)
 
 
 def _shape_slopes(barycentric: np.ndarray) -> np.ndarray:
     """Derivatives (10, 4) of the shape functions with respect to the barycentric coordinates (4,)."""
     slopes = np.zeros((10, 4))
     slopes[:4] = np.diag(4.0 * barycentric - 1.0)
-    for k, (a, b) in enumerate(_EDGES):
+    for k, (a, b) in enumerate(EDGES):
         slopes[4 + k, a], slopes[4 + k, b] = 4.0 * barycentric[b], 4.0 * barycentric[a]
     return slopes
 
@@ -66,7 +72,7 @@ def _unit_mass() -> np.ndarray:
     # Shape functions as polynomials of the barycentric coordinates: {exponents: factor}.
     unit = np.eye(4, dtype=int)
     functions = [{tuple(2 * unit[k]): 2.0, tuple(unit[k]): -1.0} for k in range(4)]
-    functions += [{tuple(unit[a] + unit[b]): 4.0} for a, b in _EDGES]
+    functions += [{tuple(unit[a] + unit[b]): 4.0} for a, b in EDGES]
     matrix = np.zeros((10, 10))
     for i, first in enumerate(functions):
         for j, second in enumerate(functions):

@@ -11,8 +11,6 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.block import ElementBlock, lower_pairs
 from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
 
-__all__ = ["SolidBlock", "Tetrahedra", "boundary_triangles", "check_density", "element_masses", "orient_corners"]
-
 
 @njit(cache=True, error_model="numpy")
 def _deformation_gradients(x, connectivity, points, gradients, F):
@@ -173,6 +171,18 @@ def _add_warped(x, step, connectivity, points, gradients, volumes, out):
                 out[node, i] += (
                     d[i, 0] * gradients[e, a, 0] + d[i, 1] * gradients[e, a, 1] + d[i, 2] * gradients[e, a, 2]
                 )
+
+
+def check_nodes(nodes: np.ndarray) -> np.ndarray:
+    """Return nodes as a contiguous array of floats (n, 3).
+
+    Raises:
+        ValueError: if they have another shape or are not finite.
+    """
+    nodes = np.ascontiguousarray(nodes, dtype=float)
+    if nodes.ndim != 2 or nodes.shape[1] != 3 or not np.isfinite(nodes).all():
+        raise ValueError(f"nodes must be finite with shape (n, 3), got shape {nodes.shape}")
+    return nodes
 
 
 def orient_corners(nodes: np.ndarray, connectivity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,0 +1,129 @@
+"""Solid parts: a mesh with an element kind and elasticity becomes the data of an element block."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
+from softgym_envs.mechanics.elements.quadratic import EDGES, QuadraticTetrahedra, add_midside_nodes
+from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra, check_nodes
+
+SOLIDS: dict[str, type[SolidBlock]] = {
+    "linear": Tetrahedra,
+    "averaged": AveragedTetrahedra,
+    "quadratic": QuadraticTetrahedra,
+}
+"""Solid elements by name."""
+
+MAX_BODY_SIZE = 10.0
+"""Largest side [m] of a body that is not taken for a mistake of units."""
+
+PerElement = float | np.ndarray | Mapping[str, float] | Callable[[np.ndarray], np.ndarray]
+"""A value for all elements, one for each (m,), one for each region by name, or a function of the centroids (m, 3)."""
+
+Fixed = np.ndarray | list[int] | Callable[[np.ndarray], np.ndarray]
+"""Clamped nodes: indices, a mask (n,), a mask (n, 3) by axis, or a function of the nodes [m] (n, 3) to one of them."""
+
+
+@dataclass(frozen=True)
+class SolidPart:
+    """A solid body, ready to become an element block ``kind(nodes, connectivity, **options)``.
+
+    Attributes:
+        nodes: [m], shape (n, 3), midside nodes included.
+        connectivity: node indices of the elements, shape (m, 4) or (m, 10).
+        fixed: components of nodes that are clamped, mask of shape (n, 3).
+        kind: class of the element block.
+        options: its material, young_modulus, poisson_ratio and density.
+    """
+
+    nodes: np.ndarray
+    connectivity: np.ndarray
+    fixed: np.ndarray
+    kind: type[SolidBlock]
+    options: dict[str, Any]
+
+
+def solid_part(
+    nodes: np.ndarray,
+    tetrahedra: np.ndarray,
+    *,
+    fixed: Fixed,
+    element: str = "linear",
+    young_modulus: PerElement = 3.0e6,
+    poisson_ratio: PerElement = 0.3,
+    total_mass: float | None = None,
+    regions: Mapping[str, np.ndarray] | None = None,
+    max_size: float = MAX_BODY_SIZE,
+    **options: Any,
+) -> SolidPart:
+    """Prepare a solid body; see `MechanicalModel.from_mesh` for the arguments."""
+    if element not in SOLIDS:
+        raise ValueError(f"unknown element '{element}'; allowed: {', '.join(SOLIDS)}")
+    nodes, tetrahedra = check_nodes(nodes), np.asarray(tetrahedra)
+    check_size(nodes, max_size, "for nodes in millimetres pass 1e-3 * nodes")
+    mask = np.zeros((len(nodes), 3), dtype=bool)
+    chosen = np.asarray(fixed(nodes) if callable(fixed) else fixed)
+    mask[chosen if chosen.size else chosen.astype(int)] = True
+    if element == "quadratic" and tetrahedra.ndim == 2 and tetrahedra.shape[1] == 4:
+        count = len(nodes)
+        nodes, tetrahedra = add_midside_nodes(nodes, tetrahedra)
+        ends = np.zeros((len(nodes) - count, 2), dtype=np.int64)
+        for slot, edge in enumerate(EDGES):
+            ends[tetrahedra[:, 4 + slot] - count] = tetrahedra[:, edge]
+        mask = np.vstack([mask, mask[ends].all(axis=1)])
+    kind = SOLIDS[element]
+    for name, value in (("young_modulus", young_modulus), ("poisson_ratio", poisson_ratio)):
+        options[name] = _element_values(name, value, nodes, tetrahedra, regions or {})
+    if total_mass is not None:
+        if not (np.isfinite(total_mass) and total_mass > 0.0):
+            raise ValueError(f"total_mass = {total_mass} kg must be positive and finite")
+        options["density"] = total_mass / kind(nodes, tetrahedra).volume  # type: ignore[call-arg]
+    return SolidPart(nodes, tetrahedra, mask, kind, options)
+
+
+def check_size(nodes: np.ndarray, max_size: float, hint: str) -> None:
+    """Refuse a body whose largest side [m] exceeds a limit.
+
+    Raises:
+        ValueError: with a hint how to correct the unit.
+    """
+    sides = np.ptp(nodes, axis=0) if len(nodes) else np.zeros(3)
+    if sides.max() > max_size:
+        spans = " x ".join(f"{side:.3g}" for side in sides)
+        raise ValueError(f"the body measures {spans} m, more than {max_size:g} m; did you mean metres? ({hint})")
+
+
+def _element_values(
+    name: str, values: PerElement, nodes: np.ndarray, tetrahedra: np.ndarray, regions: Mapping[str, np.ndarray]
+) -> float | np.ndarray:
+    """Return one value for all elements, or an array with one for each."""
+    count = len(tetrahedra)
+    if isinstance(values, Mapping):
+        out = np.full(count, np.nan)
+        for region, value in values.items():
+            if region not in regions:
+                near = get_close_matches(str(region), regions, n=1)
+                hint = f"; did you mean '{near[0]}'?" if near else ""
+                found = ", ".join(map(str, regions)) or "none"
+                raise ValueError(f"{name}: unknown region '{region}'; regions of the mesh: {found}{hint}")
+            out[regions[region]] = value
+        missing = np.flatnonzero(np.isnan(out))
+        if len(missing):
+            without = [
+                region for region, ids in regions.items() if region not in values and np.isin(missing, ids).any()
+            ]
+            where = f", in the regions {', '.join(without)}" if without else ""
+            raise ValueError(f"{name} gives no value for {len(missing)} of {count} elements{where}")
+        return out
+    if callable(values):
+        values = np.asarray(values(nodes[tetrahedra[:, :4]].mean(axis=1)), dtype=float)
+    array = np.asarray(values, dtype=float)
+    if array.ndim and array.shape != (count,):
+        raise ValueError(f"{name} must be one number, or one for each of the {count} elements, got shape {array.shape}")
+    return array if array.ndim else float(array)

@@ -1,0 +1,96 @@
+"""Closed surfaces of triangles: their connected pieces, the cavities of a mesh, and what lies inside."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from softgym_envs.mechanics.constraints.cavity import enclosed_volume
+from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
+
+
+def connected_pieces(triangles: np.ndarray) -> list[np.ndarray]:
+    """Split triangles (k, 3) into pieces that share no node."""
+    count = int(triangles.max(initial=-1)) + 1
+    pairs = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    piece = connected_components(graph, directed=False)[1][triangles[:, 0]]
+    return [triangles[piece == number] for number in np.unique(piece)]
+
+
+def inner_surfaces(nodes: np.ndarray, tetrahedra: np.ndarray) -> list[np.ndarray]:
+    """Find the closed cavities of a mesh.
+
+    Args:
+        nodes: positions [m], shape (n, 3).
+        tetrahedra: corner indices of positively oriented tetrahedra, shape (m, 4).
+
+    Returns:
+        Triangles (k, 3) of each cavity, seen counter-clockwise from inside it.
+    """
+    # Material lies inside the hull and outside the cavities: the volume within a cavity counts negative.
+    pieces = connected_pieces(boundary_triangles(tetrahedra))
+    return [piece for piece in pieces if enclosed_volume(nodes, piece) < 0.0]
+
+
+def encloses(nodes: np.ndarray, triangles: np.ndarray, point: np.ndarray) -> bool:
+    """Whether a closed, consistently oriented surface of triangles (k, 3) encloses a point [m] (3,).
+
+    The sum of the solid angles of the triangles is 4 pi inside and 0 outside (Van Oosterom and Strackee 1983).
+    """
+    a, b, c = (nodes[triangles[:, i]] - point for i in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+    across = la * lb * lc
+    for u, v, length in ((a, b, lc), (b, c, la), (c, a, lb)):
+        across += np.einsum("ij,ij->i", u, v) * length
+    return abs(2.0 * np.arctan2(volume, across).sum()) > 2.0 * np.pi
+
+
+@njit(cache=True, error_model="numpy")
+def _pierces(start, end, a, b, c, tolerance):
+    """Whether the open segment from ``start`` to ``end`` crosses the inside of a triangle (Moeller and Trumbore)."""
+    direction, u, v, s = end - start, b - a, c - a, start - a
+    across = np.cross(direction, v)
+    determinant = u @ across
+    size = np.sqrt((direction @ direction) * (u @ u) * (v @ v))
+    if abs(determinant) <= tolerance * size:  # parallel
+        return False
+    turned = np.cross(s, u)
+    first, second, along = (s @ across) / determinant, (direction @ turned) / determinant, (v @ turned) / determinant
+    low = min(min(first, second), min(1.0 - first - second, min(along, 1.0 - along)))
+    return low > tolerance
+
+
+@njit(cache=True, error_model="numpy")
+def _first_crossing(points, triangles, order, low, high, tolerance):
+    """Two triangles that cross each other, or (-1, -1). ``order`` sorts them by ``low`` along the first axis."""
+    count = triangles.shape[0]
+    for m in range(count):
+        i = order[m]
+        for n in range(m + 1, count):
+            j = order[n]
+            if low[j, 0] > high[i, 0]:
+                break
+            if low[j, 1] > high[i, 1] or low[i, 1] > high[j, 1] or low[j, 2] > high[i, 2] or low[i, 2] > high[j, 2]:
+                continue
+            for first, second in ((i, j), (j, i)):
+                t, u = triangles[first], triangles[second]
+                for k in range(3):
+                    p, q = t[k], t[(k + 1) % 3]
+                    # An edge that begins or ends on the other triangle only touches it.
+                    if p != u[0] and p != u[1] and p != u[2] and q != u[0] and q != u[1] and q != u[2]:
+                        if _pierces(points[p], points[q], points[u[0]], points[u[1]], points[u[2]], tolerance):
+                            return i, j
+    return -1, -1
+
+
+def self_intersection(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+    """Return a place [m] (3,) where triangles (k, 3) cross each other, or None. Touching is allowed."""
+    corners = points[triangles]
+    axes = np.argsort(-np.ptp(points, axis=0))  # few triangles overlap along the longest side
+    low, high = corners.min(axis=1)[:, axes], corners.max(axis=1)[:, axes]
+    i, j = _first_crossing(points, triangles, np.argsort(low[:, 0]), low, high, 1e-9)
+    return None if i < 0 else 0.5 * (corners[i].mean(axis=0) + corners[j].mean(axis=0))
