@@ -93,9 +93,7 @@ def positive_definite(count: int = 1_000_000) -> dict[str, object]:
             continue
         model = pretrained_model(robot)
         rng = np.random.default_rng(0)
-        low, high = (
-            np.array([getattr(v, end) for v in robot.design_space.variables.values()]) for end in ("low", "high")
-        )
+        low, high = (np.array([getattr(v, end) for v in robot.design_space]) for end in ("low", "high"))
         good, smallest = 0, np.inf
         for _ in range(-(-count // 10_000)):
             designs = rng.uniform(low, high, (1000, len(low)))

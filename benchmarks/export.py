@@ -265,7 +265,7 @@ def _onnx_speed(model: Any, displacement: np.ndarray, folder: Path) -> dict[str,
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     path = export_onnx(model, folder / "model.onnx")
     session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    design = np.array([list(model.robot.design_space.baseline.values())], dtype=np.float32)
+    design = model.robot.design_space.baseline.array[None].astype(np.float32)
     result: dict[str, object] = {}
     for count in (1, 256):
         feed = {"design": np.repeat(design, count, axis=0), "displacement": displacement[:count]}
@@ -336,7 +336,7 @@ def _measure(model: Any) -> dict[str, object]:
     """All numbers of one model, at random states of the baseline body."""
     calls = 512
     robot = model.robot
-    context = model.context(np.array([list(robot.design_space.baseline.values())]))
+    context = model.context(robot.design_space.baseline.array[None])
     rng = np.random.default_rng(0)
     displacement = rng.uniform(robot.lower, robot.upper, (calls, model.count)).astype(np.float32)
     result: dict[str, object] = {}

@@ -296,7 +296,7 @@ def inference() -> dict[str, object]:
         body = make_robot(robot, **options)
         model = pretrained_model(body)
         rng = np.random.default_rng(0)
-        designs = np.array([list(body.design_space.sample(rng).values()) for _ in range(256)])
+        designs = np.array([body.design_space.sample(rng).array for _ in range(256)])
         displacement = rng.uniform(body.lower, body.upper, (256, model.count))
         contexts = {count: model.context(designs[:count]) for count in (1, 256)}
         net = TorchModel(model)

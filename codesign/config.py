@@ -434,4 +434,4 @@ class StudyConfig(Config):
     @property
     def baseline(self) -> dict[str, float]:
         """The complete baseline design [SI]."""
-        return self.space.complete(self.environment.design)
+        return dict(self.space.complete(self.environment.design))

@@ -248,7 +248,7 @@ def design_table(robot: Robot) -> str:
             "" if v.unit == "1" else v.unit,
             v.description + (" (sampled on a logarithmic scale)" if v.log else ""),
         ]
-        for v in robot.design_space.variables.values()
+        for v in robot.design_space
     ]
     return table(["variable", "low", "baseline", "high", "unit", "meaning"], rows)
 

@@ -1,20 +1,19 @@
 """Design spaces: named, bounded, dimensioned variables of a robot's body.
 
-A design is a plain mapping ``{name: value}`` in SI units.
+A design is a mapping ``{name: value}`` in SI units. Functions accept plain mappings, partial ones included; `Design` is
+complete and checked.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 
-from softgym_envs.errors import DesignError
-
-__all__ = ["DesignSpace", "DesignVariable"]
+from softgym_envs.errors import DesignError, unknown_name
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class DesignVariable:
             raise DesignError(f"design variable '{self.name}' = {value!r} is not a number; {allowed}") from None
         if not math.isfinite(number):
             raise DesignError(f"design variable '{self.name}' = {number} is not finite; {allowed}")
-        # Bounds survive a trip through text or float32 without a false alarm, but nothing more.
+        # Bounds that were rounded to text or float32 are accepted, nothing beyond.
         slack = 1e-6 * (self.high - self.low)
         if not self.low - slack <= number <= self.high + slack:
             raise DesignError(f"design variable '{self.name}' = {number:g}{unit} is out of bounds; {allowed}")
@@ -85,81 +84,119 @@ class DesignVariable:
         return np.clip(value, self.low, self.high)
 
 
+class Design(Mapping[str, float]):
+    """A value for every variable of a design space, checked once and unchangeable.
+
+    It reads like a mapping ``{name: value}``, is made by `DesignSpace.complete` and is accepted wherever a design is.
+
+    Attributes:
+        space: the variables.
+        array: values in their order [units of the variables], read-only, shape (len(space),).
+    """
+
+    __slots__ = ("_values", "array", "space")
+
+    def __init__(self, space: DesignSpace, values: Mapping[str, float]) -> None:
+        self.space = space
+        self._values = {variable.name: variable.check(values[variable.name]) for variable in space}
+        self.array = np.array(list(self._values.values()))
+        self.array.flags.writeable = False
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self._values.items()))
+
+    def __reduce__(self) -> tuple[type[Design], tuple[DesignSpace, dict[str, float]]]:
+        return Design, (self.space, self._values)
+
+    def __repr__(self) -> str:
+        return f"Design({', '.join(f'{name}={value:g}' for name, value in self._values.items())})"
+
+
 class DesignSpace:
-    """An ordered set of `DesignVariable`."""
+    """An ordered set of `DesignVariable`; iteration goes over the variables."""
 
     def __init__(self, *variables: DesignVariable) -> None:
         names = [variable.name for variable in variables]
         if len(set(names)) != len(names):
             raise DesignError(f"design variables must have distinct names, got {names}")
         self.variables = MappingProxyType({variable.name: variable for variable in variables})
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the variables, in order."""
-        return tuple(self.variables)
-
-    @property
-    def baseline(self) -> dict[str, float]:
-        """The reference design."""
-        return {name: variable.baseline for name, variable in self.variables.items()}
+        self.names: tuple[str, ...] = tuple(names)
+        self.baseline = Design(self, {variable.name: variable.baseline for variable in variables})
 
     def __len__(self) -> int:
         return len(self.variables)
+
+    def __iter__(self) -> Iterator[DesignVariable]:
+        return iter(self.variables.values())
 
     def __getitem__(self, name: str) -> DesignVariable:
         try:
             return self.variables[name]
         except KeyError:
-            raise DesignError(f"unknown design variable '{name}'; allowed: {', '.join(self.names)}") from None
+            raise DesignError(unknown_name("design variable", name, self.names)) from None
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, DesignSpace) and tuple(self) == tuple(other)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self))
 
     def __reduce__(self) -> tuple[type[DesignSpace], tuple[DesignVariable, ...]]:
-        return DesignSpace, tuple(self.variables.values())
+        return DesignSpace, tuple(self)
 
     def __repr__(self) -> str:
         return f"DesignSpace({', '.join(self.names)})"
 
-    def complete(self, design: Mapping[str, float] | None = None) -> dict[str, float]:
-        """Validate a partial design and fill the rest from the baseline.
+    def complete(self, design: Mapping[str, float] | None = None, base: Mapping[str, float] | None = None) -> Design:
+        """Return a whole, checked design.
+
+        Args:
+            design: values of some or all variables. A `Design` of this space is returned as it is.
+            base: the other values; by default the baseline.
 
         Raises:
-            DesignError: for an unknown name, a non-finite or an out-of-range value.
+            DesignError: for an unknown name, or a value that is not finite or out of bounds.
         """
+        if isinstance(design, Design) and (design.space is self or design.space == self):
+            return design
+        start = self.baseline if base is None else self.complete(base)
         if design is None:
-            return self.baseline
+            return start
         if not isinstance(design, Mapping):
             raise DesignError(f"a design is a mapping {{name: value}}, got {type(design).__name__}: {design!r}")
-        checked = {name: self[name].check(value) for name, value in design.items()}
-        return {**self.baseline, **checked}
-
-    def override(self, base: Mapping[str, float], design: Mapping[str, float]) -> dict[str, float]:
-        """Return the complete design ``base`` with the variables of a partial ``design`` put in, validated."""
-        complete = self.complete(design)
-        return {**base, **{name: complete[name] for name in design}}
+        for name in design:
+            self[name]  # raises for an unknown name
+        return Design(self, {**start, **design})
 
     def to_unit(self, design: Mapping[str, float]) -> np.ndarray:
         """Return the design as a vector in [-1, 1], shape (len(self),)."""
         full = self.complete(design)
-        return np.array([variable.to_unit(full[name]) for name, variable in self.variables.items()], dtype=float)
+        return np.array([variable.to_unit(full[variable.name]) for variable in self], dtype=float)
 
-    def from_unit(self, vector: np.ndarray) -> dict[str, float]:
+    def from_unit(self, vector: np.ndarray) -> Design:
         """Return the design of a vector in [-1, 1], shape (len(self),). Values outside are clipped.
 
         Raises:
-            DesignError: for a wrong length or a non-finite entry.
+            DesignError: for a wrong length or an entry that is not finite.
         """
         vector = np.asarray(vector, dtype=float)
         if vector.shape != (len(self),):
             raise DesignError(f"a unit design has shape ({len(self)},), got {vector.shape}")
         if not np.isfinite(vector).all():
             raise DesignError(f"a unit design must be finite, got {vector.tolist()}")
-        return {
-            name: float(variable.from_unit(u))
-            for (name, variable), u in zip(self.variables.items(), vector, strict=True)
-        }
+        values = (float(variable.from_unit(u)) for variable, u in zip(self, vector, strict=True))
+        return Design(self, dict(zip(self.names, values, strict=True)))
 
-    def sample(self, rng: np.random.Generator, names: tuple[str, ...] | None = None) -> dict[str, float]:
+    def sample(self, rng: np.random.Generator, names: Sequence[str] | None = None) -> Design:
         """Draw a uniform design; variables not in ``names`` (default: all) keep their baseline."""
         chosen = self.names if names is None else names
-        design = {name: float(self[name].from_unit(rng.uniform(-1.0, 1.0))) for name in chosen}
-        return self.complete(design)
+        return self.complete({name: float(self[name].from_unit(rng.uniform(-1.0, 1.0))) for name in chosen})

@@ -205,7 +205,7 @@ def random_condensed_model(
 def random_states(robot: Robot, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return ``count`` random designs, shape (count, n_design), and actuator displacements, shape (count, n_a)."""
     rng = np.random.default_rng(seed)
-    designs = np.array([list(robot.design_space.sample(rng).values()) for _ in range(count)])
+    designs = np.array([robot.design_space.sample(rng).array for _ in range(count)])
     return designs, rng.uniform(robot.lower, robot.upper, (count, len(robot.actuators)))
 
 

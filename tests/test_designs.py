@@ -140,15 +140,50 @@ def test_single_precision_and_text_round_trips_are_not_out_of_bounds():
 
 def test_none_and_nothing_are_the_baseline():
     assert SPACE.complete() == SPACE.complete(None) == SPACE.complete({}) == SPACE.baseline
-    changed = SPACE.baseline
-    changed["length"] = 0.0
+    with pytest.raises(TypeError):
+        SPACE.baseline["length"] = 0.0
     assert SPACE.baseline["length"] == 0.040
+
+
+def test_a_design_is_checked_once_and_never_changes():
+    design = SPACE.complete({"length": 0.041})
+    assert SPACE.complete(design) is design
+    assert copy.deepcopy(SPACE).complete(design) is design  # an equal space is the same box
+    np.testing.assert_array_equal(design.array, [0.041, 3e6, 0.5])
+    with pytest.raises(ValueError, match="read-only"):
+        design.array[0] = 0.04
+    assert design == {"length": 0.041, "young_modulus": 3e6, "offset": 0.5}
+    assert dict(design) == {**design}
+    assert hash(design) == hash(SPACE.complete({"length": 0.041}))
+    assert repr(design) == "Design(length=0.041, young_modulus=3e+06, offset=0.5)"
+    for again in (copy.deepcopy(design), pickle.loads(pickle.dumps(design))):
+        assert again == design
+        assert again.space == SPACE
+
+
+def test_a_design_of_another_space_is_checked_again():
+    narrow = DesignSpace(DesignVariable("length", 0.038, 0.0405, 0.040, "m", "narrower"))
+    with pytest.raises(DesignError, match="'length' = 0.041 m is out of bounds"):
+        narrow.complete(DesignSpace(SPACE["length"]).complete({"length": 0.041}))
+    with pytest.raises(DesignError, match="unknown design variable 'young_modulus'"):
+        narrow.complete(SPACE.baseline)
+
+
+def test_variables_that_are_not_given_come_from_another_design():
+    base = SPACE.complete({"length": 0.041, "offset": 0.1})
+    assert SPACE.complete({"offset": 0.2}, base) == {"length": 0.041, "young_modulus": 3e6, "offset": 0.2}
+    assert SPACE.complete({"offset": 0.2}, {"length": 0.042})["length"] == 0.042
+    with pytest.raises(DesignError, match="'length' = 1 m is out of bounds"):
+        SPACE.complete({"offset": 0.2}, {"length": 1.0})
 
 
 @pytest.mark.parametrize(
     ("design", "message"),
     [
-        ({"lenght": 0.04}, "unknown design variable 'lenght'; allowed: length, young_modulus, offset"),
+        (
+            {"lenght": 0.04},
+            r"variable 'lenght'; did you mean 'length'\? allowed: length, young_modulus, offset",
+        ),
         ({3: 0.04}, "unknown design variable '3'"),
         ({"length": 0.05}, r"design variable 'length' = 0.05 m is out of bounds; allowed: 0.038 to 0.042 m"),
         ({"offset": 7}, r"'offset' = 7 is out of bounds; allowed: -2 to 1$"),

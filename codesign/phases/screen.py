@@ -36,7 +36,7 @@ def screen_jobs(folder: StudyFolder) -> list[Job]:
     config = folder.config
 
     def make(values: dict[str, float]) -> dict[str, Any]:
-        design = config.space.complete({**config.baseline, **values})
+        design = dict(config.space.complete(values, config.baseline))
         goals = folder.goals["selection"][: config.screen.goals]
         return {"values": values, "qp": assess("qp", config.environment, goals, design)}
 

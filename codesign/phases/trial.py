@@ -162,7 +162,7 @@ def run_trial(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
         ``evaluation`` is that of the trial's controller, ``qp`` that of the inverse QP, on the selection goals.
     """
     config = folder.config
-    design = config.space.complete({**config.baseline, **trial.params})
+    design = dict(config.space.complete(trial.params, config.baseline))
     goals = folder.goals["selection"]
     started, cpu = time.perf_counter(), time.process_time()
     result: dict[str, Any] = {

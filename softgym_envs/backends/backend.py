@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from softgym_envs.designs import Design
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.dynamics import Motion
 from softgym_envs.robots.base import Robot
@@ -65,7 +66,7 @@ class Backend(ABC):
     moving: bool = False
     takes_force: bool = False
     robot: Robot
-    design: dict[str, float]
+    design: Design
     state: State
 
     @abstractmethod

@@ -78,7 +78,7 @@ class FEMBackend(Backend):
         }
         self._max_effort = np.array([actuator.max_effort for actuator in robot.actuators])
         self._limited = bool(np.isfinite(self._max_effort).any())
-        self.design = {}
+        self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
     def reset(self, design: Mapping[str, float] | None = None) -> State:
@@ -96,7 +96,7 @@ class FEMBackend(Backend):
                 rest = statics.solve(zero)
             self._dynamics = Dynamics(model, **self._options) if self.moving else None
             self._rest = self._state(rest, zero, still=True)
-            self.model, self._statics, self.design = model, statics, dict(complete)
+            self.model, self._statics, self.design = model, statics, complete
         self.restore(self._rest)
         self._mode = "displacement"  # of the present state's command
         return self.state

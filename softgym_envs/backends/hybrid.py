@@ -113,7 +113,7 @@ class HybridBackend(SurrogateBackend):
         self._taught: dict[tuple[float, ...], list[np.ndarray]] = {}  # displacements [range] of states kept, by body
         self._store = StateStore(robot, folder)
         self._learned = 0  # of the states in the store
-        self.design = {}
+        self.design = None  # type: ignore[assignment]  # until the first reset
         if self._store.count:
             data = self._store.data
             for body, displacement in zip(data["design"].tolist(), data["displacement"], strict=True):
@@ -133,14 +133,14 @@ class HybridBackend(SurrogateBackend):
             changed = True
         if changed:
             zero = np.zeros(self.model.count)
-            context = self.model.context(np.array([list(complete.values())]))
+            context = self.model.context(complete.array[None])
             rest = at_rest(self.model, context, self._unilateral)
             if rest.converged[0] and rest.trusted[0]:
-                self._context, self.design = context, dict(complete)
+                self._context, self.design = context, complete
                 self._rest = self._state(zero, rest)
             else:
                 known = self._ready(complete)
-                self._context, self.design, self._rest = context, dict(complete), known
+                self._context, self.design, self._rest = context, complete, known
         self.state = self._rest
         return self.state
 
@@ -203,7 +203,7 @@ class HybridBackend(SurrogateBackend):
         self._known.append(found)
         place = found.displacement / span
         # What the learned model cannot represent (equilibria that only hold while driven) teaches nothing.
-        taught = self._taught.setdefault(tuple(self.design.values()), [])
+        taught = self._taught.setdefault(tuple(self.design.array.tolist()), [])
         if found.stable and rest.stable and all(np.abs(place - p).max() > DISTINCT for p in taught):
             taught.append(place)
             self._waiting.append(found)
@@ -249,7 +249,7 @@ class HybridBackend(SurrogateBackend):
         upper = np.triu_indices(len(rows[0].condensed.effort))
         self._store.add(
             {
-                "design": np.tile(list(self.design.values()), (len(rows), 1)),
+                "design": np.tile(self.design.array, (len(rows), 1)),
                 "displacement": np.stack([row.displacement for row in rows]),
                 "effort": np.stack([row.effort for row in rows]),
                 "effector": np.stack([row.effector.ravel() for row in rows]),
@@ -271,8 +271,8 @@ class HybridBackend(SurrogateBackend):
     def _take(self, model: Model) -> None:
         """Go over to a model, with the present body."""
         self.model = model
-        if self.design:
-            self._context = model.context(np.array([list(self.design.values())]))
+        if self.design is not None:
+            self._context = model.context(self.design.array[None])
 
     def _take_up(self) -> None:
         """Go on from states of an earlier run: with the weights that learned them, else learn them now."""

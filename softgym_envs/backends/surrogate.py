@@ -128,15 +128,14 @@ class SurrogateBackend(Backend):
         self.robot = robot
         self.model = pretrained_model(robot, weights, members)
         self._unilateral = robot.unilateral
-        self.design = {}
+        self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)
         if complete != self.design:
-            values = np.array([list(complete.values())])
-            self._context = self.model.context(values)
-            self.design = dict(complete)
+            self._context = self.model.context(complete.array[None])
+            self.design = complete
             rest = at_rest(self.model, self._context, self._unilateral)
             if not rest.converged[0]:
                 raise ConvergenceError(f"the surrogate finds no rest of design {complete}")

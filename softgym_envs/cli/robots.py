@@ -21,7 +21,7 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
 
     body = options.robot_of(robot, options_)
     click.echo(f"{robot} ({body.weights_name})\n\ndesign variables:")
-    for variable in body.design_space.variables.values():
+    for variable in body.design_space:
         unit = "" if variable.unit == "1" else f" {variable.unit}"
         bounds = f"[{variable.low:g}, {variable.high:g}]{unit}"
         click.echo(f"  {variable.name:16s} {variable.baseline:<10g} {bounds:24s} {variable.description}")

@@ -114,7 +114,7 @@ class SurrogateFingers:
         self.model = model
         self.origin = robot.object_frame(complete)
         self.span = robot.upper - robot.lower
-        self._context = model.context(np.array([list(complete.values())]))
+        self._context = model.context(complete.array[None])
 
     def evaluate(self, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         context = Context.shared(self._context, len(displacement))

@@ -11,7 +11,7 @@ from gymnasium.utils import EzPickle
 
 from softgym_envs.backends import make_backend
 from softgym_envs.backends.backend import Backend, State
-from softgym_envs.designs import DesignSpace
+from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.envs.spaces import Interface
 from softgym_envs.envs.tasks.base import make_task
 from softgym_envs.errors import ConvergenceError
@@ -131,9 +131,9 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self._step = 0
 
     @property
-    def design(self) -> dict[str, float]:
+    def design(self) -> Design:
         """The present body."""
-        return dict(self.backend.design)
+        return self.backend.design
 
     @property
     def state(self) -> State:
@@ -170,10 +170,10 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if unknown:
             raise ValueError(f"unknown reset option '{sorted(unknown)[0]}'; allowed: design, goal")
         if options.get("design") is not None:
-            design = self.design_space.override(self._fixed_design, options["design"])
+            design = self.design_space.complete(options["design"], self._fixed_design)
         elif self._sampled:
             drawn = self.design_space.sample(self.np_random, self._sampled)
-            design = {**self._fixed_design, **{name: drawn[name] for name in self._sampled}}
+            design = self.design_space.complete({name: drawn[name] for name in self._sampled}, self._fixed_design)
         else:
             design = self._fixed_design
         self.backend.reset(design)

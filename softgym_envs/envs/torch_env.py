@@ -125,13 +125,13 @@ class TorchVectorEnv:
         )
 
         # Bodies are kept in double precision: near 0.5 a Poisson's ratio needs its digits.
-        variables = list(space.variables.values())
+        variables = list(space)
         double = torch.float64
         self._log = torch.tensor([v.log for v in variables], device=self.device)
         self._ends = put([np.log([v.low, v.high]) if v.log else [v.low, v.high] for v in variables], double).T
         self._sampled = [space.names.index(name) for name in design_names(space, sample_design)]
         self._shown = [space.names.index(name) for name in shown]
-        self._fixed = put(list(space.complete(design).values()), double)
+        self._fixed = put(space.complete(design).array, double)
 
         self._generator = torch.Generator(self.device)
         self._generator.seed()
@@ -291,13 +291,13 @@ class TorchVectorEnv:
     def _check_designs(self, design: Any) -> Tensor:
         if isinstance(design, Mapping):
             fixed = dict(zip(self.design_space.names, self._fixed.tolist(), strict=True))
-            values = np.array([list(self.design_space.override(fixed, design).values())])
+            values = self.design_space.complete(design, fixed).array[None]
         else:
             values = np.asarray(_array(design), dtype=float)
             shape = (self.num_envs, len(self.design_space))
             if values.shape != shape:
                 raise ValueError(f"design must be a mapping or an array of shape {shape}, got {values.shape}")
-            for variable, column in zip(self.design_space.variables.values(), values.T, strict=True):
+            for variable, column in zip(self.design_space, values.T, strict=True):
                 variable.check(column.min()), variable.check(column.max())
         return torch.as_tensor(values, device=self.device)
 

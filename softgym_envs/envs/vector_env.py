@@ -103,8 +103,7 @@ class SoftRobotVectorEnv(VectorEnv):
 
         self._unilateral = self.robot.unilateral
         n = len(self.robot.actuators)
-        baseline = np.tile(list(self._fixed_design.values()), (num_envs, 1))
-        self.designs = baseline.astype(float)
+        self.designs = np.tile(self._fixed_design.array, (num_envs, 1))
         # One body for all, until they differ.
         self._context = Context.shared(self.model.context(self.designs[:1]), num_envs)
         self._rest_effort = np.zeros((num_envs, n))
@@ -162,18 +161,18 @@ class SoftRobotVectorEnv(VectorEnv):
             designs = [design] * len(index) if isinstance(design, Mapping) else list(design)
             if len(designs) != len(index):
                 raise ValueError(f"design must be one body or a list of {len(index)}, got {len(designs)}")
-            self.designs[index] = [list(self.design_space.override(self._fixed_design, d).values()) for d in designs]
+            self.designs[index] = [self.design_space.complete(d, self._fixed_design).array for d in designs]
             self._begin_bodies(index)
             self._changed[index] = True
         elif self._sampled:
             names = self.design_space.names
-            self.designs[index] = list(self._fixed_design.values())
+            self.designs[index] = self._fixed_design.array
             for column, draws in enumerate(self.design_sampler(self.np_random, index).T):
                 name = self._sampled[column]
                 self.designs[index, names.index(name)] = self.design_space[name].from_unit(draws)
             self._begin_bodies(index)
         elif self._changed[index].any():
-            self.designs[index] = list(self._fixed_design.values())
+            self.designs[index] = self._fixed_design.array
             self._begin_bodies(index)
             self._changed[index] = False
         self._command[index] = 0.0

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from softgym_envs.designs import DesignSpace
+from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.mechanics.constraints import EmbeddedPoints
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
@@ -252,7 +252,7 @@ class Robot(ABC):
             setattr(self, name, value)
         lengths = {"size": self.size}
         bounded = [(a.name, a.high, a.unit) for a in self.actuators]
-        bounded += [(v.name, v.high, v.unit) for v in self.design_space.variables.values()]
+        bounded += [(v.name, v.high, v.unit) for v in self.design_space]
         lengths |= {f"high of '{name}'": high for name, high, unit in bounded if unit == "m"}
         for label, length in lengths.items():
             if length > LARGEST:
@@ -336,7 +336,7 @@ class MeshedRobot(Robot):
         """Return the model of a meshed body: material, boundary conditions, actuators, effectors, contacts."""
 
     @property
-    def reference_design(self) -> Mapping[str, float]:
+    def reference_design(self) -> Design:
         """The design whose mesh is moved to all others: the baseline, or one nearer the middle of the box."""
         return self.design_space.baseline
 

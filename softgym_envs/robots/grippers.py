@@ -73,7 +73,7 @@ class FingerRobot(Robot):
 
     def variables(self) -> tuple[DesignVariable, ...]:
         """Design variables: those of the finger, and more if there are any."""
-        return tuple(self.finger.design_space.variables.values())
+        return tuple(self.finger.design_space)
 
     @abstractmethod
     def object_rest(self, design: Mapping[str, float]) -> np.ndarray:

@@ -763,7 +763,7 @@ def _finished(model: Model, g: _Builder) -> Any:
     )
     variables = [
         {"name": v.name, "low": v.low, "high": v.high, "baseline": v.baseline, "unit": v.unit}
-        for v in robot.design_space.variables.values()
+        for v in robot.design_space
     ]
     properties = {
         "robot": robot.name,

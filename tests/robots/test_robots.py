@@ -277,7 +277,7 @@ def test_wrong_physics_is_an_error_of_the_caller_not_of_the_design(options, mess
 @pytest.mark.parametrize(
     ("design", "message"),
     [
-        ({"lenght": 0.04}, "unknown design variable 'lenght'; allowed: length"),
+        ({"lenght": 0.04}, r"unknown design variable 'lenght'; did you mean 'length'\? allowed: length"),
         ({"length": 0.05}, r"'length' = 0.05 m is out of bounds; allowed: 0.038 to 0.042 m"),
         ({"height": float("nan")}, "'height' = nan is not finite"),
         ([0.04], "a design is a mapping"),

@@ -314,7 +314,7 @@ def test_columns_are_states_of_the_fem(made):
     rest = data["rest"]
     assert np.abs(data["effort"][rest]).max() == 0.0
     assert np.abs(data["displacement"][rest]).max() < 1e-12
-    bounds = [(v.low, v.high) for v in robot.design_space.variables.values()]
+    bounds = [(v.low, v.high) for v in robot.design_space]
     for column, (low, high) in zip(data["design"].T, bounds, strict=True):
         assert (column >= low).all() and (column <= high).all()
 
@@ -431,7 +431,7 @@ def test_damaged_shards_are_named_set_aside_and_made_again(copied, trunk, damage
 def test_another_plan_does_not_mix(copied):
     for options, name in (
         ({"groups_per_shard": 3}, "groups_per_shard"),
-        ({"robot_options": {"elements": 9}}, "robot_"),
+        ({"robot_options": {"elements": 9}}, "mechanics_key, robot_options"),
     ):
         with pytest.raises(DataError, match=f"holds another dataset .different: {name}"):
             generate_dataset(copied, "trunk", PLAN, **{"groups_per_shard": 2, "progress": False, **options})

@@ -138,7 +138,7 @@ def test_fewer_members_are_the_first_ones(tmp_path):
     model = random_model("one")
     fewer = potential.Model(model.robot, model.tensors, {}, 1)
     designs, displacement = random_states(model.robot, 5)
-    baseline = np.repeat([list(model.robot.design_space.baseline.values())], 5, axis=0)
+    baseline = np.tile(model.robot.design_space.baseline.array, (5, 1))
     compiled = Compiled(export_c(model, None, tmp_path / "model.h", members=1, name="finger"))
     assert_same(fewer, baseline, displacement, compiled(displacement, 3)[0])
     with pytest.raises(AssertionError, match="effort"):

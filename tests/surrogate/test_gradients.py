@@ -32,8 +32,8 @@ def test_design_gradients_are_derivatives(name):
     model, _ = untrained_potential(robot, members=2)
     net = TorchModel(model)
     designs, displacement = (torch.as_tensor(v) for v in random_states(robot, 4))
-    low = torch.as_tensor([v.low for v in robot.design_space.variables.values()], dtype=torch.float64)
-    high = torch.as_tensor([v.high for v in robot.design_space.variables.values()], dtype=torch.float64)
+    low = torch.as_tensor([v.low for v in robot.design_space], dtype=torch.float64)
+    high = torch.as_tensor([v.high for v in robot.design_space], dtype=torch.float64)
     rng = torch.Generator().manual_seed(1)
 
     def outputs(unit):

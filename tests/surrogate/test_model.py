@@ -228,7 +228,7 @@ def test_trust_follows_domain_and_spread():
     domain = {"displacement": box, "design": {"length": [0.039, 0.041]}, "inflation": 2.0, "limit": 1e-3}
     model, _ = untrained_potential(robot)
     model = potential.Model(robot, model.tensors, {"domain": domain})
-    designs = np.array([list(robot.design_space.complete({"length": v}).values()) for v in (0.040, 0.0415)])
+    designs = np.array([robot.design_space.complete({"length": v}).array for v in (0.040, 0.0415)])
     context = model.context(designs).rows(np.array([0, 0, 0, 1]))
     displacement = np.array([[0.005, 0.005], [0.005, 0.012], [0.005, 0.005], [0.005, 0.005]])
     uncertainty, trusted = model.trust(context, displacement, np.array([4e-4, 4e-4, 6e-4, 4e-4]))

@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign
+from softgym_envs.designs import Design
+from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign, unknown_name
 from softgym_envs.mechanics.solvers.statics import Equilibrium, Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.features import learned_variables
@@ -81,7 +82,7 @@ class SamplingPlan:
             return sobol.random_base2(int(np.ceil(np.log2(max(total, 2)))))[first : first + count]
         return qmc.LatinHypercube(dimension, rng=rng).random(total)[first : first + count]
 
-    def designs(self, robot: Robot, first: int, count: int) -> list[dict[str, float]]:
+    def designs(self, robot: Robot, first: int, count: int) -> list[Design]:
         """Complete designs of groups ``first .. first + count``.
 
         Raises:
@@ -92,7 +93,7 @@ class SamplingPlan:
         names = learned_variables(robot) if self.vary is None else self.vary
         for name in (*names, *self.bounds):
             if name not in space.names:
-                raise DesignError(f"unknown design variable '{name}'; allowed: {', '.join(space.names)}")
+                raise DesignError(unknown_name("design variable", name, space.names))
         for name in self.bounds.keys() - set(names):
             raise DesignError(f"bounds of '{name}', which is not drawn; drawn: {', '.join(names) or 'none'}")
         for name in self.design.keys() & set(names):

@@ -62,7 +62,7 @@ def test_normal_force_is_that_of_a_tip_blocked_across(finger, on_fem):
 def test_surrogate_and_torch_agree_with_fem(finger, on_fem):
     surrogate = Evaluator(finger, STATES, backend="surrogate", actuation=[PULL], steps=2)({})
     learned = LearnedBodies(finger, STATES, actuation=[PULL], steps=2)
-    values = learned(torch.tensor([list(finger.design_space.baseline.values())], dtype=torch.float64))[0]
+    values = learned(torch.tensor(finger.design_space.baseline.array[None]))[0]
     for name, value in zip(STATES, values.tolist(), strict=True):
         assert surrogate[name] == pytest.approx(on_fem[name], rel=0.02), name
         assert value == pytest.approx(surrogate[name], rel=1e-4), name
