@@ -54,13 +54,13 @@ def optima() -> dict[str, object]:
 
         by_gradient = configured({"method": "gradient"})
         found = optimise(by_gradient)
-        best = found["best"]
-        result[f"{metric}: gradient, design"] = _shown(best["design"])
-        result[f"{metric}: gradient, surrogate and FEM"] = [best["surrogate"][metric], best["fem"][metric]]
-        least = best["cost"] + 1e-4  # of the normalised cost
-        ends = [descent["cost"] for descent in found["descents"]]
+        best = found.best
+        result[f"{metric}: gradient, design"] = _shown(best.design)
+        result[f"{metric}: gradient, surrogate and FEM"] = [best.surrogate[metric], (best.fem or {})[metric]]
+        least = best.cost + 1e-4  # of the normalised cost
+        ends = [descent.cost for descent in found.descents]
         result[f"{metric}: gradient, corners that lead there"] = f"{sum(end < least for end in ends)} of {len(ends)}"
-        result[f"{metric}: gradient, grid of {found['grid']} and all descents [s]"] = round(found["seconds"], 2)
+        result[f"{metric}: gradient, grid of {found.grid} and all descents [s]"] = round(found.seconds, 2)
 
         box = by_gradient.bodies.box()
         began, values, designs = time.perf_counter(), [], []
@@ -109,22 +109,22 @@ def calibration() -> dict[str, object]:
         ("surrogate, TPE", {"method": "tpe"}),
     ):
         found = calibrate(configured(["poisson_ratio"], starts=starts, level=None, **options), data=three)
-        ends = [round(fit["found"]["poisson_ratio"], 5) for fit in found["fits"]]
+        ends = [round(fit.found["poisson_ratio"], 5) for fit in found.fits]
         result[f"nu 0.47, 3 positions, {name}: from each start"] = ends
-        result[f"nu 0.47, 3 positions, {name}: found"] = round(found["design"]["poisson_ratio"], 6)
-        result[f"nu 0.47, 3 positions, {name}: all starts [s]"] = round(found["seconds"], 2)
+        result[f"nu 0.47, 3 positions, {name}: found"] = round(found.design["poisson_ratio"], 6)
+        result[f"nu 0.47, 3 positions, {name}: all starts [s]"] = round(found.seconds, 2)
     tensions = measure(robot, {"poisson_ratio": 0.47}, np.linspace(0.0, 0.010, 3)[:, None])
     found = calibrate(configured(["poisson_ratio"], starts=starts, level=None), data=tensions)
-    result["nu 0.47, 3 positions and tensions, surrogate: found"] = round(found["design"]["poisson_ratio"], 6)
-    result["nu 0.47, 3 positions and tensions, surrogate: all starts [s]"] = round(found["seconds"], 2)
+    result["nu 0.47, 3 positions and tensions, surrogate: found"] = round(found.design["poisson_ratio"], 6)
+    result["nu 0.47, 3 positions and tensions, surrogate: all starts [s]"] = round(found.seconds, 2)
     pulled = measure(robot, {"young_modulus": 2.2e6}, [[2.0], [5.0], [10.0], [15.0]], driven="effort")
     found = calibrate(configured(["young_modulus"]), data=pulled)
-    result["E 2.2 MPa, 4 efforts, surrogate: error [%]"] = 100.0 * (found["design"]["young_modulus"] / 2.2e6 - 1.0)
-    result["E 2.2 MPa, 4 efforts, surrogate [s]"] = round(found["seconds"], 2)
+    result["E 2.2 MPa, 4 efforts, surrogate: error [%]"] = 100.0 * (found.design["young_modulus"] / 2.2e6 - 1.0)
+    result["E 2.2 MPa, 4 efforts, surrogate [s]"] = round(found.seconds, 2)
     both = calibrate(configured(["young_modulus", "poisson_ratio"], refine=True, level=None), data=pulled)
     result["E and nu, 4 efforts, surrogate, then FEM: errors"] = [
-        both["design"]["young_modulus"] / 2.2e6 - 1.0,
-        both["design"]["poisson_ratio"] - 0.47,
+        both.design["young_modulus"] / 2.2e6 - 1.0,
+        both.design["poisson_ratio"] - 0.47,
     ]
 
     rng = np.random.default_rng(0)
@@ -132,7 +132,8 @@ def calibration() -> dict[str, object]:
     for fit, data, truth in (("poisson_ratio", eleven, 0.47), ("young_modulus", pulled, 2.2e6)):
         covered, widths = 0, []
         for _ in range(runs):
-            low, high = calibrate(configured([fit]), data=data.with_noise(0.01, rng))["interval"][fit]
+            intervals = calibrate(configured([fit]), data=data.with_noise(0.01, rng)).intervals or {}
+            low, high = intervals[fit]
             covered += low <= truth <= high
             widths.append(high - low)
         result[f"{fit}, 1 % noise, {len(data)} states: 95 % intervals that cover the truth"] = f"{covered} of {runs}"
@@ -147,6 +148,7 @@ def sensor_front() -> dict[str, object]:
     """
     from benchmarks.sensor_finger import DESIGNS
     from codesign.tools.config import OptimiseConfig
+    from codesign.tools.metrics import METRICS
     from codesign.tools.plots import draw_front
     from codesign.tools.search import search
     from softgym_envs.config import load_config
@@ -176,7 +178,7 @@ def sensor_front() -> dict[str, object]:
     on_front = {row.trial for row in found.front}
     front = np.array([k for k, row in enumerate(feasible) if int(row["trial"]) in on_front])
     references = {name: [row[metric] for metric in metrics] for name, row in built.items()}
-    draw_front(folder / "front_with_built_fingers.png", metrics, values, front, references)
+    draw_front(folder / "front_with_built_fingers.png", [METRICS[name] for name in metrics], values, front, references)
     result: dict[str, object] = {
         "designs: feasible, infeasible, repeated": [found.feasible, found.infeasible, found.repeated],
         "evaluation, over all processes [s]": round(found.busy_seconds, 1),

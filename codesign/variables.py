@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from pydantic import Field
 
@@ -86,24 +87,42 @@ def split_values(values: Mapping[str, float]) -> tuple[dict[str, float], dict[st
     return {name: value for name, value in values.items() if name not in options}, options
 
 
+def change_options(
+    options: Mapping[str, Mapping[str, Any]], values: Mapping[str, float], where: str = ""
+) -> dict[str, dict[str, Any]]:
+    """Return options of robot and task with other values.
+
+    Args:
+        options: options by owner, ``"robot"`` or ``"task"``.
+        values: values by variable, ``{"robot.<option>": value}``.
+        where: prefix of the configuration key of the options, for messages: ``"environment."``.
+
+    Raises:
+        ValueError: if a value is for an entry of a vector that the options do not contain.
+    """
+    changed = {owner: dict(given) for owner, given in options.items()}
+    for name, value in values.items():
+        match = _OPTION.fullmatch(name)
+        assert match is not None  # `make_variables` checked it
+        owner, option, index = match.groups()
+        if index is None:
+            changed[owner][option] = value
+            continue
+        vector = changed[owner].get(option)
+        if not isinstance(vector, Sequence) or isinstance(vector, str) or int(index) >= len(vector):
+            raise ValueError(f"variable '{name}': give all of {option} in {where}{owner}_options first")
+        changed[owner][option] = [value if k == int(index) else entry for k, entry in enumerate(vector)]
+    return changed
+
+
 def with_options(environment: EnvironmentConfig, values: Mapping[str, float]) -> EnvironmentConfig:
     """Return an environment with other values of options of robot and task.
 
     Raises:
         ValueError: if a value is for an entry of a vector that the environment's options do not contain.
     """
-    update = {"robot": dict(environment.robot_options), "task": dict(environment.task_options)}
-    for name, value in values.items():
-        match = _OPTION.fullmatch(name)
-        assert match is not None  # `make_variables` checked it
-        owner, option, index = match.groups()
-        if index is None:
-            update[owner][option] = value
-            continue
-        vector = update[owner].get(option)
-        if not isinstance(vector, Sequence) or isinstance(vector, str) or int(index) >= len(vector):
-            raise ValueError(f"variable '{name}': give all of {option} in environment.{owner}_options first")
-        update[owner][option] = [value if k == int(index) else entry for k, entry in enumerate(vector)]
     if not values:
         return environment
-    return environment.model_copy(update={"robot_options": update["robot"], "task_options": update["task"]})
+    options = {"robot": environment.robot_options, "task": environment.task_options}
+    changed = change_options(options, values, "environment.")
+    return environment.model_copy(update={f"{owner}_options": given for owner, given in changed.items()})

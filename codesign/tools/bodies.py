@@ -1,101 +1,32 @@
-"""From a design to the values of its metrics: the free variables, and the two backends that evaluate them."""
+"""Metrics of designs on the two backends: one design at a time, or a batch with gradients."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.tools.metrics import METRICS, Course
+from codesign.tools.metrics import Course, Metric, find_metrics
+from codesign.variables import split_values
 from softgym_envs.backends import make_backend
 from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.designs import DesignSpace
 from softgym_envs.errors import ConfigError
 from softgym_envs.mechanics.constraints import Cavity
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.potential import model as potential
+from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import TorchModel
 from softgym_envs.surrogate.pretrained import pretrained_model
 
-__all__ = ["Box", "Evaluator", "LearnedBodies"]
-
-
-class Box:
-    """The designs under consideration: free variables within bounds, the others fixed.
-
-    Args:
-        space: all variables of the robot.
-        variables: names of the free ones; default all.
-        bounds: narrower bounds of some of them, ``{name: (low, high)}`` [SI].
-        design: values of the others, and the reference of the free ones; the rest is the robot's baseline.
-
-    Raises:
-        DesignError: for an unknown name, or a value or a bound outside the robot's own bounds.
-        ConfigError: for a variable named twice, or bounds of one that is not free.
-    """
-
-    def __init__(
-        self,
-        space: DesignSpace,
-        variables: Sequence[str] | None = None,
-        bounds: Mapping[str, tuple[float, float]] | None = None,
-        design: Mapping[str, float] | None = None,
-    ) -> None:
-        self.names = tuple(space.names if variables is None else variables)
-        if len(set(self.names)) != len(self.names):
-            raise ConfigError(f"variables {list(self.names)} name one twice")
-        for name in bounds or {}:
-            if name not in self.names:
-                raise ConfigError(f"bounds of '{name}', which is not among the variables {', '.join(self.names)}")
-        self.space = space
-        self.reference = space.complete(design)
-        free = []
-        for name in self.names:
-            variable = space[name]
-            low, high = (bounds or {}).get(name, (variable.low, variable.high))
-            low, high = variable.check(low), variable.check(high)
-            free.append(replace(variable, low=low, high=high, baseline=min(max(self.reference[name], low), high)))
-        self.free = DesignSpace(*free)
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def design(self, unit: np.ndarray) -> dict[str, float]:
-        """Return the complete design of a point in [-1, 1]^d."""
-        return {**self.reference, **self.free.from_unit(unit)}
-
-    def unit(self, design: Mapping[str, float]) -> np.ndarray:
-        """Return the point in [-1, 1]^d of a design, shape (d,)."""
-        return self.free.to_unit({name: design[name] for name in self.names})
-
-    def values(self, unit: Tensor) -> Tensor:
-        """Return complete designs (B, len(space)) of points (B, d), with gradients."""
-        columns = {name: torch.full((len(unit),), value, dtype=torch.float64) for name, value in self.reference.items()}
-        for k, (name, variable) in enumerate(self.free.variables.items()):
-            ends = np.array([variable.low, variable.high])
-            low, high = np.log(ends) if variable.log else ends
-            value = low + 0.5 * (unit[:, k] + 1.0) * (high - low)
-            columns[name] = torch.exp(value) if variable.log else value
-        return torch.stack(list(columns.values()), dim=1)
-
-    def corners(self) -> np.ndarray:
-        """All corners, shape (2^d, d)."""
-        return np.stack(np.meshgrid(*[[-1.0, 1.0]] * len(self), indexing="ij"), axis=-1).reshape(-1, len(self))
-
-    def grid(self, count: int) -> np.ndarray:
-        """A regular grid of about ``count`` points, corners included, shape (m, d) with m >= count."""
-        steps = max(2, int(np.ceil(count ** (1.0 / len(self)) - 1e-9)))
-        line = np.linspace(-1.0, 1.0, steps)
-        return np.stack(np.meshgrid(*[line] * len(self), indexing="ij"), axis=-1).reshape(-1, len(self))
+RobotMaker = Callable[[Mapping[str, float]], Robot]
+"""Makes a robot with other values of its options, ``{"robot.<option>": value}``."""
 
 
 def full_command(robot: Robot, actuation: Sequence[float] | None) -> np.ndarray:
-    """Check an actuation (n_a,), by default half of every actuator's upper limit.
+    """Return a checked actuation (n_a,); default: half of the upper limit of each actuator.
 
     Raises:
         ConfigError: for a wrong length, or a displacement out of range.
@@ -103,24 +34,30 @@ def full_command(robot: Robot, actuation: Sequence[float] | None) -> np.ndarray:
     command = np.array(0.5 * robot.upper if actuation is None else actuation, dtype=float)
     if command.shape != robot.lower.shape or not ((command >= robot.lower) & (command <= robot.upper)).all():
         allowed = ", ".join(f"{a.name} {a.low:g} to {a.high:g} {a.unit}" for a in robot.actuators)
-        raise ConfigError(f"actuation {command.tolist()} is not allowed; allowed: {allowed}")
+        raise ConfigError(f"actuation {command.tolist()} is out of range; allowed: {allowed}")
     return command
 
 
-def check_metrics(robot: Robot, metrics: Sequence[str], backend: str) -> None:
-    """Raise `ConfigError` for a metric that is unknown, or that a backend or a robot does not have."""
-    for name in metrics:
-        if name not in METRICS:
-            raise ConfigError(f"unknown metric '{name}'; allowed: {', '.join(METRICS)}")
-        needs = METRICS[name].needs
-        if needs != "states" and backend != "fem":
-            raise ConfigError(f"metric '{name}' needs backend 'fem', got '{backend}'")
-        if needs == "sensors" and not hasattr(robot, "cavities"):
-            raise ConfigError(f"metric '{name}' needs a robot with sensing cavities, got '{robot.name}'")
+def check_metrics(robot: Robot, metrics: Sequence[str | Metric], backend: str) -> tuple[Metric, ...]:
+    """Return metrics by name.
+
+    Raises:
+        ConfigError: for an unknown or repeated metric, or one that the backend or the robot does not provide.
+    """
+    try:
+        found = find_metrics(tuple(metrics))
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    for metric in found:
+        if metric.needs in ("body", "sensors") and backend != "fem":
+            raise ConfigError(f"metric '{metric.name}' needs backend 'fem', got '{backend}'")
+        if metric.needs == "sensors" and not hasattr(robot, "cavities"):
+            raise ConfigError(f"metric '{metric.name}' needs a robot with sensing cavities, got '{robot.name}'")
+    return found
 
 
 def body_axis(robot: Robot) -> int:
-    """Coordinate along which a robot lies at rest."""
+    """Return the coordinate along which a robot lies at rest."""
     return int(np.argmax(np.abs(robot.effector_rest)))
 
 
@@ -128,33 +65,37 @@ class Evaluator:
     """Metrics of one design at a time, on FEM or on a surrogate.
 
     Args:
-        robot: the family of bodies.
-        metrics: names in `METRICS`.
+        robot: the robot.
+        metrics: metrics, or their names or paths, see `codesign.tools.metrics.find_metric`.
         backend: ``"fem"`` or ``"surrogate"``.
-        actuation: full command: displacements of the actuators, shape (n_a,); default half of their upper limits.
+        actuation: full command: displacements of the actuators, shape (n_a,); default: half of their upper limits.
         steps: states beyond rest along the actuation, evenly spaced.
-        weights: folder of the surrogate's weights; default the shipped ones.
+        weights: folder of the surrogate's weights; default: the pretrained ones.
+        make_robot: needed for designs that contain robot options.
 
     Raises:
-        ConfigError: for an unknown metric, or one that the backend or the robot does not have; for a malformed command.
+        ConfigError: for an unknown metric, one that the backend or the robot does not provide, or a malformed command.
     """
 
     def __init__(
         self,
         robot: Robot,
-        metrics: Sequence[str],
+        metrics: Sequence[str | Metric],
         *,
         backend: str = "fem",
         actuation: Sequence[float] | None = None,
         steps: int = 1,
         weights: str | Path | None = None,
+        make_robot: RobotMaker | None = None,
     ) -> None:
-        check_metrics(robot, metrics, backend)
-        self.robot, self.metrics = robot, tuple(metrics)
+        self.metrics = check_metrics(robot, metrics, backend)
+        self.robot = robot
         self.command = full_command(robot, actuation)
         self.steps = steps
-        self.kind = backend
-        self._options = {"weights": weights} if backend == "surrogate" else {}
+        self.backend = backend
+        self._backend_options = {"weights": weights} if backend == "surrogate" else {}
+        self._make_robot = make_robot
+        self._options: dict[str, float] = {}
 
     def course(self, design: Mapping[str, float]) -> Course:
         """Return the states of one design.
@@ -163,8 +104,12 @@ class Evaluator:
             InfeasibleDesign: if the geometry cannot exist.
             ConvergenceError: if an equilibrium is not found.
         """
-        # A backend keeps one body; a new one spares the rest state of another.
-        backend = make_backend(self.kind, self.robot, design=design, **self._options)
+        variables, options = split_values(design)
+        if options != self._options:
+            assert self._make_robot is not None
+            self.robot, self._options = self._make_robot(options), options
+        # A backend keeps its body in memory, so every design gets a new one.
+        backend = make_backend(self.backend, self.robot, design=variables, **self._backend_options)
         states = [backend.state]
         states += [backend.step(k / self.steps * self.command) for k in range(1, self.steps + 1)]
         sensor, material = None, None
@@ -184,13 +129,17 @@ class Evaluator:
         )
 
     def __call__(self, design: Mapping[str, float]) -> dict[str, float]:
-        """Return the metrics of a design [SI]; raises as `course`."""
-        course = self.course(design)
-        return {name: float(METRICS[name].formula(course)[0]) for name in self.metrics}
+        """Return the metrics of a complete design by name [SI]; raises as `course`."""
+        from_states = any(metric.needs != "design" for metric in self.metrics)
+        course = self.course(design) if from_states else None
+        return {
+            metric.name: float(metric(dict(design)) if metric.needs == "design" else metric(course)[0])
+            for metric in self.metrics
+        }
 
 
 def _stack(arrays: list[np.ndarray]) -> Tensor:
-    """States (K, 1, ...) of one body."""
+    """Return states (K, 1, ...) of one body."""
     return torch.as_tensor(np.stack(arrays)[:, None], dtype=torch.float64)
 
 
@@ -205,27 +154,29 @@ class LearnedBodies:
     Actuators are where they are commanded to be: no cable hangs slack. Rest is zero displacement.
 
     Args:
-        robot: the family of bodies.
-        metrics: names in `METRICS`.
-        actuation: full command: displacements of the actuators, shape (n_a,); default half of their upper limits.
+        robot: the robot.
+        metrics: metrics, or their names or paths.
+        actuation: full command: displacements of the actuators, shape (n_a,); default: half of their upper limits.
         steps: states beyond rest along the actuation, evenly spaced.
-        weights: folder of the surrogate's weights; default the shipped ones.
+        weights: folder of the surrogate's weights; default: the pretrained ones.
 
     Raises:
-        ConfigError: as for `Evaluator`, and for weights that are not of a potential network.
+        ConfigError: as for `Evaluator`, for metrics without gradients, and for weights of another kind of network.
     """
 
     def __init__(
         self,
         robot: Robot,
-        metrics: Sequence[str],
+        metrics: Sequence[str | Metric],
         *,
         actuation: Sequence[float] | None = None,
         steps: int = 1,
         weights: str | Path | None = None,
     ) -> None:
-        check_metrics(robot, metrics, "surrogate")
-        self.robot, self.metrics = robot, tuple(metrics)
+        self.metrics = check_metrics(robot, metrics, "surrogate")
+        if rigid := [metric.name for metric in self.metrics if metric.needs == "design"]:
+            raise ConfigError(f"metric '{rigid[0]}' is a function of the design without gradients; use solver 'search'")
+        self.robot = robot
         self.command = torch.as_tensor(full_command(robot, actuation))
         self.steps = steps
         self.net = learned_model(robot, weights)
@@ -247,7 +198,7 @@ class LearnedBodies:
     def __call__(self, values: Tensor) -> Tensor:
         """Return the metrics of complete designs (B, len(space)), shape (B, m) [SI]."""
         course = self.course(values)
-        return torch.stack([METRICS[name].formula(course) for name in self.metrics], dim=1)
+        return torch.stack([metric(course) for metric in self.metrics], dim=1)
 
 
 def learned_model(robot: Robot, weights: str | Path | None = None) -> TorchModel:
@@ -258,6 +209,6 @@ def learned_model(robot: Robot, weights: str | Path | None = None) -> TorchModel
         WeightsError: if there are no weights.
     """
     model = pretrained_model(robot, weights)
-    if not isinstance(model, potential.Model):
+    if not isinstance(model, Model):
         raise ConfigError(f"gradients need weights of a 'potential' network, got '{model.network}'")
     return TorchModel(model)

@@ -1,123 +1,158 @@
-"""Configuration of the design tools. Everything is SI."""
+"""Configurations of the design tools. All quantities are SI."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from codesign.sampling import SamplerConfig
-from codesign.tools.bodies import Box, Evaluator, LearnedBodies, check_metrics, full_command
-from codesign.tools.metrics import METRICS
+from codesign.tools.bodies import Evaluator, LearnedBodies, check_metrics, full_command
+from codesign.tools.box import Box
+from codesign.tools.metrics import METRICS, Metric, find_metric
+from codesign.tools.nuisance import ContactConfig, OffsetConfig, check_nuisances
+from codesign.variables import OptionRange, change_options
 from softgym_envs.config import Config
 from softgym_envs.robots import make_robot
 from softgym_envs.robots.base import Robot
 
-__all__ = [
-    "BodiesConfig",
-    "CalibrationConfig",
-    "GradientConfig",
-    "ObjectiveConfig",
-    "OptimiseConfig",
-    "SearchConfig",
-    "SensitivityConfig",
-]
+
+def _metric_name(value: Any) -> Any:
+    """Return the name or path of a metric that may be given as an object."""
+    if isinstance(value, Metric):
+        function = value.function
+        name = value.name if METRICS.get(value.name) is value else f"{function.__module__}:{function.__qualname__}"
+        if find_metric(name) is not value:
+            raise ValueError(f"metric '{value.name}' is not found as '{name}'; define it at the top of a module")
+        return name
+    if isinstance(value, str):
+        find_metric(value)
+    return value
 
 
-class BodiesConfig(Config):
-    """Which bodies, and how they are evaluated.
+MetricName = Annotated[str, BeforeValidator(_metric_name)]
+"""Name in `codesign.tools.metrics.METRICS`, or path of a metric of your own, ``"my_module:my_metric"``."""
+
+FolderName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+
+
+class RobotConfig(Config):
+    """A robot, the designs under consideration, and the backend.
 
     Attributes:
-        robot: registry name.
+        robot: registered name, or path ``"my_module:MyRobot"``.
         robot_options: options of the robot.
-        variables: free design variables; default all.
-        bounds: narrower bounds of some of them, ``{name: [low, high]}``.
-        design: values of the others, and the reference of the free ones; the rest is the robot's baseline.
+        ranges: bounds of free robot options, ``{"robot.<option>": {low, high, baseline, unit}}``.
+        bounds: narrower bounds of free design variables, ``{name: [low, high]}``.
+        design: values of the other design variables, and reference values of the free ones; the rest keeps the robot's
+            baseline.
         backend: ``"fem"`` or ``"surrogate"``.
-        weights: folder of the surrogate's weights; default the shipped ones.
-        actuation: full command, a displacement for each actuator; default half of their upper limits.
-        steps: states beyond rest along the actuation.
+        weights: folder of the surrogate's weights; default: the pretrained ones.
     """
 
     robot: str
     robot_options: dict[str, Any] = Field(default_factory=dict)
-    variables: tuple[str, ...] | None = Field(default=None, min_length=1)
+    ranges: dict[str, OptionRange] = Field(default_factory=dict)
     bounds: dict[str, tuple[float, float]] = Field(default_factory=dict)
     design: dict[str, float] = Field(default_factory=dict)
     backend: Literal["fem", "surrogate"] = "surrogate"
     weights: str | None = None
+
+    @model_validator(mode="after")
+    def _makes_a_robot(self) -> RobotConfig:
+        self.make_robot({name: option.baseline for name, option in self.ranges.items() if name.startswith("robot.")})
+        return self
+
+    def make_robot(self, options: Mapping[str, float] | None = None) -> Robot:
+        """Return the robot, with other values of options ``{"robot.<option>": value}``."""
+        return make_robot(self.robot, **change_options({"robot": self.robot_options}, options or {})["robot"])
+
+
+class BodiesConfig(RobotConfig):
+    """The bodies of a search or a sensitivity study, and how they are actuated; see also `RobotConfig`.
+
+    Attributes:
+        variables: free design variables, and free robot options as ``robot.<option>``; default: all design variables.
+        actuation: full command, a displacement for each actuator; default: half of their upper limits.
+        steps: states beyond rest along the actuation.
+    """
+
+    variables: tuple[str, ...] | None = Field(default=None, min_length=1)
     actuation: tuple[float, ...] | None = None
     steps: int = Field(default=1, ge=1)
 
     @model_validator(mode="after")
-    def _exists(self) -> BodiesConfig:
+    def _consistent(self) -> BodiesConfig:
         full_command(self.make_robot(), self.actuation)
         self.box()
         return self
 
-    def make_robot(self) -> Robot:
-        """Return the family of bodies."""
-        return make_robot(self.robot, **self.robot_options)
-
     def box(self) -> Box:
         """Return the designs under consideration."""
-        return Box(self.make_robot().design_space, self.variables, self.bounds, self.design)
+        return Box(self.make_robot().design_space, self.variables, self.bounds, self.design, self.ranges)
 
     def evaluator(self, metrics: tuple[str, ...], backend: str | None = None) -> Evaluator:
-        """Return what evaluates one design at a time, on this backend or another."""
+        """Return the evaluator of single designs, on the configured backend or another one."""
         backend = self.backend if backend is None else backend
-        weights = self.weights if backend == "surrogate" else None
         return Evaluator(
-            self.make_robot(), metrics, backend=backend, actuation=self.actuation, steps=self.steps, weights=weights
+            self.make_robot(),
+            metrics,
+            backend=backend,
+            actuation=self.actuation,
+            steps=self.steps,
+            weights=self.weights if backend == "surrogate" else None,
+            make_robot=self.make_robot,
         )
 
     def learned(self, metrics: tuple[str, ...]) -> LearnedBodies:
-        """Return what evaluates batches with gradients."""
+        """Return the evaluator of batches, with gradients."""
         return LearnedBodies(
             self.make_robot(), metrics, actuation=self.actuation, steps=self.steps, weights=self.weights
         )
 
 
 class ObjectiveConfig(Config):
-    """One objective.
+    """One objective. In a file, the metric alone is enough.
 
     Attributes:
-        metric: name in `codesign.tools.metrics.METRICS`.
-        goal: ``"maximize"``, ``"minimize"``, or a value [SI] to come near to; default: what the metric is good for.
-        weight: gamma of eq. 4.18, used where objectives are added up.
+        metric: name of a metric, or path of one of your own, ``"my_module:my_metric"``.
+        goal: ``"maximize"``, ``"minimize"``, or a target value [SI]; default: the direction of the metric.
+        weight: gamma of eq. 4.18 of the thesis, for solvers that add objectives up.
     """
 
-    metric: str
+    metric: MetricName
     goal: Literal["maximize", "minimize"] | float | None = None
     weight: float = Field(default=1.0, gt=0.0)
 
-    @model_validator(mode="after")
-    def _known(self) -> ObjectiveConfig:
-        if self.metric not in METRICS:
-            raise ValueError(f"unknown metric '{self.metric}'; allowed: {', '.join(METRICS)}")
-        return self
+    @model_validator(mode="before")
+    @classmethod
+    def _metric_alone(cls, data: Any) -> Any:
+        return {"metric": data} if isinstance(data, str | Metric) else data
+
+    def find(self) -> Metric:
+        """Return the metric."""
+        return find_metric(self.metric)
 
     def cost(self, value: Any) -> Any:
-        """Return what is minimised, of a value of the metric [SI] (a number, an array or a tensor)."""
-        goal = self.goal
-        if goal is None:
-            goal = "maximize" if METRICS[self.metric].better == "larger" else "minimize"
+        """Return the cost to minimise for a value of the metric [SI] (a number, an array or a tensor)."""
+        goal = self.find().direction if self.goal is None else self.goal
         if isinstance(goal, float):
             return abs(value - goal)
         return -value if goal == "maximize" else value
 
 
 class SearchConfig(Config):
-    """Search without gradients (Optuna); several objectives give a Pareto front.
+    """Search without gradients (Optuna). Several objectives give a Pareto front.
 
     Attributes:
         method: ``"search"``.
-        sampler: who proposes designs.
+        sampler: algorithm that proposes designs.
         trials: designs to evaluate, infeasible ones included.
-        batch: designs that are proposed together, for NSGA-II the population. The result depends on it and not on the
+        batch: designs that are proposed together; for NSGA-II, the population. The result depends on it, but not on the
             number of workers.
-        starts: designs to evaluate first, ``{name: value}`` each; missing variables take the reference, within bounds.
+        starts: designs to evaluate first, ``{name: value}`` each; missing variables take the reference, moved into the
+            bounds.
     """
 
     method: Literal["search"]
@@ -127,10 +162,10 @@ class SearchConfig(Config):
     starts: tuple[dict[str, float], ...] = ()
 
     @model_validator(mode="after")
-    def _generations(self) -> SearchConfig:
+    def _whole_generations(self) -> SearchConfig:
         if self.sampler.name == "nsgaii" and self.batch != self.sampler.options.get("population_size", 50):
             raise ValueError(
-                f"batch = {self.batch} must be the population of NSGA-II, "
+                f"batch = {self.batch} must equal the population of NSGA-II, "
                 f"population_size = {self.sampler.options.get('population_size', 50)}"
             )
         return self
@@ -143,10 +178,10 @@ class GradientConfig(Config):
         method: ``"gradient"``.
         starts: ``"corners"`` of the box, the ``"reference"`` design, or ``"grid"``: the best designs of a grid.
         count: number of starts, for ``"grid"``.
-        grid: designs of the grid that the objectives are normalised on and that starts are chosen from.
-        iterations: most iterations of a descent.
+        grid: number of designs on the grid that normalises the objectives and from which starts are chosen.
+        iterations: largest number of iterations of a descent.
         tolerance: a descent ends when no component of the projected gradient of the normalised cost is larger.
-        check: evaluate the best design also on FEM.
+        check: also evaluate the best design on FEM.
     """
 
     method: Literal["gradient"]
@@ -158,31 +193,18 @@ class GradientConfig(Config):
     check: bool = True
 
 
-def check_starts(starts: Sequence[Mapping[str, float]], box: Box) -> None:
-    """Check that starts are of free variables, within their bounds.
-
-    Raises:
-        ValueError: for a variable that is not free.
-        DesignError: for a value out of bounds.
-    """
-    for start in starts:
-        if unknown := sorted(start.keys() - set(box.names)):
-            raise ValueError(f"starts: '{unknown[0]}' is not free; free: {', '.join(box.names)}")
-        box.free.complete(start)
-
-
 class OptimiseConfig(Config):
     """A search for the best bodies.
 
     Attributes:
-        name: of the results' folder.
-        bodies: which bodies, and how they are evaluated.
+        name: name of the results' folder.
+        bodies: the bodies and how they are evaluated.
         objectives: one or several.
         solver: search or gradient.
-        workers: processes, for a search.
+        workers: number of processes, for a search.
     """
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    name: FolderName
     bodies: BodiesConfig
     objectives: tuple[ObjectiveConfig, ...] = Field(min_length=1)
     solver: Annotated[SearchConfig | GradientConfig, Field(discriminator="method")]
@@ -190,40 +212,46 @@ class OptimiseConfig(Config):
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """Names of the objectives' metrics."""
+        """Names or paths of the objectives' metrics."""
         return tuple(objective.metric for objective in self.objectives)
 
     @model_validator(mode="after")
     def _consistent(self) -> OptimiseConfig:
-        if len(set(self.metrics)) != len(self.metrics):
-            raise ValueError(f"objectives: a metric is named twice in {', '.join(self.metrics)}")
         check_metrics(self.bodies.make_robot(), self.metrics, self.bodies.backend)
+        box = self.bodies.box()
         if isinstance(self.solver, SearchConfig):
-            check_starts(self.solver.starts, self.bodies.box())
-        if isinstance(self.solver, GradientConfig) and self.bodies.backend != "surrogate":
-            raise ValueError("solver 'gradient' needs bodies.backend = 'surrogate': meshes have no derivative")
+            for start in self.solver.starts:
+                box.check_start(start)
+            return self
+        if self.bodies.backend != "surrogate":
+            raise ValueError("solver 'gradient' needs bodies.backend = 'surrogate': FEM has no such derivatives")
+        if box.options:
+            raise ValueError(f"solver 'gradient' cannot vary the option '{box.options[0]}'; use solver 'search'")
+        if rigid := [o.metric for o in self.objectives if o.find().needs == "design"]:
+            raise ValueError(f"solver 'gradient' has no derivative of metric '{rigid[0]}'; use solver 'search'")
         return self
 
 
 class SensitivityConfig(Config):
-    """Which variables matter for which metrics.
+    """A study of which variables matter for which metrics.
 
     Attributes:
-        name: of the results' folder.
-        bodies: which bodies, and how they are evaluated.
-        metrics: names in `codesign.tools.metrics.METRICS`.
-        method: ``"oat"`` (one at a time, eq. 3.1), ``"morris"`` (elementary effects) or ``"sobol"`` (variances).
-        levels: values of each variable between its bounds, both included: two for the thesis' study (``oat``), an even
+        name: name of the results' folder.
+        bodies: the bodies and how they are evaluated.
+        metrics: names of metrics, or paths of your own, ``"my_module:my_metric"``.
+        method: ``"oat"`` (one variable at a time; thesis, eq. 3.1), ``"morris"`` (elementary effects) or ``"sobol"``
+            (shares of the variance).
+        levels: values of each variable between its bounds, both included: two as in the thesis (``oat``), an even
             number of grid levels (``morris``).
         samples: trajectories (``morris``), or base samples, a power of two (``sobol``).
         confidence: level of the intervals (``morris``, ``sobol``).
-        seed: of the samples.
-        workers: processes.
+        seed: seed of the samples.
+        workers: number of processes.
     """
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    name: FolderName
     bodies: BodiesConfig
-    metrics: tuple[str, ...] = Field(min_length=1)
+    metrics: tuple[MetricName, ...] = Field(min_length=1)
     method: Literal["oat", "morris", "sobol"] = "oat"
     levels: int = Field(default=2, ge=2)
     samples: int = Field(default=64, ge=2)
@@ -241,52 +269,50 @@ class SensitivityConfig(Config):
         return self
 
 
-class CalibrationConfig(Config):
-    """Fit of design variables to measurements.
+class CalibrationConfig(RobotConfig):
+    """Fit of design variables, robot options and nuisance parameters to measurements; see also `RobotConfig`.
 
     Attributes:
-        name: of the results' folder.
-        robot: registry name.
-        robot_options: options of the robot.
-        design: values of the variables that are not fitted; the rest is the robot's baseline.
-        fit: variables to fit.
-        bounds: narrower bounds of some of them.
-        data: CSV or JSON file of measurements, see `codesign.tools.calibration.read_measurements`.
-        backend: ``"surrogate"`` or ``"fem"``.
-        weights: folder of the surrogate's weights; default the shipped ones.
+        name: name of the results' folder.
+        fit: design variables to fit, and robot options as ``robot.<option>``.
+        nuisances: unknowns of the measurement that are fitted too, by name: offsets of columns and the distance of an
+            object, see `codesign.tools.nuisance`.
+        data: CSV or JSON file of measurements, see `codesign.tools.measurements.read_measurements`.
         method: ``"gradient"`` (least squares) or ``"tpe"`` (Optuna).
-        starts: first values ``{name: value}``, one fit from each; default the reference design (``gradient``).
-        trials: evaluations (``tpe``).
+        starts: first values ``{name: value}`` of variables and nuisance parameters, one fit from each; default: the
+            reference design.
+        trials: number of evaluations (``tpe``).
         refine: fit once more on FEM, from the best fit on the surrogate.
-        level: of the interval; None for no interval.
-        seed: of ``tpe``.
+        level: confidence level of the intervals; None for no intervals.
+        seed: seed of ``tpe``.
     """
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
-    robot: str
-    robot_options: dict[str, Any] = Field(default_factory=dict)
-    design: dict[str, float] = Field(default_factory=dict)
+    name: FolderName
     fit: tuple[str, ...] = Field(min_length=1)
-    bounds: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    nuisances: dict[str, Annotated[OffsetConfig | ContactConfig, Field(discriminator="kind")]] = Field(
+        default_factory=dict
+    )
     data: str
-    backend: Literal["fem", "surrogate"] = "surrogate"
-    weights: str | None = None
     method: Literal["gradient", "tpe"] = "gradient"
-    starts: tuple[dict[str, float], ...] = ()
+    starts: tuple[dict[str, float], ...] = Field(default=({},), min_length=1)
     trials: int = Field(default=250, ge=1)
     refine: bool = False
     level: float | None = Field(default=0.95, gt=0.0, lt=1.0)
     seed: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")
-    def _exists(self) -> CalibrationConfig:
-        check_starts(self.starts, self.box())
+    def _consistent(self) -> CalibrationConfig:
+        box = self.box()
+        check_nuisances(self.nuisances, self.make_robot(), self.fit)
+        if box.options and self.backend != "fem":
+            raise ValueError(f"fit: the option '{box.options[0]}' needs backend 'fem', got '{self.backend}'")
+        for start in self.starts:
+            for name, value in start.items():
+                if name in self.nuisances:
+                    self.nuisances[name].check(name, value)
+            box.check_start({name: value for name, value in start.items() if name not in self.nuisances})
         return self
-
-    def make_robot(self) -> Robot:
-        """Return the family of bodies."""
-        return make_robot(self.robot, **self.robot_options)
 
     def box(self) -> Box:
         """Return the fitted variables within their bounds."""
-        return Box(self.make_robot().design_space, self.fit, self.bounds, self.design)
+        return Box(self.make_robot().design_space, self.fit, self.bounds, self.design, self.ranges)

@@ -1,34 +1,32 @@
-"""Design along the surrogate's gradients, in a box, from several starts (thesis 4.5.3)."""
+"""Optimisation along the surrogate's gradients, in a box, from several starts (thesis, sec. 4.5.3)."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.tools.bodies import Box
+from codesign.tools.box import Box
 from codesign.tools.config import GradientConfig, ObjectiveConfig, OptimiseConfig
 from codesign.tools.folder import run_folder
+from codesign.tools.plots import draw_descents
+from codesign.tools.records import BestDesign, Descent, GradientResult
 from softgym_envs.config import provenance
 from softgym_envs.storage import write_json
 
-__all__ = ["Descent", "WeightedCost", "descend", "optimise"]
-
 
 class WeightedCost:
-    """The cost that is minimised: ``sum gamma_i (O_i - min O_i) / (max O_i - min O_i)`` (eq. 4.18).
+    """The cost to minimise: ``sum gamma_i (O_i - min O_i) / (max O_i - min O_i)`` (thesis, eq. 4.18).
 
     Args:
-        objectives: what is wanted of each metric.
-        metrics: values of the metrics (B, m) of complete designs (B, len(space)).
+        objectives: the objectives O_i with their weights gamma_i.
+        metrics: returns the metrics (B, m) of complete designs (B, len(space)).
         box: the designs under consideration.
-        grid: number of designs, on a regular grid, that the extremes are taken over.
+        grid: number of designs, on a regular grid, over which the extremes are taken.
 
     Attributes:
         points: the grid in unit coordinates, shape (n, d).
@@ -47,22 +45,22 @@ class WeightedCost:
         self.points = box.grid(grid)
         with torch.no_grad():
             values = metrics(box.values(torch.as_tensor(self.points)))
-            single = self._single(values)
+            single = self._each(values)
             self._low, self._range = single.amin(dim=0), single.amax(dim=0) - single.amin(dim=0)
             self._range = self._range.clamp(min=1e-300)
-            self.costs = self._add(single).numpy()
+            self.costs = self._sum(single).numpy()
         self.values = values.numpy()
 
-    def _single(self, values: Tensor) -> Tensor:
+    def _each(self, values: Tensor) -> Tensor:
         return torch.stack([o.cost(values[:, k]) for k, o in enumerate(self.objectives)], dim=1)
 
-    def _add(self, single: Tensor) -> Tensor:
+    def _sum(self, single: Tensor) -> Tensor:
         gamma = torch.tensor([objective.weight for objective in self.objectives], dtype=torch.float64)
         return ((single - self._low) / self._range) @ gamma
 
     def __call__(self, unit: Tensor) -> Tensor:
         """Return the cost of points (B, d) in unit coordinates, shape (B,)."""
-        return self._add(self._single(self.metrics(self.box.values(unit))))
+        return self._sum(self._each(self.metrics(self.box.values(unit))))
 
     def with_gradient(self, unit: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the cost of one point (d,) and its gradient (d,)."""
@@ -72,40 +70,18 @@ class WeightedCost:
         return float(cost[0].detach()), gradient[0].numpy()
 
 
-@dataclass(frozen=True)
-class Descent:
-    """One descent.
-
-    Attributes:
-        start: unit coordinates of the start, (d,).
-        end: and of the end, (d,).
-        cost: at the end.
-        history: cost after each iteration, the start first.
-        projected_gradient: largest component of the gradient at the end that the box does not stop.
-        evaluations: of cost and gradient.
-    """
-
-    start: list[float]
-    end: list[float]
-    cost: float
-    history: list[float]
-    projected_gradient: float
-    evaluations: int
-
-
 def descend(cost: WeightedCost, start: np.ndarray, *, iterations: int = 100, tolerance: float = 1e-6) -> Descent:
     """Minimise a cost within the box from one start (L-BFGS-B).
 
     Args:
-        cost: what is minimised.
+        cost: the cost.
         start: unit coordinates, shape (d,).
-        iterations: bound on them.
-        tolerance: of the projected gradient.
+        iterations: largest number of iterations.
+        tolerance: largest component of the projected gradient at the end.
     """
     from scipy.optimize import minimize
 
-    first = float(cost(torch.as_tensor(start[None]))[0])
-    history = [first]
+    history = [float(cost(torch.as_tensor(start[None]))[0])]
     found = minimize(
         cost.with_gradient,
         start,
@@ -118,12 +94,17 @@ def descend(cost: WeightedCost, start: np.ndarray, *, iterations: int = 100, tol
     end, gradient = np.asarray(found.x), np.asarray(found.jac)
     projected = end - np.clip(end - gradient, -1.0, 1.0)
     return Descent(
-        start.tolist(), end.tolist(), float(found.fun), history, float(np.abs(projected).max()), int(found.nfev)
+        start=cost.box.design(start),
+        end=cost.box.design(end),
+        cost=float(found.fun),
+        history=history,
+        projected_gradient=float(np.abs(projected).max()),
+        evaluations=int(found.nfev),
     )
 
 
 def starts_of(solver: GradientConfig, cost: WeightedCost) -> np.ndarray:
-    """Return the starts that a configuration asks for, in unit coordinates (n, d)."""
+    """Return the starts of a configuration in unit coordinates (n, d)."""
     if solver.starts == "corners":
         return cost.box.corners()
     if solver.starts == "reference":
@@ -131,37 +112,35 @@ def starts_of(solver: GradientConfig, cost: WeightedCost) -> np.ndarray:
     return cost.points[np.argsort(cost.costs, kind="stable")[: solver.count]]
 
 
-def optimise(config: OptimiseConfig, folder: str | Path | None = None) -> dict[str, Any]:
+def optimise(config: OptimiseConfig, folder: str | Path | None = None) -> GradientResult:
     """Descend from every start, and evaluate the best design on the surrogate and on FEM.
 
     Args:
-        config: with solver ``"gradient"``.
-        folder: where ``result.json``, the resolved configuration and a picture go, or None.
-
-    Returns:
-        ``best`` (design, cost and metrics by backend), ``descents`` and ``seconds``; lengths and all else are SI.
+        config: a configuration with solver ``"gradient"``.
+        folder: where ``result.json``, the resolved configuration and a picture go; None to write nothing.
 
     Raises:
-        ConfigError: if the weights have no exact gradients, the folder holds something else or another process is at
-            it, see `codesign.tools.folder.run_folder`.
-        WeightsError: if there are none.
+        ConfigError: if the weights have no exact gradients, or the folder cannot be used, see
+            `codesign.tools.folder.run_folder`.
+        WeightsError: if there are no weights.
         InfeasibleDesign: if the best design cannot be built for the check on FEM.
-        ConvergenceError: if it has no equilibrium there.
+        ConvergenceError: if the best design has no equilibrium on FEM.
     """
     if folder is None:
         return _optimise(config)[0]
-    from codesign.tools.plots import draw_descents
-
-    folder = Path(folder)
-    with run_folder(folder, config, "an optimisation", may_change=("name", "workers")):
-        result, cost, descents = _optimise(config)
-        write_json(folder / "result.json", {**provenance(), **result})
-        draw_descents(folder / "descents.png", cost, descents)
+    with run_folder(folder, config, "an optimisation", may_change=("name", "workers")) as place:
+        result, cost = _optimise(config)
+        write_json(place / "result.json", {**provenance(), **result.to_json()})
+        ends = [cost.box.unit(descent.end) for descent in result.descents]
+        with torch.no_grad():
+            reached = cost.metrics(cost.box.values(torch.tensor(np.array(ends)))).numpy()
+        metrics = [objective.find() for objective in config.objectives]
+        histories = [descent.history for descent in result.descents]
+        draw_descents(place / "descents.png", metrics, histories, cost.values, reached)
     return result
 
 
-def _optimise(config: OptimiseConfig) -> tuple[dict[str, Any], WeightedCost, list[Descent]]:
-    """Return what `optimise` does, the cost and the descents."""
+def _optimise(config: OptimiseConfig) -> tuple[GradientResult, WeightedCost]:
     solver = config.solver
     assert isinstance(solver, GradientConfig)
     bodies, box = config.bodies, config.bodies.box()
@@ -173,15 +152,7 @@ def _optimise(config: OptimiseConfig) -> tuple[dict[str, Any], WeightedCost, lis
     ]
     seconds = time.perf_counter() - began
     best = min(descents, key=lambda descent: descent.cost)
-    design = box.design(np.array(best.end))
-    # The backend, unlike the gradients, lets cables hang slack: it has the last word.
-    values = {name: bodies.evaluator(config.metrics, name)(design) for name in ("surrogate", "fem")[: 1 + solver.check]}
-    result: dict[str, Any] = {
-        "best": {"design": design, "cost": best.cost, **values},
-        "descents": [
-            asdict(d) | {"start": box.design(np.array(d.start)), "end": box.design(np.array(d.end))} for d in descents
-        ],
-        "grid": len(cost.points),
-        "seconds": seconds,
-    }
-    return result, cost, descents
+    # Unlike the gradients, the backend lets cables hang slack: its values count.
+    surrogate = bodies.evaluator(config.metrics, "surrogate")(best.end)
+    fem = bodies.evaluator(config.metrics, "fem")(best.end) if solver.check else None
+    return GradientResult(BestDesign(best.end, best.cost, surrogate, fem), descents, len(cost.points), seconds), cost

@@ -12,22 +12,22 @@ from typing import Literal
 
 import numpy as np
 
+from codesign.tools.contact import Plane, step_towards_plane
 from softgym_envs.backends import make_backend
-from softgym_envs.errors import DataError
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.errors import DataError, unknown_name
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
-
-__all__ = ["Measurements", "measure", "read_measurements", "write_measurements"]
 
 AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """N states of one body. What was not measured is NaN, whole columns at a time.
+    """N states of one body. Columns that were not measured are NaN.
 
     Attributes:
-        driven: what was imposed: ``"displacement"`` or ``"effort"`` of the actuators.
+        driven: which quantity of the actuators was imposed: ``"displacement"`` or ``"effort"``.
         displacement: of the actuators [m, ...], shape (N, n_a).
         effort: of the actuators [N, ...], shape (N, n_a).
         effector: positions [m], shape (N, 3 k) for k effectors.
@@ -43,16 +43,16 @@ class Measurements:
 
     @property
     def command(self) -> np.ndarray:
-        """What was imposed, shape (N, n_a)."""
+        """The imposed displacements or efforts, shape (N, n_a)."""
         return self.displacement if self.driven == "displacement" else self.effort
 
     def with_noise(self, relative: float, rng: np.random.Generator) -> Measurements:
-        """Return a copy with Gaussian noise on what was measured, not on what was imposed.
+        """Return a copy with Gaussian noise on the measured columns, not on the imposed ones.
 
         Args:
             relative: standard deviation, relative to the root mean square of the effectors' distances from their mean,
                 and of the efforts.
-            rng: of the noise.
+            rng: generator of the noise.
         """
         spread = np.sqrt(np.nanmean((self.effector - self.effector.mean(axis=0)) ** 2))
         noisy = replace(self, effector=self.effector + rng.normal(0.0, relative * spread, self.effector.shape))
@@ -63,7 +63,7 @@ class Measurements:
 
 
 def columns_of(robot: Robot) -> tuple[list[str], list[str], list[str]]:
-    """Names of the columns of displacements, efforts and effector coordinates."""
+    """Return the names of the columns of displacements, efforts and effector coordinates."""
     return (
         [f"{actuator.name}_displacement" for actuator in robot.actuators],
         [f"{actuator.name}_effort" for actuator in robot.actuators],
@@ -72,15 +72,15 @@ def columns_of(robot: Robot) -> tuple[list[str], list[str], list[str]]:
 
 
 def read_measurements(path: str | Path, robot: Robot) -> Measurements:
-    """Read measured states from a file, in SI: metres, newtons, cubic metres, pascals.
+    """Return measured states from a file, in SI units: metres, newtons, cubic metres, pascals.
 
     A CSV file has a header; a JSON file is a list of records, or an object of columns. The columns are
-    ``<actuator>_displacement`` or ``<actuator>_effort`` of every actuator (with both, displacements were imposed and
-    efforts measured), and ``<effector>_x``, ``_y``, ``_z``, those that were measured.
+    ``<actuator>_displacement`` or ``<actuator>_effort`` of every actuator, and those of ``<effector>_x``, ``_y`` and
+    ``_z`` that were measured. With displacements and efforts, the displacements were imposed and the efforts measured.
 
     Args:
-        path: ends with .csv or .json.
-        robot: what was measured.
+        path: file name that ends with .csv or .json.
+        robot: the measured robot.
 
     Raises:
         DataError: if the file is missing or malformed; the message names the column, the row and what is allowed.
@@ -88,7 +88,7 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
     path = Path(path)
     readers = {".csv": _read_csv, ".json": _read_json}
     if path.suffix not in readers:
-        raise DataError(f"measurements '{path}' must be a file that ends with {' or '.join(readers)}")
+        raise DataError(f"measurements '{path}' must end with {' or '.join(readers)}")
     try:
         table = readers[path.suffix](path)
     except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
@@ -97,10 +97,10 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
 
 
 def write_measurements(path: str | Path, robot: Robot, data: Measurements) -> None:
-    """Write a CSV file that `read_measurements` reads. Columns of NaN are left out."""
+    """Write a CSV file for `read_measurements`. Columns of NaN are left out."""
     names = [name for group in columns_of(robot) for name in group]
     table = np.column_stack([data.displacement, data.effort, data.effector])
-    if data.driven == "effort":  # a displacement beside it would mean that it was imposed
+    if data.driven == "effort":  # a column of displacements would mean that they were imposed
         table[:, : data.displacement.shape[1]] = np.nan
     kept = ~np.isnan(table).any(axis=0)
     with atomic_write(path, "w") as stream:
@@ -116,26 +116,36 @@ def measure(
     *,
     driven: Literal["displacement", "effort"] = "displacement",
     backend: str = "fem",
+    plane: Plane | None = None,
 ) -> Measurements:
-    """Simulate measured states.
+    """Return simulated measurements.
 
     Args:
-        robot: the family of bodies.
+        robot: the robot.
         design: the body; missing variables take their baseline.
         commands: imposed displacements or efforts, shape (N, n_a).
-        driven: which of them.
+        driven: whether displacements or efforts are imposed.
         backend: ``"fem"`` or ``"surrogate"``.
+        plane: a plane in the way of the first effector, on FEM.
 
     Raises:
+        ValueError: for a plane on a surrogate.
         DesignError: for a malformed design.
         InfeasibleDesign: if the geometry cannot exist.
         ConvergenceError: if an equilibrium is not found.
     """
     physics = make_backend(backend, robot, design=design)
-    states = [physics.step(np.asarray(command, dtype=float), driven) for command in commands]
+    imposed = [np.asarray(command, dtype=float) for command in commands]
+    if plane is None:
+        states = [physics.step(command, driven) for command in imposed]
+    elif isinstance(physics, FEMBackend):
+        rest = physics.state.effector[0]
+        states = [step_towards_plane(physics, command, driven, plane, rest) for command in imposed]
+    else:
+        raise ValueError(f"a plane needs backend 'fem', got '{backend}'")
     return Measurements(
         driven,
-        # What was imposed on a cable that hangs slack is not what it reached.
+        # A slack cable does not reach the imposed displacement.
         displacement=np.array([s.command if driven == "displacement" else s.displacement for s in states]),
         effort=np.array([state.effort for state in states]),
         effector=np.array([state.effector.ravel() for state in states]),
@@ -149,7 +159,7 @@ def _read_csv(path: Path) -> dict[str, list]:
         raise ValueError("it is empty")
     header = [name.strip() for name in rows[0]]
     if len(set(header)) != len(header):
-        raise ValueError(f"its header names a column twice: {', '.join(header)}")
+        raise ValueError(f"its header has a column twice: {', '.join(header)}")
     for number, row in enumerate(rows[1:], start=1):
         if len(row) != len(header):
             raise ValueError(f"row {number} has {len(row)} values, the header {len(header)}")
@@ -173,14 +183,44 @@ def _read_json(path: Path) -> dict[str, list]:
 
 def _checked(path: Path, table: dict[str, list], robot: Robot) -> Measurements:
     displacement, effort, effector = columns_of(robot)
-    known = [*displacement, *effort, *effector]
     where = f"measurements '{path}'"
+    found = _numbers(where, table, [*displacement, *effort, *effector])
+    driven: Literal["displacement", "effort"]
+    if all(name in table for name in displacement):
+        driven = "displacement"
+    elif all(name in table for name in effort):
+        driven = "effort"
+    else:
+        raise DataError(f"{where}: it needs the columns {', '.join(displacement)}, or {', '.join(effort)}")
+    given = [name for name in (displacement if driven == "effort" else effort) if name in table]
+    if given and (driven == "effort" or len(given) < len(effort)):
+        raise DataError(f"{where}: column '{given[0]}' is present, but not the same column of every actuator")
+    if not any(name in table for name in (*effector, *(effort if driven == "displacement" else ()))):
+        raise DataError(f"{where}: nothing was measured; give some of {', '.join(effector)}")
+    far = 10.0 * robot.size
+    for name in effector:
+        if name in table and np.abs(found[name]).max() > far:
+            raise DataError(
+                f"{where}: column '{name}' reaches {np.abs(found[name]).max():g} m, on a robot of {robot.size:g} m; "
+                "did you mean metres?"
+            )
+
+    def block(names: list[str]) -> np.ndarray:
+        return np.column_stack([found[name] for name in names])
+
+    data = Measurements(driven, block(displacement), block(effort), block(effector))
+    _check_imposed(where, data, robot)
+    return data
+
+
+def _numbers(where: str, table: dict[str, list], known: list[str]) -> dict[str, np.ndarray]:
+    """Return all known columns as numbers; those that the table lacks are NaN."""
     for name in table:
         if name not in known:
-            raise DataError(f"{where}: unknown column '{name}'; allowed: {', '.join(known)}")
+            raise DataError(f"{where}: {unknown_name('column', name, known)}")
     count = len(next(iter(table.values()), []))
     if count == 0:
-        raise DataError(f"{where}: it holds no states")
+        raise DataError(f"{where}: it contains no states")
     found = {name: np.full(count, np.nan) for name in known}
     for name, column in table.items():
         for k, entry in enumerate(column):
@@ -191,40 +231,21 @@ def _checked(path: Path, table: dict[str, list], robot: Robot) -> Measurements:
             if not math.isfinite(value):
                 raise DataError(f"{where}: column '{name}', row {k + 1}: {entry!r} is not a finite number")
             found[name][k] = value
-    driven: Literal["displacement", "effort"]
-    if all(name in table for name in displacement):
-        driven = "displacement"
-    elif all(name in table for name in effort):
-        driven = "effort"
-    else:
-        raise DataError(f"{where}: it needs the columns {', '.join(displacement)}, or {', '.join(effort)}")
-    given = [name for name in (displacement if driven == "effort" else effort) if name in table]
-    if given and (driven == "effort" or len(given) < len(effort)):
-        raise DataError(f"{where}: column '{given[0]}' is there, but not that of every actuator")
-    if not any(name in table for name in (*effector, *(effort if driven == "displacement" else ()))):
-        raise DataError(f"{where}: nothing was measured; give some of {', '.join(effector)}")
-    for k, actuator in enumerate(robot.actuators):
-        values = found[(displacement if driven == "displacement" else effort)[k]]
-        if driven == "displacement":
+    return found
+
+
+def _check_imposed(where: str, data: Measurements, robot: Robot) -> None:
+    """Raise DataError for an imposed displacement or effort that its actuator cannot have."""
+    for actuator, values in zip(robot.actuators, data.command.T, strict=True):
+        if data.driven == "displacement":
             low, high, unit = actuator.low, actuator.high, f" {actuator.unit}"
+            slack = 1e-6 * (high - low)
         else:
             low, high, unit = (0.0 if actuator.unilateral else -actuator.max_effort), actuator.max_effort, ""
-        slack = 1e-6 * (actuator.high - actuator.low) if driven == "displacement" else 0.0
+            slack = 0.0
         outside = np.flatnonzero((values < low - slack) | (values > high + slack))
         if len(outside):
             raise DataError(
-                f"{where}: {driven} {values[outside[0]]:g}{unit} of '{actuator.name}' in row {outside[0] + 1} is out "
-                f"of bounds; allowed: {low:g} to {high:g}{unit}"
+                f"{where}: {data.driven} {values[outside[0]]:g}{unit} of '{actuator.name}' in row {outside[0] + 1} is "
+                f"out of bounds; allowed: {low:g} to {high:g}{unit}"
             )
-    far = 10.0 * robot.size
-    for name in effector:
-        if name in table and np.abs(found[name]).max() > far:
-            raise DataError(
-                f"{where}: column '{name}' reaches {np.abs(found[name]).max():g} m, on a robot of {robot.size:g} m; "
-                "lengths are in metres"
-            )
-
-    def block(names: list[str]) -> np.ndarray:
-        return np.column_stack([found[name] for name in names])
-
-    return Measurements(driven, block(displacement), block(effort), block(effector))

@@ -1,7 +1,7 @@
-"""What a body is worth, read from its condensed model along one actuation: one formula for all backends.
+"""Metrics of a body without a controller, read from its condensed model along one actuation.
 
-A formula takes a `Course`, the states of a batch of bodies from rest to the full command, as tensors. On the surrogate
-they carry gradients with respect to the design; from FEM they are numbers.
+A metric of the suite is one formula for all backends. It takes a `Course`: the states of a batch of bodies from rest to
+the full command, as tensors. On the surrogate they carry gradients with respect to the design.
 """
 
 from __future__ import annotations
@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-__all__ = ["METRICS", "Course", "Metric"]
+from softgym_envs.errors import unknown_name
+from softgym_envs.registry import import_object
+
+Direction = Literal["maximize", "minimize"]
 
 
 @dataclass(frozen=True)
@@ -27,8 +30,8 @@ class Course:
         effector: effector positions [m], shape (K, B, n_e).
         compliance: W, actuators before effectors, shape (K, B, n_a + n_e, n_a + n_e).
         axis: coordinate along which the body lies at rest: 0, 1 or 2.
-        sensor: volumes of the cavities [m3], shape (K, B, n_s), where the body has any.
-        material: volume of the solid [m3], shape (B,), where it is known.
+        sensor: volumes of the cavities [m3], shape (K, B, n_s), if the body has cavities.
+        material: volume of the solid [m3], shape (B,), on FEM.
     """
 
     displacement: Tensor
@@ -46,7 +49,7 @@ class Course:
 
     @property
     def jacobian(self) -> Tensor:
-        """Motion of the first effector per actuator displacement, ``W_ea W_aa^-1``, shape (K, B, 3, n_a)."""
+        """Displacement of the first effector per actuator displacement, ``W_ea W_aa^-1``, shape (K, B, 3, n_a)."""
         n = self.effort.shape[-1]
         return torch.linalg.solve(self.compliance[..., :n, :n], self.compliance[..., n : n + 3, :n], left=False)
 
@@ -58,97 +61,98 @@ class Course:
 
 
 def bending_angle(course: Course) -> Tensor:
-    """Eq. 4.15: ``acos(|p_z| / |p(0)|)`` of the tip, with z the axis of the body."""
+    """Return the angle ``acos(|p_z| / |p(0)|)`` of the tip, with z the axis of the body (thesis, eq. 4.15)."""
     tip = course.effector[..., :3]
     return torch.acos((tip[-1, :, course.axis].abs() / tip[0].norm(dim=-1)).clamp(max=1.0))
 
 
 def angular_displacement(course: Course) -> Tensor:
-    """Eq. 3.3: ``acos(|p_z| / |p|)`` of the tip, with z the axis of the body."""
+    """Return the angle ``acos(|p_z| / |p|)`` of the tip, with z the axis of the body (thesis, eq. 3.3)."""
     tip = course.effector[-1, :, :3]
     return torch.acos((tip[:, course.axis].abs() / tip.norm(dim=-1)).clamp(max=1.0))
 
 
-def across(course: Course) -> Tensor:
-    """Direction of the tip's way across the axis of the body, shape (B, 3)."""
-    way = course.travel[-1].clone()
-    way[:, course.axis] = 0.0
-    return way / way.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+def _across(course: Course) -> Tensor:
+    """Return the direction in which the tip moves sideways, perpendicular to the axis of the body, shape (B, 3)."""
+    sideways = course.travel[-1].clone()
+    sideways[:, course.axis] = 0.0
+    return sideways / sideways.norm(dim=-1, keepdim=True).clamp(min=1e-12)
 
 
 def contact_force(course: Course) -> Tensor:
-    """Eq. 4.16 and 4.17: force on the tip, blocked in all directions, along its way across the body.
+    """Return the sideways force on a tip that is blocked in all directions (thesis, eq. 4.16 and 4.17).
 
-    The tip is the contact point and ``delta_c`` counts from its rest position; the tangent at the free state says what
-    it takes to bring the tip back. The thesis reads the component y, in which its finger bends. Against the equilibrium
-    with a blocked tip the force along the body is far off, for the tangent does not know that it buckles or stretches.
+    The tip is the contact point, and ``delta_c`` is measured from its rest position. The tangent at the free state
+    gives the force that brings the tip back. The thesis takes the component y, in which its finger bends. The force
+    along the body differs widely from the equilibrium with a blocked tip, because the tangent ignores buckling and
+    stretching.
     """
-    return (torch.linalg.solve(course.held[-1], course.travel[-1]) * across(course)).sum(-1).abs()
+    return (torch.linalg.solve(course.held[-1], course.travel[-1]) * _across(course)).sum(-1).abs()
 
 
-def normal_forces(course: Course) -> Tensor:
-    """Eq. 4.16 for a tip blocked along its way across the body alone, at every state [N], shape (K, B)."""
-    way = across(course)
-    return ((course.travel * way).sum(-1) / torch.einsum("bi,kbij,bj->kb", way, course.held, way)).abs()
+def _normal_forces(course: Course) -> Tensor:
+    """Return the force on a tip that is blocked sideways only, at every state [N], shape (K, B)."""
+    sideways = _across(course)
+    return ((course.travel * sideways).sum(-1) / torch.einsum("bi,kbij,bj->kb", sideways, course.held, sideways)).abs()
 
 
 def normal_force(course: Course) -> Tensor:
-    """Eq. 4.16 for a contact without friction: force on the tip, blocked along its way across the body alone."""
-    return normal_forces(course)[-1]
+    """Return the force on a tip that is blocked sideways only: eq. 4.16 of the thesis without friction."""
+    return _normal_forces(course)[-1]
 
 
 def grasp_resistance(course: Course) -> Tensor:
-    """Eq. 3.11 with the normal force: the least effort per force along the actuation."""
+    """Return the smallest actuator effort per normal force along the actuation (thesis, eq. 3.11)."""
     effort = course.effort[1:].abs().amax(dim=-1)
-    return (effort / normal_forces(course)[1:].clamp(min=1e-12)).amin(dim=0)
+    return (effort / _normal_forces(course)[1:].clamp(min=1e-12)).amin(dim=0)
 
 
 def travel(course: Course) -> Tensor:
-    """How far the effector moves."""
+    """Return how far the effector moves."""
     return course.travel[-1].norm(dim=-1)
 
 
 def manipulability(course: Course) -> Tensor:
-    """Yoshikawa's measure of the effector's Jacobian: the product of its singular values."""
+    """Return Yoshikawa's manipulability: the product of the singular values of the effector's Jacobian."""
     return torch.linalg.svdvals(course.jacobian[-1]).prod(dim=-1)
 
 
 def tip_stiffness(course: Course) -> Tensor:
-    """Smallest stiffness of the effector in any direction, with held actuators."""
+    """Return the smallest stiffness of the effector in any direction, with held actuators."""
     return 1.0 / torch.linalg.eigvalsh(course.held[-1])[:, -1]
 
 
 def effort(course: Course) -> Tensor:
-    """Largest effort of an actuator at the full command."""
+    """Return the largest effort of an actuator at the full command."""
     return course.effort[-1].abs().amax(dim=-1)
 
 
 def work(course: Course) -> Tensor:
-    """Work of the actuators from rest, by the trapezoidal rule: the integral behind eq. 3.12."""
+    """Return the work of the actuators from rest: the integral in eq. 3.12 of the thesis, by the trapezoidal rule."""
     mean = 0.5 * (course.effort[1:] + course.effort[:-1])
     return (mean * course.displacement.diff(dim=0)).sum(dim=(0, 2))
 
 
 def material_volume(course: Course) -> Tensor:
-    """Volume of the solid."""
+    """Return the volume of the solid."""
     assert course.material is not None
     return course.material
 
 
 def volume_change(course: Course) -> Tensor:
-    """Eq. 3.3: the change of the first cavity's volume."""
+    """Return the change of the first cavity's volume (thesis, eq. 3.3)."""
     assert course.sensor is not None
     return (course.sensor[-1, :, 0] - course.sensor[0, :, 0]).abs()
 
 
 def relative_volume_change(course: Course) -> Tensor:
-    """Eq. 3.4: that change relative to the actuated volume, the relative change of pressure when it is closed."""
+    """Return the volume change relative to the actuated volume: the pressure change of a closed cavity (eq. 3.4)."""
     assert course.sensor is not None
     return volume_change(course) / course.sensor[-1, :, 0]
 
 
 def cavity_volume(course: Course) -> Tensor:
-    """Eq. 3.4: the first cavity's volume at rest."""
+    """Return the first cavity's volume at rest (thesis, eq. 3.4)."""
     assert course.sensor is not None
     return course.sensor[0, :, 0]
 
@@ -158,45 +162,118 @@ class Metric:
     """One number of a body.
 
     Args:
-        formula: its values (B,) from a `Course`.
-        unit: of the value.
-        better: what a designer usually wants of it.
-        needs: ``"sensors"``: a body with sensing cavities, on FEM; ``"body"``: a meshed body, on FEM; ``"states"``: a
-            surrogate is enough.
+        name: identifier, as in configurations and tables.
+        function: ``Course -> values`` of shape (B,); with ``needs="design"``, ``{variable: value} -> value``.
+        unit: SI unit, or ``"1"``.
+        direction: what a designer usually wants: ``"maximize"`` or ``"minimize"``.
+        needs: ``"states"``: any backend; ``"body"``: a meshed body, on FEM; ``"sensors"``: sensing cavities, on
+            FEM; ``"design"``: the values of the variables alone.
+        description: one line for tables; default: the first line of the function's documentation.
     """
 
-    formula: Callable[[Course], Tensor]
+    name: str
+    function: Callable[[Any], Any]
     unit: str
-    better: Literal["larger", "smaller"]
-    needs: Literal["states", "body", "sensors"] = "states"
+    direction: Direction
+    needs: Literal["states", "body", "sensors", "design"] = "states"
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        if self.direction not in ("maximize", "minimize"):
+            raise ValueError(f"metric '{self.name}': direction = {self.direction!r}; allowed: maximize, minimize")
+        if self.needs not in ("states", "body", "sensors", "design"):
+            raise ValueError(f"metric '{self.name}': needs = {self.needs!r}; allowed: states, body, sensors, design")
+        if not self.description:
+            object.__setattr__(self, "description", (self.function.__doc__ or self.name).splitlines()[0])
+
+    def __call__(self, argument: Any) -> Any:
+        """Return what the function returns."""
+        return self.function(argument)
 
     @property
-    def description(self) -> str:
-        """First line of the formula's documentation."""
-        return (self.formula.__doc__ or "").splitlines()[0]
+    def display_unit(self) -> str:
+        """The unit in which people read the metric."""
+        return _DISPLAY.get(self.unit, (1.0, self.unit))[1]
 
-    def shown(self, value: float) -> tuple[float, str]:
-        """Return a value as people read it, and its unit."""
-        scale, unit = SHOWN.get(self.unit, (1.0, self.unit))
-        return scale * value, unit
+    @property
+    def display_scale(self) -> float:
+        """The factor from SI to the display unit."""
+        return _DISPLAY.get(self.unit, (1.0, self.unit))[0]
+
+    @property
+    def label(self) -> str:
+        """The name in words, with the display unit."""
+        words = self.name.replace("_", " ")
+        return words if self.display_unit == "1" else f"{words} [{self.display_unit}]"
 
 
-SHOWN = {"m": (1e3, "mm"), "m3": (1e9, "mm3"), "rad": (180.0 / math.pi, "deg"), "J": (1e3, "mJ")}
+_DISPLAY = {"m": (1e3, "mm"), "m3": (1e9, "mm3"), "rad": (180.0 / math.pi, "deg"), "J": (1e3, "mJ")}
 
 METRICS: dict[str, Metric] = {
-    "bending_angle": Metric(bending_angle, "rad", "larger"),
-    "angular_displacement": Metric(angular_displacement, "rad", "larger"),
-    "contact_force": Metric(contact_force, "N", "larger"),
-    "normal_force": Metric(normal_force, "N", "larger"),
-    "grasp_resistance": Metric(grasp_resistance, "effort/N", "smaller"),
-    "travel": Metric(travel, "m", "larger"),
-    "manipulability": Metric(manipulability, "1", "larger"),
-    "tip_stiffness": Metric(tip_stiffness, "N/m", "larger"),
-    "effort": Metric(effort, "effort", "smaller"),
-    "work": Metric(work, "J", "smaller"),
-    "material_volume": Metric(material_volume, "m3", "smaller", needs="body"),
-    "volume_change": Metric(volume_change, "m3", "larger", needs="sensors"),
-    "relative_volume_change": Metric(relative_volume_change, "1", "larger", needs="sensors"),
-    "cavity_volume": Metric(cavity_volume, "m3", "larger", needs="sensors"),
+    metric.name: metric
+    for metric in (
+        Metric("bending_angle", bending_angle, "rad", "maximize"),
+        Metric("angular_displacement", angular_displacement, "rad", "maximize"),
+        Metric("contact_force", contact_force, "N", "maximize"),
+        Metric("normal_force", normal_force, "N", "maximize"),
+        Metric("grasp_resistance", grasp_resistance, "effort/N", "minimize"),
+        Metric("travel", travel, "m", "maximize"),
+        Metric("manipulability", manipulability, "1", "maximize"),
+        Metric("tip_stiffness", tip_stiffness, "N/m", "maximize"),
+        Metric("effort", effort, "effort", "minimize"),
+        Metric("work", work, "J", "minimize"),
+        Metric("material_volume", material_volume, "m3", "minimize", needs="body"),
+        Metric("volume_change", volume_change, "m3", "maximize", needs="sensors"),
+        Metric("relative_volume_change", relative_volume_change, "1", "maximize", needs="sensors"),
+        Metric("cavity_volume", cavity_volume, "m3", "maximize", needs="sensors"),
+    )
 }
-"""Registry: name to metric."""
+"""Metrics of the suite by name."""
+
+
+def design_metric(unit: str, direction: Direction) -> Callable[[Callable[[Any], float]], Metric]:
+    """Return a decorator that makes a metric of a function of the design.
+
+    The decorated function takes ``{variable: value}`` [SI], with all variables of the body, and returns a number. Name
+    it in a configuration as ``my_module:my_function``::
+
+        @design_metric(unit="kg", direction="minimize")
+        def mass(design):
+            return 1.1e3 * design["length"] * design["height"] ** 2
+    """
+    return lambda function: Metric(getattr(function, "__name__", "metric"), function, unit, direction, needs="design")
+
+
+def find_metric(name: str | Metric) -> Metric:
+    """Return a metric by its name or its path ``"my_module:my_metric"``; a metric is returned as it is.
+
+    Raises:
+        ValueError: for an unknown name, or a path that does not lead to a metric.
+    """
+    if isinstance(name, Metric):
+        return name
+    if name in METRICS:
+        return METRICS[name]
+    if ":" not in name:
+        raise ValueError(unknown_name("metric", name, METRICS) + ", or a metric of your own as my_module:my_metric")
+    found = import_object("metric", name)
+    if not isinstance(found, Metric):
+        raise ValueError(
+            f"metric '{name}' is a {type(found).__name__} without a unit; decorate the function with "
+            "@design_metric(unit=..., direction=...), or make it a Metric"
+        )
+    return found
+
+
+def find_metrics(names: tuple[str | Metric, ...]) -> tuple[Metric, ...]:
+    """Return several metrics; see `find_metric`.
+
+    Raises:
+        ValueError: also for two metrics with the same name.
+    """
+    metrics = tuple(find_metric(name) for name in names)
+    shown = [metric.name for metric in metrics]
+    repeated = [name for name in shown if shown.count(name) > 1]
+    if repeated:
+        raise ValueError(f"metric '{repeated[0]}' is named twice")
+    return metrics

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,50 +14,14 @@ from codesign.sampling import make_sampler
 from codesign.tools.config import OptimiseConfig, SearchConfig
 from codesign.tools.evaluation import Evaluation, evaluate_each
 from codesign.tools.folder import run_folder
+from codesign.tools.plots import draw_front
+from codesign.tools.records import FrontDesign, SearchResult
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.storage import atomic_write, drop_torn_line, write_json
 
 if TYPE_CHECKING:
     import optuna
-
-
-@dataclass(frozen=True)
-class FrontDesign:
-    """A design that no other design of a search beats in every objective.
-
-    Attributes:
-        trial: number of its trial.
-        design: complete design [SI].
-        metrics: its metrics [SI].
-    """
-
-    trial: int
-    design: dict[str, float]
-    metrics: dict[str, float]
-
-
-@dataclass(frozen=True)
-class SearchResult:
-    """Result of a search.
-
-    Attributes:
-        front: the non-dominated designs sorted by the first objective; the one best design for a single objective.
-        feasible: number of designs with metrics.
-        infeasible: number of designs without.
-        repeated: number of proposals of a design that was known already.
-        busy_seconds: evaluation time, summed over all processes.
-    """
-
-    front: list[FrontDesign]
-    feasible: int
-    infeasible: int
-    repeated: int
-    busy_seconds: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain data."""
-        return asdict(self)
 
 
 def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True) -> SearchResult:
@@ -76,15 +40,13 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
         ConfigError: if the folder cannot be used, see `codesign.tools.folder.run_folder`.
         ConvergenceError: if no design is feasible.
     """
-    from codesign.tools.plots import draw_front
-
     with run_folder(folder, config, "a search", may_change=("name", "workers", "solver.trials")) as place:
         study = _Search(config, place)
         study.run(progress)
         result, values, front = study.result()
         write_json(place / "result.json", {**provenance(), **result.to_json()})
         study.write_table(place / "trials.csv")
-        draw_front(place / "front.png", config.metrics, values, front)
+        draw_front(place / "front.png", [o.find() for o in config.objectives], values, front)
     return result
 
 
@@ -187,13 +149,13 @@ class _Search:
         self._study._storage.set_trial_user_attr(trial._trial_id, "evaluation", evaluation.to_json())
         if evaluation.feasible:
             objectives = self.config.objectives
-            self._study.tell(trial.number, [float(o.cost(evaluation.metrics[o.metric])) for o in objectives])
+            self._study.tell(trial.number, [float(o.cost(evaluation.metrics[o.find().name])) for o in objectives])
         else:
             self._study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
 
     def result(self) -> tuple[SearchResult, np.ndarray, np.ndarray]:
         """Return the result, the metrics (n, m) [SI] of all feasible designs, and the indices of the front in them."""
-        names = self.config.metrics
+        names = [objective.find().name for objective in self.config.objectives]
         evaluations = [_evaluation(trial) for trial in self.trials()]
         feasible = [trial for trial in self.trials() if trial.values is not None]
         if not feasible:
@@ -224,7 +186,7 @@ class _Search:
 
     def write_table(self, path: Path) -> None:
         """Write a CSV file with one row per trial."""
-        names = self.config.metrics
+        names = [objective.find().name for objective in self.config.objectives]
         with atomic_write(path, "w") as stream:
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(["trial", *self.box.names, *names, "infeasible", "seconds"])

@@ -1,6 +1,6 @@
-"""Which design variables matter: one at a time (eq. 3.1), Morris' elementary effects, Sobol's variances (SALib).
+"""Which design variables matter: one at a time (thesis, eq. 3.1), Morris' elementary effects, Sobol's indices (SALib).
 
-Samples lie evenly in the unit coordinates of the design space: logarithmic variables on their logarithm.
+Samples are uniform in the unit coordinates of the box: logarithmic variables are uniform in their logarithm.
 """
 
 from __future__ import annotations
@@ -11,23 +11,31 @@ from typing import Any
 
 import numpy as np
 
-from codesign.tools.bodies import Box, Evaluator
+from codesign.tools.bodies import Evaluator
+from codesign.tools.box import Box
 from codesign.tools.config import SensitivityConfig
 from codesign.tools.evaluation import Evaluation, evaluate_each
 from codesign.tools.folder import run_folder
+from codesign.tools.metrics import find_metric
+from codesign.tools.plots import draw_sensitivity
+from codesign.tools.records import SensitivityResult
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
 from softgym_envs.storage import JsonLines, write_json
 
 Table = dict[str, dict[str, float]]
-"""Indices of each variable."""
+"""Indices by variable."""
 
-GROUPS: dict[str, Callable[[int], int]] = {"oat": lambda d: 1, "morris": lambda d: d + 1, "sobol": lambda d: d + 2}
-"""How many samples belong together with d variables: each stands alone, a trajectory, a block of Saltelli's."""
+GROUP_SIZES: dict[str, Callable[[int], int]] = {
+    "oat": lambda d: 1,  # every sample alone
+    "morris": lambda d: d + 1,  # a trajectory
+    "sobol": lambda d: d + 2,  # a block of Saltelli's scheme
+}
+"""Number of samples that belong together, for d variables."""
 
 
 def one_at_a_time(points: np.ndarray, values: np.ndarray, box: Box) -> Table:
-    """Indices of eq. 3.1: the range of a metric along one variable over its range along all, in percent.
+    """Return the range of a metric along each variable, in percent of its range over all samples (thesis, eq. 3.1).
 
     Args:
         points: unit coordinates (n, d): the reference first, then ``levels`` points along each variable.
@@ -35,8 +43,8 @@ def one_at_a_time(points: np.ndarray, values: np.ndarray, box: Box) -> Table:
         box: the designs.
 
     Returns:
-        ``share`` [%], ``low`` and ``high`` (the metric's extremes along the variable, the reference included) and
-        ``infeasible`` designs, for each variable.
+        For each variable, ``share`` [%], ``low`` and ``high`` (extremes of the metric along the variable, the reference
+        included), and the number of ``infeasible`` designs.
     """
     levels = (len(points) - 1) // len(box)
     spread = float(np.nanmax(values) - np.nanmin(values))
@@ -55,23 +63,23 @@ def one_at_a_time(points: np.ndarray, values: np.ndarray, box: Box) -> Table:
 
 
 def morris(points: np.ndarray, values: np.ndarray, box: Box, levels: int, confidence: float, seed: int) -> Table:
-    """Morris' elementary effects: changes of the metric per change of a variable by its whole range.
+    """Return Morris' elementary effects: changes of a metric when a variable changes by its whole range.
 
     Args:
         points: unit coordinates (n, d): trajectories of d + 1 points. Those with an infeasible design are left out.
         values: the metric there, shape (n,); NaN where a design is infeasible.
         box: the designs.
-        levels: of the grid.
+        levels: number of levels of the grid.
         confidence: level of the intervals.
-        seed: of their bootstrap.
+        seed: seed of their bootstrap.
 
     Returns:
-        ``mu`` (mean), ``mu_star`` (mean of the absolute values), ``sigma`` (standard deviation: how much a variable
-        acts through others or not in proportion) and ``mu_star_interval`` (half width), for each variable.
+        For each variable, ``mu`` (mean), ``mu_star`` (mean of the absolute values), ``sigma`` (standard deviation,
+        large for interactions and nonlinear effects) and ``mu_star_interval`` (half width).
     """
     from SALib.analyze import morris as salib
 
-    kept = _whole_blocks(values, GROUPS["morris"](len(box)))
+    kept = _in_whole_groups(values, GROUP_SIZES["morris"](len(box)))
     found = salib.analyze(
         _problem(box), 0.5 * (points[kept] + 1.0), values[kept], conf_level=confidence, num_levels=levels, seed=seed
     )
@@ -80,23 +88,23 @@ def morris(points: np.ndarray, values: np.ndarray, box: Box, levels: int, confid
 
 
 def sobol(values: np.ndarray, box: Box, confidence: float, seed: int) -> Table:
-    """Sobol's indices: shares of the variance of the metric over the box.
+    """Return Sobol's indices: shares of the variance of a metric over the box.
 
     Args:
-        values: the metric at Saltelli's samples, shape (n (d + 2),); NaN where a design is infeasible. Blocks with one
-            are left out: the others are no longer independent samples of the variables, so that the shares are biased,
-            by more the fewer blocks are left.
+        values: the metric at Saltelli's samples, shape (n (d + 2),); NaN where a design is infeasible. Blocks with an
+            infeasible design are left out. The variables of the other blocks are no longer independent, which biases
+            the shares, more so the fewer blocks are left.
         box: the designs.
         confidence: level of the intervals.
-        seed: of their bootstrap.
+        seed: seed of their bootstrap.
 
     Returns:
-        ``first`` (of the variable alone) and ``total`` (with all its interactions), and the half widths of their
-        intervals, for each variable.
+        For each variable, ``first`` (effect of the variable alone), ``total`` (with all its interactions), and the half
+        widths of their intervals.
     """
     from SALib.analyze import sobol as salib
 
-    kept = _whole_blocks(values, GROUPS["sobol"](len(box)))
+    kept = _in_whole_groups(values, GROUP_SIZES["sobol"](len(box)))
     found = salib.analyze(
         _problem(box), values[kept], calc_second_order=False, conf_level=confidence, seed=seed, print_to_console=False
     )
@@ -108,14 +116,9 @@ def _problem(box: Box) -> dict[str, Any]:
     return {"num_vars": len(box), "names": list(box.names), "bounds": [[0.0, 1.0]] * len(box)}
 
 
-def _whole(values: np.ndarray, size: int) -> np.ndarray:
-    """Which blocks of ``size`` samples (n,) are feasible throughout, shape (n / size,)."""
-    return ~np.isnan(values.reshape(-1, size)).any(axis=1)
-
-
-def _whole_blocks(values: np.ndarray, size: int) -> np.ndarray:
-    """Which samples (n,) belong to blocks of ``size`` samples that are all feasible."""
-    whole = _whole(values, size)
+def _in_whole_groups(values: np.ndarray, size: int) -> np.ndarray:
+    """Return which samples (n,) belong to groups of ``size`` samples that are all feasible."""
+    whole = ~np.isnan(values.reshape(-1, size)).any(axis=1)
     if whole.sum() < 2:
         raise ConvergenceError(f"only {whole.sum()} of {len(whole)} groups of samples are feasible; narrow the bounds")
     return np.repeat(whole, size)
@@ -179,33 +182,29 @@ def evaluate_all(
     return [found[k] for k in range(len(designs))]
 
 
-def analyse(config: SensitivityConfig, folder: str | Path, *, progress: bool = True) -> dict[str, Any]:
-    """Evaluate the samples of a study and compute its indices; goes on where it was stopped.
+def analyse_sensitivity(config: SensitivityConfig, folder: str | Path, *, progress: bool = True) -> SensitivityResult:
+    """Evaluate the samples of a study and compute its indices; continues a study that was interrupted.
 
     Args:
         config: the study.
         folder: where ``evaluations.jsonl``, ``result.json``, the resolved configuration and a picture go.
-        progress: show a bar.
-
-    Returns:
-        ``indices`` (``{metric: {variable: {index: value}}}``, see `one_at_a_time`, `morris` and `sobol`), ``designs``,
-        ``infeasible``, ``groups_kept`` (share of the trajectories or blocks without an infeasible design, of which the
-        indices are) and ``seconds`` of evaluation over all processes.
+        progress: show a progress bar.
 
     Raises:
-        ConfigError: if SALib is not installed (``morris``, ``sobol``), or the folder holds something else or another
-            process is at it, see `codesign.tools.folder.run_folder`.
+        ConfigError: if SALib is not installed (``morris``, ``sobol``), or the folder cannot be used, see
+            `codesign.tools.folder.run_folder`.
         DataError: if a line of ``evaluations.jsonl`` is damaged.
         ConvergenceError: if too few designs are feasible.
     """
-    folder = Path(folder)
-    with run_folder(folder, config, "a sensitivity study", may_change=("name", "workers")):
-        return _analyse(config, folder, progress)
+    with run_folder(folder, config, "a sensitivity study", may_change=("name", "workers")) as place:
+        result = _analyse(config, place, progress)
+        write_json(place / "result.json", {**provenance(), **result.to_json()})
+        metrics = [find_metric(name) for name in config.metrics]
+        draw_sensitivity(place / "sensitivity.png", config.method, metrics, result.indices)
+    return result
 
 
-def _analyse(config: SensitivityConfig, folder: Path, progress: bool) -> dict[str, Any]:
-    from codesign.tools.plots import draw_sensitivity
-
+def _analyse(config: SensitivityConfig, folder: Path, progress: bool) -> SensitivityResult:
     box = config.bodies.box()
     try:
         points = sample(config, box)
@@ -213,33 +212,30 @@ def _analyse(config: SensitivityConfig, folder: Path, progress: bool) -> dict[st
         raise ConfigError(
             f"method '{config.method}' needs SALib ({error}): pip install 'softgym-envs[design]'"
         ) from None
-    records = evaluate_all(
+    evaluations = evaluate_all(
         config.bodies.evaluator(config.metrics),
         [box.design(point) for point in points],
         folder / "evaluations.jsonl",
         workers=config.workers,
         progress=progress,
     )
-    if config.method == "oat" and not records[0].feasible:
-        raise ConvergenceError(f"the reference design is not feasible: {records[0].infeasible}")
-    lost = np.array([0.0 if record.feasible else np.nan for record in records])
-    tables: dict[str, Table] = {}
-    for metric in config.metrics:
-        values = np.array([record.metrics.get(metric, np.nan) for record in records])
+    if config.method == "oat" and not evaluations[0].feasible:
+        raise ConvergenceError(f"the reference design is infeasible: {evaluations[0].infeasible}")
+    indices: dict[str, Table] = {}
+    for metric in map(find_metric, config.metrics):
+        values = np.array([evaluation.metrics.get(metric.name, np.nan) for evaluation in evaluations])
         if config.method == "oat":
-            tables[metric] = one_at_a_time(points, values, box)
+            indices[metric.name] = one_at_a_time(points, values, box)
         elif config.method == "morris":
-            tables[metric] = morris(points, values, box, config.levels, config.confidence, config.seed)
+            indices[metric.name] = morris(points, values, box, config.levels, config.confidence, config.seed)
         else:
-            tables[metric] = sobol(values, box, config.confidence, config.seed)
-    result: dict[str, Any] = {
-        "method": config.method,
-        "indices": tables,
-        "designs": len(records),
-        "infeasible": sum(not record.feasible for record in records),
-        "groups_kept": float(_whole(lost, GROUPS[config.method](len(box))).mean()),
-        "seconds": sum(record.seconds for record in records),
-    }
-    write_json(folder / "result.json", {**provenance(), **result})
-    draw_sensitivity(folder / "sensitivity.png", config.method, tables)
-    return result
+            indices[metric.name] = sobol(values, box, config.confidence, config.seed)
+    feasible = np.array([evaluation.feasible for evaluation in evaluations])
+    return SensitivityResult(
+        method=config.method,
+        indices=indices,
+        designs=len(evaluations),
+        infeasible=int((~feasible).sum()),
+        groups_kept=float(feasible.reshape(-1, GROUP_SIZES[config.method](len(box))).all(axis=1).mean()),
+        seconds=sum(evaluation.seconds for evaluation in evaluations),
+    )

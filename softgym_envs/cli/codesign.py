@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -51,20 +50,20 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
     The method is one at a time, Morris or Sobol. An interrupted run continues where it stopped.
     """
     from codesign.tools.config import SensitivityConfig
-    from codesign.tools.sensitivity import analyse
+    from codesign.tools.sensitivity import analyse_sensitivity
     from softgym_envs.config import load_config
 
     study = load_config(config, SensitivityConfig, overrides)
     folder = Path("results") / study.name if folder is None else folder
     with options.resumable():
-        result = analyse(study, folder, progress=not quiet)
-    for metric, table in result["indices"].items():
+        result = analyse_sensitivity(study, folder, progress=not quiet)
+    for metric, table in result.indices.items():
         keys = list(next(iter(table.values())))
         click.echo(f"\n{metric:24s} " + " ".join(f"{key:>16s}" for key in keys))
         for variable, row in table.items():
             click.echo(f"  {variable:22s} " + " ".join(f"{row[key]:16.5g}" for key in keys))
-    kept = f" ({100 * result['groups_kept']:.0f} % of the sample groups remain)" if result["infeasible"] else ""
-    click.echo(f"\n{result['designs']} designs, {result['infeasible']} infeasible{kept}; wrote {folder}")
+    kept = f" ({100 * result.groups_kept:.0f} % of the sample groups remain)" if result.infeasible else ""
+    click.echo(f"\n{result.designs} designs, {result.infeasible} infeasible{kept}; wrote {folder}")
 
 
 @click.command()
@@ -84,14 +83,14 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
     folder = Path("results") / study.name if folder is None else folder
     if study.solver.method == "gradient":
         result = gradient.optimise(study, folder)
-        click.echo(json.dumps(result["best"], indent=2))
-        click.echo(f"{len(result['descents'])} descents, {result['seconds']:.2f} s; wrote {folder}")
+        click.echo(json.dumps(result.best.to_json(), indent=2))
+        click.echo(f"{len(result.descents)} descents, {result.seconds:.2f} s; wrote {folder}")
         return
     with options.resumable():
         found = search(study, folder, progress=not quiet)
     ends = found.front[:1] if len(study.objectives) == 1 else [found.front[0], found.front[-1]]
     for row in ends:
-        click.echo(json.dumps(asdict(row)))
+        click.echo(json.dumps(row.to_json()))
     click.echo(
         f"{len(found.front)} designs on the front of {found.feasible} feasible and {found.infeasible} infeasible "
         f"designs; wrote {folder}"
@@ -111,17 +110,17 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
     study = load_config(config, CalibrationConfig, overrides)
     folder = Path("results") / study.name if folder is None else folder
     result = run(study, folder)
-    for name in study.fit:
-        value, ends = result["design"][name], (result["interval"] or {}).get(name)
+    for name, value in {**{name: result.design[name] for name in study.fit}, **result.nuisances}.items():
+        ends = (result.intervals or {}).get(name)
         text = f"{name} = {value:.6g}"
         if ends is not None and ends[1] > ends[0]:
             # Enough digits to distinguish the ends.
             digits = max(6, 2 - math.floor(math.log10((ends[1] - ends[0]) / (abs(value) or 1.0))))
-            text += f", {100 * result['level']:g} % interval {ends[0]:.{digits}g} to {ends[1]:.{digits}g}"
+            text += f", {100 * (result.level or 0.0):g} % interval {ends[0]:.{digits}g} to {ends[1]:.{digits}g}"
         elif ends is not None:
             text += ", no interval: the model fits the data exactly"
-        if name in result["at_bound"]:
+        if name in result.at_bound:
             text += "; at its bound: the best fit may lie outside the bounds"
         click.echo(text)
-    errors = ", ".join(f"{name} {value:.3g}" for name, value in result["errors"].items())
-    click.echo(f"root mean square errors: {errors} [SI]; {result['seconds']:.1f} s; wrote {folder}")
+    errors = ", ".join(f"{name} {value:.3g}" for name, value in result.errors.items())
+    click.echo(f"root mean square errors: {errors} [SI]; {result.seconds:.1f} s; wrote {folder}")

@@ -7,17 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.tools.bodies import Box
-from codesign.tools.calibration import (
-    Coordinates,
-    LearnedMisfit,
-    Misfit,
-    calibrate,
-    fit_gradient,
-    profile_interval,
-)
+from codesign.tools.box import Box
+from codesign.tools.calibration import calibrate, fit_gradient, profile_interval
 from codesign.tools.config import CalibrationConfig
 from codesign.tools.measurements import Measurements, measure, read_measurements, write_measurements
+from codesign.tools.misfit import LearnedMisfit, Misfit
+from codesign.tools.parameters import Parameters
 from softgym_envs.config import check_config
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.robots import make_robot
@@ -52,31 +47,34 @@ def test_poisson_ratio_from_three_starts(finger, positions, tmp_path):
     write_measurements(tmp_path / "measured.csv", finger, positions)
     config = configured("poisson_ratio", starts=STARTS, refine=True, level=None, data=str(tmp_path / "measured.csv"))
     result = calibrate(config, tmp_path / "out")
-    found = [fit["found"]["poisson_ratio"] for fit in result["fits"]]
+    found = [fit.found["poisson_ratio"] for fit in result.fits]
     assert np.ptp(found) < 1e-6 and abs(found[0] - 0.47) < 0.003  # on the surrogate
-    assert result["design"]["poisson_ratio"] == pytest.approx(0.47, abs=1e-6)  # and on FEM
-    assert json.loads((tmp_path / "out" / "result.json").read_text())["design"] == result["design"]
+    assert result.design["poisson_ratio"] == pytest.approx(0.47, abs=1e-6)  # and on FEM
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["design"] == result.design
     assert (tmp_path / "out" / "calibration.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_young_modulus_from_efforts(pulled):
     result = calibrate(configured("young_modulus", level=None), data=pulled)
-    assert result["design"]["young_modulus"] == pytest.approx(2.2e6, rel=0.01)
+    assert result.design["young_modulus"] == pytest.approx(2.2e6, rel=0.01)
 
 
 def test_tpe_comes_near_what_the_gradient_finds(positions):
     by_gradient = calibrate(configured("poisson_ratio", level=None), data=positions)
     by_tpe = calibrate(configured("poisson_ratio", method="tpe", trials=80, level=None), data=positions)
-    assert by_tpe["design"]["poisson_ratio"] == pytest.approx(by_gradient["design"]["poisson_ratio"], abs=5e-4)
-    assert by_tpe["fits"][0]["cost"] >= by_gradient["fits"][0]["cost"]
+    assert by_tpe.design["poisson_ratio"] == pytest.approx(by_gradient.design["poisson_ratio"], abs=5e-4)
+    assert by_tpe.fits[0].cost >= by_gradient.fits[0].cost
 
 
 class Line(Misfit):
     """A body whose tip height is proportional to the command and to the logarithm of its stiffness."""
 
-    def predict(self, values):
-        slope = torch.log(values[:, 3] / 3e6)
-        return torch.stack([0 * slope, 0 * slope, slope * torch.as_tensor(self.data.displacement[:, 0]), 0 * slope], 1)
+    def readings(self, point):
+        slope = np.log(self.parameters.values(point)["young_modulus"] / 3e6) * self.data.displacement[:, 0]
+        return np.stack([0 * slope, 0 * slope, slope, 0 * slope], axis=1)
+
+    def jacobian(self, point):
+        return (self.residuals(point + 1e-6) - self.residuals(point - 1e-6))[:, None] / 2e-6
 
 
 def test_intervals_cover_the_truth_as_often_as_they_say(finger):
@@ -87,8 +85,9 @@ def test_intervals_cover_the_truth_as_often_as_they_say(finger):
     for _ in range(100):
         effector = np.full((8, 3), np.nan)
         effector[:, 1] = np.log(truth / 3e6) * command[:, 0] + rng.normal(0.0, 3e-5, 8)
-        misfit = Line(finger, box, Measurements("displacement", command, np.full((8, 1), np.nan), effector))
-        fit = fit_gradient(misfit, box.reference)
+        data = Measurements("displacement", command, np.full((8, 1), np.nan), effector)
+        misfit = Line(finger, Parameters(finger, box), data)
+        fit = fit_gradient(misfit, {})
         low, high = profile_interval(misfit, {**box.reference, **fit.found}, "young_modulus", 0.8)
         covered += low <= truth <= high
     assert 68 <= covered <= 92
@@ -97,7 +96,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(finger):
 def test_an_interval_under_noise(pulled):
     noisy = pulled.with_noise(0.01, np.random.default_rng(0))
     result = calibrate(configured("young_modulus"), data=noisy)
-    low, high = result["interval"]["young_modulus"]
+    low, high = result.intervals["young_modulus"]
     assert low < 2.2e6 < high and 0.002 < (high - low) / 2.2e6 < 0.1
 
 
@@ -106,8 +105,8 @@ def test_intervals_of_two_variables(finger):
     data = measure(finger, {"young_modulus": 2.2e6, "poisson_ratio": 0.46}, [[0.004], [0.008], [0.012]])
     data = data.with_noise(0.003, np.random.default_rng(1))
     truth = {"poisson_ratio": 0.46}
-    both = calibrate(configured("young_modulus", "poisson_ratio"), data=data)["interval"]["young_modulus"]
-    alone = calibrate(configured("young_modulus", design=truth), data=data)["interval"]["young_modulus"]
+    both = calibrate(configured("young_modulus", "poisson_ratio"), data=data).intervals["young_modulus"]
+    alone = calibrate(configured("young_modulus", design=truth), data=data).intervals["young_modulus"]
     assert both[0] < 2.2e6 < both[1] and alone[0] < 2.2e6 < alone[1]
     assert both[1] - both[0] > 1.2 * (alone[1] - alone[0])
 
@@ -115,7 +114,8 @@ def test_intervals_of_two_variables(finger):
 @pytest.mark.parametrize("driven", ["displacement", "effort"])
 def test_derivatives_of_residuals(finger, positions, pulled, driven):
     data = positions if driven == "displacement" else pulled
-    misfit = LearnedMisfit(finger, Box(finger.design_space, ["length", "young_modulus", "poisson_ratio"]), data)
+    box = Box(finger.design_space, ["length", "young_modulus", "poisson_ratio"])
+    misfit = LearnedMisfit(finger, Parameters(finger, box), data)
     point = np.array([0.2, 0.1, 0.3])
     J = misfit.jacobian(point)
     for k in range(3):
@@ -128,35 +128,35 @@ def test_slack_cables_of_the_surrogate():
     """A command that leaves one cable slack: the body is where FEM has it."""
     robot = make_robot("finger")
     data = measure(robot, {}, [[0.012, 0.0], [0.015, 0.001]])
-    misfit = LearnedMisfit(robot, Box(robot.design_space, ["length"]), data)
-    assert misfit.errors(misfit.coordinates.point(robot.design_space.baseline))["effector"] < 2e-4
+    misfit = LearnedMisfit(robot, Parameters(robot, Box(robot.design_space, ["length"])), data)
+    assert misfit.errors(misfit.parameters.point(robot.design_space.baseline))["effector"] < 2e-4
 
 
 def test_coordinates_are_those_of_equation_3_14(finger):
     """With nu_inf = 0.5: nu = (nu_inf - nu_m)(1 - exp(-nu_0 / tau)) + nu_m."""
     low, high, limit = 0.4, 0.499, 0.5
-    coordinates = Coordinates(Box(finger.design_space, ["poisson_ratio"], {"poisson_ratio": (low, high)}))
+    coordinates = Parameters(finger, Box(finger.design_space, ["poisson_ratio"], {"poisson_ratio": (low, high)}))
     tau = -1.0 / np.log(1.0 - (high - low) / (limit - low))
     for share in (0.0, 0.3, 1.0):
         nu = (limit - low) * (1.0 - np.exp(-share / tau)) + low
-        design = coordinates.design(np.array([2.0 * share - 1.0]))
+        design = coordinates.values(np.array([2.0 * share - 1.0]))
         assert design["poisson_ratio"] == pytest.approx(nu)
         assert coordinates.point(design)[0] == pytest.approx(2.0 * share - 1.0)
-    row = coordinates.values(torch.zeros(1, 1, dtype=torch.float64))[0]
+    row = coordinates.design(torch.zeros(1, 1, dtype=torch.float64))[0]
     assert row[:4].tolist() == [finger.design_space.baseline[name] for name in finger.design_space.names[:4]]
 
 
 def test_a_value_at_its_bound_is_told(positions):
     result = calibrate(configured("poisson_ratio", bounds={"poisson_ratio": [0.30, 0.46]}, level=None), data=positions)
-    assert result["at_bound"] == ["poisson_ratio"] and result["design"]["poisson_ratio"] == pytest.approx(0.46)
-    assert calibrate(configured("poisson_ratio", level=None), data=positions)["at_bound"] == []
+    assert result.at_bound == ["poisson_ratio"] and result.design["poisson_ratio"] == pytest.approx(0.46)
+    assert calibrate(configured("poisson_ratio", level=None), data=positions).at_bound == []
 
 
 def test_what_cannot_be_fitted(positions):
     with pytest.raises(ConfigError, match="'young_modulus' changes nothing that was measured"):
         calibrate(configured("young_modulus"), data=positions)
     one = replace(positions, **{k: getattr(positions, k)[:1] for k in ("displacement", "effort", "effector")})
-    with pytest.raises(DataError, match="one measured state is too little"):
+    with pytest.raises(DataError, match="there is only one measured state: nothing can be fitted"):
         calibrate(configured("poisson_ratio"), data=one)
     with pytest.raises(ConfigError, match="'length' is not free; free: poisson_ratio"):
         configured("poisson_ratio", starts=[{"length": 0.04}])
@@ -169,17 +169,20 @@ HEADER = "cable_1_displacement,tip_y,tip_z\n"
     ("text", "words"),
     [
         ("", "it is empty"),
-        (HEADER, "it holds no states"),
+        (HEADER, "it contains no states"),
         (HEADER + "0.0,0.01\n", "row 1 has 2 values, the header 3"),
         (HEADER + "0.0,0.01,abc\n", "column 'tip_z', row 1: 'abc' is not a finite number"),
         (HEADER + "0.0,nan,-0.12\n", "column 'tip_y', row 1: 'nan' is not a finite number"),
         (HEADER + "0.0,0.01,-0.12\n5.0,0.03,-0.11\n", "displacement 5 m of 'cable_1' in row 2 is out of bounds"),
-        (HEADER + "0.0,10.5,-120\n", "column 'tip_y' reaches 10.5 m, on a robot of 0.12 m; lengths are in metres"),
-        ("cable_displacement,tip_y\n0,0\n", "unknown column 'cable_displacement'; allowed: cable_1_displacement"),
+        (HEADER + "0.0,10.5,-120\n", "column 'tip_y' reaches 10.5 m, on a robot of 0.12 m; did you mean metres?"),
+        (
+            "cable_displacement,tip_y\n0,0\n",
+            "unknown column 'cable_displacement'; did you mean 'cable_1_displacement'?",
+        ),
         ("tip_y,tip_z\n0,0\n", "it needs the columns cable_1_displacement, or cable_1_effort"),
         ("cable_1_displacement\n0\n", "nothing was measured; give some of"),
         ("cable_1_effort,tip_y\n-1,0\n", "effort -1 of 'cable_1' in row 1 is out of bounds; allowed: 0 to inf"),
-        ("tip_y,tip_y\n0,0\n", "names a column twice"),
+        ("tip_y,tip_y\n0,0\n", "has a column twice"),
     ],
 )
 def test_malformed_csv(finger, tmp_path, text, words):
@@ -220,5 +223,5 @@ def test_files_come_back(finger, tmp_path, positions, pulled):
     assert back.effector[:, 2].tolist() == [-0.12, -0.1] and np.isnan(back.effector[:, :2]).all()
     with pytest.raises(DataError, match="No such file"):
         read_measurements(tmp_path / "nothing.csv", finger)
-    with pytest.raises(DataError, match="ends with .csv or .json"):
+    with pytest.raises(DataError, match="must end with .csv or .json"):
         read_measurements(tmp_path / "measured.txt", finger)

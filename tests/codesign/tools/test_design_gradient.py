@@ -35,7 +35,7 @@ def test_every_corner_leads_to_the_dexterity_optimum():
     best = min(end.cost for end in ends)
     assert max(end.cost for end in ends) - best < 1e-6
     dense = WeightedCost(config.objectives, cost.metrics, cost.box, 8000)
-    value = float(cost.metrics(cost.box.values(_tensor(ends[0].end)))[0, 0])
+    value = float(cost.metrics(cost.box.values(_tensor(cost.box.unit(ends[0].end))))[0, 0])
     assert value >= dense.values.max() - 1e-9
 
 
@@ -51,7 +51,7 @@ def test_target_and_weights(tmp_path):
     by_target = optimise(configured({"metric": "bending_angle", "goal": 1.57}, check=False))
     by_goal = optimise(configured({"metric": "bending_angle", "goal": "maximize"}, check=False))
     for name in BODIES["variables"]:
-        assert by_target["best"]["design"][name] == pytest.approx(by_goal["best"]["design"][name], abs=1e-6)
+        assert by_target.best.design[name] == pytest.approx(by_goal.best.design[name], abs=1e-6)
     found = []
     for weight in (0.1, 0.9):
         config = configured(
@@ -59,7 +59,7 @@ def test_target_and_weights(tmp_path):
             {"metric": "contact_force", "weight": 1 - weight},
             check=False,
         )
-        found.append(optimise(config, tmp_path / str(weight))["best"]["surrogate"])
+        found.append(optimise(config, tmp_path / str(weight)).best.surrogate)
     assert found[0]["contact_force"] > found[1]["contact_force"] + 0.5
     assert found[0]["bending_angle"] < found[1]["bending_angle"] - 0.001
     kept = json.loads((tmp_path / "0.9" / "result.json").read_text())
@@ -67,12 +67,12 @@ def test_target_and_weights(tmp_path):
     assert (tmp_path / "0.9" / "descents.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ConfigError, match="holds an optimisation with objectives"):
         optimise(config, tmp_path / "0.1")
-    assert optimise(config, tmp_path / "0.9")["best"]["surrogate"] == found[1]
+    assert optimise(config, tmp_path / "0.9").best.surrogate == found[1]
 
 
 def test_the_best_is_checked_on_fem():
-    best = optimise(configured({"metric": "bending_angle"}, starts="grid", count=1))["best"]
-    assert best["fem"]["bending_angle"] == pytest.approx(best["surrogate"]["bending_angle"], rel=0.005)
+    best = optimise(configured({"metric": "bending_angle"}, starts="grid", count=1)).best
+    assert best.fem["bending_angle"] == pytest.approx(best.surrogate["bending_angle"], rel=0.005)
 
 
 def test_wrong_configurations():
@@ -88,4 +88,4 @@ def test_wrong_configurations():
 def _tensor(point):
     import torch
 
-    return torch.tensor([point], dtype=torch.float64)
+    return torch.as_tensor(point[None])

@@ -8,10 +8,10 @@ import pytest
 
 from codesign.tools import calibration, gradient
 from codesign.tools import search as module
-from codesign.tools.bodies import Box
+from codesign.tools.box import Box
 from codesign.tools.config import CalibrationConfig, OptimiseConfig, SensitivityConfig
 from codesign.tools.search import search
-from codesign.tools.sensitivity import analyse, morris, one_at_a_time, sample, sobol
+from codesign.tools.sensitivity import analyse_sensitivity, morris, one_at_a_time, sample, sobol
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 from softgym_envs.robots import make_robot
@@ -247,15 +247,15 @@ def test_one_at_a_time_is_equation_3_1():
 
 def test_sensitivity_goes_on(tmp_path):
     config = study("oat", metrics=["bending_angle", "normal_force"])
-    result = analyse(config, tmp_path, progress=False)
+    result = analyse_sensitivity(config, tmp_path, progress=False)
     records = (tmp_path / "evaluations.jsonl").read_bytes().splitlines(keepends=True)
     (tmp_path / "evaluations.jsonl").write_bytes(b"".join(records[:3]) + records[3][:20])
-    assert analyse(config, tmp_path, progress=False)["indices"] == result["indices"]
+    assert analyse_sensitivity(config, tmp_path, progress=False).indices == result.indices
     assert (tmp_path / "evaluations.jsonl").read_bytes().count(b"\n") == 7
-    assert json.loads((tmp_path / "result.json").read_text())["indices"] == result["indices"]
+    assert json.loads((tmp_path / "result.json").read_text())["indices"] == result.indices
     assert (tmp_path / "sensitivity.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ConfigError, match="holds a sensitivity study with metrics"):
-        analyse(study("oat"), tmp_path, progress=False)
+        analyse_sensitivity(study("oat"), tmp_path, progress=False)
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
@@ -268,7 +268,7 @@ def test_shipped_configurations_load(path):
 
 
 def test_wrong_configurations():
-    with pytest.raises(ConfigError, match="must be the population of NSGA-II, population_size = 6"):
+    with pytest.raises(ConfigError, match="must equal the population of NSGA-II, population_size = 6"):
         configured(solver={"method": "search", "sampler": SAMPLER, "trials": 20, "batch": 5})
     with pytest.raises(ConfigError, match="power of two"):
         study("sobol", samples=100)

@@ -1,0 +1,244 @@
+"""Residuals of a body against measured states, on a surrogate or on FEM (thesis, eq. 3.9)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign.tools.bodies import RobotMaker, learned_model
+from codesign.tools.contact import Plane, step_towards_plane
+from codesign.tools.measurements import Measurements
+from codesign.tools.parameters import Parameters
+from codesign.variables import split_values
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.backends.surrogate import released, settle
+from softgym_envs.errors import ConfigError, ConvergenceError, DataError
+from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.model import Context
+
+
+class Misfit(ABC):
+    """Residuals of a body against measurements, each relative to the size of what was measured.
+
+    Effector coordinates are divided by the root mean square of their distances from their mean, efforts by their own
+    root mean square.
+
+    Args:
+        robot: the robot.
+        parameters: the fitted quantities.
+        data: measured states.
+
+    Raises:
+        ConfigError: for an offset of a column that was not measured.
+        DataError: if there are not more measured numbers than parameters, or they do not vary at all.
+
+    Attributes:
+        count: number of residuals.
+        evaluations: number of computations of the residuals so far.
+    """
+
+    def __init__(self, robot: Robot, parameters: Parameters, data: Measurements) -> None:
+        self.robot, self.parameters, self.data = robot, parameters, data
+        efforts = data.effort if data.driven == "displacement" else np.full_like(data.effort, np.nan)
+        self._measured = np.column_stack([efforts, data.effector])
+        self._columns = np.flatnonzero(~np.isnan(self._measured).any(axis=0))
+        n = self._actuators = efforts.shape[1]
+        self._check_offsets()
+        kept, spread = self._columns, np.ones(self._measured.shape[1])
+        if (group := kept[kept < n]).size:
+            spread[:n] = np.sqrt(np.mean(self._measured[:, group] ** 2))
+        if (group := kept[kept >= n]).size:
+            away = self._measured[:, group] - self._measured[:, group].mean(axis=0)
+            spread[n:] = np.sqrt(np.mean(away**2))
+        self._scale = spread[kept]
+        self.count = len(data) * len(kept)
+        self.evaluations = 0
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        if not (self._scale > 0.0).all():
+            what = "there is only one measured state" if len(data) == 1 else "the measured states are all the same"
+            raise DataError(f"{what}: nothing can be fitted")
+        if self.count <= len(parameters):
+            raise DataError(
+                f"{self.count} measured numbers cannot determine {len(parameters)} parameters and their error"
+            )
+
+    def _check_offsets(self) -> None:
+        """Raise ConfigError for an offset of a column that is neither imposed nor measured."""
+        n = self._actuators
+        imposed = np.arange(n) + (0 if self.data.driven == "displacement" else n)
+        known = {*imposed.tolist(), *(self._columns + n).tolist()}
+        for name, column in self.parameters.offsets:
+            if column not in known:
+                raise ConfigError(f"nuisances: the column of '{name}' was neither imposed nor measured")
+
+    @abstractmethod
+    def readings(self, point: np.ndarray) -> np.ndarray:
+        """Return the predicted readings of efforts and effectors at a point (p,), shape (N, n_a + n_e)."""
+
+    @abstractmethod
+    def jacobian(self, point: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the residuals, shape (count, p)."""
+
+    def residuals(self, point: np.ndarray) -> np.ndarray:
+        """Return the residuals at a point (p,), shape (count,)."""
+        if self._last is not None and np.array_equal(self._last[0], point):
+            return self._last[1]
+        self.evaluations += 1
+        found = ((self.readings(point) - self._measured)[:, self._columns] / self._scale).ravel()
+        self._last = np.array(point, dtype=float), found
+        return found
+
+    def cost(self, point: np.ndarray) -> float:
+        """Return the sum of the squared residuals."""
+        return float(np.sum(self.residuals(point) ** 2))
+
+    def errors(self, point: np.ndarray) -> dict[str, float]:
+        """Return the root mean square errors of ``effort`` [N, ...] and ``effector`` [m], if they were measured."""
+        error = self.residuals(point).reshape(len(self.data), -1) * self._scale
+        groups = {"effort": self._columns < self._actuators, "effector": self._columns >= self._actuators}
+        return {name: float(np.sqrt(np.mean(error[:, g] ** 2))) for name, g in groups.items() if g.any()}
+
+
+class LearnedMisfit(Misfit):
+    """Residuals of a surrogate, with exact derivatives, also for actuators driven in effort and for slack cables.
+
+    Args:
+        robot: the robot.
+        parameters: the fitted quantities, without robot options.
+        data: measured states.
+        weights: folder of the surrogate's weights; default: the pretrained ones.
+
+    Raises:
+        ConfigError: as for `Misfit`, and if the network of the weights has no exact derivatives.
+        DataError: as for `Misfit`.
+    """
+
+    def __init__(
+        self, robot: Robot, parameters: Parameters, data: Measurements, weights: str | Path | None = None
+    ) -> None:
+        super().__init__(robot, parameters, data)
+        self.net = learned_model(robot, weights)
+        self._unilateral = robot.unilateral
+        self._reached = np.zeros(data.command.shape)
+
+    def readings(self, point: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return self._predict(torch.tensor(np.tile(point, (len(self.data), 1)), dtype=torch.float64)).numpy()
+
+    def jacobian(self, point: np.ndarray) -> np.ndarray:
+        rows = torch.tensor(np.tile(point, (len(self.data), 1)), dtype=torch.float64, requires_grad=True)
+        predicted = self._predict(rows)
+        # Each row of the prediction depends on its own copy of the point alone: one backward pass per column.
+        columns = [torch.autograd.grad(predicted[:, k].sum(), rows, retain_graph=True)[0] for k in self._columns]
+        return (torch.stack(columns, dim=1).numpy() / self._scale[:, None]).reshape(self.count, -1)
+
+    def _predict(self, points: Tensor) -> Tensor:
+        """Return the readings (N, n_a + n_e) of N equal points (N, p), with gradients."""
+        model, n = self.net.model, self._actuators
+        quantities = self.parameters.quantities(points)
+        imposed = quantities.offsets[:, :n] if self.data.driven == "displacement" else quantities.offsets[:, n : 2 * n]
+        command = torch.as_tensor(self.data.command) - imposed
+        given = command.detach().numpy()
+        context = Context.shared(model.context(quantities.design[:1].detach().numpy()), len(self.data))
+        if self.data.driven == "effort":
+            settled = released(model, context, given, self._reached)
+            free, target = np.ones(given.shape, dtype=bool), command
+        else:
+            settled = settle(model, context, given, self._reached, self._unilateral)
+            free, target = settled.slack, torch.zeros_like(command)
+        if not settled.converged.all():
+            raise ConvergenceError("the surrogate finds no state for some of the measured commands")
+        self._reached = settled.displacement
+        displacement = torch.as_tensor(settled.displacement)
+        if self.data.driven == "displacement":
+            # Taut cables are exactly where they were commanded to be; the search only ends close to it.
+            displacement = torch.where(torch.as_tensor(free), displacement, command)
+        if free.any():
+            # One more Newton step in double precision, then one that carries the derivatives of the actuators that are
+            # driven in effort with respect to the design.
+            with torch.no_grad():
+                displacement = self._step(quantities.design, displacement, free, target)
+            displacement = self._step(quantities.design, displacement, free, target)
+        effort, effector, W = self.net(quantities.design, displacement)
+        if quantities.distance is not None:
+            effort, effector = self._touch(quantities.design, quantities.distance, effort, effector, W, free)
+        return torch.cat([effort, effector], dim=1) + quantities.offsets[:, n:]
+
+    def _step(self, design: Tensor, displacement: Tensor, free: np.ndarray, target: Tensor) -> Tensor:
+        """Return displacements (N, n_a) after one Newton step of the ``free`` ones towards their efforts ``target``."""
+        loose = torch.as_tensor(free)
+        effort, _, W = self.net(design, displacement)
+        n = effort.shape[1]
+        K = torch.linalg.inv(W[:, :n, :n]).detach()
+        A = torch.where(loose[:, :, None] & loose[:, None, :], K, torch.eye(n, dtype=torch.float64))
+        return displacement - torch.linalg.solve(A, torch.where(loose, effort - target, 0.0))
+
+    def _touch(
+        self, design: Tensor, distance: Tensor, effort: Tensor, effector: Tensor, W: Tensor, free: np.ndarray
+    ) -> tuple[Tensor, Tensor]:
+        """Return efforts and effectors with the force of the plane, from the tangent at the free state (eq. 4.16)."""
+        n = effort.shape[1]
+        normal = torch.as_tensor(self.parameters.normal)
+        rest = self.net(design[:1], torch.zeros((1, n), dtype=torch.float64))[1][0, :3]
+        held = torch.as_tensor(~free)
+        W_an = W[:, :n, n : n + 3] @ normal
+        A = torch.where(held[:, :, None] & held[:, None, :], W[:, :n, :n], torch.eye(n, dtype=torch.float64))
+        reaction = torch.linalg.solve(A, torch.where(held, W_an, 0.0))  # efforts of held actuators per contact force
+        moved = W[:, n:, n : n + 3] @ normal - (W[:, n:, :n] @ reaction[:, :, None])[:, :, 0]
+        overlap = (effector[:, :3] - rest) @ normal - distance
+        force = torch.relu(overlap) / (moved[:, :3] @ normal)
+        return effort + force[:, None] * reaction, effector - force[:, None] * moved
+
+
+class FEMMisfit(Misfit):
+    """Residuals of finite elements, with derivatives by finite differences.
+
+    Args:
+        robot: the robot.
+        parameters: the fitted quantities.
+        data: measured states.
+        make_robot: makes the robot with other values of fitted options.
+    """
+
+    difference = 1e-4  # in coordinates
+
+    def __init__(
+        self, robot: Robot, parameters: Parameters, data: Measurements, make_robot: RobotMaker | None = None
+    ) -> None:
+        super().__init__(robot, parameters, data)
+        self._make_robot = make_robot
+        self._options: dict[str, float] = {}
+
+    def readings(self, point: np.ndarray) -> np.ndarray:
+        values = self.parameters.values(point)
+        quantities = self.parameters.quantities(torch.as_tensor(np.asarray(point, dtype=float)[None]))
+        offsets, n = quantities.offsets[0].numpy(), self._actuators
+        imposed = offsets[:n] if self.data.driven == "displacement" else offsets[n : 2 * n]
+        variables, options = split_values(values)
+        if options != self._options:
+            assert self._make_robot is not None
+            self.robot, self._options = self._make_robot(options), options
+        backend = FEMBackend(self.robot, {name: variables[name] for name in self.parameters.box.space.names})
+        rest = backend.state.effector[0]
+        rows = []
+        for command in self.data.command - imposed:
+            if quantities.distance is None:
+                state = backend.step(command, self.data.driven)
+            else:
+                assert self.parameters.normal is not None
+                plane = Plane(float(quantities.distance), self.parameters.normal)
+                state = step_towards_plane(backend, command, self.data.driven, plane, rest)
+            rows.append(np.concatenate([state.effort, state.effector.ravel()]))
+        return np.array(rows) + offsets[n:]
+
+    def jacobian(self, point: np.ndarray) -> np.ndarray:
+        base, columns = self.residuals(point), []
+        for k, value in enumerate(point):
+            moved = np.array(point, dtype=float)
+            moved[k] += self.difference if value < 0.0 else -self.difference
+            columns.append((self.residuals(moved) - base) / (moved[k] - value))
+        return np.stack(columns, axis=1)
