@@ -68,6 +68,9 @@ def main() -> None:
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     threadpool_limits(1)
+    # Robots, tasks and objectives of your own ("my_module:MyRobot") may be in the current folder. At the end of the
+    # search path, its files cannot replace modules of the suite.
+    sys.path.append(os.getcwd())
     try:
         cli(prog_name="softgym", standalone_mode=False)
     except click.exceptions.Exit as leave:
