@@ -108,7 +108,7 @@ class Box:
         line = np.linspace(-1.0, 1.0, steps)
         return np.stack(np.meshgrid(*[line] * len(self), indexing="ij"), axis=-1).reshape(-1, len(self))
 
-    def check_start(self, start: Mapping[str, float]) -> dict[str, float]:
+    def check_start(self, start: Mapping[str, float]) -> Mapping[str, float]:
         """Return the free values of a start; missing ones take the reference, moved into the bounds.
 
         Raises:
