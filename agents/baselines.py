@@ -48,7 +48,7 @@ class InverseQPAgent:
             command = self._solve(env, self._controllers[env], present)
         except ConvergenceError:
             command = present
-        return env.interface.action(command, present)
+        return env.spaces.action(command, present)
 
     def _begin(self, env: Any) -> None:
         self._controllers[env] = make_controller(env.robot, env.task)

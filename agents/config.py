@@ -2,32 +2,39 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pydantic import Field, field_validator, model_validator
 
 from softgym_envs.config import Config
-from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.errors import unknown_name
-from softgym_envs.robots import make_robot
+from softgym_envs.envs.options import default_backend
+from softgym_envs.envs.registration import EnvironmentRow, find_row
+from softgym_envs.envs.tasks.registry import TASKS
+from softgym_envs.registry import class_path
+from softgym_envs.robots.registry import make_robot
 
 if TYPE_CHECKING:
     import gymnasium
+    from gymnasium.envs.registration import EnvSpec
 
+    from softgym_envs.envs.tasks.base import Task
     from softgym_envs.robots.base import Robot
-
-__all__ = ["EnvironmentConfig", "SACConfig", "TrainConfig", "check_hindsight", "check_start"]
 
 
 class EnvironmentConfig(Config):
-    """An environment: its ID and the options of ``gymnasium.make``; the backend is by default that of its row.
+    """An environment by its ID, or a robot with a task, and the options of ``gymnasium.make``.
 
-    With ``residual_scale`` the agent acts on top of the inverse QP: the action that is done is
-    ``clip(action of the QP + residual_scale * action of the agent, -1, 1)``.
+    A robot and a task are registered names or paths such as ``my_module:MyRobot``; in Python they may be classes, which
+    are stored as their paths. With ``residual_scale`` the agent corrects the inverse QP: the environment is given
+    ``clip(QP action + residual_scale * agent action, -1, 1)``.
     """
 
-    id: str
-    backend: str = "surrogate"
+    id: str | None = Field(default=None, description="ID of an environment, in place of robot and task")
+    robot: str | None = Field(default=None, description="registered name or module:class, in place of id")
+    task: str | None = Field(default=None, description="registered name or module:class, in place of id")
+    max_episode_steps: int | None = Field(default=None, gt=0, description="default that of the ID or the task")
+    backend: str = Field(default="surrogate", description="default that of the ID, or surrogate if weights ship")
     design: dict[str, float] | None = None
     sample_design: bool | list[str] = False
     design_in_observation: bool | list[str] = False
@@ -36,47 +43,88 @@ class EnvironmentConfig(Config):
     task_options: dict[str, Any] = {}
     backend_options: dict[str, Any] = {}
     residual_scale: float = Field(
-        default=0.0, ge=0, le=2, description="share of the agent's action on top of the QP's; 0: no QP"
+        default=0.0, ge=0, le=2, description="factor of the agent's action when it is added to the QP's; 0: no QP"
     )
 
     @model_validator(mode="before")
     @classmethod
-    def _default_backend(cls, data: Any) -> Any:
-        row = ENVIRONMENTS.get(str(data.get("id"))) if isinstance(data, dict) else None
-        return {"backend": row.backend, **data} if row is not None else data
+    def _paths_of_classes(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        paths = {name: class_path(data[name]) for name in ("robot", "task") if isinstance(data.get(name), type)}
+        return {**data, **paths}
 
-    @field_validator("id")
-    @classmethod
-    def _known(cls, value: str) -> str:
-        if value not in ENVIRONMENTS:
-            raise ValueError(unknown_name("environment", value, ENVIRONMENTS))
-        return value
+    @model_validator(mode="after")
+    def _complete(self) -> EnvironmentConfig:
+        if self.id is None and (self.robot is None or self.task is None):
+            raise ValueError("an environment needs an id, or a robot and a task")
+        if self.id is not None and (self.robot is not None or self.task is not None):
+            raise ValueError("an environment has an id, or a robot and a task, not both")
+        row = self.row  # checks the ID, or the task
+        if "backend" not in self.model_fields_set:
+            backend = row.backend or default_backend(self.make_robot(), self.backend_options)
+            object.__setattr__(self, "backend", backend)
+        return self
+
+    @property
+    def row(self) -> EnvironmentRow:
+        """Robot, task, time limit and default options.
+
+        Raises:
+            ValueError: for an unknown ID or task.
+        """
+        if self.id is not None:
+            row = find_row(self.id)
+        else:
+            task = cast("str", self.task)
+            row = EnvironmentRow(cast("str", self.robot), task, TASKS.class_of(task).max_episode_steps)
+        if self.max_episode_steps is not None:
+            row = replace(row, max_episode_steps=self.max_episode_steps)
+        return row
+
+    @property
+    def title(self) -> str:
+        """The ID, or robot and task."""
+        return self.id or f"{self.robot} {self.task}"
+
+    @property
+    def task_class(self) -> type[Task]:
+        """Class of the task."""
+        return TASKS.class_of(self.row.task)
+
+    @property
+    def has_surrogate(self) -> bool:
+        """Whether surrogate weights ship for the robot."""
+        return (self.row.backend or default_backend(self.make_robot(), {})) == "surrogate"
 
     def on(self, backend: str) -> EnvironmentConfig:
-        """The same environment on another backend; options of the present backend do not apply there."""
+        """Return the same environment on another backend, without the options of the present one."""
         options = self.backend_options if backend == self.backend else {}
         return self.model_copy(update={"backend": backend, "backend_options": options})
 
-    def robot(self) -> Robot:
-        """Make the family of bodies.
+    def make_robot(self) -> Robot:
+        """Return the robot.
 
         Raises:
-            ValueError: for a wrong option of the robot.
+            ValueError: for an unknown robot or a wrong option of it.
         """
-        row = ENVIRONMENTS[self.id]
+        row = self.row
+        if row.robot is None:
+            raise ValueError(f"environment '{self.id}' needs a robot: give robot and task in place of the id")
         return make_robot(row.robot, **{**row.robot_options, **self.robot_options})
 
+    def _spec(self) -> EnvSpec:
+        return self.row.spec(self.id or "SoftGym/Configured-v0")
+
     def _options(self, overrides: dict[str, Any]) -> dict[str, Any]:
-        options = self.model_dump(exclude={"id", "residual_scale"})
+        options = self.model_dump(exclude={"id", "robot", "task", "max_episode_steps", "residual_scale"})
         return {**options, **overrides}
 
     def make(self, **overrides: Any) -> gymnasium.Env:
         """Return the environment; ``overrides`` replace options of ``gymnasium.make``."""
         import gymnasium
 
-        import softgym_envs  # noqa: F401 - registers the IDs
-
-        env = gymnasium.make(self.id, **self._options(overrides))
+        env = gymnasium.make(self._spec(), **self._options(overrides))
         return self._wrapped(env) if self.residual_scale else env
 
     def _wrapped(self, env: gymnasium.Env) -> gymnasium.Wrapper:
@@ -85,25 +133,23 @@ class EnvironmentConfig(Config):
         return ResidualQP(env, self.residual_scale)
 
     def make_vec(self, num_envs: int, **overrides: Any) -> gymnasium.vector.VectorEnv:
-        """Return the batched environment on the surrogate, or one process for each environment on finite elements."""
+        """Return the batched environment on the surrogate, or one process per environment on other backends."""
         import gymnasium
 
-        import softgym_envs  # noqa: F401 - registers the IDs
-
         if self.backend == "surrogate":
-            envs = gymnasium.make_vec(self.id, num_envs=num_envs, **self._options(overrides))
+            envs = gymnasium.make_vec(self._spec(), num_envs=num_envs, **self._options(overrides))
             if not self.residual_scale:
                 return envs
             from agents.residual import VectorResidualQP
 
             return VectorResidualQP(envs, self.residual_scale)
         return gymnasium.make_vec(
-            self.id,
+            self._spec(),
             num_envs=num_envs,
             vectorization_mode="async" if num_envs > 1 else "sync",
             vector_kwargs={
                 "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP,
-                # Said, because joblib's workers have a start method of their own that cannot pickle these.
+                # Set explicitly: the start method of joblib's workers cannot pickle these environments.
                 **({"context": "fork"} if num_envs > 1 else {}),
             },
             wrappers=[self._wrapped] if self.residual_scale else [],

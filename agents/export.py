@@ -14,7 +14,7 @@ from softgym_envs.storage import atomic_write
 from softgym_envs.version import __version__
 
 if TYPE_CHECKING:
-    from softgym_envs.envs.spaces import Interface
+    from softgym_envs.envs.spaces import AgentSpaces
 
 __all__ = ["export_policy_onnx"]
 
@@ -53,9 +53,9 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
     policy = policy if isinstance(policy, Policy) else Policy(policy)
     config = EnvironmentConfig.model_validate(policy.card["config"]["environment"])
     env = config.make()
-    interface: Interface = env.unwrapped.interface  # type: ignore[attr-defined]
+    spaces: AgentSpaces = env.unwrapped.spaces  # type: ignore[attr-defined]
     env.close()
-    data = _graph(policy, interface, config, onnx).SerializeToString()
+    data = _graph(policy, spaces, config, onnx).SerializeToString()
     with atomic_write(path) as stream:
         stream.write(data)
     return path
@@ -85,24 +85,24 @@ class _Nodes:
         return self("Div", value, self("Add", self("Abs", value), 1.0))
 
 
-def _graph(policy: Policy, interface: Interface, config: EnvironmentConfig, onnx: Any) -> Any:
-    robot, n = interface.robot, len(interface.robot.actuators)
+def _graph(policy: Policy, spaces: AgentSpaces, config: EnvironmentConfig, onnx: Any) -> Any:
+    robot, n = spaces.robot, len(spaces.robot.actuators)
     sizes = {"command": n, "displacement": n, "effort": n, "effector": 3, "goal": 3}
-    if interface.moving:
+    if spaces.moving:
         sizes["velocity"] = 3
-    if interface.design_names:
-        sizes["design"] = len(interface.design_names)
+    if spaces.design_names:
+        sizes["design"] = len(spaces.design_names)
 
     g = _Nodes(onnx)
-    middle, half = 0.5 * (interface.lower + interface.upper), 0.5 * (interface.upper - interface.lower)
+    middle, half = 0.5 * (spaces.lower + spaces.upper), 0.5 * (spaces.upper - spaces.lower)
     parts = [g("Div", g("Sub", name, middle), half) for name in ("command", "displacement")]
     parts.append(g.squashed(g("Div", "effort", robot.effort_scale)))
-    parts += [g("Div", name, interface.reach) for name in ("effector", "goal")]
-    parts.append(g.squashed(g("Mul", g("Sub", "goal", "effector"), interface.axes / interface.error_scale)))
-    if interface.moving:
+    parts += [g("Div", name, spaces.position_scale) for name in ("effector", "goal")]
+    parts.append(g.squashed(g("Mul", g("Sub", "goal", "effector"), spaces.axes / spaces.error_scale)))
+    if spaces.moving:
         parts.append(g.squashed(g("Div", "velocity", robot.size)))
-    if interface.design_names:
-        parts.append(_unit_design(interface, g))
+    if spaces.design_names:
+        parts.append(_unit_design(spaces, g))
     h = g("Clip", g("Concat", *parts, axis=-1), -1.0, 1.0)
     for weight, bias in policy.hidden:
         h = g("Relu", g("Add", g("MatMul", h, weight), bias))
@@ -111,13 +111,13 @@ def _graph(policy: Policy, interface: Interface, config: EnvironmentConfig, onnx
     outputs = ["action"]
     if not config.residual_scale:
         outputs.append("next_command")
-        if interface.action_mode == "increment":
-            target = g("Add", "command", g("Mul", action, interface.rates))
+        if spaces.action_mode == "increment":
+            target = g("Add", "command", g("Mul", action, spaces.rates))
         else:
             step = g("Sub", g("Add", g("Mul", action, half), middle), "command")
-            step = g("Min", g("Max", step, -interface.rates), interface.rates)
+            step = g("Min", g("Max", step, -spaces.rates), spaces.rates)
             target = g("Add", "command", step)
-        g("Min", g("Max", target, interface.lower), interface.upper, output="next_command")
+        g("Min", g("Max", target, spaces.lower), spaces.upper, output="next_command")
 
     def value(name: str, size: int) -> Any:
         return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["B", size])
@@ -142,7 +142,7 @@ def _graph(policy: Policy, interface: Interface, config: EnvironmentConfig, onnx
         "actuators": json.dumps(
             [{"name": a.name, "low": a.low, "high": a.high, "unit": a.unit} for a in robot.actuators]
         ),
-        "design": json.dumps([{"name": name, "unit": space[name].unit} for name in interface.design_names]),
+        "design": json.dumps([{"name": name, "unit": space[name].unit} for name in spaces.design_names]),
         "steps": str(policy.card.get("steps")),
     }
     onnx.helper.set_model_props(model, described)
@@ -150,9 +150,9 @@ def _graph(policy: Policy, interface: Interface, config: EnvironmentConfig, onnx
     return model
 
 
-def _unit_design(interface: Interface, g: _Nodes) -> str:
+def _unit_design(spaces: AgentSpaces, g: _Nodes) -> str:
     """Design variables in [-1, 1], as the observation shows them."""
-    variables = [interface.robot.design_space[name] for name in interface.design_names]
+    variables = [spaces.robot.design_space[name] for name in spaces.design_names]
     is_log = np.array([variable.log for variable in variables])
     low, high = (np.array([getattr(variable, end) for variable in variables]) for end in ("low", "high"))
     low, high = (np.where(is_log, np.log(np.where(is_log, end, 1.0)), end) for end in (low, high))

@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from softgym_envs.envs.spaces import Interface
+from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.base import Task
 
 __all__ = ["HindsightBuffer"]
@@ -23,7 +23,7 @@ class HindsightBuffer(ReplayBuffer):
 
     Args:
         *args: as for `ReplayBuffer`.
-        interface: layout of the observations.
+        spaces: layout of the observations.
         task: gives rewards; its goal stays where it is during an episode.
         share: of samples with another goal.
         **kwargs: as for `ReplayBuffer`.
@@ -35,11 +35,11 @@ class HindsightBuffer(ReplayBuffer):
         ValueError: for a task whose goal moves: what followed then belongs to other goals.
     """
 
-    def __init__(self, *args: Any, interface: Interface, task: Task, share: float, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, spaces: AgentSpaces, task: Task, share: float, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if task.horizon != 1:
             raise ValueError(f"hindsight = {share} needs a goal that stays; task '{task.name}' moves it; allowed: 0")
-        self.interface, self.task, self.share = interface, task, share
+        self.spaces, self.task, self.share = spaces, task, share
         self.ends = np.full((self.buffer_size, self.n_envs), -1, dtype=np.int64)
 
     def add(
@@ -85,12 +85,12 @@ class HindsightBuffer(ReplayBuffer):
 
         # A reward of exactly zero is that of a step that was not found; no goal makes it better.
         chosen = np.flatnonzero((draws[1] < self.share) & (rewards != 0.0))
-        goals = self.interface.effector(self.next_observations[later[chosen], columns[chosen]])
-        observations[chosen] = self.interface.with_goal(observations[chosen], goals)
+        goals = self.spaces.observed_effector(self.next_observations[later[chosen], columns[chosen]])
+        observations[chosen] = self.spaces.with_goal(observations[chosen], goals)
         reached = following[chosen]
-        following[chosen] = self.interface.with_goal(reached, goals)
-        distance = self.task.distance(self.interface.effector(reached), goals)
-        terms = self.task.reward_terms(distance, self.interface.effort_share(reached))
+        following[chosen] = self.spaces.with_goal(reached, goals)
+        distance = self.task.distance(self.spaces.observed_effector(reached), goals)
+        terms = self.task.reward_terms(distance, self.spaces.observed_effort_share(reached))
         rewards[chosen] = np.prod(list(terms.values()), axis=0)
 
         ended = self.dones[batch_inds, columns] * (1.0 - self.timeouts[batch_inds, columns])

@@ -39,7 +39,7 @@ class DesignProposer(ABC):
         env: Any = model.get_env()
         vector = env.env.unwrapped
         self.config, self.folder = config, folder
-        self.names: tuple[str, ...] = tuple(vector._sampled)
+        self.names: tuple[str, ...] = tuple(vector.sampled_variables)
         self.size = len(self.names)
         #: Bodies of the present and of the last episode of each sub-environment.
         self._bodies = np.zeros((2, vector.num_envs, self.size))

@@ -9,9 +9,9 @@ import numpy as np
 
 from agents.config import EnvironmentConfig
 from softgym_envs.config import check_config
-from softgym_envs.envs.env import design_names
-from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.envs.options import design_names
 from softgym_envs.errors import ConfigError, DataError, WeightsError
+from softgym_envs.registry import class_path
 from softgym_envs.storage import atomic_write, read_json, write_json
 
 __all__ = ["Policy", "policy_path", "read_tensors", "save_policy"]
@@ -119,8 +119,9 @@ class Policy:
         own = _meaning(self.environment)
         for key, (meaning, shown) in _meaning(environment).items():
             if meaning != own[key][0]:
+                name = "robot" if key == "id" and environment.id is None else key
                 raise ConfigError(
-                    f"environment.{key} = {shown} does not fit policy '{self.path}', which was trained with "
+                    f"environment.{name} = {shown} does not fit policy '{self.path}', which was trained with "
                     f"{own[key][1]}; allowed: that, or another policy"
                 )
 
@@ -142,8 +143,8 @@ class Policy:
 
 
 def _meaning(environment: EnvironmentConfig) -> dict[str, tuple[Any, object]]:
-    """What observations and actions mean: by key, what must be equal, and how a message shows it."""
-    row, robot = ENVIRONMENTS[environment.id], environment.robot()
+    """Return what observations and actions mean: for each key what must be equal, and how a message shows it."""
+    row, robot = environment.row, environment.make_robot()
     shown = design_names(robot.design_space, environment.design_in_observation)
     variables = [robot.design_space[name] for name in shown]
     scales = (
@@ -152,7 +153,10 @@ def _meaning(environment: EnvironmentConfig) -> dict[str, tuple[Any, object]]:
         [(variable.low, variable.high, variable.log) for variable in variables],
     )
     return {
-        "id": ((row.robot, row.task), f"{environment.id} (robot {row.robot}, task {row.task})"),
+        "id": (
+            (class_path(type(robot)), class_path(environment.task_class)),
+            f"{environment.title} (robot {row.robot}, task {row.task})",
+        ),
         "residual_scale": (environment.residual_scale, environment.residual_scale),
         "action_mode": (environment.action_mode, environment.action_mode),
         "design_in_observation": (shown, list(shown)),

@@ -67,4 +67,4 @@ class VectorResidualQP(gymnasium.vector.VectorActionWrapper):
                 commands[i] = controller.solve(model, goals[i], previous[i], env.slack[i])
             except ConvergenceError:  # a QP that fails holds still
                 pass
-        return env.interface.action(commands, previous)
+        return env.spaces.action(commands, previous)

@@ -12,7 +12,6 @@ import numpy as np
 
 from agents.config import EnvironmentConfig
 from agents.statistics import Estimate, crossed_estimate, stratified_estimate
-from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json
 
@@ -62,13 +61,13 @@ class StoredRuns:
 
     @property
     def follows(self) -> bool:
-        """The task is a path."""
-        return ENVIRONMENTS[self.environment.id].task == "track"
+        """Whether the goal moves along a path."""
+        return self.environment.task_class.horizon > 1
 
     @property
     def horizon(self) -> int:
         """Steps of an episode, so that a return divided by it is at most 1."""
-        return ENVIRONMENTS[self.environment.id].max_episode_steps
+        return self.environment.row.max_episode_steps
 
 
 def load_runs(folder: str | Path = RESULTS) -> list[StoredRuns]:

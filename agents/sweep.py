@@ -24,7 +24,6 @@ import numpy as np
 
 from agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.config import check_config, difference, load_config, provenance
-from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.executors import parallel_map
 from softgym_envs.storage import read_json, write_json
@@ -145,7 +144,7 @@ def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goal
             "steps": card["steps"],
             "best_step": card["best_step"],
             "cpu_seconds": card.get("cpu_seconds"),
-            "horizon": ENVIRONMENTS[config.environment.id].max_episode_steps,
+            "horizon": config.environment.row.max_episode_steps,
             "curve": card["curve"],
             "evaluations": _evaluations(config.environment, {"sac": policy}, goals, fem_goals),
             "provenance": provenance(),
@@ -166,7 +165,7 @@ def evaluate_baselines(path: Path, folder: Path, goals: int, fem_goals: int) -> 
         result,
         {
             "environment": environment.model_dump(mode="json"),
-            "horizon": ENVIRONMENTS[environment.id].max_episode_steps,
+            "horizon": environment.row.max_episode_steps,
             "evaluations": _evaluations(environment, agents, goals, fem_goals),
             "provenance": provenance(),
         },

@@ -185,7 +185,7 @@ def _make_model(config: TrainConfig) -> SAC:
 
         single = config.environment.make()
         known: Any = single.unwrapped
-        options = {"interface": known.interface, "task": known.task, "share": sac.hindsight}
+        options = {"spaces": known.spaces, "task": known.task, "share": sac.hindsight}
         buffer = {"replay_buffer_class": HindsightBuffer, "replay_buffer_kwargs": options}
         single.close()
     model = SAC(

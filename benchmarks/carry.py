@@ -47,7 +47,7 @@ def swing(parameters: np.ndarray):
         k = next(step)
         path = np.vstack([np.zeros(4), angles])
         command = np.array([np.interp(k, times, path[:, j]) for j in range(4)])
-        return env.interface.action(command, env.state.command)
+        return env.spaces.action(command, env.state.command)
 
     return act
 

@@ -13,7 +13,7 @@ from codesign.objectives import OBJECTIVES
 from codesign.sampling import SamplerConfig, check_options
 from softgym_envs.config import Config
 from softgym_envs.designs import DesignSpace
-from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.envs.tasks.reach import Reach
 from softgym_envs.robots.base import Robot
 
 __all__ = [
@@ -299,7 +299,7 @@ class StudyConfig(Config):
     def _comparable(cls, environment: EnvironmentConfig) -> EnvironmentConfig:
         if environment.sample_design:
             raise ValueError("sample_design must be false: a trial has one body; 'variables' names what is optimised")
-        environment.robot().design_space.complete(environment.design)
+        environment.make_robot().design_space.complete(environment.design)
         return environment
 
     @model_validator(mode="after")
@@ -353,13 +353,13 @@ class StudyConfig(Config):
             raise ValueError(
                 f"environment.backend = '{self.environment.backend}' has no joint training; allowed: surrogate"
             )
-        row = ENVIRONMENTS[self.environment.id]
-        if self.goals.source == "family" and row.backend != "surrogate":
+        row = self.environment.row
+        if self.goals.source == "family" and not self.environment.has_surrogate:
             raise ValueError(
                 f"goals.source = 'family' needs a surrogate, which robot '{row.robot}' has not; allowed: task, zone"
             )
         trains = plan.trains or plan.proposer or self.finalists.seeds
-        if self.goals.source != "task" and trains and row.task != "reach":
+        if self.goals.source != "task" and trains and not issubclass(self.environment.task_class, Reach):
             raise ValueError(
                 f"goals.source = '{self.goals.source}' gives points to train on, task '{row.task}' takes paths; "
                 "allowed: task"
@@ -419,7 +419,7 @@ class StudyConfig(Config):
     @property
     def robot(self) -> Robot:
         """The family of bodies."""
-        return self.environment.robot()
+        return self.environment.make_robot()
 
     @property
     def space(self) -> DesignSpace:
@@ -429,7 +429,7 @@ class StudyConfig(Config):
     @property
     def episode_steps(self) -> int:
         """Environment steps of an episode."""
-        return ENVIRONMENTS[self.environment.id].max_episode_steps
+        return self.environment.row.max_episode_steps
 
     @property
     def baseline(self) -> dict[str, float]:

@@ -24,7 +24,7 @@ from codesign.report.results import write_results
 from codesign.scheduling.jobs import missing_jobs
 from codesign.scheduling.processes import run_workers
 from codesign.scheduling.queue import Ledger, distributions, make_pruner, make_sampler
-from softgym_envs.envs.env import design_names
+from softgym_envs.envs.options import design_names
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign, SoftGymError
 from softgym_envs.storage import read_json, write_json
 

@@ -24,8 +24,9 @@ import softgym_envs  # noqa: F401 - registers the environments
 from softgym_envs.backends import BACKENDS
 from softgym_envs.envs.env import SoftRobotEnv
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.envs.spaces import Interface
-from softgym_envs.envs.tasks.base import TASKS, Task
+from softgym_envs.envs.spaces import AgentSpaces
+from softgym_envs.envs.tasks.base import Task
+from softgym_envs.envs.tasks.registry import TASKS
 from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock
@@ -351,7 +352,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
     task_class: Any = TASKS[row.task]
     task: Task = task_class(robot, **row.task_options)
     moving = bool(row.backend_options.get("dynamics"))
-    interface = Interface(robot, action_mode="increment", design_names=(), axes=task.axes, moving=moving)
+    spaces = AgentSpaces(robot, action_mode="increment", design_names=(), axes=task.axes, moving=moving)
     scales = observation_scales(robot)
     along = "" if task.axes.all() else " along " + " and ".join(np.array(list("xyz"))[task.axes > 0.0])
     unit = robot.actuators[0].unit
@@ -402,8 +403,8 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         for size, *cells in parts:
             rows.append([str(start) if size == 1 else f"{start}-{start + size - 1}", *cells])
             start += size
-        if (start,) != interface.observation_space.shape:
-            raise ValueError(f"the table of observations has {start} rows, not {interface.observation_space.shape}")
+        if (start,) != spaces.observation_space.shape:
+            raise ValueError(f"the table of observations has {start} rows, not {spaces.observation_space.shape}")
         rows.append([f"{start}-", "design variables, if `design_in_observation`", "bounds to [-1, 1]", ""])
         return table(["index", "observation", "scaled by", "unit"], rows)
 

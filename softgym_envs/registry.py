@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from softgym_envs.errors import unknown_name
@@ -78,6 +79,10 @@ class Registry(Mapping[str, type]):
         else:
             raise ValueError(unknown_name(self.kind, name_or_class, self))
         return self._checked(import_object(self.kind, found) if isinstance(found, str) else found)
+
+    def class_of(self, source: object) -> Any:
+        """Return the class of a registered name, a path, a class or an object, see `resolve`."""
+        return self.resolve(source if isinstance(source, str | type) else type(source))
 
     def make(self, name_or_class: object, *arguments: object, **options: object) -> Any:
         """Return an object of a class of this registry.
@@ -227,6 +232,25 @@ def check_options(owner: str, cls: type, positional: int, options: Mapping[str, 
     missing = [name for name, (p, _) in allowed.items() if p.default is p.empty and name not in options]
     if missing:
         raise ValueError(f"{owner} needs the option {' and '.join(missing)}")
+
+
+def class_path(cls: type) -> str:
+    """Return the path ``"module:class"`` by which other processes import a class.
+
+    The module of a class in the running script is the script's file, as if it were imported.
+
+    Raises:
+        ValueError: for a class that cannot be imported: one inside a function or of an interactive session.
+    """
+    module = cls.__module__
+    if module == "__main__":
+        import __main__
+
+        spec, file = getattr(__main__, "__spec__", None), getattr(__main__, "__file__", None)
+        module = spec.name if spec is not None else Path(file).stem if file else "__main__"
+    if module == "__main__" or "." in cls.__qualname__:
+        raise ValueError(f"class {_path(cls)} cannot be imported by other processes: define it at the top of a module")
+    return f"{module}:{cls.__qualname__}"
 
 
 def _shown(cls: type) -> str:

@@ -12,7 +12,7 @@ import yaml
 from codesign.config import StudyConfig
 from softgym_envs.config import check_config
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.envs.spaces import Interface
+from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.robots import ROBOTS
 from softgym_envs.surrogate.training import FitConfig
 
@@ -79,10 +79,10 @@ def test_pages_of_environments_are_completed(identifier):
 def test_scales_of_the_observation_are_the_real_ones(identifier):
     robot = generate.robot_of(ENVIRONMENTS[identifier].robot)
     scales = generate.observation_scales(robot)
-    interface = Interface(robot, action_mode="increment", design_names=(), moving=True)
+    spaces = AgentSpaces(robot, action_mode="increment", design_names=(), moving=True)
     n, none = len(robot.actuators), np.zeros(0)
     here, there, speed = np.zeros(3), np.array([scales["error"], 0.0, 0.0]), np.array([0.0, 0.0, scales["speed"]])
-    row = interface.observe(robot.lower, robot.upper, robot.effort_scale, here, there, none, speed)
+    row = spaces.observe(robot.lower, robot.upper, robot.effort_scale, here, there, none, speed)
     expected = np.concatenate([-np.ones(n), np.ones(n), np.full(n, 0.5), here, there / scales["position"]])
     np.testing.assert_allclose(row, [*expected, 0.5, 0.0, 0.0, 0.0, 0.0, 0.5], atol=1e-6)
 

@@ -17,7 +17,6 @@ from codesign.objectives import OBJECTIVES, rank_key, violations
 from codesign.phases.shared_policy import JUDGE
 from codesign.phases.trial import assess, training_config
 from codesign.scheduling.jobs import Job
-from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import read_json, write_json
 
@@ -188,7 +187,7 @@ def _environments(config: StudyConfig) -> dict[str, EnvironmentConfig]:
     own = config.environment
     options: dict[str, dict[str, Any]] = {"surrogate": {}, "fem": {}, own.backend: own.backend_options}
     options["fem"] = {**options["fem"], **config.finalists.fem_options}
-    backends = BACKENDS if ENVIRONMENTS[own.id].backend == "surrogate" else ("fem",)
+    backends = BACKENDS if own.has_surrogate else ("fem",)
     return {
         backend: own.model_copy(update={"backend": backend, "backend_options": options[backend]})
         for backend in backends

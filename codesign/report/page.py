@@ -219,7 +219,7 @@ def _question(study: StudyFolder, results: Mapping[str, Any]) -> list[tuple[str,
         others = "it has one path and no other, so the final test is on the same"
     done = ", ".join(f"{results['trials'][s]} {s}" for s in ("complete", "pruned", "infeasible"))
     rows = [
-        ("Task", f"{config.environment.id}, success within {1e3 * results['success_distance']:g} mm at the end"),
+        ("Task", f"{config.environment.title}, success within {1e3 * results['success_distance']:g} mm at the end"),
         ("Body", f"{len(optimised)} variables: {ranges}"),
         ("Objective", f"{OBJECTIVES[config.objective].label.lower()} on {count} goals, {direction}"),
         (

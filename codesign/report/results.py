@@ -24,8 +24,7 @@ from codesign.phases.finalists import (
 from codesign.phases.screen import screen_records
 from codesign.scheduling.queue import open_study
 from softgym_envs.config import provenance
-from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.envs.tasks.base import make_task
+from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.storage import atomic_write, read_json, write_json
 
 __all__ = ["collect", "mean_interval", "rank_correlation", "rate_interval", "write_results"]
@@ -96,8 +95,8 @@ def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float |
 def success_distance(folder: StudyFolder) -> float:
     """Distance below which a goal counts as reached [m]."""
     config = folder.config
-    task = make_task(ENVIRONMENTS[config.environment.id].task, config.robot, **config.environment.task_options)
-    return task.success_distance
+    row = config.environment.row
+    return make_task(row.task, config.robot, **{**row.task_options, **config.environment.task_options}).success_distance
 
 
 def _table(record: Mapping[str, Any], key: str) -> np.ndarray:
@@ -260,7 +259,7 @@ def collect(folder: StudyFolder) -> dict[str, Any]:
     return {
         "name": config.name,
         "title": config.title or config.name,
-        "environment": config.environment.id,
+        "environment": config.environment.title,
         "objective": config.objective,
         "strategy": config.strategy,
         "command": folder.account()["command"],

@@ -19,7 +19,7 @@ def list_() -> None:
     """List environments, robots, backends and tasks."""
     from softgym_envs.backends import BACKENDS
     from softgym_envs.envs.registration import ENVIRONMENTS
-    from softgym_envs.envs.tasks.base import TASKS
+    from softgym_envs.envs.tasks.registry import TASKS
     from softgym_envs.robots import ROBOTS
 
     click.echo("environments:")

@@ -1,82 +1,177 @@
-"""The table of environment IDs. A new environment is one row."""
+"""Environment IDs. A new environment of the suite is one row."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["ENVIRONMENTS", "EnvironmentRow", "register_environments"]
+from softgym_envs.errors import unknown_name
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
+
+    from softgym_envs.envs.tasks.base import Task
+    from softgym_envs.robots.base import Robot
+
+    RobotSource = str | type[Robot] | Robot
+    TaskSource = str | type[Task] | Task
 
 
 @dataclass(frozen=True)
 class EnvironmentRow:
-    """One environment ID: a robot, a task, a time limit, and what they are made with unless told otherwise.
+    """What an environment ID stands for: a robot, a task, a time limit and their default options.
 
     Attributes:
-        robot: registry name of the robot.
-        task: registry name of the task.
+        robot: registry name, ``"module:class"``, class or object; None where ``gymnasium.make`` must be given one.
+        task: registry name, ``"module:class"``, class or object.
         max_episode_steps: time limit.
-        backend: ``"surrogate"`` where weights ship for the robot, else ``"fem"``.
-        backend_options: options of that backend.
+        backend: name of the backend; None for the surrogate where weights ship for the robot, else FEM.
         robot_options: options of the robot.
         task_options: options of the task.
+        backend_options: options of that backend.
     """
 
-    robot: str
-    task: str
+    robot: RobotSource | None
+    task: TaskSource
     max_episode_steps: int
-    backend: str = "surrogate"
-    robot_options: dict[str, Any] = field(default_factory=dict)
-    task_options: dict[str, Any] = field(default_factory=dict)
-    backend_options: dict[str, Any] = field(default_factory=dict)
+    backend: str | None = None
+    robot_options: Mapping[str, Any] = field(default_factory=dict)
+    task_options: Mapping[str, Any] = field(default_factory=dict)
+    backend_options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def defaults(self) -> dict[str, Any]:
+        """Default options in the form that environments take them.
+
+        They are one option because ``gymnasium.make`` replaces whole mappings: the user's ``robot_options`` would
+        otherwise remove all of these.
+        """
+        options = ("robot_options", "task_options", "backend_options")
+        return {"defaults": {"backend": self.backend, **{name: dict(getattr(self, name)) for name in options}}}
+
+    def spec(self, id: str) -> EnvSpec:
+        """Return Gymnasium's specification of the environment, under an ID."""
+        from gymnasium.envs.registration import EnvSpec
+
+        return EnvSpec(
+            id=id,
+            entry_point="softgym_envs.envs.env:SoftRobotEnv",
+            # Only the surrogate is batched; without this entry point, make_vec steps single environments in turn.
+            vector_entry_point=(
+                "softgym_envs.envs.vector_env:SoftRobotVectorEnv" if self.backend in ("surrogate", None) else None
+            ),
+            max_episode_steps=self.max_episode_steps,
+            kwargs={"robot": self.robot, "task": self.task, "backend": self.backend, **self.defaults},
+        )
+
+
+def _row(robot: str, task: str, max_episode_steps: int, backend: str = "surrogate", **options: Any) -> EnvironmentRow:
+    return EnvironmentRow(robot, task, max_episode_steps, backend, **options)
 
 
 MOVING = {"dynamics": True}
 
 ENVIRONMENTS: dict[str, EnvironmentRow] = {
-    "SoftGym/FingerReach-v0": EnvironmentRow("finger", "reach", 50),
-    "SoftGym/FingerTrack-v0": EnvironmentRow("finger", "track", 100),
-    "SoftGym/DiamondReach-v0": EnvironmentRow("diamond", "reach", 50),
-    # The published circle asks for cables that push back on their way out.
-    "SoftGym/DiamondTrack-v0": EnvironmentRow("diamond", "track", 100, robot_options={"unilateral": False}),
-    "SoftGym/CableTrunkReach-v0": EnvironmentRow("cable_trunk", "reach", 50),
-    "SoftGym/CableTrunkTrack-v0": EnvironmentRow("cable_trunk", "track", 100),
-    "SoftGym/TrunkReach-v0": EnvironmentRow("trunk", "reach", 50),
-    "SoftGym/TrunkTrack-v0": EnvironmentRow("trunk", "track", 100),
-    "SoftGym/FingerPress-v0": EnvironmentRow("press_finger", "track", 100),
-    "SoftGym/GripperPinch-v0": EnvironmentRow("two_finger_gripper", "track", 100),
-    "SoftGym/GripperManipulate-v0": EnvironmentRow("three_finger_gripper", "track", 100),
-    "SoftGym/TetrapodReach-v0": EnvironmentRow("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
-    "SoftGym/TetrapodTrack-v0": EnvironmentRow("tetrapod", "track", 100, backend="fem", backend_options=MOVING),
-    "SoftGym/TetrapodCarry-v0": EnvironmentRow("tetrapod", "carry", 100, backend="fem", backend_options=MOVING),
+    "SoftGym/FingerReach-v0": _row("finger", "reach", 50),
+    "SoftGym/FingerTrack-v0": _row("finger", "track", 100),
+    "SoftGym/DiamondReach-v0": _row("diamond", "reach", 50),
+    # On its way out the published circle needs cables that push.
+    "SoftGym/DiamondTrack-v0": _row("diamond", "track", 100, robot_options={"unilateral": False}),
+    "SoftGym/CableTrunkReach-v0": _row("cable_trunk", "reach", 50),
+    "SoftGym/CableTrunkTrack-v0": _row("cable_trunk", "track", 100),
+    "SoftGym/TrunkReach-v0": _row("trunk", "reach", 50),
+    "SoftGym/TrunkTrack-v0": _row("trunk", "track", 100),
+    "SoftGym/FingerPress-v0": _row("press_finger", "track", 100),
+    "SoftGym/GripperPinch-v0": _row("two_finger_gripper", "track", 100),
+    "SoftGym/GripperManipulate-v0": _row("three_finger_gripper", "track", 100),
+    "SoftGym/TetrapodReach-v0": _row("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
+    "SoftGym/TetrapodTrack-v0": _row("tetrapod", "track", 100, backend="fem", backend_options=MOVING),
+    "SoftGym/TetrapodCarry-v0": _row("tetrapod", "carry", 100, backend="fem", backend_options=MOVING),
 }
-"""All environment IDs."""
+"""All environments of a robot with a task, by ID; `register_environment` adds to them."""
+
+
+GENERIC_ENVIRONMENTS: dict[str, EnvironmentRow] = {
+    "SoftGym/Reach-v0": EnvironmentRow(None, "reach", 50),
+    "SoftGym/Track-v0": EnvironmentRow(None, "track", 100),
+}
+"""IDs of a task for any robot, which is an option: ``gymnasium.make("SoftGym/Reach-v0", robot=MyRobot)``."""
+
+
+def find_row(id: str) -> EnvironmentRow:
+    """Return the row of an environment ID.
+
+    Raises:
+        ValueError: for an unknown ID.
+    """
+    row = ENVIRONMENTS.get(id) or GENERIC_ENVIRONMENTS.get(id)
+    if row is None:
+        raise ValueError(unknown_name("environment", id, [*ENVIRONMENTS, *GENERIC_ENVIRONMENTS]))
+    return row
+
+
+def register_environment(
+    id: str,
+    *,
+    robot: RobotSource,
+    task: TaskSource,
+    max_episode_steps: int | None = None,
+    backend: str | None = None,
+    robot_options: Mapping[str, Any] | None = None,
+    task_options: Mapping[str, Any] | None = None,
+    backend_options: Mapping[str, Any] | None = None,
+) -> None:
+    """Register an environment ID of your own with Gymnasium, the command line and studies.
+
+    Other processes know the ID only if they import the module that registers it.
+
+    Args:
+        id: such as ``"MyLab/ArmReach-v0"``.
+        robot: registry name, ``"module:class"``, class or object.
+        task: registry name, ``"module:class"``, class or object.
+        max_episode_steps: time limit; default that of the task.
+        backend: name of the backend; None for the surrogate where weights ship for the robot, else FEM.
+        robot_options: options of the robot.
+        task_options: options of the task.
+        backend_options: options of the backend.
+
+    Raises:
+        ValueError: for an ID that is taken or an unknown robot or task.
+    """
+    import gymnasium
+
+    from softgym_envs.envs.tasks.registry import TASKS
+    from softgym_envs.robots.registry import ROBOTS
+
+    if id in gymnasium.registry:
+        raise ValueError(f"environment '{id}' is already registered")
+    ROBOTS.class_of(robot)
+    if max_episode_steps is None:
+        max_episode_steps = TASKS.class_of(task).max_episode_steps
+    row = EnvironmentRow(
+        robot, task, max_episode_steps, backend, robot_options or {}, task_options or {}, backend_options or {}
+    )
+    ENVIRONMENTS[id] = row
+    _register(row.spec(id))
 
 
 def register_environments() -> None:
-    """Register every row of `ENVIRONMENTS` with Gymnasium."""
+    """Register all rows with Gymnasium."""
     import gymnasium
 
-    for identifier, row in ENVIRONMENTS.items():
-        if identifier not in gymnasium.registry:
-            gymnasium.register(
-                id=identifier,
-                entry_point="softgym_envs.envs.env:SoftRobotEnv",
-                # Only the surrogate is batched; without an entry point make_vec steps single environments in turn.
-                vector_entry_point=(
-                    "softgym_envs.envs.vector_env:SoftRobotVectorEnv" if row.backend == "surrogate" else None
-                ),
-                max_episode_steps=row.max_episode_steps,
-                kwargs={
-                    "robot": row.robot,
-                    "task": row.task,
-                    "backend": row.backend,
-                    # Gymnasium replaces whole mappings; these stay under what the user gives.
-                    "defaults": {
-                        "backend": row.backend,
-                        "robot_options": dict(row.robot_options),
-                        "task_options": dict(row.task_options),
-                        "backend_options": dict(row.backend_options),
-                    },
-                },
-            )
+    for id, row in {**ENVIRONMENTS, **GENERIC_ENVIRONMENTS}.items():
+        if id not in gymnasium.registry:
+            _register(row.spec(id))
+
+
+def _register(spec: EnvSpec) -> None:
+    import gymnasium
+
+    gymnasium.register(
+        id=spec.id,
+        entry_point=spec.entry_point,
+        vector_entry_point=spec.vector_entry_point,
+        max_episode_steps=spec.max_episode_steps,
+        kwargs=spec.kwargs,
+    )

@@ -1,31 +1,35 @@
-"""What an agent sees and does: spaces, scaling and bookkeeping shared by the single and the batched environment."""
+"""Observation and action of an agent: layout, scaling and bounds, shared by all environments."""
 
 from __future__ import annotations
 
 import numpy as np
 from gymnasium import spaces
 
+from softgym_envs.envs.arrays import Array, namespace
 from softgym_envs.robots.base import Robot
 
-__all__ = ["Interface"]
 
+class AgentSpaces:
+    """Observation and action spaces of a robot with a task, and the scaling between them and SI units.
 
-class Interface:
-    """Observation and action layout of a robot and a task. All methods work on batches (B, ...).
+    Methods take single states or batches (B, ...). `command` and `observe` also take torch tensors, in a copy of this
+    object whose arrays are tensors.
 
     Args:
         robot: the robot.
         action_mode: ``"increment"``: an action of 1 moves a command by its largest rate; ``"absolute"``: -1 and 1 are
-            the ends of the actuator's range, approached at no more than the rate.
-        design_names: design variables shown in the observation, none for an empty tuple.
-        axes: which coordinates of the effector count in the error, shape (3,); default all.
-        moving: show velocities, as an agent needs in dynamics.
+            the ends of the actuator's range, which the command approaches no faster than its rate.
+        design_names: design variables in the observation; an empty tuple for none.
+        axes: coordinates of the effector that count in the error, 1 or 0, shape (3,); default all.
+        moving: whether the observation contains the effector's velocity, which an agent needs in dynamics.
 
     Attributes:
-        reach: what positions are divided by [m].
-        error_scale: distance to the goal that is shown as one half [m].
-        slices: where the parts of an observation are: command, displacement, effort, effector, goal, error, velocity,
-            design.
+        action_space: of one environment, shape (n_a,).
+        observation_space: of one environment, shape (d,).
+        position_scale: positions are divided by it [m].
+        error_scale: distance to the goal that appears as one half [m].
+        slices: where to find the parts of an observation: command, displacement, effort, effector, goal, error,
+            velocity, design.
     """
 
     def __init__(
@@ -42,12 +46,15 @@ class Interface:
         self.robot = robot
         self.action_mode = action_mode
         self.design_names = design_names
-        self.axes = np.ones(3) if axes is None else axes
+        self.axes: Array = np.ones(3) if axes is None else axes
         self.moving = moving
-        self.lower, self.upper, self.rates = robot.lower, robot.upper, robot.rates
-        self._middle = 0.5 * (self.lower + self.upper)
-        self._half = 0.5 * (self.upper - self.lower)
-        self.reach = 1.25 * robot.size
+        self.lower: Array = robot.lower
+        self.upper: Array = robot.upper
+        self.rates: Array = robot.rates
+        self.effort_scale: Array = np.asarray(robot.effort_scale, dtype=float)
+        self.middle: Array = 0.5 * (robot.lower + robot.upper)
+        self.half_range: Array = 0.5 * (robot.upper - robot.lower)
+        self.position_scale = 1.25 * robot.size
         self.error_scale = robot.workspace_scale / 2.5
         n = len(robot.actuators)
         self.action_space = spaces.Box(-1.0, 1.0, (n,), np.float32)
@@ -81,67 +88,84 @@ class Interface:
             raise ValueError(f"action = {action.tolist()} must be finite; allowed: -1 to 1")
         return np.minimum(np.maximum(action, -1.0), 1.0)
 
-    def command(self, action: np.ndarray, previous: np.ndarray) -> np.ndarray:
-        """Commanded displacements that follow an action, shape (..., n_a)."""
+    def command(self, action: Array, previous: Array) -> Array:
+        """Return the commanded displacements that an action in [-1, 1] leads to, shape (..., n_a)."""
+        xp = namespace(action)
         if self.action_mode == "increment":
             target = previous + action * self.rates
         else:
-            target = self._middle + action * self._half
-            target = previous + np.minimum(np.maximum(target - previous, -self.rates), self.rates)
-        return np.minimum(np.maximum(target, self.lower), self.upper)
+            target = self.middle + action * self.half_range
+            target = previous + xp.minimum(xp.maximum(target - previous, -self.rates), self.rates)
+        return xp.minimum(xp.maximum(target, self.lower), self.upper)
 
     def action(self, command: np.ndarray, previous: np.ndarray) -> np.ndarray:
-        """The action that leads to a command, for controllers that think in displacements; shape (..., n_a)."""
+        """Return the action that leads to a command, shape (..., n_a), for controllers that compute displacements."""
         if self.action_mode == "increment":
             action = (command - previous) / self.rates
         else:
-            action = (command - self._middle) / self._half
+            action = (command - self.middle) / self.half_range
         return np.minimum(np.maximum(action, -1.0), 1.0).astype(np.float32)
 
     def observe(
         self,
-        command: np.ndarray,
-        displacement: np.ndarray,
-        effort: np.ndarray,
-        effector: np.ndarray,
-        goal: np.ndarray,
-        unit_design: np.ndarray,
-        velocity: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Scaled observation (..., d): command, displacement, effort, effector, goal, error, velocity, design.
+        command: Array,
+        displacement: Array,
+        effort: Array,
+        effector: Array,
+        goal: Array,
+        unit_design: Array,
+        velocity: Array | None = None,
+    ) -> Array:
+        """Return the observation of a state, shape (..., d), float32 or of the tensors' type.
 
-        Efforts and errors have no bound of their own and are squashed by x / (1 + |x|), which loses nothing.
+        The parts are command, displacement, effort, effector, goal, error, velocity and design. Efforts, errors and
+        velocities are unbounded; x / (1 + abs(x)) maps them to (-1, 1) without loss.
+
+        Args:
+            command: commanded displacements, shape (..., n_a).
+            displacement: displacements, shape (..., n_a).
+            effort: efforts, shape (..., n_a).
+            effector: first effector [m], shape (..., 3).
+            goal: goal [m], shape (..., 3).
+            unit_design: design variables in [-1, 1], shape (..., k).
+            velocity: of the first effector [m/s], shape (..., 3); required if ``moving``.
         """
-        relative = effort / self.robot.effort_scale
-        speed = velocity / self.robot.size if self.moving and velocity is not None else None
-        parts = (
-            (command - self._middle) / self._half,
-            (displacement - self._middle) / self._half,
-            relative / (1.0 + np.abs(relative)),
-            effector / self.reach,
-            *self._show_goal(effector, goal),
-            *(() if speed is None else (speed / (1.0 + np.abs(speed)),)),
-            unit_design,
-        )
-        observation = np.concatenate(parts, axis=-1)
-        return np.minimum(np.maximum(observation, -1.0), 1.0).astype(np.float32)
+        xp = namespace(effector)
+        parts = [
+            (command - self.middle) / self.half_range,
+            (displacement - self.middle) / self.half_range,
+            _squash(effort / self.effort_scale),
+            effector / self.position_scale,
+            *self._goal_parts(effector, goal),
+        ]
+        if self.moving and velocity is not None:
+            parts.append(_squash(velocity / self.robot.size))
+        observation = xp.concatenate((*parts, unit_design), axis=-1).clip(-1.0, 1.0)
+        return observation.astype(np.float32) if xp is np else observation
 
-    def _show_goal(self, effector: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        error = self.axes * (goal - effector) / self.error_scale
-        return goal / self.reach, error / (1.0 + np.abs(error))
+    def _goal_parts(self, effector: Array, goal: Array) -> tuple[Array, Array]:
+        return goal / self.position_scale, _squash(self.axes * (goal - effector) / self.error_scale)
 
-    def effector(self, observation: np.ndarray) -> np.ndarray:
-        """The first effector [m] (..., 3) that observations (..., d) show, with their seven digits."""
-        return observation[..., self.slices["effector"]].astype(float) * self.reach
+    def observed_effector(self, observation: np.ndarray) -> np.ndarray:
+        """Return the first effector [m] (..., 3) in observations (..., d), with the digits of float32."""
+        return observation[..., self.slices["effector"]].astype(float) * self.position_scale
 
-    def effort_share(self, observation: np.ndarray) -> np.ndarray:
-        """The mean effort over its scale (...) that observations (..., d) show."""
+    def effort_share(self, effort: Array) -> Array:
+        """Return the mean over the actuators (...) of efforts (..., n_a) relative to their scale."""
+        return abs(effort / self.effort_scale).mean(axis=-1)
+
+    def observed_effort_share(self, observation: np.ndarray) -> np.ndarray:
+        """Return `effort_share` (...) of the efforts in observations (..., d)."""
         squashed = np.abs(observation[..., self.slices["effort"]].astype(float))
         return (squashed / (1.0 - np.minimum(squashed, 1.0 - 1e-7))).mean(axis=-1)
 
     def with_goal(self, observation: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Observations (..., d) as they would be with other goals [m] (..., 3)."""
+        """Return observations (..., d) of the same states with other goals [m] (..., 3)."""
         changed = observation.copy()
-        shown = np.concatenate(self._show_goal(self.effector(observation), goal), axis=-1)
-        changed[..., self.slices["goal"].start : self.slices["error"].stop] = np.clip(shown, -1.0, 1.0)
+        parts = np.concatenate(self._goal_parts(self.observed_effector(observation), goal), axis=-1)
+        changed[..., self.slices["goal"].start : self.slices["error"].stop] = np.clip(parts, -1.0, 1.0)
         return changed
+
+
+def _squash(x: Array) -> Array:
+    return x / (1.0 + abs(x))

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from softgym_envs.backends.surrogate import Settled, at_rest, settle
-from softgym_envs.envs.env import design_names, merge_defaults
-from softgym_envs.envs.spaces import Interface
-from softgym_envs.envs.tasks.base import make_task
+from softgym_envs.envs.options import EnvironmentOptions, check_counts, check_reset_options, set_up
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
-from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.model import Context
 from softgym_envs.surrogate.pretrained import pretrained_model
 
-__all__ = ["SoftRobotVectorEnv"]
+if TYPE_CHECKING:
+    from softgym_envs.envs.registration import RobotSource, TaskSource
 
 
 class SoftRobotVectorEnv(VectorEnv):
@@ -29,75 +27,61 @@ class SoftRobotVectorEnv(VectorEnv):
     the first of the next episode, and ``info["final_obs"]``, ``info["final_info"]`` hold the end of the last one.
 
     Args:
-        robot: registry name of the robot.
-        task: registry name of the task.
+        robot: as for `SoftRobotEnv`.
+        task: as for `SoftRobotEnv`.
         num_envs: number of sub-environments.
-        max_episode_steps: time limit.
-        backend: ``"surrogate"``; other backends are not batched, use ``vectorization_mode="sync"`` for them.
-        design: body of every episode unless sampled or given in `reset`.
-        sample_design: as for `SoftRobotEnv`; every sub-environment draws its own.
-        design_in_observation: as for `SoftRobotEnv`.
-        action_mode: as for `SoftRobotEnv`.
-        robot_options: options of the robot.
-        task_options: options of the task.
-        backend_options: options of the backend (``weights``, ``members``).
-        defaults: as for `SoftRobotEnv`.
+        max_episode_steps: time limit; default none.
+        backend: ``"surrogate"``; ``gymnasium.make_vec(..., vectorization_mode="sync")`` steps other backends.
+        render_mode: None; batches are not rendered.
+        **options: see `EnvironmentOptions`; every sub-environment samples its own design.
+
+    Raises:
+        ValueError: for a wrong option, or a robot without a surrogate.
+        DesignError: for a malformed design.
+        WeightsError: if the surrogate's weights are damaged or belong to another robot.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
     def __init__(
         self,
-        robot: str,
-        task: str,
+        robot: RobotSource | None = None,
+        task: TaskSource = "reach",
         num_envs: int = 1,
         *,
         max_episode_steps: int | None = None,
-        backend: str = "surrogate",
-        design: Mapping[str, float] | None = None,
-        sample_design: bool | Sequence[str] = False,
-        design_in_observation: bool | Sequence[str] = False,
-        action_mode: str = "increment",
-        robot_options: Mapping[str, Any] | None = None,
-        task_options: Mapping[str, Any] | None = None,
-        backend_options: Mapping[str, Any] | None = None,
-        defaults: Mapping[str, Any] | None = None,
+        backend: str | None = None,
         render_mode: str | None = None,
+        **options: Any,
     ) -> None:
-        if backend != "surrogate":
-            raise ValueError(
-                f"backend = {backend!r} has no batched environment; allowed: 'surrogate' "
-                "(or gymnasium.make_vec(..., vectorization_mode='sync'))"
-            )
         if render_mode is not None:
             raise ValueError(
                 f"render_mode = {render_mode!r} is not available in the batched environment; allowed: None"
             )
-        if num_envs < 1:
-            raise ValueError(f"num_envs = {num_envs} must be at least 1")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps = {max_episode_steps} must be at least 1")
+        check_counts(num_envs, max_episode_steps)
+        setup = set_up(robot, task, backend, EnvironmentOptions.check(options))
+        self.robot, self.task = setup.robot, setup.task
+        if setup.backend != "surrogate":
+            raise ValueError(
+                f"backend = {setup.backend!r} of robot '{self.robot.name}' has no batched environment; "
+                "allowed: 'surrogate', or gymnasium.make_vec(..., vectorization_mode='sync')"
+            )
+        if self.task.pushes:
+            raise ValueError(
+                f"task '{self.task.name}' pushes the effector, but the batched environment takes no forces"
+            )
         self.num_envs = num_envs
         self.render_mode = None
-        robot_options, task_options, backend_options = merge_defaults(
-            defaults, backend, robot_options, task_options, backend_options
-        )
-        self.robot = make_robot(robot, **robot_options)
         self.design_space = self.robot.design_space
-        self.model = pretrained_model(self.robot, **backend_options)
-        self.task = make_task(task, self.robot, **task_options)
-        if self.task.pushes:
-            raise ValueError(f"task '{task}' pushes the effector, the batched environment knows no forces")
+        self.model = pretrained_model(self.robot, **setup.backend_options)
         self.max_episode_steps = max_episode_steps if max_episode_steps is not None else np.iinfo(np.int64).max
-        self._fixed_design = self.design_space.complete(design)
-        self._sampled = design_names(self.design_space, sample_design)
-        shown = design_names(self.design_space, design_in_observation)
+        self._fixed_design, self.sampled_variables = setup.design, setup.sampled
         #: Draws the sampled variables, in unit coordinates [-1, 1], for sub-environments ``index``: shape
         #: (len(index), number of sampled variables). Replace it to draw bodies in another way.
         self.design_sampler: Callable[[np.random.Generator, np.ndarray], np.ndarray] = self._draw_evenly
-        self.interface = Interface(self.robot, action_mode=action_mode, design_names=shown, axes=self.task.axes)
-        self.single_action_space = self.interface.action_space
-        self.single_observation_space = self.interface.observation_space
+        self.spaces = setup.spaces()
+        self.single_action_space = self.spaces.action_space
+        self.single_observation_space = self.spaces.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
@@ -111,7 +95,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self._rest_uncertainty = np.zeros(num_envs)
         self._rest_trusted = np.ones(num_envs, dtype=bool)
         self._rest_effector = np.zeros((num_envs, 3))
-        self._unit_design = np.zeros((num_envs, len(shown)))
+        self._unit_design = np.zeros((num_envs, len(setup.shown)))
         self._command = np.zeros((num_envs, n))
         self._displacement = np.zeros((num_envs, n))
         self._effort = np.zeros((num_envs, n))
@@ -128,7 +112,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self._take_rest(np.arange(num_envs), rest)
 
     def _draw_evenly(self, rng: np.random.Generator, index: np.ndarray) -> np.ndarray:
-        return rng.uniform(-1.0, 1.0, (len(self._sampled), len(index))).T
+        return rng.uniform(-1.0, 1.0, (len(self.sampled_variables), len(index))).T
 
     # -- bodies -----------------------------------------------------------------------------------------------------
 
@@ -146,7 +130,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self._rest_displacement[index], self._rest_effort[index] = rest.displacement, rest.effort
         self._rest_effector[index] = rest.effector[:, :3]
         self._rest_uncertainty[index], self._rest_trusted[index] = rest.uncertainty, rest.trusted
-        for column, name in enumerate(self.interface.design_names):
+        for column, name in enumerate(self.spaces.design_names):
             values = self.designs[index, self.design_space.names.index(name)]
             self._unit_design[index, column] = self.design_space[name].to_unit(values)
 
@@ -164,11 +148,11 @@ class SoftRobotVectorEnv(VectorEnv):
             self.designs[index] = [self.design_space.complete(d, self._fixed_design).array for d in designs]
             self._begin_bodies(index)
             self._changed[index] = True
-        elif self._sampled:
+        elif self.sampled_variables:
             names = self.design_space.names
             self.designs[index] = self._fixed_design.array
             for column, draws in enumerate(self.design_sampler(self.np_random, index).T):
-                name = self._sampled[column]
+                name = self.sampled_variables[column]
                 self.designs[index, names.index(name)] = self.design_space[name].from_unit(draws)
             self._begin_bodies(index)
         elif self._changed[index].any():
@@ -243,16 +227,12 @@ class SoftRobotVectorEnv(VectorEnv):
         if isinstance(seed, list):
             seed = int(np.random.SeedSequence(seed).generate_state(1)[0])
         super().reset(seed=seed)
-        options = dict(options or {})
-        unknown = set(options) - {"design", "goal"}
-        if unknown:
-            raise ValueError(f"unknown reset option '{sorted(unknown)[0]}'; allowed: design, goal")
-        goal = options.get("goal")
+        design, goal = check_reset_options(options)
         if goal is not None:
             shared = np.ndim(goal) < 3
             goal = self.task.check_paths(goal, () if shared else (self.num_envs,))
             goal = np.broadcast_to(goal, (self.num_envs, *goal.shape[-2:]))
-        self._begin_episodes(np.arange(self.num_envs), options.get("design"), goal)
+        self._begin_episodes(np.arange(self.num_envs), design, goal)
         return self._observe(), self._info()[0]
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -261,10 +241,10 @@ class SoftRobotVectorEnv(VectorEnv):
         Raises:
             ValueError: for actions of a wrong shape or ones that are not finite.
         """
-        actions = self.interface.check_action(actions)
+        actions = self.spaces.check_action(actions)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
-        command = self.interface.command(actions, self._command)
+        command = self.spaces.command(actions, self._command)
         settled = settle(self.model, self._context, command, self._displacement, self._unilateral, self._slack)
         self._converged = settled.converged.copy()
         if settled.converged.all():
@@ -298,18 +278,13 @@ class SoftRobotVectorEnv(VectorEnv):
         return observation, reward, np.zeros(self.num_envs, dtype=bool), truncated, info
 
     def _observe(self) -> np.ndarray:
-        return self.interface.observe(
+        return self.spaces.observe(
             self._command, self._displacement, self._effort, self._effector, self.goals, self._unit_design
         )
 
     def _info(self) -> tuple[dict[str, Any], np.ndarray]:
         goals = self.goals
-        distance = self.task.distance(self._effector, goals)
-        share = np.abs(self._effort / self.robot.effort_scale).mean(axis=1)
-        terms = self.task.reward_terms(distance, share)
-        reward = np.ones(self.num_envs)
-        for term in terms.values():
-            reward = reward * term
+        distance, terms, reward = self.task.rate(self._effector, goals, self.spaces.effort_share(self._effort))
         present = np.ones(self.num_envs, dtype=bool)
         info: dict[str, Any] = {
             "effector": self._effector.copy(),

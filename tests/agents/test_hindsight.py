@@ -17,7 +17,7 @@ def make_buffer(env, share, size=400):
         env.single_action_space,
         "cpu",
         n_envs=env.num_envs,
-        interface=env.interface,
+        spaces=env.spaces,
         task=env.task,
         share=share,
     )
@@ -62,10 +62,10 @@ def test_a_relabelled_transition_is_what_the_environment_gives_for_that_goal():
     again = run(reached[:, None, :])
     for k in range(13):
         for part in (0, 1):
-            shown = env.interface.with_goal(first[k][part], reached)
+            shown = env.spaces.with_goal(first[k][part], reached)
             assert np.abs(shown - again[k][part]).max() < 2e-6
-        distance = env.task.distance(env.interface.effector(first[k][1]), reached)
-        terms = env.task.reward_terms(distance, env.interface.effort_share(first[k][1]))
+        distance = env.task.distance(env.spaces.observed_effector(first[k][1]), reached)
+        terms = env.task.reward_terms(distance, env.spaces.observed_effort_share(first[k][1]))
         assert np.abs(np.prod(list(terms.values()), axis=0) - again[k][2]).max() < 1e-4
     assert buffer.share == 1.0
 
@@ -80,7 +80,7 @@ def test_new_goals_were_reached_at_or_after_the_transition_in_its_episode():
     samples = buffer._get_samples(rows)
     np.random.seed(4)  # noqa: NPY002
     columns = np.random.randint(0, 4, 300)  # noqa: NPY002
-    goals = samples.next_observations.numpy()[:, buffer.interface.slices["goal"]] * buffer.interface.reach
+    goals = samples.next_observations.numpy()[:, buffer.spaces.slices["goal"]] * buffer.spaces.position_scale
     episodes = np.cumsum(np.vstack([np.zeros((1, 4), bool), ends[:-1]]), axis=0)
     ahead = []
     for goal, row, column in zip(goals, rows, columns, strict=True):

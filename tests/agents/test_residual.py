@@ -42,7 +42,7 @@ def test_what_is_done_is_the_clipped_sum():
         expected = np.clip(qp(None, env.unwrapped) + 0.5 * action, -1, 1)
         before = env.unwrapped.state.command
         env.step(action)
-        done = env.unwrapped.interface.command(expected, before)
+        done = env.unwrapped.spaces.command(expected, before)
         assert np.abs(env.unwrapped.state.command - done).max() < 1e-9
 
 

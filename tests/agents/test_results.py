@@ -249,7 +249,7 @@ def test_the_graph_of_a_policy_is_the_policy(case, tmp_path):
         str(export_policy_onnx(policy, tmp_path / "policy.onnx")), providers=["CPUExecutionProvider"]
     )
     env = config.environment.make().unwrapped
-    interface, robot = env.interface, env.robot
+    spaces, robot = env.spaces, env.robot
     rng = np.random.default_rng(0)
     count = 40
     n = len(robot.actuators)
@@ -261,15 +261,15 @@ def test_the_graph_of_a_policy_is_the_policy(case, tmp_path):
         "goal": robot.size * rng.normal(size=(count, 3)),
         "velocity": robot.size * rng.normal(size=(count, 3)),
     }
-    units = rng.uniform(-1, 1, (count, len(interface.design_names)))
+    units = rng.uniform(-1, 1, (count, len(spaces.design_names)))
     design = (
         np.stack(
-            [robot.design_space[name].from_unit(units[:, k]) for k, name in enumerate(interface.design_names)], axis=1
+            [robot.design_space[name].from_unit(units[:, k]) for k, name in enumerate(spaces.design_names)], axis=1
         )
-        if interface.design_names
+        if spaces.design_names
         else np.zeros((count, 0))
     )
-    expected = policy(interface.observe(*(state[name] for name in list(state)[:5]), units, state["velocity"]))
+    expected = policy(spaces.observe(*(state[name] for name in list(state)[:5]), units, state["velocity"]))
     given = {**state, "design": design}
     feed = {entry.name: given[entry.name].astype(np.float32) for entry in session.get_inputs()}
     assert ("velocity" in feed) == (case == "moving") and ("design" in feed) == ("bodies" in case)
@@ -278,7 +278,7 @@ def test_the_graph_of_a_policy_is_the_policy(case, tmp_path):
     if case == "on the QP":
         assert set(found) == {"action"}
     else:
-        command = interface.command(expected.astype(float), state["command"])
+        command = spaces.command(expected.astype(float), state["command"])
         assert (np.abs(found["next_command"] - command) / (robot.upper - robot.lower)).max() < 1e-5
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import softgym_envs  # noqa: F401  (registers the environments)
-from softgym_envs.envs.tasks.base import make_task
+from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.robots import make_robot
 
 
@@ -91,9 +91,9 @@ def test_success_is_to_be_beyond_the_goal():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"distance": -0.1}, "distance = -0.1 must be finite and not negative"),
+        ({"distance": -0.1}, "distance = -0.1 must be non-negative and finite"),
         ({"distance": np.nan}, "distance = nan must be finite"),
-        ({"push": -1.0}, "push = -1.0 must be finite and not negative"),
+        ({"push": -1.0}, "push = -1.0 must be non-negative and finite"),
         ({"push": np.inf}, "push = inf must be finite"),
         ({"push_steps": 0}, "push_steps = 0 and push_window = 40 must be at least 1"),
         ({"push_window": 0}, "push_steps = 4 and push_window = 0 must be at least 1"),

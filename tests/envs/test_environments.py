@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 
 import softgym_envs
 from softgym_envs.backends import BACKENDS
-from softgym_envs.envs.tasks.base import make_task
+from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.errors import ConvergenceError, DesignError
 from softgym_envs.robots import make_robot
 from softgym_envs.robots.base import Robot

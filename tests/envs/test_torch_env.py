@@ -73,7 +73,7 @@ def test_absolute_actions_one_member_and_options():
         "task_options": {"command_low": 0.5, "spread": 1e-3},
     }
     reference = gymnasium.make_vec(FINGER, num_envs=3, backend_options={"members": 1}, **options).unwrapped
-    env = TorchVectorEnv(FINGER, 3, device="cpu", members=1, **options)
+    env = TorchVectorEnv(FINGER, 3, device="cpu", backend_options={"members": 1}, **options)
     goal = [0.005, 0.05, -0.1]
     expected, _ = reference.reset(seed=0, options={"goal": goal})
     observation, info = env.reset(options={"goal": goal})
@@ -135,7 +135,7 @@ def test_rows_without_a_state_end_where_they_were(monkeypatch):
         return u * torch.nan, gradient, torch.zeros_like(found)
 
     monkeypatch.setattr(env._model, "search", lose)
-    monkeypatch.setattr(env, "_draw_goals", lambda bodies, count: torch.zeros(count, 1, 3))
+    monkeypatch.setattr(env._task, "sample", lambda rng, count, kinematics: torch.zeros(count, 1, 3))
     _, reward, terminated, truncated, info = env.step(torch.ones(3, 2))
     assert truncated.tolist() == [False, True, False] and not terminated.any()
     final = info["final_info"]
@@ -149,7 +149,7 @@ def test_rows_without_a_state_end_where_they_were(monkeypatch):
 
 def test_rows_that_take_longer_are_finished(monkeypatch):
     """With a single Newton step for all rows most are finished one by one, to the same states."""
-    monkeypatch.setattr(torch_env, "STEPS", 1)
+    monkeypatch.setattr(torch_env, "NEWTON_STEPS", 1)
     reference, env = pair("SoftGym/DiamondReach-v0", 8, sample_design=True)
     finish, calls = env._finish, []
     monkeypatch.setattr(env, "_finish", lambda result: calls.append(1) or finish(result))
@@ -275,7 +275,7 @@ def test_bad_input():
         ({"id": "SoftGym/TetrapodReach-v0"}, "TetrapodReach.*allowed.*FingerReach"),
         ({"num_envs": 0}, "num_envs = 0"),
         ({"dtype": torch.float16}, "float16.*float32"),
-        ({"members": 9}, "members = 9.*1 to 5"),
+        ({"backend_options": {"members": 9}}, "members = 9.*1 to 5"),
         ({"cuda_graph": True}, "cuda_graph.*cpu"),
         ({"action_mode": "up"}, "action_mode = 'up'"),
         ({"sample_design": ["weight"]}, "weight"),

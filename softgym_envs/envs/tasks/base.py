@@ -1,44 +1,48 @@
-"""The interface of a task: it sees effectors, efforts and a goal, never a backend. All of it is batched."""
+"""The Task base class: what a robot has to do, without regard to its physics."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from math import prod
+from typing import Any, Protocol
 
 import numpy as np
 
-from softgym_envs.registry import Registry
+from softgym_envs.envs.arrays import Array, namespace, pick_rows
 from softgym_envs.robots.base import Robot
 
-__all__ = ["TASKS", "Task", "check_goals", "make_task", "tolerance"]
-
-TASKS = Registry(
-    "task",
-    {
-        "reach": "softgym_envs.envs.tasks.reach:Reach",
-        "track": "softgym_envs.envs.tasks.track:Track",
-        "carry": "softgym_envs.envs.tasks.carry:Carry",
-    },
-    base="softgym_envs.envs.tasks.base:Task",
-    group="softgym_envs.tasks",
-)
-"""All tasks by name."""
-
-Kinematics = Callable[[np.ndarray], np.ndarray]
-"""Maps commands (B, n_a) to the effectors they lead to [m], shape (B, 3), for the present bodies."""
+Kinematics = Callable[[Array], Array]
+"""Maps commands (B, n_a) to the effectors that they lead to [m], shape (B, 3), for the present bodies."""
 
 
-def tolerance(x: np.ndarray, bound: float, margin: float) -> np.ndarray:
-    """Return 1 for ``x <= bound``, falling as 1 / (1 + 9 ((x - bound) / margin)^2): 0.1 at ``bound + margin``."""
-    excess = np.maximum(x - bound, 0.0) / margin
-    return 1.0 / (1.0 + 9.0 * excess * excess)
+class Random(Protocol):
+    """What tasks draw with: a `numpy.random.Generator`, or its counterpart for tensors."""
+
+    def uniform(self, low: Any, high: Any, size: Any, /) -> Array:
+        """Draw uniformly between ``low`` and ``high``."""
+
+    def integers(self, low: int, *, size: int) -> Array:
+        """Draw integers from 0 to ``low - 1``."""
 
 
-def check_goals(goals: object, name: str, leading: tuple[int, ...] = ()) -> np.ndarray:
+def tolerance(x: Array, margin: float) -> Array:
+    """Return 1 for ``x`` = 0, falling as 1 / (1 + 9 (x / margin)^2): 0.1 at ``margin``."""
+    share = x / margin
+    return 1.0 / (1.0 + 9.0 * share * share)
+
+
+def check_goals(goals: object, name: str, robot: Robot, leading: tuple[int, ...] = ()) -> np.ndarray:
     """Return goals [m] as an array (*leading, p, 3); a single point (*leading, 3) becomes a path of one.
 
+    Args:
+        goals: points or paths of points.
+        name: of the option, for messages.
+        robot: whose goals they are.
+        leading: expected leading shape.
+
     Raises:
-        ValueError: for another shape or a value that is not finite.
+        ValueError: for another shape, a value that is not finite or a point far from the robot.
     """
     try:
         array = np.asarray(goals, dtype=float)
@@ -56,32 +60,41 @@ def check_goals(goals: object, name: str, leading: tuple[int, ...] = ()) -> np.n
 
 
 class Task(ABC):
-    """What a robot is to do.
+    """What a robot has to do: draws goals, and rates how well a state fits the present goal.
+
+    A task sees effectors, efforts and goals in SI units, always in batches, and never a backend. `TorchVectorEnv` calls
+    a copy of the task whose arrays are tensors, so `sample`, `goals`, `distance` and `reward_terms` should compute with
+    ``namespace(array)`` in place of ``numpy``. Tasks that do not are limited to the other environments.
 
     Attributes:
-        name: registry name.
-        axes: which coordinates of the effector count, 1 or 0, shape (3,).
+        name: registry name; default the name of the class in lower case.
+        horizon: control steps that a path of goals covers; the last goal holds beyond it. 1 for a single goal.
+        max_episode_steps: time limit of an episode where none is given.
+        robot: the robot.
+        axes: coordinates of the effector that count, 1 or 0, shape (3,).
         success_distance: distance below which a goal counts as reached [m].
-        horizon: control steps a goal path describes; paths hold their last goal beyond it. 1 for a single goal.
     """
 
-    #: It pushes the effector, so the backend must know forces.
+    #: Whether it applies forces to the effector, which not every backend can.
     pushes = False
 
     name: str
-    horizon: int
+    horizon: int = 1
+    max_episode_steps: int = 100
 
     def __init__(self, robot: Robot) -> None:
+        if not hasattr(self, "name"):
+            self.name = type(self).__name__.lower()
         self.robot = robot
-        self.axes = np.asarray(robot.goal_axes, dtype=float)
+        self.axes: Array = np.asarray(robot.goal_axes, dtype=float)
         self.success_distance = robot.goal_tolerance
 
     @abstractmethod
-    def sample(self, rng: np.random.Generator, count: int, kinematics: Kinematics) -> np.ndarray:
+    def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
         """Draw the goals of ``count`` episodes: paths [m], shape (count, p, 3); p = 1 for a fixed goal."""
 
-    def goals(self, paths: np.ndarray, counts: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Goals [m] (B, 3) at control steps (B,) of paths (B, p, 3), which are spread over the horizon.
+    def goals(self, paths: Array, counts: Array, steps: Array) -> Array:
+        """Return the goals [m] (B, 3) at control steps (B,) of paths (B, p, 3), which are spread over the horizon.
 
         Args:
             paths: goals of each episode; row b has ``counts[b] <= p`` of them.
@@ -90,48 +103,51 @@ class Task(ABC):
         """
         if paths.shape[1] == 1:
             return paths[:, 0]
-        index = np.minimum(steps * counts // self.horizon, counts - 1)
-        return paths[np.arange(len(paths)), index]
+        return pick_rows(paths, namespace(steps).minimum(steps * counts // self.horizon, counts - 1))
 
     def check_paths(self, goals: object, leading: tuple[int, ...] = ()) -> np.ndarray:
         """Return the goals of episodes [m] as paths (*leading, p, 3).
 
         Raises:
-            ValueError: for another shape, values that are not finite, or a path where the task has one goal.
+            ValueError: for another shape, values that are not finite, a goal far from the robot, or a path where the
+                task has a single goal.
         """
-        paths = check_goals(goals, "goal", leading)
+        paths = check_goals(goals, "goal", self.robot, leading)
         if self.horizon == 1 and paths.shape[-2] > 1:
             raise ValueError(f"task '{self.name}' has one goal an episode, got a path of {paths.shape[-2]}")
         return paths
 
-    def begin(self, rng: np.random.Generator) -> None:  # noqa: B027 - a hook, not a duty
-        """Draw what else is random in an episode of a single environment; nothing by default."""
+    def begin(self, rng: np.random.Generator) -> None:  # noqa: B027 - optional
+        """Draw whatever else is random in an episode of a single environment; nothing by default."""
 
     def push(self, step: int) -> np.ndarray | None:
-        """Force on the first effector during a control step [N], shape (3,), or None."""
+        """Return the force on the first effector during a control step [N], shape (3,), or None."""
         return None
 
-    def distance(self, effector: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Distance [m] (...) of effectors to goals, each (..., 3), along the axes that count."""
-        return np.linalg.norm(self.axes * (effector - goal), axis=-1)
+    def distance(self, effector: Array, goal: Array) -> Array:
+        """Return the distance [m] (...) of effectors to goals, each (..., 3), along the axes that count."""
+        error = self.axes * (effector - goal)
+        return namespace(error).sqrt((error * error).sum(axis=-1))
 
-    def reward_terms(self, distance: np.ndarray, effort_share: np.ndarray) -> dict[str, np.ndarray]:
+    def reward_terms(self, distance: Array, effort_share: Array) -> dict[str, Array]:
         """Return the factors of the reward, each in [0, 1].
 
         Args:
             distance: effector to goal [m], shape (...).
             effort_share: mean actuator effort over its scale, shape (...).
         """
-        close = 0.5 * tolerance(distance, 0.0, self.success_distance) + 0.5 * tolerance(
-            distance, 0.0, self.robot.workspace_scale
-        )
-        return {"distance": close, "effort": 1.0 - 0.05 * np.clip(effort_share, 0.0, 1.0)}
+        near = tolerance(distance, self.success_distance)
+        far = tolerance(distance, self.robot.workspace_scale)
+        return {"distance": 0.5 * near + 0.5 * far, "effort": 1.0 - 0.05 * effort_share.clip(0.0, 1.0)}
 
+    def rate(self, effector: Array, goal: Array, effort_share: Array) -> tuple[Array, dict[str, Array], Array]:
+        """Return distances to the goal [m], the factors of the reward, and the reward, which is their product.
 
-def make_task(name: str, robot: Robot, **options: object) -> Task:
-    """Return a task by its registry name.
-
-    Raises:
-        ValueError: for an unknown name or a wrong option.
-    """
-    return TASKS.make(name, robot, **options)
+        Args:
+            effector: first effector [m], shape (..., 3).
+            goal: goal [m], shape (..., 3).
+            effort_share: mean actuator effort over its scale, shape (...).
+        """
+        distance = self.distance(effector, goal)
+        terms = self.reward_terms(distance, effort_share)
+        return distance, terms, prod(terms.values())

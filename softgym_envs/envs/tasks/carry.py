@@ -1,27 +1,26 @@
-"""Carry: bring the effector as far to the right as it goes."""
+"""Carry: move the effector as far to the right as it goes."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from softgym_envs.envs.tasks.base import Kinematics, Task
+from softgym_envs.envs.arrays import Array, namespace
+from softgym_envs.envs.tasks.base import Kinematics, Random, Task
 from softgym_envs.robots.base import Robot
-
-__all__ = ["Carry"]
 
 
 class Carry(Task):
-    """A goal far to the right (+x), out of reach of slow motions; only x counts (thesis 5.3).
+    """A goal far to the right (+x) that slow motions do not reach; only x counts (thesis, sec. 5.3).
 
-    With a mass at the effector, momentum carries further than a motion that goes straight there. Success is to be
-    beyond the goal or within the robot's precision of it.
+    With a mass at the effector, momentum carries it further than a straight motion to the goal. An episode succeeds if
+    the effector ends beyond the goal or within the robot's goal tolerance of it.
 
     Args:
         robot: the robot.
         distance: how far to the right of the rest position the goal is [m].
         push: largest force on the effector [N] of a push in a random direction; 0 for none.
         push_steps: control steps that a push lasts.
-        push_window: it begins at a random one of so many first control steps.
+        push_window: the push begins at a random step among this many first control steps.
     """
 
     name = "carry"
@@ -39,18 +38,18 @@ class Carry(Task):
         super().__init__(robot)
         for name, value in (("distance", distance), ("push", push)):
             if not (np.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} = {value} must be finite and not negative")
+                raise ValueError(f"{name} = {value} must be non-negative and finite")
         if push_steps < 1 or push_window < 1:
             raise ValueError(f"push_steps = {push_steps} and push_window = {push_window} must be at least 1")
         self.axes = np.array([1.0, 0.0, 0.0])
-        self.goal = robot.effector_rest + np.array([distance, 0.0, 0.0])
+        self.goal: Array = robot.effector_rest + np.array([distance, 0.0, 0.0])
         self.largest_push, self.push_steps, self.push_window = push, push_steps, push_window
         self.pushes = push > 0.0
         self._force = np.zeros(3)
         self._first = 0
 
-    def sample(self, rng: np.random.Generator, count: int, kinematics: Kinematics) -> np.ndarray:
-        return np.tile(self.goal, (count, 1, 1))
+    def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
+        return namespace(self.goal).tile(self.goal, (count, 1, 1))
 
     def begin(self, rng: np.random.Generator) -> None:
         if self.largest_push:
@@ -63,5 +62,5 @@ class Carry(Task):
             return self._force
         return None
 
-    def distance(self, effector: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        return np.maximum(goal[..., 0] - effector[..., 0], 0.0)
+    def distance(self, effector: Array, goal: Array) -> Array:
+        return (goal[..., 0] - effector[..., 0]).clip(min=0.0)

@@ -1,0 +1,31 @@
+"""What tasks and spaces need to compute with NumPy arrays and torch tensors alike."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+#: A NumPy array, or a torch tensor in `TorchVectorEnv`.
+Array = Any
+
+
+def namespace(array: Array) -> Any:
+    """Return the module whose functions take ``array``: ``numpy`` or ``torch``."""
+    if isinstance(array, np.ndarray | np.generic):
+        return np
+    import torch
+
+    return torch
+
+
+def pick_rows(values: Array, index: Array) -> Array:
+    """Return ``values[b, index[b]]`` for every row b.
+
+    Args:
+        values: shape (B, p, d).
+        index: integers, shape (B,).
+    """
+    if isinstance(values, np.ndarray):
+        return values[np.arange(len(values)), index]
+    return values.gather(1, index[:, None, None].expand(-1, 1, values.shape[2]))[:, 0]

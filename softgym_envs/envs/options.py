@@ -1,0 +1,161 @@
+"""Options that all environments share, and the robot, task and spaces that follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+from softgym_envs.designs import Design, DesignSpace
+from softgym_envs.envs.spaces import AgentSpaces
+from softgym_envs.envs.tasks.base import Task
+from softgym_envs.envs.tasks.registry import make_task
+from softgym_envs.errors import unknown_name
+from softgym_envs.robots.base import Robot
+from softgym_envs.robots.registry import make_robot
+
+if TYPE_CHECKING:
+    from softgym_envs.envs.registration import RobotSource, TaskSource
+
+
+@dataclass(frozen=True)
+class EnvironmentOptions:
+    """Keyword options of `SoftRobotEnv`, `SoftRobotVectorEnv` and `TorchVectorEnv`.
+
+    Attributes:
+        design: body of every episode unless given in `reset`; missing variables take their baseline.
+        sample_design: draw the body at each reset: True for all variables, or their names.
+        design_in_observation: show the body to the agent: True for all variables, or their names.
+        action_mode: ``"increment"`` or ``"absolute"``, see `AgentSpaces`.
+        robot_options: options of the robot.
+        task_options: options of the task.
+        backend_options: options of the backend; in batched environments ``weights`` and ``members``.
+        defaults: options of the environment's ID, which those above override one by one; its ``backend_options`` hold
+            for its ``backend`` only.
+    """
+
+    design: Mapping[str, float] | None = None
+    sample_design: bool | Sequence[str] = False
+    design_in_observation: bool | Sequence[str] = False
+    action_mode: str = "increment"
+    robot_options: Mapping[str, Any] | None = None
+    task_options: Mapping[str, Any] | None = None
+    backend_options: Mapping[str, Any] | None = None
+    defaults: Mapping[str, Any] | None = None
+
+    @classmethod
+    def check(cls, options: Mapping[str, Any]) -> EnvironmentOptions:
+        """Return the options in a mapping.
+
+        Raises:
+            ValueError: for an unknown name.
+        """
+        names = [field.name for field in fields(cls)]
+        for name in options:
+            if name not in names:
+                raise ValueError(unknown_name("environment option", name, names))
+        return cls(**options)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What an environment is made of, from its options.
+
+    Attributes:
+        robot: the robot.
+        task: the task.
+        backend: name of the backend.
+        backend_options: its options.
+        design: complete design of episodes for which no other body is given or sampled.
+        sampled: variables that are drawn at each reset.
+        shown: variables in the observation.
+        action_mode: see `AgentSpaces`.
+    """
+
+    robot: Robot
+    task: Task
+    backend: str
+    backend_options: dict[str, Any]
+    design: Design
+    sampled: tuple[str, ...]
+    shown: tuple[str, ...]
+    action_mode: str
+
+    def spaces(self, *, moving: bool = False) -> AgentSpaces:
+        """Return the agent's spaces; ``moving``: with the effector's velocity."""
+        return AgentSpaces(
+            self.robot, action_mode=self.action_mode, design_names=self.shown, axes=self.task.axes, moving=moving
+        )
+
+
+def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, options: EnvironmentOptions) -> Setup:
+    """Make the robot and the task of an environment, and resolve its other options.
+
+    Args:
+        robot: registry name, ``"module:class"``, class or object.
+        task: registry name, ``"module:class"``, class or object.
+        backend: name; None for the surrogate where weights ship for the robot, else FEM.
+        options: all others.
+
+    Raises:
+        ValueError: for a missing robot or a wrong option.
+        DesignError: for a malformed design or an unknown variable.
+    """
+    defaults = options.defaults or {}
+    if robot is None:
+        raise ValueError("robot is missing; allowed: a registered name, 'module:class', a class or an object")
+    made = make_robot(robot, **{**defaults.get("robot_options", {}), **(options.robot_options or {})})
+    backend_options = dict(options.backend_options or {})
+    if backend is None:
+        backend = default_backend(made, backend_options)
+    if backend == defaults.get("backend"):
+        backend_options = {**defaults.get("backend_options", {}), **backend_options}
+    space = made.design_space
+    return Setup(
+        robot=made,
+        task=make_task(task, made, **{**defaults.get("task_options", {}), **(options.task_options or {})}),
+        backend=backend,
+        backend_options=backend_options,
+        design=space.complete(options.design),
+        sampled=design_names(space, options.sample_design),
+        shown=design_names(space, options.design_in_observation),
+        action_mode=options.action_mode,
+    )
+
+
+def default_backend(robot: Robot, backend_options: Mapping[str, Any]) -> str:
+    """Return ``"surrogate"`` where weights are given or ship for the robot, else ``"fem"``."""
+    from softgym_envs.surrogate.pretrained import pretrained_folder
+
+    return "surrogate" if "weights" in backend_options or pretrained_folder(robot).is_dir() else "fem"
+
+
+def design_names(space: DesignSpace, choice: bool | Sequence[str]) -> tuple[str, ...]:
+    """Return the variables in an option that is False, True (all variables) or a list of names.
+
+    Raises:
+        DesignError: for an unknown name.
+    """
+    if isinstance(choice, bool):
+        return space.names if choice else ()
+    return tuple(space[name].name for name in choice)
+
+
+def check_reset_options(options: Mapping[str, Any] | None) -> tuple[Any, Any]:
+    """Return ``design`` and ``goal`` of the options of `reset`, None where missing.
+
+    Raises:
+        ValueError: for another option.
+    """
+    options = options or {}
+    for name in options:
+        if name not in ("design", "goal"):
+            raise ValueError(f"unknown reset option '{name}'; allowed: design, goal")
+    return options.get("design"), options.get("goal")
+
+
+def check_counts(num_envs: int, max_episode_steps: int | None) -> None:
+    """Raise ValueError for numbers of sub-environments or steps below 1."""
+    for name, value in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
+        if value is not None and value < 1:
+            raise ValueError(f"{name} = {value} must be at least 1")
