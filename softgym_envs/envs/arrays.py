@@ -8,11 +8,13 @@ import numpy as np
 
 #: A NumPy array, or a torch tensor in `TorchVectorEnv`.
 Array = Any
+#: A tuple, as torch.compile cannot trace the union of types.
+_NUMPY_TYPES = (np.ndarray, np.generic)
 
 
 def namespace(array: Array) -> Any:
     """Return the module whose functions take ``array``: ``numpy`` or ``torch``."""
-    if isinstance(array, np.ndarray | np.generic):
+    if isinstance(array, _NUMPY_TYPES):
         return np
     import torch
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from math import prod
+from functools import reduce
+from operator import mul
 from typing import Any, Protocol
 
 import numpy as np
@@ -150,4 +151,4 @@ class Task(ABC):
         """
         distance = self.distance(effector, goal)
         terms = self.reward_terms(distance, effort_share)
-        return distance, terms, prod(terms.values())
+        return distance, terms, reduce(mul, terms.values())
