@@ -91,10 +91,10 @@ def test_success_is_to_be_beyond_the_goal():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"distance": -0.1}, "distance = -0.1 must be non-negative and finite"),
-        ({"distance": np.nan}, "distance = nan must be finite"),
-        ({"push": -1.0}, "push = -1.0 must be non-negative and finite"),
-        ({"push": np.inf}, "push = inf must be finite"),
+        ({"distance": -0.1}, "distance = -0.1 m must be non-negative and finite"),
+        ({"distance": np.nan}, "distance = nan m must be non-negative and finite"),
+        ({"push": -1.0}, "push = -1.0 N must be non-negative and finite"),
+        ({"push": np.inf}, "push = inf N must be non-negative and finite"),
         ({"push_steps": 0}, "push_steps = 0 and push_window = 40 must be at least 1"),
         ({"push_window": 0}, "push_steps = 4 and push_window = 0 must be at least 1"),
         ({"mass": 1.0}, "mass"),

@@ -57,7 +57,23 @@ def check_goals(goals: object, name: str, robot: Robot, leading: tuple[int, ...]
         raise ValueError(f"{name} must have shape ({shape}3) or ({shape}p, 3), got {array.shape}")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite, got {array.tolist()}")
-    return array
+    return robot.check_point(name, array)
+
+
+def check_length(value: float, name: str, robot: Robot) -> float:
+    """Return a length [m] that goals are moved by.
+
+    Raises:
+        ValueError: for a value that is negative, not finite or far larger than the robot.
+    """
+    if not (np.isfinite(value) and value >= 0.0):
+        raise ValueError(f"{name} = {value} m must be non-negative and finite")
+    if value > 3.0 * robot.size:
+        raise ValueError(
+            f"{name} = {value} m is more than three times the size of robot '{robot.name}' ({robot.size:g} m); "
+            "did you mean metres?"
+        )
+    return value
 
 
 class Task(ABC):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from softgym_envs.envs.arrays import Array, namespace
-from softgym_envs.envs.tasks.base import Kinematics, Random, Task
+from softgym_envs.envs.tasks.base import Kinematics, Random, Task, check_length
 from softgym_envs.robots.base import Robot
 
 
@@ -36,9 +36,9 @@ class Carry(Task):
         push_window: int = 40,
     ) -> None:
         super().__init__(robot)
-        for name, value in (("distance", distance), ("push", push)):
-            if not (np.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} = {value} must be non-negative and finite")
+        check_length(distance, "distance", robot)
+        if not (np.isfinite(push) and push >= 0.0):
+            raise ValueError(f"push = {push} N must be non-negative and finite")
         if push_steps < 1 or push_window < 1:
             raise ValueError(f"push_steps = {push_steps} and push_window = {push_window} must be at least 1")
         self.axes = np.array([1.0, 0.0, 0.0])

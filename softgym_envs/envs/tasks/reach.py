@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from softgym_envs.envs.arrays import Array, namespace
-from softgym_envs.envs.tasks.base import Kinematics, Random, Task, check_goals
+from softgym_envs.envs.tasks.base import Kinematics, Random, Task, check_goals, check_length
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots.base import Robot
 
@@ -40,10 +40,8 @@ class Reach(Task):
             raise ValueError(f"goals = {goals!r} is unknown; allowed: 'reachable' or an array of shape (k, 3)")
         if not 0.0 <= command_low < 1.0:
             raise ValueError(f"command_low = {command_low} is out of bounds; allowed: [0, 1)")
-        if not (np.isfinite(spread) and spread >= 0.0):
-            raise ValueError(f"spread = {spread} m must be non-negative and finite")
         self.command_low = command_low
-        self.spread = spread
+        self.spread = check_length(spread, "spread", robot)
 
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
         if self.fixed_goals is not None:

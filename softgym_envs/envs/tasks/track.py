@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from softgym_envs.envs.arrays import Array
-from softgym_envs.envs.tasks.base import Kinematics, Random, Task, check_goals
+from softgym_envs.envs.tasks.base import Kinematics, Random, Task, check_goals, check_length
 from softgym_envs.robots.base import Robot
 
 
@@ -24,9 +24,7 @@ class Track(Task):
     def __init__(self, robot: Robot, *, path: np.ndarray | None = None, jitter: float = 0.0) -> None:
         super().__init__(robot)
         self.path: Array = robot.reference_path() if path is None else check_goals(path, "path", robot)
-        if not (np.isfinite(jitter) and jitter >= 0.0):
-            raise ValueError(f"jitter = {jitter} m must be non-negative and finite")
-        self.jitter = jitter
+        self.jitter = check_length(jitter, "jitter", robot)
 
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
         return self.path + rng.uniform(-self.jitter, self.jitter, (count, 1, 3))
