@@ -12,7 +12,7 @@ ENVIRONMENT = EnvironmentConfig(id="SoftGym/FingerReach-v0", robot_options={"gra
 
 
 def test_options_become_variables():
-    space = ENVIRONMENT.robot().design_space
+    space = ENVIRONMENT.make_robot().design_space
     found = make_variables(["length", "task.spread"], {"task.spread": RANGE}, space)
     assert list(found) == ["length", "task.spread"]
     assert found["length"] is space["length"]
@@ -39,7 +39,7 @@ def test_options_become_variables():
 )
 def test_wrong_variables(names, ranges, message):
     with pytest.raises(ValueError, match=message):
-        make_variables(names, ranges, ENVIRONMENT.robot().design_space)
+        make_variables(names, ranges, ENVIRONMENT.make_robot().design_space)
 
 
 def test_entry_of_a_vector_that_is_not_given():
