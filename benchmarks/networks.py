@@ -218,12 +218,12 @@ def _track(path: Path, case: str, data: dict[str, dict[str, np.ndarray]], size: 
 
     from benchmarks.robots import predicted_path
     from softgym_envs.robots import make_robot
+    from softgym_envs.surrogate import potential
     from softgym_envs.surrogate.data.sampling import select_states
     from softgym_envs.surrogate.data.states import stable_rows, training_states
     from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.model import card_of
     from softgym_envs.surrogate.online import save_model
-    from softgym_envs.surrogate.potential import model as potential
     from softgym_envs.surrogate.training import Trainer
 
     torch.set_num_threads(1)

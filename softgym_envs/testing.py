@@ -224,8 +224,9 @@ def untrained_potential(
     import torch
 
     from softgym_envs.surrogate.features import Features
-    from softgym_envs.surrogate.potential import model as potential
+    from softgym_envs.surrogate.potential.model import Model
     from softgym_envs.surrogate.potential.torch import PotentialNet
+    from softgym_envs.surrogate.potential.training import stack_members
 
     torch.manual_seed(seed)
     n, e = len(robot.actuators), 3 * len(robot.effectors)
@@ -240,7 +241,7 @@ def untrained_potential(
         "held": np.array(1e-3),
     }
     states = [{k: v.detach().numpy() for k, v in net.state_dict().items()} for net in nets]
-    return potential.Model(robot, potential.stack_members(states, scales), {}), nets
+    return Model(robot, stack_members(states, scales), {}), nets
 
 
 def sample_states(
@@ -278,11 +279,11 @@ def train_small_surrogate(
     steps: int = 1500,
 ) -> None:
     """Train a surrogate of the baseline body on displacements up to ``limit`` [m] and write it to ``folder``."""
+    from softgym_envs.surrogate import potential
     from softgym_envs.surrogate.data.states import training_states
     from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.model import card_of
     from softgym_envs.surrogate.online import save_model
-    from softgym_envs.surrogate.potential import model as potential
     from softgym_envs.surrogate.training import Trainer, domain_of
 
     training = sample_states(robot, states, 0, limit=limit, sequence="halton")

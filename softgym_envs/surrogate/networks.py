@@ -8,7 +8,7 @@ from types import ModuleType
 __all__ = ["NETWORKS", "network_module"]
 
 NETWORKS: dict[str, str] = {
-    "potential": "softgym_envs.surrogate.potential.model",
+    "potential": "softgym_envs.surrogate.potential",
     "residual": "softgym_envs.surrogate.baselines.residual",
     "thesis": "softgym_envs.surrogate.baselines.thesis",
     "rbf": "softgym_envs.surrogate.baselines.rbf",

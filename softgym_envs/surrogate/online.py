@@ -42,7 +42,8 @@ from softgym_envs.storage import atomic_write, read_npz, write_json
 from softgym_envs.surrogate.data.dataset import COLUMNS
 from softgym_envs.surrogate.data.states import GROWTH, States, stable_rows, training_states
 from softgym_envs.surrogate.model import SurrogateModel
-from softgym_envs.surrogate.potential.model import Model, _targets, potential_loss, stack_members, unstack_members
+from softgym_envs.surrogate.potential.model import Model
+from softgym_envs.surrogate.potential.training import make_targets, potential_loss, stack_members, unstack_members
 
 __all__ = ["StateStore", "check_ensemble", "fine_tune", "is_of", "rehearsal_states", "save_model"]
 
@@ -253,8 +254,8 @@ def fine_tune(
         own = Model(robot, _member(model.tensors, member), {})
         seen = np.flatnonzero(~kept & ((turn % M != member) | (len(new) < 2 * M)))
         old = _predicted(own, designs, displacement)
-        targets = _targets(robot, _joined(new.rows(seen), old), scales)
-        effort_spread = float(((targets[4].mT @ targets[2][:, :, None]) ** 2).mean())
+        targets = make_targets(robot, _joined(new.rows(seen), old), scales)
+        effort_spread = targets.effort_spread
         net = PotentialNet(
             model.count,
             model.effectors,
@@ -277,7 +278,7 @@ def fine_tune(
                     len(seen) + torch.randint(len(old), (batch_size - half,), generator=generator),
                 ]
             )
-            value = potential_loss(net, [part[rows] for part in targets], effort_spread)
+            value = potential_loss(net, targets.rows(rows), effort_spread)
             optimiser.zero_grad()
             value.backward()
             torch.nn.utils.clip_grad_norm_(net.parameters(), 10.0)

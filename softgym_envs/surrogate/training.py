@@ -5,11 +5,9 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import math
 import operator
 import shutil
 import time
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,7 +15,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from softgym_envs.config import Config, provenance, save_resolved
-from softgym_envs.errors import DataError
 from softgym_envs.robots import make_robot
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.surrogate.data.dataset import generate_dataset
@@ -26,6 +23,7 @@ from softgym_envs.surrogate.data.states import full_compliance, stable_rows, tra
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel, card_of, load_model
 from softgym_envs.surrogate.networks import NETWORKS, network_module
+from softgym_envs.surrogate.trainer import Trainer
 
 __all__ = ["FitConfig", "fit", "generate", "test_errors"]
 
@@ -103,114 +101,6 @@ class FitConfig(Config):
     workers: int = Field(default=2, gt=0)
     executor: Literal["loky", "ray"] = "loky"
     seed: int = 0
-
-
-class Trainer:
-    """Trains the parts of a model; a finished part is kept on disk and not trained again.
-
-    Args:
-        options: hyper-parameters of the network.
-        seed: of weights and batches; each part starts from it, so a resumed run equals an uninterrupted one.
-        folder: where finished parts are kept, or None.
-        key: what the parts depend on (configuration and data); parts of another key are trained anew.
-        progress: show progress bars.
-        workers: parts that do not build on each other are trained by so many processes.
-    """
-
-    def __init__(
-        self,
-        options: Any,
-        seed: int,
-        folder: Path | None = None,
-        key: str = "",
-        progress: bool = False,
-        workers: int = 1,
-    ) -> None:
-        self.options, self.seed, self.folder, self.key = options, seed, folder, key
-        self.progress, self.workers = progress, workers
-
-    def optimise(
-        self, name: str, net: Any, loss: Callable, train_size: int, seed: int | None = None
-    ) -> list[dict[str, float]]:
-        """Descend under a one-cycle rate; keeps the step of the best validation loss and returns the history.
-
-        SOAP (Vyas et al. 2024, arXiv:2409.11321) is Adam in the eigenbasis of Shampoo's preconditioner. These networks
-        are small and their losses ill-conditioned: it comes as far in 4000 steps as Adam in more than 24,000.
-
-        ``loss(indices | None)`` is the loss on training rows, or on the validation set for None.
-
-        Raises:
-            DataError: if the training diverges.
-        """
-        import copy
-
-        import torch
-        from safetensors import SafetensorError
-        from safetensors.torch import load, save
-        from tqdm import tqdm
-
-        options = self.options
-        path = None if self.folder is None else self.folder / f"{name.replace(' ', '_')}-{self.key}.safetensors"
-        if path is not None and path.exists() and path.with_suffix(".json").exists():
-            try:
-                net.load_state_dict(load(path.read_bytes()))
-                return json.loads(path.with_suffix(".json").read_text())
-            except (SafetensorError, ValueError, RuntimeError, OSError) as error:
-                aside = path.with_suffix(".corrupt")
-                path.rename(aside)
-                print(f"part '{path}' is damaged ({error}); set aside as '{aside.name}' and trained again")
-        generator = torch.Generator().manual_seed(self.seed if seed is None else seed)
-        optimiser = _optimiser(options, net.parameters())
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, options.learning_rate, total_steps=options.steps, pct_start=0.05, final_div_factor=1e3
-        )
-        batch = min(options.batch_size, train_size)
-        check = max(1, options.steps // 100)
-        best, best_state, total, since, history = float("inf"), net.state_dict(), 0.0, 0, []
-        order = torch.empty(0, dtype=torch.int64)
-        with tqdm(total=options.steps, desc=name, unit="step", disable=not self.progress) as bar:
-            for step in range(options.steps):
-                if len(order) < batch:
-                    order = torch.cat([order, torch.randperm(train_size, generator=generator)])
-                value = loss(order[:batch])
-                order = order[batch:]
-                optimiser.zero_grad()
-                value.backward()
-                torch.nn.utils.clip_grad_norm_(net.parameters(), 10.0)
-                optimiser.step()
-                schedule.step()
-                total, since = total + value.item(), since + 1
-                if (step + 1) % check and step + 1 < options.steps:
-                    continue
-                with torch.no_grad():
-                    validation = float(loss(None))
-                if not math.isfinite(validation):
-                    raise DataError(
-                        f"training of '{name}' diverged at step {step}: the validation loss is {validation}"
-                    )
-                history.append({"step": step + 1, "train": total / since, "validation": validation})
-                bar.set_postfix_str(f"train {total / since:.2e}, validation {validation:.2e}")
-                bar.update(since)
-                total, since = 0.0, 0
-                if validation < best:
-                    best, best_state = validation, copy.deepcopy(net.state_dict())
-        net.load_state_dict(best_state)
-        if path is not None:
-            # The history goes first: the part counts as finished when its weights are there.
-            write_json(path.with_suffix(".json"), history)
-            with atomic_write(path) as stream:
-                stream.write(save(best_state))
-        return history
-
-
-def _optimiser(options: Any, parameters: Iterable[Any]) -> Any:
-    import torch
-
-    if options.optimiser == "adam":
-        return torch.optim.Adam(parameters, lr=options.learning_rate, betas=(0.9, 0.99))
-    from pytorch_optimizer import SOAP
-
-    return SOAP(parameters, lr=options.learning_rate, betas=(0.95, 0.95), weight_decay=0.0, precondition_frequency=10)
 
 
 def test_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[str, float]:

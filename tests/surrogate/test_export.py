@@ -18,7 +18,8 @@ from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.export import export_c, export_onnx
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel
-from softgym_envs.surrogate.potential import model as potential
+from softgym_envs.surrogate.potential.model import Model
+from softgym_envs.surrogate.potential.training import stack_members
 from softgym_envs.testing import random_states
 
 CC = shutil.which("cc") or shutil.which("gcc")
@@ -63,7 +64,7 @@ def random_model(case, seed=0, learned=None):
         "effector": np.array(0.2 * robot.size),
         "held": np.array(1e-2),
     }
-    model = potential.Model(robot, potential.stack_members(states, scales), {})
+    model = Model(robot, stack_members(states, scales), {})
     model.features = features
     return model
 
@@ -136,7 +137,7 @@ def test_the_header_computes_what_the_model_does(case, tmp_path):
 @needs_compiler
 def test_fewer_members_are_the_first_ones(tmp_path):
     model = random_model("one")
-    fewer = potential.Model(model.robot, model.tensors, {}, 1)
+    fewer = Model(model.robot, model.tensors, {}, 1)
     designs, displacement = random_states(model.robot, 5)
     baseline = np.tile(model.robot.design_space.baseline.array, (5, 1))
     compiled = Compiled(export_c(model, None, tmp_path / "model.h", members=1, name="finger"))
@@ -212,7 +213,7 @@ class Other(SurrogateModel):
 def test_bad_input_is_named_and_nothing_is_written(tmp_path, monkeypatch):
     model = random_model("two")
     for name in ("", "1st", "two words", "a-b", "_x", "naïve", "x\n"):
-        with pytest.raises(ValueError, match="no C identifier"):
+        with pytest.raises(ValueError, match="not a C identifier"):
             export_c(model, None, tmp_path / "model.h", name=name)
     with pytest.raises(DesignError, match="out of bounds"):
         export_c(model, {"length": 1.0}, tmp_path / "model.h")
@@ -228,7 +229,7 @@ def test_bad_input_is_named_and_nothing_is_written(tmp_path, monkeypatch):
         export_c(other, None, tmp_path / "model.h")
     with pytest.raises(ValueError, match="network 'thesis' cannot be exported"):
         export_onnx(other, tmp_path / "model.onnx")
-    broken = potential.Model(model.robot, model.tensors | {"scale.energy": np.array(1e60)}, {})
+    broken = Model(model.robot, model.tensors | {"scale.energy": np.array(1e60)}, {})
     with pytest.raises(ValueError, match="'effort_scale' holds values that are not finite"):
         export_c(broken, None, tmp_path / "model.h")
     monkeypatch.setitem(sys.modules, "onnx", None)

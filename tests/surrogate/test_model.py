@@ -1,10 +1,11 @@
 """Learned models: structure that holds by construction, shipped accuracy, damaged files."""
 
-import hashlib
 import json
 import shutil
+import zlib
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -18,7 +19,8 @@ from softgym_envs.surrogate import online
 from softgym_envs.surrogate.baselines import residual
 from softgym_envs.surrogate.model import Context, SurrogateModel, load_model
 from softgym_envs.surrogate.networks import NETWORKS
-from softgym_envs.surrogate.potential import model as potential
+from softgym_envs.surrogate.potential import kernels
+from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
 from softgym_envs.surrogate.training import FitConfig, Trainer, fit, generate
 from softgym_envs.testing import random_states, untrained_potential
@@ -134,7 +136,7 @@ def test_search_of_a_batch_is_that_of_its_rows(name):
     """Rows of a batch do not touch each other: not those that end early, not those without a state."""
     robot = make_robot(name)
     model = pretrained_model(robot)
-    count, lost = 2 * potential._ROWS + 5, [3, potential._ROWS + 1]
+    count, lost = 2 * kernels.ROWS_PER_BLOCK + 5, [3, kernels.ROWS_PER_BLOCK + 1]
     designs, target = random_states(robot, count)
     context = model.context(designs)
     guess = target + 0.1 * (random_states(robot, count, seed=1)[1] - target)
@@ -159,9 +161,13 @@ def test_search_of_a_batch_is_that_of_its_rows(name):
     assert np.abs(found[1][well] - expected[1]).max() < 1e-3 * np.abs(expected[1]).max()
 
 
-def test_the_search_is_compiled_anew_when_what_it_inlines_changes():
-    found = hashlib.sha256(Path(complementarity.__file__).read_bytes()).hexdigest()[:16]
-    assert found == potential._INLINED, f"write '{found}' in {potential.__file__}"
+def test_the_search_is_recompiled_when_the_code_it_inlines_changes():
+    """Numba looks for a compiled function by the values of its free variables, beside its signature and code."""
+    checksum = zlib.crc32(Path(complementarity.__file__).read_bytes())
+    assert [cell.cell_contents for cell in kernels.search.py_func.__closure__] == [checksum]
+    codegen = numba.core.registry.cpu_target.target_context.codegen()
+    keys = {f._cache._index_key((), codegen) for f in map(kernels._compile_search, (checksum, checksum, checksum + 1))}
+    assert len(keys) == 2 and kernels.search._cache._index_key((), codegen) in keys
 
 
 def test_a_row_without_a_definite_compliance_is_lost_alone(monkeypatch):
@@ -194,10 +200,10 @@ def test_members_of_an_ensemble():
     designs, displacement = random_states(robot, 5)
     assert np.isfinite(model.state(model.context(designs), displacement)[2]).all()
     for members in (1, 2):  # whose spread is smaller than that of all, which was calibrated
-        part = potential.Model(robot, model.tensors, {}, members=members)
+        part = Model(robot, model.tensors, {}, members=members)
         assert part.members == members and np.isinf(part.state(part.context(designs), displacement)[2]).all()
     with pytest.raises(ValueError, match=r"members = 4.*1 to 3"):
-        potential.Model(robot, model.tensors, {}, members=4)
+        Model(robot, model.tensors, {}, members=4)
     with pytest.raises(ValueError, match="members = 2"):
         residual.Model(robot, untrained_residual(robot).tensors, {}, members=2)
 
@@ -227,7 +233,7 @@ def test_trust_follows_domain_and_spread():
     box = [[0.0, 0.01], [0.0, 0.01]]
     domain = {"displacement": box, "design": {"length": [0.039, 0.041]}, "inflation": 2.0, "limit": 1e-3}
     model, _ = untrained_potential(robot)
-    model = potential.Model(robot, model.tensors, {"domain": domain})
+    model = Model(robot, model.tensors, {"domain": domain})
     designs = np.array([robot.design_space.complete({"length": v}).array for v in (0.040, 0.0415)])
     context = model.context(designs).rows(np.array([0, 0, 0, 1]))
     displacement = np.array([[0.005, 0.005], [0.005, 0.012], [0.005, 0.005], [0.005, 0.005]])
@@ -244,7 +250,7 @@ def test_trust_ends_where_actuators_become_soft():
     found = model.growth(context, displacement)
     zero = np.zeros_like(displacement)
     # One member judges it.
-    first = potential.Model(robot, online._member(model.tensors, 0), {})
+    first = Model(robot, online._member(model.tensors, 0), {})
     W, unmoved = (
         first.compliance(first.context(designs), d)[:, : model.count, : model.count] for d in (displacement, zero)
     )
@@ -253,7 +259,7 @@ def test_trust_ends_where_actuators_become_soft():
     np.testing.assert_allclose(model.growth(context, zero), 1.0, rtol=1e-6)
     limit = float(np.median(found))
     # Young's modulus is another in every row, and does not matter.
-    limited = potential.Model(robot, model.tensors, {"domain": {"growth": limit}})
+    limited = Model(robot, model.tensors, {"domain": {"growth": limit}})
     trusted = limited.trust(limited.context(designs), displacement, np.zeros(200))[1]
     assert trusted.tolist() == (found < limit).tolist()
     index = np.arange(50, 150)[::-1]
@@ -455,7 +461,7 @@ def test_a_damaged_part_is_trained_again(tmp_path, capsys):
     (part,) = tmp_path.glob("line-*.safetensors")
     part.write_bytes(part.read_bytes()[:20])
     np.testing.assert_array_equal(trained(), first)
-    assert "set aside as 'line-key.corrupt' and trained again" in capsys.readouterr().out
+    assert "renamed to 'line-key.corrupt'; training the part again" in capsys.readouterr().out
     np.testing.assert_array_equal(trained(), first)
 
 

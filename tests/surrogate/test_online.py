@@ -12,7 +12,8 @@ from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.data.dataset import COLUMNS
 from softgym_envs.surrogate.model import load_model
 from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of, rehearsal_states, save_model
-from softgym_envs.surrogate.potential.model import Model, stack_members, unstack_members
+from softgym_envs.surrogate.potential.model import Model
+from softgym_envs.surrogate.potential.training import stack_members, unstack_members
 from softgym_envs.testing import sample_states
 
 LIMIT = 8e-3  # that of `weights`

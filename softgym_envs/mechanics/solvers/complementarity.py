@@ -53,7 +53,7 @@ def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
 
 
 @njit(cache=True, error_model="numpy")
-def _solve_row(W, gap, unilateral, y, a, index):
+def solve_row(W, gap, unilateral, y, a, index):
     """Fill y (m,) with the consistent efforts; False if there are none.
 
     ``a`` (m, m + 1) and ``index`` (m,), of integers, are room to work in.
@@ -87,7 +87,7 @@ def _solve(W, gap, unilateral, y, found):
     count, m = gap.shape
     a, index = np.empty((m, m + 1)), np.empty(m, dtype=np.int64)
     for b in range(count):
-        found[b] = _solve_row(W[b], gap[b], unilateral, y[b], a, index)
+        found[b] = solve_row(W[b], gap[b], unilateral, y[b], a, index)
 
 
 def solve_rows(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

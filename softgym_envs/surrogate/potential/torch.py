@@ -34,23 +34,25 @@ class PotentialEnsemble:
         self.members, self.width, self.count = weights["energy1"].shape
         self.coordinates, self.convex = weights["effector"].shape[1], convex
         n, e, device = self.count, self.coordinates, weights["energy1"].device
-        A1, A2 = weights["energy1"].mT, weights["energy2"].mT
+        A1, A2 = weights["energy1"].transpose(-1, -2), weights["energy2"].transpose(-1, -2)
         P = nn.functional.softplus(weights["pass_on"])
-        self._layers = [(weights[f"body.{k}.weight"].mT, weights[f"body.{k}.bias"][:, None]) for k in range(3)]
+        self._layers = [
+            (weights[f"body.{k}.weight"].transpose(-1, -2), weights[f"body.{k}.bias"][:, None]) for k in range(3)
+        ]
         outer = (0.5 * A1[:, :, None] * A1[:, None]).flatten(1, 2)
         self._weights = {
             "A": torch.cat([A1, A2], dim=2),
             "A1": A1[:, None],
             "A2": A2[:, None],
             "P": P,
-            "PT": 0.5 * P.mT,
+            "PT": 0.5 * P.transpose(-1, -2),
             "E1": 0.5 * weights["energy1"],
             "E2": weights["energy2"],
-            "outer": outer.mT,
-            "B1": weights["shape1"].mT,
-            "B2": weights["shape2"].mT,
-            "V": weights["effector"].mT,
-            "H": weights["held"].mT,
+            "outer": outer.transpose(-1, -2),
+            "B1": weights["shape1"].transpose(-1, -2),
+            "B2": weights["shape2"].transpose(-1, -2),
+            "V": weights["effector"].transpose(-1, -2),
+            "H": weights["held"].transpose(-1, -2),
         }
         self._rest = rest
         self._triangles = {size: _triangle(size, device) for size in {n, e}}
@@ -89,10 +91,10 @@ class PotentialEnsemble:
         part = dict(zip(sizes, torch.split(h, list(sizes.values()), dim=2), strict=True))
         if self.convex:
             factor = self._triangular(part["quadratic"], n, positive=True)
-            quadratic = factor @ factor.mT
+            quadratic = factor @ factor.transpose(-1, -2)
         else:
             factor = self._triangular(part["quadratic"], n, positive=False)
-            quadratic = factor + factor.mT
+            quadratic = factor + factor.transpose(-1, -2)
         softplus = nn.functional.softplus
         body = {
             "c": torch.cat([part["c1"], part["c2"]], dim=2),
@@ -141,7 +143,7 @@ class PotentialEnsemble:
         first = (slope[:, :, None] * weights["A1"][:m]).reshape(m, -1, w)
         through = torch.bmm(first, weights["PT"][:m]).reshape(m, -1, n, w) + weights["A2"][:m]
         bent = body["a"][:m] * r2**3
-        hessian = torch.matmul(through * bent[:, :, None], through.mT).sum(dim=0)
+        hessian = torch.matmul(through * bent[:, :, None], through.transpose(-1, -2)).sum(dim=0)
         return hessian + torch.bmm(lower * r1**3, weights["outer"][:m]).sum(dim=0).reshape(-1, n, n)
 
     def _with_body(self, body: Coefficients, u: Tensor, gradient: Tensor) -> Tensor:
@@ -181,7 +183,7 @@ class PotentialEnsemble:
         x, last, r1, r2 = self._shape(body, u)
         first = ((r1**3)[:, :, None] * weights["B1"][:, None]).reshape(M, -1, w)
         inner = torch.bmm(first, weights["B2"]).reshape(M, -1, n, w) * (r2**3)[:, :, None]
-        jacobian = body["slope"] + (inner @ weights["V"][:, None]).mT
+        jacobian = body["slope"] + (inner @ weights["V"][:, None]).transpose(-1, -2)
         held = torch.baddbmm(body["held"], last, weights["H"])
         return x, jacobian, self._triangular(held, self.coordinates, positive=True)
 
@@ -295,16 +297,16 @@ class TorchModel(nn.Module):
         x, J, L = self._ensemble.shape(body, u)
         effector = x.mean(dim=0) * model.effector_scale + self._effector_mean
         J = J.mean(dim=0) * model.effector_scale
-        held = (L @ L.mT).mean(dim=0) * model.held_scale
+        held = (L @ L.transpose(-1, -2)).mean(dim=0) * model.held_scale
         flexible = _symmetric(self._inverse(hessian))
         moved = J @ flexible / model.energy_scale
         W_aa = flexible * (half[:, None] * half / model.energy_scale)
         W_ea = moved * half
-        W_ee = _symmetric(moved @ J.mT) + held
-        W = torch.cat([torch.cat([W_aa, W_ea.mT], dim=2), torch.cat([W_ea, W_ee], dim=2)], dim=1)
+        W_ee = _symmetric(moved @ J.transpose(-1, -2)) + held
+        W = torch.cat([torch.cat([W_aa, W_ea.transpose(-1, -2)], dim=2), torch.cat([W_ea, W_ee], dim=2)], dim=1)
         stiffness = self.features.stiffness(design)
         return gradient * (model.energy_scale / half) * stiffness, effector, W / stiffness[:, :, None]
 
 
 def _symmetric(matrix: Tensor) -> Tensor:
-    return 0.5 * (matrix + matrix.mT)
+    return 0.5 * (matrix + matrix.transpose(-1, -2))

@@ -1,0 +1,201 @@
+"""One body of a trained model as a self-contained C99 header, in single precision; it needs only ``math.h``."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from string import Template
+
+import numpy as np
+
+from softgym_envs.designs import Design
+from softgym_envs.storage import atomic_write
+from softgym_envs.surrogate.export.common import actuator_records, check_path, exportable
+from softgym_envs.surrogate.model import SurrogateModel
+from softgym_envs.surrogate.potential.model import Model
+from softgym_envs.version import __version__
+
+#: Template of the functions, with ``${p}`` for the prefix and ``${P}`` for the same in capitals. The arithmetic is that
+#: of the compiled kernels; loops run over hidden units innermost, which compilers vectorise without permission to
+#: reorder sums.
+_FUNCTIONS = Path(__file__).with_name("functions.h.in")
+
+
+def export_c(
+    model: SurrogateModel,
+    design: Mapping[str, float] | None,
+    path: str | Path,
+    *,
+    members: int | None = None,
+    name: str = "softgym",
+) -> Path:
+    """Write one body as a self-contained C99 header, atomically.
+
+    It defines ``<name>_state`` and ``<name>_condensed``; its first comment documents both.
+
+    Args:
+        model: a trained model of network ``"potential"``.
+        design: the body, in SI units; missing variables take their baseline.
+        path: the file, ending with ``.h``.
+        members: how many members of the ensemble are averaged; default all that the model uses.
+        name: prefix of everything the header defines, a C identifier.
+
+    Returns:
+        The path.
+
+    Raises:
+        DesignError: for a malformed design.
+        ValueError: for another network, ending or number of members, a prefix that is not an identifier, or weights
+            that are not finite in single precision.
+    """
+    path = check_path(path, ".h")
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise ValueError(
+            f"name = {name!r} is not a C identifier; allowed: a letter, then letters, digits and underscores"
+        )
+    potential = exportable(model, members)
+    complete = potential.robot.design_space.complete(design)
+    text = _header(potential, complete, name)
+    with atomic_write(path, "w") as stream:
+        stream.write(text)
+    return path
+
+
+def _number(value: float) -> str:
+    """Return the shortest decimal that a compiler reads as this float32."""
+    single = np.float32(value)
+    plain = np.format_float_positional(single, unique=True, trim="0")
+    short = np.format_float_scientific(single, unique=True, trim="0", exp_digits=1)
+    return (plain if len(plain) <= len(short) else short) + "f"
+
+
+def _initialiser(array: np.ndarray, indent: str = "    ") -> str:
+    """Return an array as a C initialiser, in lines of at most 120 characters."""
+    if array.ndim > 1:
+        return "{\n" + ",\n".join(indent + _initialiser(part, indent + "    ") for part in array) + "}"
+    lines, line = [], ""
+    for number in map(_number, array):
+        if line and len(indent) + len(line) + len(number) > 114:
+            lines.append(line)
+            line = ""
+        line += f"{number}, "
+    return "{" + f"\n{indent}".join(text.rstrip() for text in [*lines, line.rstrip(", ")]) + "}"
+
+
+def _comment(lines: Iterable[str]) -> str:
+    """Return a C comment; ``/*`` and ``*/`` in the text are separated by a space."""
+    text = "\n".join(f" * {line}".rstrip() for line in (x.replace("*/", "* /").replace("/*", "/ *") for x in lines))
+    return f"/*\n{text}\n */\n"
+
+
+def _constants(model: Model, design: Design) -> dict[str, tuple[str, np.ndarray]]:
+    """Return the constants of the header: name to (shape in C, values).
+
+    Constant factors and terms are part of the weights: the share of each member in the mean, the scales of the
+    effector, and the half of the ramp's derivative.
+    """
+    n, e = model.count, model.effectors
+    context = model.context(design.array[None])
+    stiffness = float(context.stiffness[0, 0])
+    body = {key: array[0].astype(float) for key, array in context.arrays.items()}
+    weights = {key: array.astype(float) for key, array in model.tensors.items()}
+    share = 1.0 / model.members
+    energy = model.energy_scale * stiffness
+    constants = {
+        "middle": ("[N]", model.middle),
+        "half_range": ("[N]", model.half_range),
+        "effort_scale": ("[N]", energy / model.half_range),
+        "compliance_scale": ("", np.array(1.0 / energy)),
+        "held_scale": ("", np.array(model.held_scale * share / stiffness)),
+        "quadratic": ("[N][N]", body["quadratic"]),
+        "linear": ("[N]", body["linear"]),
+        "rest": ("[E]", model.effector_mean + model.effector_scale * body["x0"].mean(axis=0)),
+        "slope": ("[E][N]", model.effector_scale * body["slope"].mean(axis=0)),
+        "c1": ("[M][H]", body["c1"]),
+        "c2": ("[M][H]", body["c2"]),
+        "a": ("[M][H]", 0.5 * share * body["a"]),
+        "b": ("[M][H]", share * body["b"]),
+        "d1": ("[M][H]", body["d1"]),
+        "d2": ("[M][H]", body["d2"]),
+        "held_bias": ("[M][T]", body["held"]),
+        "energy1": ("[M][N][H]", weights["energy1"].swapaxes(1, 2)),
+        "energy2": ("[M][N][H]", weights["energy2"].swapaxes(1, 2)),
+        "pass_on": ("[M][H][H]", np.logaddexp(0.0, weights["pass_on"]).swapaxes(1, 2)),
+        "shape1": ("[M][N][H]", weights["shape1"].swapaxes(1, 2)),
+        "shape2": ("[M][H][H]", weights["shape2"].swapaxes(1, 2)),
+        "effector": ("[M][E][H]", model.effector_scale * share * weights["effector"]),
+        "held": ("[M][T][H]", weights["held"]),
+    }
+    sizes = {"N": n, "E": e, "M": model.members, "H": model.width, "T": e * (e + 1) // 2}
+    singles = {}
+    with np.errstate(over="ignore"):
+        for key, (shape, array) in constants.items():
+            single = np.asarray(array).astype(np.float32)
+            if not np.isfinite(single).all():
+                raise ValueError(f"'{key}' holds values that are not finite in single precision")
+            assert single.shape == tuple(sizes[letter] for letter in re.findall(r"\w", shape)), key
+            singles[key] = (shape, single)
+    return singles
+
+
+def _header(model: Model, design: Design, name: str) -> str:
+    """Return the text of the header."""
+    robot, n, e = model.robot, model.count, model.effectors
+    constants = _constants(model, design)
+    upper = name.upper()
+    sizes = {
+        "N": ("ACTUATORS", n, "n"),
+        "E": ("COORDINATES", e, "e: three for each effector"),
+        "M": ("MEMBERS", model.members, "networks that are averaged"),
+        "H": ("WIDTH", model.width, "hidden units of a layer"),
+        "T": ("TRIANGLE", e * (e + 1) // 2, "entries of a triangle of the held compliance"),
+    }
+    bytes_ = 4 * sum(array.size for _, array in constants.values())
+    stack = 4 * ((2 * n + 6) * model.width + n * (3 * n + 3 * e) + 3 * e * e)
+    units = {v.name: "" if v.unit == "1" else f" {v.unit}" for v in robot.design_space}
+    about = [
+        f"Condensed model of a soft robot, written by softgym-envs {__version__} (C99, header format 1).",
+        "",
+        f"Robot      {robot.name} ({robot.weights_name})",
+        f"Options    {json.dumps(robot.mechanics_key)}",
+        *(f"{'Design' if k == 0 else '':10s} {key} = {design[key]!r}{units[key]}" for k, key in enumerate(design)),
+        *(
+            f"{'Actuators' if k == 0 else '':10s} {k}: {a['name']}, {a['low']:g} to {a['high']:g} {a['unit']}, "
+            f"effort in {a['effort_unit']}"
+            for k, a in enumerate(actuator_records(model))
+        ),
+        f"Effectors  {', '.join(robot.effectors)}: x, y, z of each in m",
+        f"Network    potential, {model.members} member(s) of width {model.width}",
+        f"Memory     {bytes_} bytes of constants, about {stack} bytes of stack",
+        "",
+        f"void {name}_state(const float displacement[{n}], float effort[{n}], float effector[{e}])",
+        "    Efforts that hold the actuators at given displacements, and the effector positions.",
+        "",
+        f"int {name}_condensed(const float displacement[{n}], float effort[{n}], float effector[{e}], "
+        f"float W[{(n + e) ** 2}])",
+        f"    The same, and the symmetric compliance W ({n + e}, {n + e}), row after row, actuators before effectors:",
+        "    d(displacement, effector) = W d(effort, force on the effectors).",
+        "    At the efforts (effort, force) the tangent predicts W (effort, force) + free, where",
+        "    free = (displacement, effector) - W (effort, 0).",
+        "    Returns 0; or 1, and W unchanged, if an input is not finite or single precision is not sufficient.",
+        "",
+        "All quantities are in SI units. The model was trained within the ranges of the actuators; outside it",
+        "extrapolates without clipping. The functions have no state and are safe to call from several threads.",
+        "",
+        "Compile with -O3 -fno-math-errno if you can: square roots become single instructions, with the same results.",
+    ]
+    parts = [
+        _comment(about),
+        f"#ifndef {upper}_H\n#define {upper}_H\n\n#include <math.h>\n",
+        "\n".join(f"#define {upper}_{word} {value} /* {meaning} */" for word, value, meaning in sizes.values()),
+        "",
+    ]
+    for key, (shape, array) in constants.items():
+        dimensions = re.sub(r"\w", lambda letter: f"{upper}_{sizes[letter.group()][0]}", shape)
+        value = _initialiser(array) if array.ndim else _number(float(array))
+        parts.append(f"static const float {name}_{key}{dimensions} = {value};")
+    parts.append(Template(_FUNCTIONS.read_text()).substitute(p=name, P=upper))
+    parts.append(f"#endif /* {upper}_H */\n")
+    return "\n".join(parts)

@@ -1,0 +1,188 @@
+"""Training of the potential networks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from softgym_envs.executors import parallel_map
+from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.data.states import States
+from softgym_envs.surrogate.trainer import History, Trainer, TrainingOptions
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from softgym_envs.surrogate.potential.torch import PotentialNet
+
+
+class Options(TrainingOptions):
+    """Hyper-parameters of the potential network."""
+
+    kind: Literal["potential"] = "potential"
+    width: int = Field(default=64, gt=0)
+    body_width: int = Field(default=64, gt=0)
+    members: int = Field(default=5, gt=0)
+
+
+def train(
+    robot: Robot, training: States, validation: States, trainer: Trainer
+) -> tuple[dict[str, np.ndarray], dict[str, History]]:
+    """Train the members, ``trainer.workers`` at a time: on the same data, each with its own seed and order of batches.
+
+    A process that trains a member uses one thread, so the weights do not depend on the number of workers.
+
+    Returns:
+        The weights of `Model`, and the history of each member.
+    """
+    options: Options = trainer.options
+    scales = _scales(robot, training)
+    data = make_targets(robot, training, scales), make_targets(robot, validation, scales)
+    rest = None
+    if training.unloaded:
+        middle = 0.5 * (robot.upper + robot.lower)
+        rest = (0.0 - middle) / (robot.upper - middle)
+    arguments = [(trainer, member, data, rest, robot.convex) for member in range(options.members)]
+    found = sorted(parallel_map(_train_member, arguments, trainer.workers), key=lambda result: result[0])
+    return stack_members([state for _, state, _ in found], scales), {f"member {k}": rows for k, _, rows in found}
+
+
+def _train_member(
+    trainer: Trainer, member: int, data: tuple[Targets, Targets], rest: np.ndarray | None, convex: bool
+) -> tuple[int, dict[str, np.ndarray], History]:
+    """Train one member; return its number, weights and history."""
+    import torch
+
+    from softgym_envs.surrogate.potential.torch import PotentialNet
+
+    torch.set_num_threads(1)
+    options: Options = trainer.options
+    seed = trainer.seed + 1000 * member
+    torch.manual_seed(seed)
+    training, validation = data
+    sizes = (training.effort.shape[1], training.effector.shape[1], training.design.shape[1])
+    net = PotentialNet(*sizes, options.width, options.body_width, rest, convex=convex)
+    effort_spread = training.effort_spread
+
+    def loss(rows: Tensor | None) -> Tensor:
+        return potential_loss(net, validation if rows is None else training.rows(rows), effort_spread)
+
+    history = trainer.optimise(f"member {member}", net, loss, len(training.design), seed=seed)
+    return member, {k: v.detach().numpy().copy() for k, v in net.state_dict().items()}, history
+
+
+def stack_members(states: list[dict[str, np.ndarray]], scales: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the weights of `Model` from the states of its members in torch."""
+    tensors = {k: states[0][k] if k == "rest" else np.stack([state[k] for state in states]) for k in states[0]}
+    return tensors | {f"scale.{k}": v for k, v in scales.items()}
+
+
+def unstack_members(tensors: Mapping[str, np.ndarray]) -> tuple[list[dict[str, np.ndarray]], dict[str, np.ndarray]]:
+    """Return the states of the members in torch and the scales: the inverse of `stack_members`."""
+    scales = {k.removeprefix("scale."): np.asarray(v) for k, v in tensors.items() if k.startswith("scale.")}
+    weights = {k: v for k, v in tensors.items() if not k.startswith("scale.")}
+    members = range(len(tensors["energy1"]))
+    return [{k: v if k == "rest" else v[member] for k, v in weights.items()} for member in members], scales
+
+
+def _scales(robot: Robot, states: States) -> dict[str, np.ndarray]:
+    """Scales that make energy, effector and held compliance of order one."""
+    n = states.effort.shape[1]
+    half = 0.5 * (robot.upper - robot.lower)
+    K = np.linalg.inv(states.W[:, :n, :n])
+    return {
+        "energy": np.array(np.median(np.einsum("bii->bi", K) * half**2)),
+        "effector_mean": states.effector.mean(axis=0),
+        "effector": np.array(max(float(states.effector.std(axis=0).max()), 1e-9)),
+        "held": np.array(np.median(np.einsum("bii->bi", states.W[:, n:, n:]))),
+    }
+
+
+class Targets(NamedTuple):
+    """Scaled inputs and targets of a network, one row per state, in single precision.
+
+    Attributes:
+        design: features of the design, shape (N, d).
+        actuation: shape (N, n).
+        effort: shape (N, n).
+        effector: shape (N, e).
+        metric: factor of W_aa in which efforts and Hessians are measured, shape (N, n, n); for robots whose W_aa may
+            have any sign, that of the body at rest.
+        hessian: of the energy, in this metric, shape (N, n, n).
+        jacobian: of the effector, shape (N, e, n).
+        whitening: metric of the held compliance, shape (N, e, e).
+        held: held compliance, shape (N, e, e).
+    """
+
+    design: Tensor
+    actuation: Tensor
+    effort: Tensor
+    effector: Tensor
+    metric: Tensor
+    hessian: Tensor
+    jacobian: Tensor
+    whitening: Tensor
+    held: Tensor
+
+    def rows(self, index: Tensor) -> Targets:
+        """Return some of the rows."""
+        return Targets(*(part[index] for part in self))
+
+    @property
+    def effort_spread(self) -> float:
+        """Mean square of the efforts in their metric, by which their errors are divided."""
+        return float(((self.metric.mT @ self.effort[:, :, None]) ** 2).mean())
+
+
+def make_targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) -> Targets:
+    """Return states as a network is trained on them."""
+    import torch
+
+    n = states.effort.shape[1]
+    a, c = slice(0, n), slice(n, None)
+    half = 0.5 * (robot.upper - robot.lower)
+    W_aa = states.W[:, a, a] / half[:, None] / half * scales["energy"]
+    metric_of = np.arange(len(states)) if robot.convex else states.rest_of
+    S = np.linalg.cholesky(0.5 * (W_aa + W_aa.swapaxes(1, 2))[metric_of])
+    hessian = np.broadcast_to(np.eye(n), W_aa.shape) if robot.convex else S.swapaxes(1, 2) @ np.linalg.inv(W_aa) @ S
+    J = np.linalg.solve(states.W[:, a, a], states.W[:, a, c]).swapaxes(1, 2)
+    W_ee = states.W[:, c, c] / scales["held"]
+    size = W_ee.shape[1]
+    C = W_ee - J @ states.W[:, a, c] / scales["held"]
+    W_ee = W_ee[metric_of]
+    # Where nothing can move while the actuators are held, C is 0 up to rounding; its factor needs a little more.
+    floor = 1e-6 * np.einsum("bii->b", W_ee)[:, None, None] / size
+    C = 0.5 * (C + C.swapaxes(1, 2)) + 2.0 * size * floor * np.eye(size)
+    whitening = np.linalg.inv(np.linalg.cholesky(C + 0.03 * W_ee))
+    parts = (
+        states.design,
+        states.actuation,
+        states.effort * half / scales["energy"],
+        (states.effector - scales["effector_mean"]) / scales["effector"],
+        S,
+        hessian,
+        J * half / scales["effector"],
+        whitening,
+        C,
+    )
+    return Targets(*(torch.as_tensor(np.ascontiguousarray(part), dtype=torch.float32) for part in parts))
+
+
+def potential_loss(net: PotentialNet, batch: Targets, effort_spread: float) -> Tensor:
+    """Return the sum of five mean squared errors of a network.
+
+    Efforts and Hessian are measured in their metric, the held compliance in its own, effector and Jacobian as they are.
+    """
+    gradient, hessian, x, jacobian, L = net(batch.design, batch.actuation)
+    S, whitening = batch.metric, batch.whitening
+    terms = (
+        ((S.mT @ (gradient - batch.effort)[:, :, None]) ** 2).mean() / effort_spread,
+        ((S.mT @ hessian @ S - batch.hessian) ** 2).mean(),
+        ((x - batch.effector) ** 2).mean(),
+        ((jacobian - batch.jacobian) ** 2).mean(),
+        ((whitening @ (L @ L.mT - batch.held) @ whitening.mT) ** 2).mean(),
+    )
+    return sum(terms[1:], terms[0])
