@@ -241,8 +241,7 @@ def shared_finger(bodies: int = 5, commands: int = 12) -> dict[str, object]:
     fingers alone and replayed on FEM.
     """
     from softgym_envs.backends.fem import FEMBackend
-    from softgym_envs.control import InverseQP
-    from softgym_envs.control.fingers import CoupledFingers, SurrogateFingers
+    from softgym_envs.control import CoupledFingers, InverseQP, SurrogateFingers
     from softgym_envs.errors import ConvergenceError
     from softgym_envs.robots import make_robot
     from softgym_envs.surrogate.pretrained import pretrained_model
@@ -253,7 +252,7 @@ def shared_finger(bodies: int = 5, commands: int = 12) -> dict[str, object]:
     for body in range(bodies):
         design = gripper.design_space.sample(rng) if body else gripper.design_space.baseline
         fem = FEMBackend(gripper, design)
-        learned = CoupledFingers.like(gripper, SurrogateFingers(model, design), design)
+        learned = CoupledFingers.for_robot(gripper, SurrogateFingers(model, design), design)
         for _ in range(commands):
             command = rng.uniform(gripper.lower, gripper.upper)
             try:
@@ -276,7 +275,7 @@ def shared_finger(bodies: int = 5, commands: int = 12) -> dict[str, object]:
         "tensions, of the largest, median [%]": 1e2 * float(np.median(tensions)),
         "W, median [%]": 1e2 * float(np.median(compliances)),
     }
-    fem, learned = FEMBackend(gripper), CoupledFingers.like(gripper, SurrogateFingers(model))
+    fem, learned = FEMBackend(gripper), CoupledFingers.for_robot(gripper, SurrogateFingers(model))
     controller = InverseQP.for_robot(gripper)
     path = gripper.reference_path()
     path = np.concatenate([np.linspace(learned.centre, path[0], 10, endpoint=False), path])

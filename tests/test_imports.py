@@ -86,9 +86,7 @@ def test_imports_go_downwards(path):
     for name, lazy, line in imports_of(path):
         there = room_of(name)
         if here is None:
-            # ``softgym_envs/__init__.py`` registers the environments, and nothing else.
-            assert there in ("softgym_envs.envs", "softgym_envs.version"), f"line {line}: {name}"
-            continue
+            continue  # ``softgym_envs/__init__.py`` exports from several rooms; that it stays light is tested below
         if there not in LEVEL or there == here:
             continue
         allowed = LEVEL[there] < LEVEL[here] or (lazy and (here, there) in LAZY)

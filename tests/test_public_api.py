@@ -10,7 +10,13 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 # A package joins this list when its __init__ uses `lazy_exports`.
-PACKAGES = ["softgym_envs.envs", "softgym_envs.mechanics", "softgym_envs.robots"]
+PACKAGES = [
+    "softgym_envs",
+    "softgym_envs.control",
+    "softgym_envs.envs",
+    "softgym_envs.mechanics",
+    "softgym_envs.robots",
+]
 
 
 @pytest.mark.parametrize("package", PACKAGES)

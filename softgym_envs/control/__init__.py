@@ -1,25 +1,31 @@
-"""Controllers: they take a condensed model and a goal, and never ask where the model came from."""
+"""Controllers and couplings that work on condensed models, whether from finite elements or learned."""
 
-from softgym_envs.control.coupling import Coupled, HeldObject, couple, rotate, tie_points
-from softgym_envs.control.embedded import EmbeddedLoop, PICorrection, follow
-from softgym_envs.control.fingers import CoupledFingers, FEMFingers, FingersState, SurrogateFingers
-from softgym_envs.control.inverse_qp import InverseQP
-from softgym_envs.control.manipulation import Manipulation, Plan
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Coupled",
-    "CoupledFingers",
-    "EmbeddedLoop",
-    "FEMFingers",
-    "FingersState",
-    "InverseQP",
-    "Manipulation",
-    "PICorrection",
-    "Plan",
-    "SurrogateFingers",
-    "HeldObject",
-    "couple",
-    "follow",
-    "rotate",
-    "tie_points",
-]
+from softgym_envs._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from softgym_envs.control.coupling import HeldObject as HeldObject
+    from softgym_envs.control.coupling import couple as couple
+    from softgym_envs.control.coupling import rotate as rotate
+    from softgym_envs.control.coupling import tie_points as tie_points
+    from softgym_envs.control.embedded import EmbeddedLoop as EmbeddedLoop
+    from softgym_envs.control.embedded import PICorrection as PICorrection
+    from softgym_envs.control.embedded import follow as follow
+    from softgym_envs.control.finger_models import FEMFingers as FEMFingers
+    from softgym_envs.control.finger_models import SurrogateFingers as SurrogateFingers
+    from softgym_envs.control.fingers import CoupledFingers as CoupledFingers
+    from softgym_envs.control.inverse_qp import InverseQP as InverseQP
+    from softgym_envs.control.manipulation import Manipulation as Manipulation
+
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "coupling": ["HeldObject", "couple", "rotate", "tie_points"],
+        "embedded": ["EmbeddedLoop", "PICorrection", "follow"],
+        "finger_models": ["FEMFingers", "SurrogateFingers"],
+        "fingers": ["CoupledFingers"],
+        "inverse_qp": ["InverseQP"],
+        "manipulation": ["Manipulation"],
+    },
+)

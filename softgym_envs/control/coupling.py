@@ -21,8 +21,6 @@ import numpy as np
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.frames import rotation_vector_matrix
 
-__all__ = ["Coupled", "HeldObject", "couple", "rotate", "tie_points"]
-
 
 def cross_matrix(vectors: np.ndarray) -> np.ndarray:
     """Return ``[v]x`` with ``[v]x w = v x w``, shape (k, 3, 3), for vectors (k, 3)."""
@@ -172,24 +170,27 @@ class Coupled:
         condensed: roles ``a`` (the actuators of all parts, in order) and ``e``: with an object, its centre [m] and, if
             wanted, its rotation vector from the present orientation [rad]; then the effectors of the chosen parts.
         condition: condition number of the scaled system of ties that was solved.
-        dropped: redundant directions of the ties, which carry no force.
+        dropped: number of redundant directions of the ties, which carry no force.
+        part_sizes: number of rows of each part.
+        force_map: efforts on all rows of the parts as an affine function of the actuator efforts, shape (n, 1 + n_a).
+        motion_map: motion of the object [m, rad] as such a function, shape (6, 1 + n_a).
     """
 
     condensed: CondensedModel
     condition: float
     dropped: int
-    _sizes: tuple[int, ...]
-    _forces: np.ndarray
-    _motion: np.ndarray
+    part_sizes: tuple[int, ...]
+    force_map: np.ndarray
+    motion_map: np.ndarray
 
     def efforts(self, effort: np.ndarray) -> list[np.ndarray]:
         """Return the efforts of all rows of every part under actuator efforts (n_a,): tie forces included."""
-        every = self._forces @ np.append(1.0, effort)
-        return np.split(every, np.cumsum(self._sizes)[:-1])
+        every = self.force_map @ np.append(1.0, effort)
+        return np.split(every, np.cumsum(self.part_sizes)[:-1])
 
     def motion(self, effort: np.ndarray) -> np.ndarray:
         """Return the motion of the object from its present pose [m, rad], shape (6,), under actuator efforts (n_a,)."""
-        return self._motion @ np.append(1.0, effort)
+        return self.motion_map @ np.append(1.0, effort)
 
 
 def _side_by_side(
@@ -338,7 +339,7 @@ def couple(
         CondensedModel(0.5 * (compliance + compliance.T), answer[order, 0], effort, (("a", n_a), ("e", size - n_a))),
         condition=saddle.condition,
         dropped=saddle.redundant.shape[1],
-        _sizes=tuple(len(model.free) for model in models),
-        _forces=forces[:, : 1 + n_a],
-        _motion=motion[:, : 1 + n_a],
+        part_sizes=tuple(len(model.free) for model in models),
+        force_map=forces[:, : 1 + n_a],
+        motion_map=motion[:, : 1 + n_a],
     )

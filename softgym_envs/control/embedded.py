@@ -11,8 +11,6 @@ from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 
-__all__ = ["EmbeddedLoop", "PICorrection", "follow"]
-
 
 class PICorrection:
     """Moves a goal by what the effector misses: ``goal + proportional * error + integral * sum of errors``.

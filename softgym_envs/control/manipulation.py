@@ -11,8 +11,6 @@ from softgym_envs.control.coupling import Coupled, HeldObject, couple
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.mechanics.condensation import CondensedModel
 
-__all__ = ["Manipulation", "Plan"]
-
 
 @dataclass(frozen=True)
 class Plan:

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.backends.surrogate import SurrogateBackend
-from softgym_envs.control import InverseQP
-from softgym_envs.control.fingers import CoupledFingers, FEMFingers, SurrogateFingers
+from softgym_envs.control import CoupledFingers, FEMFingers, InverseQP, SurrogateFingers
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -91,7 +90,7 @@ def test_fingers_around_an_object_are_the_gripper(parts, name):
     model = robot.build()
     frame = model.frames.rows[0]
     whole = Statics(model, tolerance=1e-12)
-    coupled = CoupledFingers.like(robot, FEMFingers(parts, tolerance=1e-13), load=LOADS[name], tolerance=1e-11)
+    coupled = CoupledFingers.for_robot(robot, FEMFingers(parts, tolerance=1e-13), load=LOADS[name], tolerance=1e-11)
     for command in COMMANDS[name]:
         expected, found = whole.solve(command), coupled.solve(command)
         n = len(command)
@@ -115,7 +114,7 @@ def test_other_designs_are_the_gripper_too(parts):
     design = {"length": 0.041, "height": 0.0215, "joint_height": 0.0055, "young_modulus": 5e6, "poisson_ratio": 0.4}
     command = COMMANDS[robot.name][0]
     expected = Statics(robot.build(design)).solve(command)
-    found = CoupledFingers.like(robot, FEMFingers(parts, design), design).solve(command)
+    found = CoupledFingers.for_robot(robot, FEMFingers(parts, design), design).solve(command)
     np.testing.assert_allclose(found.position, expected.condensed.delta.e, atol=1e-8)
     np.testing.assert_allclose(found.effort, expected.effort[:6], atol=1e-4)
 
@@ -123,7 +122,7 @@ def test_other_designs_are_the_gripper_too(parts):
 def test_the_inverse_controller_moves_the_object(parts):
     """With the coupled model alone; the gripper as one model goes where it says."""
     robot = make_robot("three_finger_gripper", mesh_size=MESH_SIZE)
-    coupled = CoupledFingers.like(robot, FEMFingers(parts))
+    coupled = CoupledFingers.for_robot(robot, FEMFingers(parts))
     controller = InverseQP.for_robot(robot)
     goal = coupled.centre + [0.0005, -0.0005, 0.004]
     command = np.zeros(6)
@@ -142,7 +141,7 @@ def test_one_learned_finger_makes_the_gripper():
     rng = np.random.default_rng(3)
     for design in (robot.design_space.baseline, robot.design_space.sample(rng)):
         whole = Statics(robot.build(design))
-        learned = CoupledFingers.like(robot, SurrogateFingers(model, design), design)
+        learned = CoupledFingers.for_robot(robot, SurrogateFingers(model, design), design)
         for _ in range(2):
             command = rng.uniform(robot.lower, robot.upper)
             expected, found = whole.solve(command), learned.solve(command)
@@ -159,7 +158,7 @@ def test_a_finger_out_of_its_domain_is_told():
     narrow = type(model)(
         model.robot, model.tensors, {**model.card, "domain": {**model.card["domain"], "displacement": box}}
     )
-    fingers = CoupledFingers.like(gripper, SurrogateFingers(narrow))
+    fingers = CoupledFingers.for_robot(gripper, SurrogateFingers(narrow))
     command = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0]) * 1e-3
     assert fingers.solve(command).trusted
     command[2] = 4e-3
@@ -350,4 +349,4 @@ def test_malformed_commands_are_refused(parts):
         with pytest.raises(ValueError, match=message):
             coupled.solve(command, mode)
     with pytest.raises(ValueError, match="'two_finger_gripper' hold no rigid object"):
-        CoupledFingers.like(make_robot("two_finger_gripper", mesh_size=MESH_SIZE), Energy())
+        CoupledFingers.for_robot(make_robot("two_finger_gripper", mesh_size=MESH_SIZE), Energy())
