@@ -7,8 +7,7 @@ import meshio
 import numpy as np
 from scipy.spatial import Delaunay
 
-from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.mechanics import MechanicalModel, Statics
 
 # A bar of 100 x 20 x 20 mm, in millimetres as most programs write it.
 axes = np.linspace(0, 100, 11), np.linspace(0, 20, 4), np.linspace(0, 20, 4)
@@ -19,17 +18,17 @@ meshio.Mesh(points, [("tetra", Delaunay(points).simplices)]).write(path)
 
 model = MechanicalModel.from_file(
     path,
-    scale=1e-3,
-    fixed_box=(-0.001, 0.001, -1, 1, -1, 1),
-    young_modulus=5e5,
+    unit="mm",
+    fixed_box=(-0.001, 0.001, -1, 1, -1, 1),  # x, y and z of the clamped nodes [m]
+    young_modulus=lambda centroids: np.where(centroids[:, 0] < 0.05, 8e5, 4e5),  # stiffer near the clamp
     poisson_ratio=0.45,
     material="stable_neo_hookean",
     density=1100.0,
     gravity=(0.0, 0.0, -9.81),
 )
-line = np.column_stack([np.linspace(0.005, 0.095, 10), np.full(10, 0.010), np.full(10, 0.017)])
-model.add_cable("cable", line, pull_point=np.array([-0.005, 0.010, 0.017]))
-model.add_effector("tip", np.array([0.099, 0.010, 0.010]))
+guides = np.column_stack([np.linspace(0.005, 0.095, 10), np.full(10, 0.010), np.full(10, 0.017)])
+model.add_cable("cable", guides, pull_point=[-0.005, 0.010, 0.017])
+model.add_effector("tip", [0.099, 0.010, 0.010])
 
 statics = Statics(model)
 for millimetres in (0.0, 2.0, 4.0, 6.0):

@@ -28,3 +28,8 @@ def test_example(path, tmp_path):
     assert done.stdout.strip() and not done.stderr.strip()
     if arguments:
         assert (tmp_path / "image.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_from_an_stl_to_the_compliance_takes_15_lines():
+    lines = (ROOT / "examples" / "05_stl_to_compliance.py").read_text().splitlines()
+    assert sum(bool(line.strip()) for line in lines) <= 15

@@ -211,4 +211,4 @@ class _SurrogateState(State):
         effort[: model.count] = self.effort
         delta = np.concatenate([self.displacement, self.effector.ravel()])
         W = batch.compliance[0]
-        return CondensedModel(W, delta - W @ effort, effort, batch.roles)
+        return CondensedModel(W, delta - W @ effort, effort, batch.roles, batch.rows)

@@ -208,7 +208,7 @@ class SoftRobotVectorEnv(VectorEnv):
         # Slack cables carry no effort, whatever the network's last digits say.
         effort[:, : self.model.count] = self._effort
         free = delta - np.einsum("bij,bj->bi", batch.compliance, effort)
-        return CondensedModel(batch.compliance, free, effort, batch.roles)
+        return CondensedModel(batch.compliance, free, effort, batch.roles, batch.rows)
 
     # -- Gymnasium --------------------------------------------------------------------------------------------------
 

@@ -1,76 +1,148 @@
-"""The condensed model: all that is known of a soft robot above the physics.
+"""The condensed model: everything that controllers, environments and objectives need to know of a soft robot.
 
-Thesis eq. 2.5-2.14 and 4.1-4.3: with ``H_i`` the gradient of constraint function ``delta_i`` and ``A`` the
-tangent of the equilibrium,
+Thesis, eq. 2.5-2.14 and 4.1-4.3: with ``H_i`` the gradient of constraint function ``delta_i`` and ``A`` the tangent of
+the equilibrium,
 
     W_ij = H_i A^-1 H_j^T,    delta_free = delta - W effort,    delta(effort + d) = W (effort + d) + delta_free.
 
-``A`` here holds the geometric terms too, so that ``W`` is exactly the derivative of the equilibrium.
+``A`` here includes the geometric terms, so that ``W`` is exactly the derivative of the equilibrium.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-
-__all__ = ["CondensedModel", "Roles"]
 
 Roles = tuple[tuple[str, int], ...]
 """Role letters and sizes in order, e.g. ``(("a", 2), ("e", 3))``: actuators, effectors, contacts."""
 
+_ROLE_NAMES = {"a": "actuator", "e": "effector", "c": "contact", "s": "sensor"}
+_EFFORT_UNITS = {"m": "N", "m3": "Pa", "rad": "N m", "1": "N m"}
 
-class RoleVector:
+
+class Row(NamedTuple):
+    """Name and units of one row of a condensed model.
+
+    Attributes:
+        name: of the actuator, or of the effector with its axis.
+        unit: of the displacement.
+        effort_unit: of the effort.
+    """
+
+    name: str
+    unit: str
+    effort_unit: str
+
+
+def effort_unit(unit: str) -> str:
+    """Return the unit of the effort that is conjugate to a displacement in a unit, e.g. N for m."""
+    return _EFFORT_UNITS.get(unit, f"J/{unit}")
+
+
+def point_rows(name: str, unit: str = "m") -> list[Row]:
+    """Return the rows of the three coordinates of a point."""
+    return [Row(f"{name} {axis}", unit, effort_unit(unit)) for axis in "xyz"]
+
+
+class _RoleView:
+    """An array whose parts along its last axes are read by role letters.
+
+    Args:
+        title: what the array holds.
+        array: the values.
+        model: the condensed model that it belongs to.
+    """
+
+    __slots__ = ("array", "model", "title")
+
+    def __init__(self, title: str, array: np.ndarray, model: CondensedModel) -> None:
+        self.title = title
+        self.array = array
+        self.model = model
+
+    def _slice(self, attribute: str, role: str) -> slice:
+        if attribute in _RoleView.__slots__ or attribute.startswith("__"):  # while being copied or unpickled
+            raise AttributeError(attribute)
+        slices = self.model.slices
+        if role not in slices:
+            kind = "role" if len(attribute) == 1 else "block"
+            raise AttributeError(f"no {kind} '{attribute}'; roles: {', '.join(slices)}")
+        return slices[role]
+
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.array, dtype=dtype) if copy else np.asarray(self.array, dtype=dtype)
+
+
+class RoleVector(_RoleView):
     """A vector (..., n) whose parts are read by role letter: ``delta.e``."""
 
-    __slots__ = ("array", "slices")
-
-    def __init__(self, array: np.ndarray, slices: Mapping[str, slice]) -> None:
-        self.array = array
-        self.slices = slices
+    __slots__ = ()
 
     def __getattr__(self, role: str) -> np.ndarray:
-        if role in self.__slots__:  # while being copied or unpickled
-            raise AttributeError(role)
-        try:
-            return self.array[..., self.slices[role]]
-        except KeyError:
-            raise AttributeError(f"no role '{role}'; roles: {', '.join(self.slices)}") from None
+        part = self._slice(role, role)  # first: it refuses what copying and unpickling look for
+        return self.array[..., part]
 
-    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.array, dtype=dtype) if copy else np.asarray(self.array, dtype=dtype)
+    def __repr__(self) -> str:
+        rows = self.model.labels
+        if self.array.ndim > 1:
+            return _batch_summary(self.title, self.array, rows)
+        units = [row.effort_unit if self.title == "effort" else row.unit for row in rows]
+        values = {self.title: [f"{value:.5g}" for value in self.array]}
+        return _table([f"{row.name} [{unit}]" for row, unit in zip(rows, units, strict=True)], values)
 
 
-class RoleMatrix:
+class RoleMatrix(_RoleView):
     """A matrix (..., n, n) whose blocks are read by two role letters: ``W.ea``."""
 
-    __slots__ = ("array", "slices")
-
-    def __init__(self, array: np.ndarray, slices: Mapping[str, slice]) -> None:
-        self.array = array
-        self.slices = slices
+    __slots__ = ()
 
     def __getattr__(self, roles: str) -> np.ndarray:
-        if roles in self.__slots__:  # while being copied or unpickled
-            raise AttributeError(roles)
-        if len(roles) == 2 and roles[0] in self.slices and roles[1] in self.slices:
-            return self.array[..., self.slices[roles[0]], self.slices[roles[1]]]
-        raise AttributeError(f"no block '{roles}'; roles: {', '.join(self.slices)}")
+        row, column = self._slice(roles, roles[:1]), self._slice(roles, roles[1:])
+        return self.array[..., row, column]
 
-    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.array, dtype=dtype) if copy else np.asarray(self.array, dtype=dtype)
+    def __repr__(self) -> str:
+        rows = self.model.labels
+        if self.array.ndim > 2:
+            return _batch_summary(self.title, self.array, rows)
+        columns = {
+            f"{row.name} [{row.effort_unit}]": [f"{value:.4g}" for value in column]
+            for row, column in zip(rows, self.array.T, strict=True)
+        }
+        return _table([f"{row.name} [{row.unit}]" for row in rows], columns, corner=self.title)
 
 
-@dataclass(frozen=True)
+def _table(rows: Sequence[str], columns: Mapping[str, Sequence[str]], corner: str = "") -> str:
+    """Return a table of texts with names of rows at the left and of columns above."""
+    width = max(map(len, [*rows, corner]))
+    widths = [max(map(len, [name, *values])) for name, values in columns.items()]
+    head = "  ".join([corner.ljust(width), *(name.rjust(w) for name, w in zip(columns, widths, strict=True))])
+    lines = [
+        "  ".join([row.ljust(width), *(value.rjust(w) for value, w in zip(values, widths, strict=True))])
+        for row, values in zip(rows, zip(*columns.values(), strict=True), strict=True)
+    ]
+    return "\n".join([head, *lines])
+
+
+def _batch_summary(title: str, array: np.ndarray, rows: Sequence[Row]) -> str:
+    names = ", ".join(f"{row.name} [{row.unit}, {row.effort_unit}]" for row in rows)
+    return f"{title} of shape {array.shape}; rows: {names}"
+
+
+@dataclass(frozen=True, repr=False)
 class CondensedModel:
     """Compliance and free displacement between the actuators, effectors and contacts of a robot.
 
+    Printed, ``W``, ``delta_free`` and ``delta`` show names and units.
+
     Attributes:
-        compliance: ``W``, shape (..., n, n), symmetric [delta unit / effort unit].
-        free: ``delta_free``, shape (..., n): the displacements at zero effort by the tangent.
+        compliance: ``W``, shape (..., n, n), symmetric [displacement unit / effort unit].
+        free: ``delta_free``, shape (..., n): the displacements at zero effort, extrapolated with the tangent.
         effort: efforts at which the model was taken, shape (..., n).
         roles: role letters and sizes, in order.
+        rows: names and units of the rows, where they are known.
 
     Any leading shape is a batch. Effector entries of delta are absolute positions [m].
     """
@@ -79,6 +151,7 @@ class CondensedModel:
     free: np.ndarray
     effort: np.ndarray
     roles: Roles
+    rows: tuple[Row, ...] = ()
 
     @property
     def slices(self) -> dict[str, slice]:
@@ -90,21 +163,33 @@ class CondensedModel:
         return result
 
     @property
+    def labels(self) -> tuple[Row, ...]:
+        """Names and units of the rows, numbered by role where they are not known."""
+        if self.rows:
+            return self.rows
+        return tuple(Row(f"{_ROLE_NAMES[r]} {k + 1}", "?", "?") for r, size in self.roles for k in range(size))
+
+    @property
     def W(self) -> RoleMatrix:
         """Compliance, read by blocks: ``W.ea`` has shape (..., n_e, n_a)."""
-        return RoleMatrix(self.compliance, self.slices)
+        return RoleMatrix("W", self.compliance, self)
 
     @property
     def delta_free(self) -> RoleVector:
         """Free displacement, read by role: ``delta_free.e`` has shape (..., n_e)."""
-        return RoleVector(self.free, self.slices)
+        return RoleVector("delta_free", self.free, self)
 
     @property
     def lambda_(self) -> RoleVector:
         """Efforts, read by role."""
-        return RoleVector(self.effort, self.slices)
+        return RoleVector("effort", self.effort, self)
 
     @property
     def delta(self) -> RoleVector:
         """Displacements at the state of the model, ``W effort + delta_free``."""
-        return RoleVector(np.einsum("...ij,...j->...i", self.compliance, self.effort) + self.free, self.slices)
+        delta = np.einsum("...ij,...j->...i", self.compliance, self.effort) + self.free
+        return RoleVector("delta", delta, self)
+
+    def __repr__(self) -> str:
+        batch = self.free.shape[:-1]
+        return f"CondensedModel({', '.join(row.name for row in self.labels)}{f'; batch {batch}' if batch else ''})"

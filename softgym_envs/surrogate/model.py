@@ -18,7 +18,7 @@ import numba
 import numpy as np
 
 from softgym_envs.errors import WeightsError
-from softgym_envs.mechanics.condensation import CondensedModel, Roles
+from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row, effort_unit, point_rows
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.domain import Domain
@@ -120,6 +120,8 @@ class SurrogateModel(ABC):
         self.effectors = 3 * len(robot.effectors)
         self.size = self.count + self.effectors
         self.roles: Roles = (("a", self.count), ("e", self.effectors))
+        commanded = [Row(a.name, a.unit, effort_unit(a.unit)) for a in robot.actuators]
+        self.rows = (*commanded, *(row for name in robot.effectors for row in point_rows(name)))
         #: A quarter of the actuators' ranges, the unit of steps and tolerances of searches.
         self.span = 0.25 * (robot.upper - robot.lower)
 
@@ -251,7 +253,7 @@ class SurrogateModel(ABC):
         W = self.compliance(context, displacement)
         full = np.concatenate([effort, np.zeros_like(effector)], axis=-1)
         delta = np.concatenate([displacement, effector], axis=-1)
-        return CondensedModel(W, delta - np.einsum("bij,bj->bi", W, full), full, self.roles)
+        return CondensedModel(W, delta - np.einsum("bij,bj->bi", W, full), full, self.roles, self.rows)
 
     @abstractmethod
     def _prepare(self, design: np.ndarray) -> dict[str, np.ndarray]:

@@ -13,7 +13,10 @@ import pickle
 import numpy as np
 import pytest
 
-from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.condensation import CondensedModel, effort_unit
+from softgym_envs.mechanics.constraints import Bond, Cable, Cavity, Chamber, Point, Servo
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.statics import Statics
 
 FORCE, LENGTH = 1e-3, 1e-6
 
@@ -185,3 +188,46 @@ def test_views_by_role_can_be_copied(batch):
     for view in (batch.W, batch.delta_free):
         for again in (copy.copy(view), copy.deepcopy(view), pickle.loads(pickle.dumps(view))):
             np.testing.assert_array_equal(np.asarray(again), np.asarray(view))
+
+
+# -- names and units ------------------------------------------------------------------------------------------------
+
+
+def test_W_prints_with_names_and_units(box):
+    nodes, tetrahedra = box((0.1, 0.02, 0.02), (5, 1, 1))
+    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] == 0.0, young_modulus=1e6)
+    model.add_cable("upper", [[0.05, 0.01, 0.018], [0.09, 0.01, 0.018]], [-0.01, 0.01, 0.018])
+    model.add_effector("tip", [0.1, 0.01, 0.01])
+    condensed = Statics(model).solve([0.002]).condensed
+    table = [line.split("  ") for line in str(condensed.W).splitlines()]
+    header = [cell.strip() for cell in table[0] if cell]
+    assert header == ["W", "upper [N]", "tip x [N]", "tip y [N]", "tip z [N]"]
+    assert [line[0].strip() for line in table[1:]] == ["upper [m]", "tip x [m]", "tip y [m]", "tip z [m]"]
+    numbers = [[float(cell) for cell in line[1:] if cell.strip()] for line in table[1:]]
+    np.testing.assert_allclose(numbers, condensed.compliance, rtol=1e-3)
+    lines = str(condensed.delta_free).splitlines()
+    assert lines[0].strip() == "delta_free" and lines[2].startswith("tip x [m]")
+    assert float(lines[2].split()[-1]) == pytest.approx(condensed.free[1], rel=1e-4)
+    assert str(condensed.lambda_).splitlines()[1].split() == ["upper", "[N]", f"{condensed.effort[0]:.5g}"]
+    assert repr(condensed) == "CondensedModel(upper, tip x, tip y, tip z)"
+
+
+def test_rows_of_a_batch_and_rows_without_names(batch):
+    assert str(batch.W).startswith("W of shape (4, 5, 5); rows: actuator 1 [?, ?], actuator 2")
+    assert str(batch.delta).startswith("delta of shape (4, 5); rows: actuator 1")
+    assert repr(batch) == "CondensedModel(actuator 1, actuator 2, effector 1, effector 2, effector 3; batch (4,))"
+
+
+def test_units_of_pressure_and_angles():
+    assert [effort_unit(unit) for unit in ("m", "m3", "rad", "1")] == ["N", "Pa", "N m", "N m"]
+    for kind in (Bond, Cable, Cavity, Chamber, Point, Servo):
+        assert effort_unit(kind.unit[0]) == kind.unit[1]
+
+
+def test_fem_and_surrogate_name_their_rows_alike(fingers):
+    from softgym_envs.testing import untrained_potential
+
+    robot, model = fingers(2, "corotational")
+    surrogate, _ = untrained_potential(robot)
+    assert surrogate.rows == Statics(model).solve([0.0, 0.0]).condensed.rows
+    assert [row.name for row in surrogate.rows[:2]] == [actuator.name for actuator in robot.actuators]

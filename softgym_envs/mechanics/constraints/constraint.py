@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-__all__ = ["Constraint"]
+from softgym_envs.mechanics.condensation import Row, point_rows
 
 
 class Constraint(ABC):
@@ -27,6 +27,10 @@ class Constraint(ABC):
     dofs: np.ndarray
     unilateral: bool = False
     unit: tuple[str, str] = ("m", "N")
+
+    def rows(self) -> list[Row]:
+        """Names and units of its rows."""
+        return [Row(self.name, *self.unit)] if self.size == 1 else point_rows(self.name, self.unit[0])
 
     @abstractmethod
     def value(self, x: np.ndarray) -> np.ndarray:

@@ -114,6 +114,10 @@ class Statics:
         self.linearisation = Linearisation(model)
         self._assembly = model.assembly
         sizes = dict(model.roles)
+        self._roles = tuple(role for role in model.roles if role[0] != "b")
+        self._labels = tuple(
+            row for letter in sizes if letter != "b" for c in model.constraints[letter] for row in c.rows()
+        )
         self._actuators = sizes.get("a", 0)
         self._effectors = self._actuators + np.arange(sizes.get("e", 0))
         self._contacts = self._actuators + sizes.get("e", 0) + np.arange(sizes.get("c", 0))
@@ -347,7 +351,8 @@ class Statics:
             compliance=W,
             free=delta[:count] - W @ effort[:count],
             effort=effort[:count],
-            roles=tuple(role for role in self.model.roles if role[0] != "b"),
+            roles=self._roles,
+            rows=self._labels,
         )
         return Equilibrium(
             x=self.x.copy(),
