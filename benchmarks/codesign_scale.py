@@ -1,6 +1,6 @@
 """Co-design sweeps whose processes are killed and whose database is restarted; and where their time goes.
 
-``softgym bench codesign_kills codesign_profile`` or ``python -m benchmarks.codesign_scale`` (ten minutes).
+``softgym bench codesign_kills codesign_profile`` (ten minutes).
 """
 
 from __future__ import annotations
@@ -268,9 +268,3 @@ def profile() -> dict[str, object]:
         **{f"share of {name} [%]": 100.0 * seconds / total for name, seconds in parts.items()},
         "share inside training or evaluation [%]": 100.0 * (spent["train"] + spent["assess"]) / total,
     }
-
-
-if __name__ == "__main__":
-    from benchmarks.run import run
-
-    run(["codesign_kills", "codesign_profile"], "results/codesign_scale.json")

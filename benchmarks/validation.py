@@ -1,182 +1,31 @@
-"""The mechanics against exact and published solutions, each on refined meshes.
+"""Statics compared with exact and published solutions, each on refined meshes.
 
-``softgym bench validation`` computes all cases, prints them, and writes the table of ``docs/validation.md``. Every
-case is a function that returns `Row`s, one for each element and mesh; the tests run them on coarse meshes.
+``softgym bench validation`` computes all cases; docs/validation.md shows them. Every case is a function that returns
+rows, one for each element and mesh; the tests run them on coarse meshes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ellipeinc, ellipk, ellipkinc
 
+from benchmarks.bodies import clamped_beam, halved, linear_response, solid, sphere_octant, straight, traction
+from benchmarks.rows import MeshRow as Row
+from benchmarks.rows import as_results, with_orders
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints import Cavity, Chamber, EmbeddedPoints, Point
+from softgym_envs.mechanics.constraints import Chamber
 from softgym_envs.mechanics.elements.beams import Section
-from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.materials import MATERIALS
-from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solids import SOLIDS
-from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.testing import box_mesh
 
-__all__ = ["CASES", "Row", "validation"]
-
-DOCUMENT = Path(__file__).parents[1] / "docs" / "validation.md"
-START, END = "<!-- table: start -->", "<!-- table: end -->"
-
-Mapping = Callable[[np.ndarray], np.ndarray]
-
-
-@dataclass(frozen=True)
-class Row:
-    """One computed value.
-
-    Args:
-        case: what is computed.
-        element: element, and material where it matters.
-        level: the mesh, in words.
-        unknowns: number of equations.
-        value: computed.
-        reference: exact or published; NaN where the reference is another of our own solutions.
-        error: relative to the reference, or as the case says.
-        order: of the error since the mesh before, whose elements are twice as large; NaN for the first.
-    """
-
-    case: str
-    element: str
-    level: str
-    unknowns: int
-    value: float
-    reference: float
-    error: float
-    order: float = float("nan")
-
-
-def _orders(rows: list[Row], floor: float = 1e-10) -> list[Row]:
-    """Fill in the observed orders of rows of one element, each mesh twice as fine; none below round-off."""
-    result = rows[:1]
-    for before, row in zip(rows, rows[1:], strict=False):
-        first, second = abs(before.error), abs(row.error)
-        known = first > floor and second > floor
-        result.append(replace(row, order=float(np.log2(first / second)) if known else float("nan")))
-    return result
-
-
-# -- meshes ---------------------------------------------------------------------------------------------------------
-
-
-def box(cells: Sequence[int], jitter: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Unit cube cut into boxes of six tetrahedra: nodes (n, 3), inner ones moved by ``jitter`` cells, and corners."""
-    counts = np.array(cells)
-    grid = np.stack(np.meshgrid(*(np.arange(n + 1) for n in cells), indexing="ij"), axis=-1).reshape(-1, 3)
-    inside = ((grid > 0) & (grid < counts)).all(axis=1)
-    noise = np.random.default_rng(0).uniform(-jitter, jitter, grid.shape) * inside[:, None]
-    strides = np.array([(cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1])
-    first = grid[(grid < counts).all(axis=1)] @ strides
-    orders = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
-    paths = [first[:, None] + np.concatenate([[0], np.cumsum(strides[list(order)])]) for order in orders]
-    return (grid + noise) / counts, np.concatenate(paths)
-
-
-def shell_octant(count: int, layers: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Octant of the region 1 <= |x| + |y| + |z| <= 2: nodes (n, 3), tetrahedra (m, 4), triangles of the inner face."""
-    ids, face = {}, []
-    for i in range(count + 1):
-        for j in range(count + 1 - i):
-            ids[i, j] = len(face)
-            face.append([i, j, count - i - j])
-    triangles = [[ids[i, j], ids[i + 1, j], ids[i, j + 1]] for i, j in ids if i + j < count]
-    triangles += [[ids[i + 1, j], ids[i + 1, j + 1], ids[i, j + 1]] for i, j in ids if i + j < count - 1]
-    surface = np.sort(np.array(triangles), axis=1)
-    points = np.array(face) / count
-    nodes = np.concatenate([points * (1.0 + layer / layers) for layer in range(layers + 1)])
-    tetrahedra = []
-    for layer in range(layers):
-        low, high = surface + layer * len(points), surface + (layer + 1) * len(points)
-        # Prisms whose sides are cut from the lower node of lowest number: neighbours agree.
-        for k in range(3):
-            tetrahedra.append(np.column_stack([low[:, : k + 1], high[:, k:]]))
-    return nodes, np.concatenate(tetrahedra), np.array(triangles)
-
-
-def to_sphere(points: np.ndarray) -> np.ndarray:
-    """Move points (n, 3) along their rays so that |x| + |y| + |z| becomes their distance."""
-    lengths = np.linalg.norm(points, axis=1)
-    return points * (np.abs(points).sum(axis=1) / lengths)[:, None]
-
-
-def solid(
-    mesh: tuple[np.ndarray, np.ndarray],
-    element: str,
-    fixed: Callable[[np.ndarray], np.ndarray],
-    mapping: Mapping,
-    **options,
-) -> MechanicalModel:
-    """A body of one element on a mapped mesh; midside nodes are mapped, too, so edges may be curved.
-
-    Args:
-        mesh: nodes (n, 3) and tetrahedra (m, 4) before the mapping.
-        element: a name of `SOLIDS`.
-        fixed: mask (n,) or (n, 3) of clamped nodes, from the nodes before the mapping.
-        mapping: nodes before -> nodes [m].
-        **options: of the element block.
-    """
-    nodes, tetrahedra = mesh
-    if element == "quadratic":
-        nodes, tetrahedra = add_midside_nodes(nodes, tetrahedra)
-    mapped = mapping(nodes)
-    return MechanicalModel(mapped, [SOLIDS[element](mapped, tetrahedra, **options)], fixed=fixed(nodes))
-
-
-def traction(model: MechanicalModel, selected: Callable[[np.ndarray], np.ndarray], force: np.ndarray) -> np.ndarray:
-    """Nodal loads (n, 3) of a uniform traction with a total ``force`` [N] on the outer faces of selected nodes (n,)."""
-    connectivity = model.solids[0].connectivity
-    corners = connectivity[:, :4]
-    faces = corners[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
-    _, first, counts = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    outer = faces[first[counts == 1]]
-    outer = outer[selected(model.nodes)[outer].all(axis=1)]
-    x = model.nodes[outer]
-    areas = 0.5 * np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
-    if connectivity.shape[1] == 10:  # corners carry nothing of a uniform traction, midside nodes a third each
-        outer = quadratic_triangles(outer, connectivity)[:, 3:]
-    loads = np.zeros_like(model.nodes)
-    np.add.at(loads, outer, areas[:, None, None] / (3.0 * areas.sum()) * force)
-    return loads
-
-
-def linear_response(model: MechanicalModel, loads: np.ndarray) -> np.ndarray:
-    """Displacements [m] (n, 3) under small loads [N] (n, 3): one solve with the tangent at rest."""
-    tangent = Linearisation(model)
-    assert tangent.update(model.nodes, np.zeros(model.assembly.size))
-    free = model.kinematics.free_dofs
-    moved = np.zeros(model.nodes.size)
-    moved[free] = tangent.solve(loads.ravel()[free])
-    return moved.reshape(-1, 3)
-
-
-def clamped_beam(
-    curve: Callable[[float], tuple[np.ndarray, np.ndarray]], elements: int, order: int, section: Section, **options
-) -> MechanicalModel:
-    """A beam along a curve on [0, 1] (position, rotation), clamped at 0, with an effector at 1."""
-    body = ModelBuilder()
-    places = np.linspace(0.0, 1.0, order * elements + 1)
-    frames = [body.add_frame(*curve(t), fixed=t == 0.0, fixed_spin=t == 0.0) for t in places]
-    body.add_beam(frames, section=section, order=order, **options)
-    model = body.build()
-    model.add("e", Point("tip", EmbeddedPoints.in_frame(frames[-1], np.zeros(3), model.nodes)))
-    return model
-
-
-def straight(length: float) -> Callable[[float], tuple[np.ndarray, np.ndarray]]:
-    """A line along x, for `clamped_beam`."""
-    return lambda t: (np.array([length * t, 0.0, 0.0]), np.eye(3))
-
+ROUND_OFF = 1e-10
+"""Relative errors below this have no order."""
 
 # -- patch test -----------------------------------------------------------------------------------------------------
 
@@ -189,7 +38,7 @@ def patch(levels: Sequence[int] = (2, 3, 4)) -> list[Row]:
         for material in MATERIALS:
             for cells in levels:
                 model = solid(
-                    box((cells, cells, cells), jitter=0.25),
+                    box_mesh(cells=(cells, cells, cells), jitter=0.25),
                     element,
                     lambda x: (np.isclose(x, 0.0, atol=1e-12) | np.isclose(x, 1.0)).any(axis=1),
                     lambda x: x,
@@ -223,7 +72,7 @@ def cantilever(solids: Sequence[int] = (1, 2, 4), beams: Sequence[int] = (1, 2, 
         found = []
         for cells in solids if element == "quadratic" else [2 * n for n in solids]:
             model = solid(
-                box((10 * cells, cells, cells)),
+                box_mesh(cells=(10 * cells, cells, cells)),
                 element,
                 lambda x: x[:, 0] == 0.0,
                 lambda x: x * [length, width, width],
@@ -234,7 +83,7 @@ def cantilever(solids: Sequence[int] = (1, 2, 4), beams: Sequence[int] = (1, 2, 
             value = float(np.vdot(loads, linear_response(model, loads)))
             level = f"{cells} cells across"
             found.append(Row("cantilever", element, level, model.equations, value, exact, value / exact - 1.0))
-        rows += _orders(found)
+        rows += with_orders(found, ROUND_OFF)
     for order in (1, 2):
         found = []
         for elements in beams:
@@ -242,7 +91,7 @@ def cantilever(solids: Sequence[int] = (1, 2, 4), beams: Sequence[int] = (1, 2, 
             value = float(Statics(model).solve([]).condensed.W.ee[2, 2])
             level, name = f"{elements} elements", f"beam of order {order}"
             found.append(Row("cantilever", name, level, model.equations, value, exact, value / exact - 1.0))
-        rows += _orders(found)
+        rows += with_orders(found, ROUND_OFF)
     return rows
 
 
@@ -285,7 +134,7 @@ def elastica(levels: Sequence[int] = (4, 8, 16), loads: Sequence[float] = (1.0, 
                 name, case = f"beam of order {order}", f"elastica, PL2/EI = {load:g}: deflection"
                 level = f"{elements} elements"
                 found.append(Row(case, name, level, model.equations, float(-tip[2]), float(exact[1]), error))
-            rows += _orders(found, floor=1e-6)
+            rows += with_orders(found, floor=1e-6)
     return rows
 
 
@@ -311,7 +160,7 @@ def circle(levels: Sequence[int] = (8, 16, 32)) -> list[Row]:
             gap = float(np.linalg.norm(tip))
             level, name = f"{elements} elements", f"beam of order {order}"
             found.append(Row("bending to a circle: gap", name, level, model.equations, gap, 0.0, gap))
-        rows += _orders(found, floor=1e-8)
+        rows += with_orders(found, floor=1e-8)
     return rows
 
 
@@ -382,17 +231,19 @@ def bend(
             for elements in beams if order == 2 else [2 * n for n in beams]:
                 tip, unknowns = beam_tip(elements, order, square)
                 found.append(row(f"beam of order {order}", f"{elements} elements", unknowns, tip, true, float(true[2])))
-            rows += _orders(found, floor=1e-8)
+            rows += with_orders(found, floor=1e-8)
         found = []
         for along in solids:
             across = along // 16
-            model = solid(box((along, across, across)), "quadratic", lambda x: x[:, 0] == 0.0, _bend_of_box, **options)
+            model = solid(
+                box_mesh(cells=(along, across, across)), "quadratic", lambda x: x[:, 0] == 0.0, _bend_of_box, **options
+            )
             model.nodal_loads[:] = traction(model, _is_end_of_bend, np.array([0.0, 0.0, load]))
             x = Statics(model, tolerance=1e-7).solve([]).x
             tip = model.nodal_loads[:, 2] @ x / load
             level = f"{along} x {across} x {across} cells"
             found.append(row("quadratic", level, model.equations, tip, true, float(true[2])))
-        rows += _orders(found)
+        rows += with_orders(found, ROUND_OFF)
     return rows
 
 
@@ -426,7 +277,7 @@ def _cook(levels: Sequence[int], element: str, poisson_ratio: float) -> list[Row
             return np.column_stack([48.0 * s, 44.0 * s + t * (44.0 - 28.0 * s), thick * x[:, 2]])
 
         model = solid(
-            box((cells, cells, 1)),
+            box_mesh(cells=(cells, cells, 1)),
             element,
             lambda x: np.column_stack([x[:, 0] == 0.0, x[:, 0] == 0.0, np.ones(len(x), dtype=bool)]),
             mapping,
@@ -439,49 +290,10 @@ def _cook(levels: Sequence[int], element: str, poisson_ratio: float) -> list[Row
         value = float(moved[corner, 1].mean())
         case, level = f"Cook's membrane, nu = {poisson_ratio:g}", f"{cells} x {cells} cells"
         found.append(Row(case, element, level, model.equations, value, reference, value / reference - 1.0))
-    return _orders(found)
+    return with_orders(found, ROUND_OFF)
 
 
 # -- sphere ---------------------------------------------------------------------------------------------------------
-
-
-def sphere_octant(count: int, element: str, *, split: bool = False, **options) -> MechanicalModel:
-    """An octant of a thick sphere (radii 1 and 2) on its planes of symmetry.
-
-    Actuator: the pressure in the cavity, closed by flat triangles between the inner edge and the centre.
-
-    Args:
-        count: cells along an edge, and through the wall.
-        element: a name of `SOLIDS`.
-        split: whether the cavity of quadratic elements is of split triangles, not of quadratic ones.
-        **options: of the element block.
-    """
-    nodes, tetrahedra, inner = shell_octant(count, count)
-    if element == "quadratic":
-        nodes, tetrahedra = add_midside_nodes(nodes, tetrahedra)
-        inner = split_triangles(inner, tetrahedra) if split else quadratic_triangles(inner, tetrahedra)
-    nodes = to_sphere(nodes)
-    quadratic = inner.shape[1] == 6
-    inward = np.linalg.det(nodes[inner[:, :3]]) < 0.0
-    inner[inward] = inner[inward][:, [0, 2, 1, 5, 4, 3] if quadratic else [0, 2, 1]]
-    # Edges of one triangle only, from corner to corner, with the midside node.
-    sides = (
-        [inner[:, [0, 1, 3]], inner[:, [1, 2, 4]], inner[:, [2, 0, 5]]]
-        if quadratic
-        else [inner, inner[:, [1, 2, 0]], inner[:, [2, 0, 1]]]
-    )
-    edges = {(a, b): middle for a, b, middle in np.concatenate(sides).tolist()}
-    rim = {edge: middle for edge, middle in edges.items() if edge[::-1] not in edges}
-    # The centre and the middles of its spokes belong to no element: such nodes are held.
-    centre, corners = len(nodes), sorted({a for a, _ in rim})
-    spoke = {a: centre + 1 + k for k, a in enumerate(corners)}
-    nodes = np.vstack([nodes, np.zeros((1, 3)), 0.5 * nodes[corners]])
-    closing = [[b, a, centre, middle, spoke[a], spoke[b]] for (a, b), middle in rim.items()]
-    block = SOLIDS[element](nodes, tetrahedra, **options)
-    model = MechanicalModel(nodes, [block], fixed=np.isclose(nodes, 0.0, atol=1e-12))
-    surface = np.vstack([inner, np.array(closing)[:, : inner.shape[1]]])
-    model.add("a", Cavity("cavity", surface, nodes))
-    return model
 
 
 def sphere(levels: Sequence[int] = (2, 4, 8), ratios: Sequence[float] = (0.3, 0.499)) -> list[Row]:
@@ -506,7 +318,7 @@ def sphere(levels: Sequence[int] = (2, 4, 8), ratios: Sequence[float] = (0.3, 0.
                 value = float(np.vdot(loads, moved) / np.vdot(loads, model.nodes))
                 case, level = f"thick sphere, nu = {nu:g}", f"{count} cells"
                 found.append(Row(case, name, level, model.equations, value, exact, value / exact - 1.0))
-            rows += _orders(found)
+            rows += with_orders(found, ROUND_OFF)
     return rows
 
 
@@ -541,22 +353,11 @@ def cavity_work(levels: Sequence[int] = (2, 4, 8), count: int = 2) -> list[Row]:
                     name = f"{element}, {material}"
                     case = f"work of a cavity, {'volume' if mode == 'displacement' else 'pressure'}-driven"
                     found.append(Row(case, name, f"{steps} steps", model.equations, work, energy, work / energy - 1.0))
-                rows += _orders(found)
+                rows += with_orders(found, ROUND_OFF)
     return rows
 
 
 # -- soft finger ----------------------------------------------------------------------------------------------------
-
-
-def halved(nodes: np.ndarray, tetrahedra: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut every tetrahedron into eight at the middles of its edges; new nodes are marked where both ends are."""
-    finer, ten = add_midside_nodes(nodes, tetrahedra)
-    marked = np.append(mask, np.zeros(len(finer) - len(nodes), dtype=bool))
-    for slot, (a, b) in enumerate([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]):
-        marked[ten[:, 4 + slot]] = mask[ten[:, a]] & mask[ten[:, b]]
-    corners = [(0, 4, 6, 7), (4, 1, 5, 8), (6, 5, 2, 9), (7, 8, 9, 3)]
-    middle = [(6, 8, 4, 5), (6, 8, 5, 9), (6, 8, 9, 7), (6, 8, 7, 4)]
-    return finer, ten[:, corners + middle].reshape(-1, 4), marked
 
 
 def finger(halvings: int = 1, ratios: Sequence[float] = (0.3, 0.47, 0.499)) -> list[Row]:
@@ -566,13 +367,14 @@ def finger(halvings: int = 1, ratios: Sequence[float] = (0.3, 0.47, 0.499)) -> l
     quadratic elements on the finest one.
     """
     from softgym_envs.robots import make_robot
+    from softgym_envs.robots.soft_finger import in_flange
 
     robot = make_robot("finger", cables=1)
     rows = []
     for nu in ratios:
         design = robot.design_space.complete({"poisson_ratio": nu})
         mesh = robot.body(design)
-        nodes, tetrahedra, fixed = mesh.nodes, mesh.tetrahedra, robot.clamped(mesh)
+        nodes, tetrahedra, fixed = mesh.nodes, mesh.tetrahedra, in_flange(mesh.nodes)
         found: dict[str, list[Row]] = {element: [] for element in SOLIDS}
         for level in range(halvings + 1):
             if level:
@@ -612,32 +414,7 @@ CASES: dict[str, Callable[[], list[Row]]] = {
 """Registry of cases."""
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Rows as a Markdown table."""
-    lines = [
-        "| case | element | mesh | unknowns | value | reference | error | order |",
-        "|---|---|---|--:|--:|--:|--:|--:|",
-    ]
-    for row in rows:
-        order = "" if np.isnan(row.order) else f"{row.order:.1f}"
-        lines.append(
-            f"| {row.case} | {row.element} | {row.level} | {row.unknowns} | {row.value:.6g} | {row.reference:.6g} "
-            f"| {row.error:.2g} | {order} |"
-        )
-    return "\n".join(lines)
-
-
 def validation() -> dict[str, object]:
-    """Exact and published solutions on refined meshes; writes the table of docs/validation.md."""
+    """Exact and published solutions on refined meshes (docs/validation.md shows the table)."""
     rows = [row for case in CASES.values() for row in case()]
-    text = DOCUMENT.read_text()
-    before, after = text.split(START)[0], text.split(END)[1]
-    DOCUMENT.write_text(f"{before}{START}\n\n{table(rows)}\n\n{END}{after}")
-    return {
-        f"{row.case} | {row.element} | {row.level}": {
-            key: None if isinstance(value, float) and np.isnan(value) else value
-            for key, value in asdict(row).items()
-            if key not in ("case", "element", "level")
-        }
-        for row in rows
-    }
+    return as_results(rows, "case", "element", "level")

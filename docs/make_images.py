@@ -1,23 +1,26 @@
 """Draw the pictures of the documentation: ``make docs-images``, or ``python docs/make_images.py [NAME ...]``.
 
 Names are those of robots, of environment pages (``finger_reach``) and of other pictures; default: all. Pictures go to
-``docs/images/NAME.png``.
+``docs/images/NAME.png``, the animation to ``docs/images/episodes.gif``. The picture ``report`` needs a finished study
+(``make demo``) and Chromium, so it is drawn only when it is named.
 """
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from generate import ROOT, environment_pages
 from PIL import Image
+from site_writing import DOCS, environment_pages
 
 from agents.evaluation import make_agent
 from softgym_envs.robots import ROBOTS, make_robot
@@ -36,6 +39,8 @@ COMMANDS: dict[str, tuple[float, ...]] = {
     "three_finger_gripper": (0.35, 0.35, 0.35, 0.35, 0.35, 0.35),
 }
 WIDTH, HEIGHT = 800, 520
+FILMED = ("SoftGym/FingerTrack-v0", "SoftGym/DiamondTrack-v0", "SoftGym/TrunkTrack-v0")
+FRAMES = 45
 
 
 def draw_robot(name: str) -> np.ndarray:
@@ -51,7 +56,7 @@ def draw_robot(name: str) -> np.ndarray:
 
 
 def draw_environment(name: str) -> np.ndarray:
-    """Draw an environment on the finite elements, on the way to its goal under the inverse QP."""
+    """Draw an environment on finite elements while the inverse QP moves it to its goal."""
     env = gymnasium.make(environment_pages()[name], backend="fem", render_mode="rgb_array", render_size=(WIDTH, HEIGHT))
     act = make_agent("qp")
     observation, _ = env.reset(seed=1)
@@ -63,6 +68,30 @@ def draw_environment(name: str) -> np.ndarray:
     return image
 
 
+def film(identifier: str, size: int) -> Iterator[np.ndarray]:
+    """Yield `FRAMES` pictures of one episode under the inverse QP."""
+    env = gymnasium.make(identifier, render_mode="rgb_array", render_size=(size, size))
+    act = make_agent("qp")
+    observation, _ = env.reset(seed=1)
+    unwrapped: Any = env.unwrapped
+    steps = unwrapped.task.horizon
+    shown = np.linspace(0, steps - 1, FRAMES).astype(int)
+    for step in range(steps):
+        observation, *_ = env.step(act(observation, unwrapped))
+        for _ in range(int((shown == step).sum())):
+            yield np.asarray(env.render())
+    env.close()
+
+
+def draw_episodes(path: Path) -> None:
+    """Write an animation of three robots that follow their paths."""
+    films = [list(film(identifier, 280)) for identifier in FILMED]
+    rows = [np.concatenate(frames, axis=1) for frames in zip(*films, strict=True)]
+    palette = Image.fromarray(rows[len(rows) // 2]).quantize(96)
+    frames = [Image.fromarray(row).quantize(palette=palette, dither=Image.Dither.NONE) for row in rows]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=80, loop=0, optimize=True)
+
+
 def draw_codesign() -> np.ndarray:
     """Draw the baseline finger and the winner of the demo study."""
     designs = [{}, {"length": 0.038, "height": 0.0211, "joint_height": 0.005}]
@@ -72,23 +101,40 @@ def draw_codesign() -> np.ndarray:
 
 
 def draw_arm() -> np.ndarray:
-    """Take the picture that the tutorial on one's own robot makes."""
+    """Return the picture that the tutorial on a robot of your own draws."""
     with tempfile.TemporaryDirectory() as folder:
-        page = ROOT / "tutorials" / "own_robot.md"
-        subprocess.run([sys.executable, str(ROOT / "run_page.py"), str(page), folder], check=True)
+        page = DOCS / "tutorials" / "own_robot.md"
+        subprocess.run([sys.executable, str(DOCS / "run_page.py"), str(page), folder], check=True)
         return np.asarray(Image.open(Path(folder) / "arm.png"))
 
 
+def draw_report() -> np.ndarray:
+    """Take a screenshot of the report of a finished study (default ``results/demo``, or ``$STUDY``) with Chromium."""
+    report = Path(os.environ.get("STUDY", "results/demo")).resolve() / "report.html"
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if not report.is_file() or browser is None:
+        raise SystemExit(f"the picture 'report' needs Chromium and '{report}' (make demo)")
+    with tempfile.TemporaryDirectory() as folder:
+        picture = Path(folder) / "report.png"
+        options = ["--headless", "--no-sandbox", "--hide-scrollbars", "--window-size=1100,1150"]
+        subprocess.run([browser, *options, f"--screenshot={picture}", report.as_uri()], check=True)
+        return np.asarray(Image.open(picture).convert("RGB"))
+
+
 def main(names: list[str]) -> None:
-    """Draw the named pictures, or all."""
+    """Draw the named pictures, or all but the report."""
     table: dict[str, Callable[[], np.ndarray]] = {"codesign": draw_codesign, "arm": draw_arm}
     table |= {name: partial(draw_robot, name) for name in ROBOTS}
     table |= {name: partial(draw_environment, name) for name in environment_pages()}
-    for name in names or table:
-        path = ROOT / "images" / f"{name}.png"
-        image = Image.fromarray(table[name]())
-        image.save(path, optimize=True)
-        print(f"wrote {path}, {image.width} x {image.height}, {path.stat().st_size // 1024} kB")
+    for name in names or [*table, "episodes"]:
+        path = DOCS / "images" / f"{name}.png"
+        if name == "episodes":
+            path = path.with_suffix(".gif")
+            draw_episodes(path)
+        else:
+            draw = draw_report if name == "report" else table[name]
+            Image.fromarray(draw()).save(path, optimize=True)
+        print(f"wrote {path}, {path.stat().st_size // 1024} kB")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
 """The documentation: every ID and robot has a page, the code of the tutorials runs, and the site builds."""
 
+import importlib
 import importlib.util
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -27,21 +29,23 @@ def load(name):
     return module
 
 
-generate = load("generate")
+generate = load("generate")  # puts its folder on the search path
+writing, api = (importlib.import_module(f"site_{name}") for name in ("writing", "api"))
+robots, environments = (importlib.import_module(f"site_{name}") for name in ("robots", "environments"))
 code_blocks = load("run_page").code_blocks
 PAGES = sorted(DOCS.rglob("*.md"))
 
 
 def test_names_of_pages():
-    assert generate.page_name("SoftGym/CableTrunkReach-v0") == "cable_trunk_reach"
-    assert generate.page_name("SoftGym/FingerTrack-v12") == "finger_track"
+    assert writing.page_name("SoftGym/CableTrunkReach-v0") == "cable_trunk_reach"
+    assert writing.page_name("SoftGym/FingerTrack-v12") == "finger_track"
 
 
 @pytest.mark.parametrize("identifier", ENVIRONMENTS)
 def test_every_environment_has_a_page_with_a_description(identifier):
-    page = DOCS / "environments" / f"{generate.page_name(identifier)}.md"
+    page = DOCS / "environments" / f"{writing.page_name(identifier)}.md"
     assert page.is_file(), f"write {page.relative_to(ROOT)}: a title and '## Description', the rest is generated"
-    assert generate.describes(page.read_text())
+    assert writing.describes(page.read_text())
     version = int(identifier.rsplit("-v", 1)[1])
     assert version == 0 or f"* v{version}:" in page.read_text(), "a new version is a line of the version history"
 
@@ -50,35 +54,35 @@ def test_every_environment_has_a_page_with_a_description(identifier):
 def test_every_robot_has_a_page_with_a_description(name):
     page = DOCS / "robots" / f"{name}.md"
     assert page.is_file(), f"write {page.relative_to(ROOT)}: a title, '## Description' and '## Published beside ours'"
-    assert generate.describes(page.read_text())
-    assert dict(generate.split(page.read_text())).get("Published beside ours")
+    assert writing.describes(page.read_text())
+    assert dict(writing.split(page.read_text())).get("Published beside ours")
 
 
 def test_an_empty_description_is_seen():
-    assert not generate.describes(
+    assert not writing.describes(
         "# Title\n\n## Description\n\n<!-- to be written, by somebody, in many words: " + "x " * 60 + "-->"
     )
-    assert not generate.describes("# Title\n\n" + "word " * 60)
-    assert generate.describes("# Title\n\n## Description\n\n" + "word " * 60)
+    assert not writing.describes("# Title\n\n" + "word " * 60)
+    assert writing.describes("# Title\n\n## Description\n\n" + "word " * 60)
 
 
 @pytest.mark.parametrize("identifier", ENVIRONMENTS)
 def test_pages_of_environments_are_completed(identifier):
-    text = (DOCS / "environments" / f"{generate.page_name(identifier)}.md").read_text()
-    sections = generate.environment_sections(identifier)
-    page = generate.compose(text, generate.environment_top(identifier), sections)
-    found = [heading for heading, body in generate.split(page) if heading in sections and body]
+    text = (DOCS / "environments" / f"{writing.page_name(identifier)}.md").read_text()
+    sections = environments.environment_sections(identifier)
+    page = writing.compose(text, environments.environment_top(identifier), sections)
+    found = [heading for heading, body in writing.split(page) if heading in sections and body]
     assert found == list(sections)
-    assert generate.HERE not in page
-    robot = generate.robot_of(ENVIRONMENTS[identifier].robot)
+    assert writing.HERE not in page
+    robot = robots.robot_of(ENVIRONMENTS[identifier].robot)
     for name in robot.design_space.names:
         assert f"`{name}`" in page
 
 
 @pytest.mark.parametrize("identifier", ENVIRONMENTS)
 def test_scales_of_the_observation_are_the_real_ones(identifier):
-    robot = generate.robot_of(ENVIRONMENTS[identifier].robot)
-    scales = generate.observation_scales(robot)
+    robot = robots.robot_of(ENVIRONMENTS[identifier].robot)
+    scales = environments.observation_scales(robot)
     spaces = AgentSpaces(robot, action_mode="increment", design_names=(), moving=True)
     n, none = len(robot.actuators), np.zeros(0)
     here, there, speed = np.zeros(3), np.array([scales["error"], 0.0, 0.0]), np.array([0.0, 0.0, scales["speed"]])
@@ -92,15 +96,28 @@ def test_the_printed_size_of_the_observation_is_the_real_one(identifier):
     import gymnasium
 
     env = gymnasium.make(identifier)
-    assert f"({env.observation_space.shape[0]} + k,)" in generate.environment_top(identifier)
+    assert f"({env.observation_space.shape[0]} + k,)" in environments.environment_top(identifier)
     env.close()
+
+
+@pytest.mark.parametrize("package", api.PACKAGES)
+def test_names_of_the_reference_can_be_imported(package):
+    """Every name that the reference links to is imported from the package under which it stands."""
+    links = re.findall(rf"\[`(\w+)`\]\({re.escape(package)}\.md#(\w+)\)", api.api_index())
+    page = api.api_page(package)
+    for name, anchor in links:
+        assert name == anchor and f"{{ #{name} }}" in page
+        value = getattr(importlib.import_module(package), name)
+        module = re.search(rf"^::: ([\w.]+)\.{name}$", page, flags=re.MULTILINE)[1]
+        assert getattr(importlib.import_module(module), name) is value
+    assert [name for name, _ in links] == api.public_names(package)
 
 
 def test_what_a_page_says_itself_wins():
     template = {"One": lambda: "generated one", "Two": lambda: "generated two", "Three": lambda: ""}
     page = "# T\n\n## Two\n\nbefore\n\n<!-- generated -->\n\n## Own\n\n```sh\n## no heading\n```\n"
-    composed = generate.compose(page, "top", template)
-    assert [heading for heading, _ in generate.split(composed)] == ["", "One", "Two", "Own"]
+    composed = writing.compose(page, "top", template)
+    assert [heading for heading, _ in writing.split(composed)] == ["", "One", "Two", "Own"]
     assert "before\n\ngenerated two" in composed and "generated one" in composed
 
 
@@ -133,7 +150,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     pages = sorted(path.relative_to(tmp_path / "site").as_posix() for path in (tmp_path / "site").rglob("*.html"))
-    wanted = [f"environments/{generate.page_name(identifier)}.html" for identifier in ENVIRONMENTS]
+    wanted = [f"environments/{writing.page_name(identifier)}.html" for identifier in ENVIRONMENTS]
     assert {*wanted, *(f"robots/{name}.html" for name in ROBOTS), "index.html"} <= set(pages)
     assert not list((tmp_path / "site").rglob("*.py"))
     # Nothing is loaded from elsewhere when a page is read.

@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import softgym_envs  # noqa: F401  (registers the environments)
-from benchmarks import dynamics as cases
+from benchmarks import robot_dynamics as cases
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots import make_robot

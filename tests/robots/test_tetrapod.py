@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import dynamics as cases
+from benchmarks import robot_dynamics as cases
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError, DesignError
 from softgym_envs.mechanics.elements.beams import Beam

@@ -1,0 +1,376 @@
+"""Tables of the documentation, made from the recorded results by `benchmarks.page`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from benchmarks.page import figure, number, records, results
+
+WEIGHTS = {
+    "finger_1cable": "finger, 1 cable",
+    "finger_2cables": "finger, 2 cables",
+    "press_finger": "press finger",
+    "diamond": "Diamond",
+    "three_finger_gripper": "three-finger gripper",
+    "two_finger_gripper": "two-finger gripper",
+    "trunk": "Stiff-Flop trunk",
+    "cable_trunk": "cable trunk",
+    "contact_finger": "contact finger",
+}
+"""Names of the shipped weights, as people call the robots."""
+
+HEADLINES = ("finger", "diamond", "trunk", "two_finger_gripper", "tetrapod")
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "") -> str:
+    """Return a Markdown table; ``align`` has one of ``l`` and ``r`` for each column, default ``l``."""
+    rules = ["--:" if side == "r" else "---" for side in align.ljust(len(head), "l")]
+    return "\n".join(f"| {' | '.join(str(cell) for cell in row)} |" for row in (head, rules, *rows))
+
+
+def named(benchmark: str, *columns: tuple[str, str], names: Iterable[str] = WEIGHTS) -> list[list[str]]:
+    """Return a row for each robot that has results: its name, then one figure for each (result, format)."""
+    found = results(benchmark)
+    return [
+        [WEIGHTS[name], *(figure(benchmark, f"{name}: {result}", form) for result, form in columns)]
+        for name in names
+        if f"{name}: {columns[0][0]}" in found
+    ]
+
+
+def short(value: float) -> str:
+    """Write two significant digits, or three from 1 on."""
+    return number(value, "#.2g") if abs(value) < 1.0 else f"{value:.3g}"
+
+
+# -- co-design ------------------------------------------------------------------------------------------------------
+
+
+def headlines() -> str:
+    """Five studies: mean distance to the test goals on FEM, from the baseline to the winner."""
+    rows = []
+    for key in HEADLINES:
+        study = results("codesign")[key]
+        row = study["rows"][0]
+        name = f"{study['title']}; {row['controller'].partition(',')[0]}"
+        rows.append([name, *_ends(row), f"`{study['command']}`"])
+    return markdown(["robot; controller", "baseline", "winner", "command"], rows, "lrrl")
+
+
+def _ends(row: dict[str, Any]) -> list[str]:
+    return [f"{row['baseline [mm]']:.2f} mm", f"→ {row['winner [mm]']:.2f} mm"]
+
+
+def codesign() -> str:
+    """All studies: mean distances and the intervals of their change."""
+    rows = []
+    for study in results("codesign").values():
+        for index, row in enumerate(study["rows"]):
+            low, high = row["change, 95% interval [mm]"]
+            name = "" if index else study["title"]
+            rows.append([name, row["controller"], *_ends(row), f"{low:.1f} to {high:.1f} mm"])
+    return markdown(["robot", "controller", "baseline", "winner", "95% interval of the change"], rows, "llrrr")
+
+
+def codesign_goals() -> str:
+    """All studies: goals reached and CPU time."""
+    rows = []
+    for study in results("codesign").values():
+        for index, row in enumerate(study["rows"]):
+            shares = [row.get(f"goals reached by the {who} [%]") for who in ("baseline", "winner")]
+            reached = ["" if shares[0] is None else f"{shares[0]}%", "" if shares[1] is None else f"→ {shares[1]}%"]
+            time = row.get("CPU with FEM check [min]")
+            cells = [row["controller"], *reached, str(row["test goals"]), f"{time:.1f} min" if time else ""]
+            rows.append(["" if index else study["title"], *cells])
+    head = ["robot", "controller", "goals reached, baseline", "winner", "test goals", "CPU time, FEM check included"]
+    return markdown(head, rows, "llrrrr")
+
+
+def codesign_bodies() -> str:
+    """What the winners look like."""
+    studies = results("codesign").values()
+    return markdown(
+        ["robot", "dimensions, baseline → winner", "command"],
+        [[s["title"], s["rows"][0].get("winner's body", ""), f"`{s['command']}`"] for s in studies],
+    )
+
+
+def strategies() -> str:
+    """Regret and cost of the co-design strategies."""
+    found = results("strategies")
+    head = ["strategy", "regret at the end [%]", "environment steps", "steps of the given policy"]
+    head += ["steps until regret stays below 10%", "below 1%", "CPU [min]"]
+    columns = ["regret at the end [%]", "environment steps", "steps behind the policy it is given"]
+    columns += ["environment steps to 10% regret", "environment steps to 1% regret", "CPU minutes"]
+    names = [key.removesuffix(f": {columns[0]}") for key in found if key.endswith(f": {columns[0]}")]
+    return markdown(head, [[n, *(_spread(found[f"{n}: {c}"]) for c in columns)] for n in names], "lrrrrrr")
+
+
+def _spread(value: object) -> str:
+    """Write ``median (smallest to largest)`` without a spread where there is none."""
+    if not isinstance(value, str):
+        return f"{value:,}"
+    text = value.replace("inf", "not reached").replace(" (one repeat)", "")
+    middle, _, rest = text.partition(" (")
+    low, _, high = rest.rstrip(")").partition(" to ")
+    return middle if low == high == middle else text
+
+
+def kills() -> str:
+    """Studies whose processes are killed."""
+    rows = []
+    for storage, title in (("journal", "journal in a folder"), ("postgresql", "PostgreSQL")):
+
+        def value(name: str, storage: str = storage) -> str:
+            return figure("codesign_kills", f"{storage}: {name}")
+
+        killed, restarts = value("kills, restarts of the server").split(", ")
+        kept, lost = value("finished trials kept once, lost or twice").split(", ")
+        rerun = value("trials under way that were killed and ran again")
+        rows.append([title, killed, restarts, kept, lost, rerun])
+    head = ["storage", "kills of all processes", "restarts of the server", "finished trials kept exactly once"]
+    return markdown([*head, "lost or duplicated", "interrupted trials that ran again"], rows, "lrrrrr")
+
+
+def profile() -> str:
+    """Where the time of a study goes."""
+    found = results("codesign_profile")
+    shares = {k[len("share of ") : -4]: v for k, v in found.items() if k.startswith("share of ")}
+    return markdown(["part", "share of the time"], [[k, f"{v:.1f}%"] for k, v in shares.items()], "lr")
+
+
+# -- policies -------------------------------------------------------------------------------------------------------
+
+
+def agents() -> str:
+    """Policies and baselines on unseen goals, from the stored runs."""
+    from agents.results import load_runs, table
+
+    return table(load_runs()).replace("\n## ", "\n### ").strip()
+
+
+def carry() -> str:
+    """How far to the right the Tetrapod comes."""
+    found: dict[str, dict[str, str]] = {}
+    for key, value in results("carry").items():
+        payload, _, name = key.partition(", ")
+        values = [float(v) for v in value.split(",")] if isinstance(value, str) else value
+        found.setdefault(name.partition(":")[0], {})[payload] = f"{values[0]:.1f} | {values[1]:.1f}"
+    rows = [[name, row.get("0 kg", " | "), row.get("1 kg", " | ")] for name, row in found.items()]
+    head = ["controller", "no payload: farthest [mm]", "end [mm]", "1 kg: farthest [mm]", "end [mm]"]
+    lines = markdown(head, [], "lrrrr").splitlines()
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
+
+
+# -- surrogates -----------------------------------------------------------------------------------------------------
+
+
+def test_set() -> str:
+    """Errors of the shipped weights on their test sets."""
+    rows = named(
+        "test_set",
+        ("states for training / in the test set", ""),
+        ("effector error, mean [mm]", ".2g"),
+        ("effector error, worst [mm]", ".2g"),
+        ("W, between actuators, relative error, median [%]", ".2g"),
+        ("W, actuators to effector, relative error, median [%]", ".2g"),
+        ("W, effector, relative error, median [%]", ".2g"),
+        ("effector errors below the uncertainty [%]", ".0f"),
+        ("trusted [%]", ".1f"),
+    )
+    for row in rows:
+        row[1] = f"{int(row[1].partition(' /')[0]):,}"
+    head = ["weights", "training states", "effector error, mean [mm]", "worst [mm]", "`W_aa`, median error [%]"]
+    head += ["`W_ea` [%]", "`W_ee` [%]", "errors below the uncertainty [%]", "trusted [%]"]
+    return markdown(head, rows, "lrrrrrrrr")
+
+
+def buckling() -> str:
+    """States about to buckle: how many there are, and how many the surrogate trusts."""
+    found = results("test_set")
+    rows = []
+    for name, title in WEIGHTS.items():
+        share = found[f"{name}: left out as about to buckle [% of the states]"]
+        if share > 0.0:
+            left = [f"{name}: left out: {what}" for what in ("effector error, mean [mm]", "effector error, worst [mm]")]
+            trusted = next(v for k, v in found.items() if k.startswith(f"{name}: left out: trusted"))
+            rows.append([title, f"{share:.2g}", *(f"{found[key]:.2g}" for key in left), f"{trusted:.0f}"])
+    head = ["weights", "share of all states [%]", "effector error, mean [mm]", "worst [mm]", "trusted [%]"]
+    return markdown(head, rows, "lrrrr")
+
+
+def predicted_tracking() -> str:
+    """Reference paths followed on the surrogate alone."""
+    column = ("prediction to FEM, largest [mm]", "#.2g")
+    return markdown(["weights", "largest distance [mm]"], named("predicted_tracking", column), "lr")
+
+
+def trajectories() -> str:
+    """Closing trajectory on the designs of the thesis."""
+    rows = []
+    for key, value in results("trajectories").items():
+        if ": error" in key:
+            case, _, published = key.partition(": error [%] (thesis ")
+            rows.append([case, f"{value:.3f}", published.removesuffix(" %)")])
+    return markdown(["design", "error [%]", "thesis [%]"], rows, "lrr")
+
+
+def design_gradients() -> str:
+    """Gradients in the design against differences of FEM."""
+    rows = named(
+        "design_gradients",
+        ("bodies compared", ""),
+        ("relative error, median [%]", ".1f"),
+        ("relative error, three quarters are below [%]", ".1f"),
+    )
+    return markdown(["weights", "bodies", "median error [%]", "upper quartile [%]"], rows, "lrrr")
+
+
+def networks() -> str:
+    """Networks on the same data, by number of states."""
+    found = results("networks")
+    rows = []
+    for key in found:
+        if key.endswith(": effector error, mean [mm]"):
+            stem = key.removesuffix(": effector error, mean [mm]")
+            case, rest = stem.split(", ", 1)
+            name, states = rest.rsplit(", ", 1)
+            columns = ("effector error, mean [mm]", "loss as in the thesis", "W error, median [%]")
+            cells = [_short_exponents(str(found[f"{stem}: {column}"])) for column in columns]
+            seconds = f"{found[f'{stem}: training [CPU s]']:.0f}"
+            rows.append([case, name, states.removesuffix(" states"), *cells, seconds])
+    head = ["body", "network", "states", "effector error, mean [mm]", "loss as in the thesis", "`W`, median error [%]"]
+    return markdown([*head, "training, CPU [s]"], rows, "llrrrrr")
+
+
+def _short_exponents(text: str) -> str:
+    return text.replace("e-0", "e-")
+
+
+# -- design tools ---------------------------------------------------------------------------------------------------
+
+
+def design_optima() -> str:
+    """Optimal fingers by gradient and by TPE, beside those of the thesis."""
+    rows = []
+    for metric, unit, digits in (
+        ("bending_angle", "rad", 4),
+        ("contact_force", "N", 2),
+        ("normal_force", "N", 2),
+    ):
+        found = {k.removeprefix(f"{metric}: "): v for k, v in results("design_optima").items() if k.startswith(metric)}
+
+        def pair(values: list[float], unit: str = unit, digits: int = digits) -> str:
+            return " / ".join(f"{value:.{digits}f}" for value in values) + f" {unit}"
+
+        methods = [["gradient", found["gradient, design"], pair(found["gradient, surrogate and FEM"])]]
+        for start in ("best", "worst"):
+            values = found[f"TPE, {start} corner, surrogate and FEM"]
+            methods.append([f"TPE, {start} start", found[f"TPE, 60 trials, {start} corner, design"], pair(values)])
+        if "thesis, design" in found:
+            on_fem = found["thesis' design on FEM"]
+            methods.append(["thesis", found["thesis, design"], f"– / {on_fem:.{digits}f} {unit}"])
+        seconds = [found["gradient, grid of 729 and all descents [s]"], found["TPE, all corners [s]"]]
+        times = [f"{value:.1f} s" for value in seconds] + [""] * len(methods)
+        for index, (name, design, value) in enumerate(methods):
+            label = f"`{metric}`" if index == 0 else ""
+            rows.append([label, name, " / ".join(f"{d:.1f}" for d in design), value, times[index]])
+    head = ["metric", "method", "length / height / joint height [mm]", "surrogate / FEM", "time, all eight starts"]
+    return markdown(head, rows, "lllrr")
+
+
+# -- mechanics ------------------------------------------------------------------------------------------------------
+
+
+def tracking() -> str:
+    """Published paths followed by the inverse QP on FEM."""
+    rows = []
+    for key, value in results("tracking").items():
+        if key.endswith(": largest error [mm]"):
+            name = key.removesuffix(": largest error [mm]")
+            mean = results("tracking")[f"{name}: mean [mm]"]
+            rows.append([name.replace(" %", "%"), short(value), short(mean)])
+    return markdown(["path", "largest error [mm]", "mean [mm]"], rows, "lrr")
+
+
+def stiff_flop() -> str:
+    """Rest compliance of the Stiff-Flop trunk."""
+    rows = []
+    for key, value in results("stiff_flop").items():
+        if isinstance(value, str) and value.startswith("ours "):
+            ours, published = value.removeprefix("ours ").split(", published ")
+            published, difference = published.split(": ")
+            entry, _, rest = key.partition(" ")
+            rows.append([f"`{entry}` {rest}".strip(), published, ours, difference.replace(" %", "%")])
+    return markdown(["entry", "published", "ours", "difference"], rows, "lrrr")
+
+
+def validation() -> str:
+    """Exact and published solutions on refined meshes."""
+    rows = []
+    for key, row in results("validation").items():
+        order = "" if row["order"] is None else f"{row['order']:.1f}"
+        values = [f"{row[name]:.6g}" for name in ("value", "reference")]
+        rows.append([*key.split(" | "), str(row["unknowns"]), *values, f"{row['error']:.2g}", order])
+    head = ["case", "element", "mesh", "unknowns", "value", "reference", "error", "order"]
+    return markdown(head, rows, "lllrrrrr")
+
+
+# -- speed ----------------------------------------------------------------------------------------------------------
+
+
+def surrogate_speed() -> str:
+    """Steps per second of the environments on surrogates."""
+    found = results("surrogate_step")
+    names = [key.removesuffix(", single: steps per second") for key in found if ", single: " in key]
+    kinds = ("single", "1024 at once in 1 process(es)", "1024 at once in 2 process(es)")
+    rows = [[n, *(f"{found[f'{n}, {kind}: steps per second']:,.0f}" for kind in kinds)] for n in names]
+    return markdown(["environment", "one at a time", "1024 at once, one process", "two processes"], rows, "lrrr")
+
+
+def fem_speed() -> str:
+    """Steps per second of the environments on FEM."""
+    found = results("fem_speed")
+    rows = []
+    for key, value in found.items():
+        if key.endswith("-v0: steps per second"):
+            name = key.removesuffix(": steps per second")
+            nodes, elements, _ = found[f"{name}: nodes, elements, equations"].split(", ")
+            rows.append([name.removesuffix("-v0"), nodes, elements, f"{value:.0f}"])
+    return markdown(["environment", "nodes", "elements", "steps per second"], rows, "lrrr")
+
+
+def deployed() -> str:
+    """Times of the exported C model."""
+    rows = []
+    for robot in ("finger", "trunk"):
+        stem = f"{robot}, 5 member(s)"
+        cells = [figure("deployed", f"{stem}: {name}", ".0f") for name in (
+            "C state, -O3 -march=native [us]", "C condensed, -O3 -march=native [us]", "Python state, batch 1 [us]",
+            "Python condensed, batch 1 [us]",
+        )]  # fmt: skip
+        loop = f"{results('deployed')[f'{stem}: Algorithm 2 in C as a whole [Hz]'] / 1e3:.0f}"
+        rows.append([robot, *cells, loop])
+    head = ["model, five members", "C: state [µs]", "C: state and `W` [µs]", "Python: state [µs]"]
+    return markdown([*head, "Python: state and `W` [µs]", "control loop in C [kHz]"], rows, "lrrrrr")
+
+
+def provenance() -> str:
+    """Commit and command of every recorded result."""
+    rows = []
+    for name, entry in sorted(records().items()):
+        command = entry.get("command", f"softgym bench {name}")
+        rows.append([f"`{name}`", f"`{command}`", f"`{entry['commit'][:12]}`", entry.get("note", "")])
+    return markdown(["result", "command", "commit", "note"], rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    function.__name__: function
+    for function in (
+        headlines, codesign, codesign_goals, codesign_bodies, strategies, kills, profile, agents, carry, test_set,
+        buckling, predicted_tracking, trajectories, design_gradients, networks, design_optima,
+        tracking, stiff_flop, validation, surrogate_speed, fem_speed, deployed, provenance,
+    )
+}  # fmt: skip
+"""Tables by the name that a marked place gives."""

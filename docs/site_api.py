@@ -1,0 +1,75 @@
+"""API reference: every public name, under the path from which it is imported."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from importlib import import_module
+from pathlib import Path
+
+from site_writing import code, first_sentence, table
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+PACKAGES = {
+    "softgym_envs": "Registries, design spaces, errors",
+    "softgym_envs.envs": "Environments",
+    "softgym_envs.robots": "Robots",
+    "softgym_envs.mechanics": "Mechanics",
+    "softgym_envs.surrogate": "Surrogates",
+    "softgym_envs.backends": "Backends",
+    "softgym_envs.control": "Control",
+    "agents": "Agents",
+    "codesign": "Co-design",
+}
+"""Packages that export public names, and the titles of their pages."""
+
+
+def public_names(package: str) -> list[str]:
+    """Names that a package exports, dunder names left out."""
+    return [name for name in getattr(import_module(package), "__all__", []) if not name.startswith("__")]
+
+
+def defining_module(package: str, name: str) -> str:
+    """Module in which a public name is defined, read from the imports of the package."""
+    path = REPOSITORY / package.replace(".", "/") / "__init__.py"
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and name in {a.asname or a.name for a in node.names}:
+            found = node.module
+            inner = REPOSITORY / found.replace(".", "/") / "__init__.py"
+            return defining_module(found, name) if inner.is_file() else found
+    return package
+
+
+def described(package: str, name: str) -> str:
+    """First sentence of what documents a public name."""
+    value = getattr(import_module(package), name)
+    if isinstance(value, type) or inspect.isfunction(value):
+        return code(first_sentence(inspect.getdoc(value) or ""))
+    # A constant: the string below its assignment.
+    source = Path(import_module(defining_module(package, name)).__file__ or "")
+    text = re.search(rf'^{name}\b.*?^"""(.+?)"""', source.read_text(), flags=re.MULTILINE | re.DOTALL)
+    return code(first_sentence(text[1])) if text else ""
+
+
+def api_page(package: str) -> str:
+    """Reference of a package, drawn from the docstrings."""
+    parts = [f"# {PACKAGES[package]}\n\nImport these names from `{package}`."]
+    for name in public_names(package):
+        parts.append(f"## {name} {{ #{name} }}\n\n::: {defining_module(package, name)}.{name}")
+    return "\n\n".join(parts) + "\n"
+
+
+def api_index() -> str:
+    """All public names with links."""
+    parts = [
+        "# API reference",
+        "These names are public: they keep their meaning within a minor version. All other modules are implementation. "
+        "Units are SI.",
+    ]
+    for package, title in PACKAGES.items():
+        rows = [[f"[`{name}`]({package}.md#{name})", described(package, name)] for name in public_names(package)]
+        if rows:
+            parts += [f"## {title}\n\n`from {package} import ...`", table(["name", ""], rows)]
+    return "\n\n".join(parts) + "\n"

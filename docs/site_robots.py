@@ -1,0 +1,152 @@
+"""Generated parts of the robots' pages."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from itertools import groupby
+from typing import Any
+
+from site_writing import code, environment_pages, first_sentence, number, options_of, quantity, span, summary, table
+
+from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.mechanics.elements.beams import Beam
+from softgym_envs.mechanics.elements.block import ElementBlock
+from softgym_envs.mechanics.elements.tetrahedra import SolidBlock
+from softgym_envs.robots import ROBOTS, Actuator, Robot, make_robot
+from softgym_envs.surrogate.pretrained import pretrained_folder
+
+EFFORT = {"m": "N", "m3": "Pa", "rad": "N m"}
+"""Unit of the effort conjugate to a displacement."""
+MOVES = {
+    "m": "shortening of a cable",
+    "m3": "growth of a chamber's volume",
+    "rad": "angle of a servo",
+}
+
+
+@cache
+def robot_of(name: str, options: tuple[tuple[str, Any], ...] = ()) -> Robot:
+    """Return a robot of the registry, made once."""
+    return make_robot(name, **dict(options))
+
+
+def groups_of(actuators: Sequence[Actuator]) -> list[tuple[str, list[Actuator]]]:
+    """Actuators that differ by their names only, with their indices as a text."""
+    result, start = [], 0
+    for _, same in groupby(actuators, lambda a: (a.low, a.high, a.rate, a.unit, a.unilateral)):
+        members = list(same)
+        result.append((str(start) if len(members) == 1 else f"{start}-{start + len(members) - 1}", members))
+        start += len(members)
+    return result
+
+
+def actuator_table(robot: Robot) -> str:
+    """Actuators with their ranges and rates."""
+    limited = any(math.isfinite(actuator.max_effort) for actuator in robot.actuators)
+    rows = [
+        [
+            index,
+            ", ".join(f"`{member.name}`" for member in members),
+            MOVES.get(members[0].unit, "displacement"),
+            span(members[0].low, members[0].high, members[0].unit),
+            quantity(members[0].rate, members[0].unit),
+            "no" if members[0].unilateral else "yes",
+            quantity(members[0].max_effort, EFFORT.get(members[0].unit, "")) if limited else "",
+        ]
+        for index, members in groups_of(robot.actuators)
+    ]
+    head = ["index", "actuator", "displacement", "range", "largest change a step", "pushes", "largest effort"]
+    return table(head if limited else head[:-1], rows if limited else [row[:-1] for row in rows])
+
+
+def design_table(robot: Robot) -> str:
+    """The design space, in SI as it is given to the code."""
+    rows = [
+        [
+            f"`{v.name}`",
+            number(v.low),
+            number(v.baseline),
+            number(v.high),
+            "" if v.unit == "1" else v.unit,
+            v.description + (" (sampled on a logarithmic scale)" if v.log else ""),
+        ]
+        for v in robot.design_space
+    ]
+    return table(["variable", "low", "baseline", "high", "unit", "meaning"], rows)
+
+
+def model_facts(robot: Robot) -> list[list[str]]:
+    """What the finite-element model of the baseline body consists of."""
+    model = robot.build()
+    rows = [["nodes", f"{len(model.nodes) - 4 * len(model.frames):,}"]]
+    for block_class in dict.fromkeys(type(block) for block in model.blocks):
+        blocks = [block for block in model.blocks if type(block) is block_class]
+        elements = [elements_of(block) for block in blocks]
+        words = " ".join(re.findall(r"[A-Z][a-z]+", block_class.__name__)).lower()
+        times = f" ({len(blocks)} x {elements[0]:,})" if len(blocks) > 1 and len(set(elements)) == 1 else ""
+        rows.append(["beam elements" if block_class is Beam else words, f"{sum(elements):,}{times}"])
+    if len(model.frames):
+        rows.append(["frames of beams and rigid parts", f"{len(model.frames)}"])
+    rows.append(["degrees of freedom", f"{model.equations:,}"])
+    for role, word in (("e", "effectors"), ("s", "sensors"), ("c", "contact points"), ("b", "bonds")):
+        if model.constraints[role]:
+            rows.append([word, ", ".join(f"`{constraint.name}`" for constraint in model.constraints[role])])
+    if model.volume > 0.0:
+        rows.append(["volume", f"{1e9 * model.volume:,.0f} mm³"])
+    if model.mass > 0.0:
+        rows.append(["mass", f"{1e3 * model.mass:.1f} g"])
+    rows.append(["effector of the baseline body at rest", point(robot.effector_rest)])
+    rows.append(["efforts scale exactly with", f"`{robot.stiffness_variable}`" if robot.stiffness_variable else "-"])
+    return rows
+
+
+def elements_of(block: ElementBlock) -> int:
+    """Number of elements of a block; a rigid body is one."""
+    if isinstance(block, Beam):
+        return len(block.rows)
+    return len(block.connectivity) if isinstance(block, SolidBlock) else 1
+
+
+def point(values: Iterable[float]) -> str:
+    """Write a point in millimetres."""
+    return f"({', '.join(number(round(1e3 * float(v), 6)) for v in values)}) mm"
+
+
+def robot_sections(name: str) -> dict[str, Callable[[], str]]:
+    """Template of a robot's page."""
+    robot = robot_of(name)
+
+    def model() -> str:
+        facts = table(["baseline body", ""], model_facts(robot))
+        path = type(robot).reference_path
+        text = "" if path is Robot.reference_path else f"\n\nReference path: {code(first_sentence(path.__doc__ or ''))}"
+        return facts + text
+
+    def weights() -> str:
+        if pretrained_folder(robot).is_dir():
+            return f"Weights of a surrogate ship for the default options (`{robot.weights_name}`)."
+        return "No surrogate ships for the default options: environments run on FEM; `softgym fit` makes one."
+
+    def environments() -> str:
+        rows = [
+            [f"[`{identifier}`](../environments/{page}.md)", summary(identifier)]
+            for page, identifier in environment_pages().items()
+            if ENVIRONMENTS[identifier].robot == name
+        ]
+        return f"{table(['ID', 'task'], rows)}\n\n{weights()}" if rows else weights()
+
+    return {
+        "Description": lambda: "",
+        "Published beside ours": lambda: "",
+        "Design space": lambda: design_table(robot),
+        "Actuators": lambda: actuator_table(robot),
+        "Model": model,
+        "Options": lambda: (
+            f'Of `make_robot("{name}", ...)`, and `robot_options` of an environment:\n\n'
+            + table(["option", "default", "meaning"], options_of(ROBOTS[name]))
+        ),
+        "Environments": environments,
+    }
