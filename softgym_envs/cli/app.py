@@ -82,6 +82,8 @@ def main() -> None:
     except click.ClickException as error:
         _fail(error.format_message())
     except (SoftGymError, ValueError, OSError, gymnasium.error.Error) as error:
+        if hasattr(error, "__notes__"):  # an error in the code of a robot, noted by `Robot.build`
+            raise
         _fail(str(error))
 
 

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from softgym_envs.designs import Design, DesignSpace
+from softgym_envs.errors import SoftGymError
 from softgym_envs.mechanics.constraints import EmbeddedPoints
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
@@ -174,8 +175,17 @@ class Robot(ABC):
         Raises:
             DesignError: for a malformed design.
             InfeasibleDesign: if the geometry cannot exist.
+
+        Any other exception is an error in the robot's code; a note in it names the robot and the design.
         """
-        return self.assemble(self.design_space.complete(design))
+        complete = self.design_space.complete(design)
+        try:
+            return self.assemble(complete)
+        except SoftGymError:
+            raise
+        except Exception as error:
+            error.add_note(f"while assembling robot '{self.name}' for {complete}")
+            raise
 
     @property
     def mechanics_key(self) -> dict[str, Any]:

@@ -178,6 +178,7 @@ def test_a_bug_in_a_robot_surfaces_as_itself():
         Buggy().build()
     assert not isinstance(caught.value, InfeasibleDesign)
     assert caught.traceback[-1].name == "assemble"
+    assert caught.value.__notes__ == ["while assembling robot 'buggy' for Design(length=0.05)"]
 
 
 def test_only_a_robot_says_that_a_design_is_infeasible():
