@@ -29,7 +29,7 @@ from benchmarks import (
     validation,
 )
 from softgym_envs.config import provenance
-from softgym_envs.errors import ConfigError
+from softgym_envs.errors import ConfigError, unknown_name
 from softgym_envs.storage import write_json
 
 __all__ = ["BENCHMARKS", "run"]
@@ -81,7 +81,7 @@ def run(names: Sequence[str], output: str | Path) -> dict[str, dict[str, object]
     """
     for name in names:
         if name not in BENCHMARKS:
-            raise ConfigError(f"unknown benchmark '{name}'; allowed: {', '.join(BENCHMARKS)}")
+            raise ConfigError(unknown_name("benchmark", name, BENCHMARKS))
     kept = _read(Path(output))
     results: dict[str, dict[str, object]] = {}
     for name in names or BENCHMARKS:

@@ -122,7 +122,7 @@ def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> Model
 
 
 def _dotted(problem: ErrorDetails) -> str:
-    return ".".join(map(str, problem["loc"])) or "(top level)"
+    return ".".join(map(str, problem["loc"]))
 
 
 def _describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
@@ -134,9 +134,9 @@ def _describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{'.'.join(map(str, parents))}: {known}" if parents else known
     message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("\n", " ")
     shown = _PASSWORD.sub(r":***@", repr(problem["input"]))
-    if isinstance(problem["input"], dict) or shown in message:
-        return f"{key}: {message}"
-    return f"{key}: {message}, got {shown}"
+    if not isinstance(problem["input"], dict) and shown not in message:
+        message += f", got {shown}"
+    return f"{key}: {message}" if problem["loc"] else message
 
 
 def difference(old: Config, new: Config, *, ignore: Sequence[str] = ()) -> str | None:

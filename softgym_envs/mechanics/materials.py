@@ -12,6 +12,8 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numba import njit
 
+from softgym_envs.errors import unknown_name
+
 __all__ = ["MATERIALS", "Corotational", "Material", "StableNeoHookean", "lame_parameters", "resolve_material"]
 
 
@@ -279,5 +281,5 @@ def resolve_material(material: str | Material) -> Material:
     if isinstance(material, Material):
         return material
     if material not in MATERIALS:
-        raise ValueError(f"unknown material '{material}'; allowed: {', '.join(MATERIALS)}")
+        raise ValueError(unknown_name("material", material, MATERIALS))
     return MATERIALS[material]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.quadratic import EDGES, QuadraticTetrahedra, add_midside_nodes
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra, check_nodes
@@ -64,7 +65,7 @@ def solid_part(
 ) -> SolidPart:
     """Prepare a solid body; see `MechanicalModel.from_mesh` for the arguments."""
     if element not in SOLIDS:
-        raise ValueError(f"unknown element '{element}'; allowed: {', '.join(SOLIDS)}")
+        raise ValueError(unknown_name("element", element, SOLIDS))
     nodes, tetrahedra = check_nodes(nodes), np.asarray(tetrahedra)
     check_size(nodes, max_size, "for nodes in millimetres pass 1e-3 * nodes")
     mask = np.zeros((len(nodes), 3), dtype=bool)

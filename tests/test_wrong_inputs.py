@@ -1,0 +1,208 @@
+"""Wrong units, names and values are refused at once, with one line that says what is wrong and what is allowed."""
+
+from __future__ import annotations
+
+import fnmatch
+from pathlib import Path
+
+import gymnasium
+import meshio
+import numpy as np
+import pytest
+import yaml
+
+import softgym_envs  # noqa: F401 - registers the environments
+from agents.config import TrainConfig
+from codesign.config import StudyConfig
+from codesign.tools.config import CalibrationConfig, OptimiseConfig
+from softgym_envs.config import load_config
+from softgym_envs.errors import SoftGymError
+from softgym_envs.mechanics import MechanicalModel
+from softgym_envs.robots import make_robot
+from softgym_envs.surrogate.training import FitConfig
+from softgym_envs.testing import box_mesh
+
+ROOT = Path(__file__).resolve().parent.parent
+NODES, TETRAHEDRA = box_mesh((0.1, 0.02, 0.02), (4, 1, 1))
+REACH = "SoftGym/FingerReach-v0"
+
+
+def body(nodes=NODES, **options):
+    return MechanicalModel.from_mesh(nodes, TETRAHEDRA, fixed=nodes[:, 0] == 0.0, **options)
+
+
+def from_file(folder):
+    path = folder / "body.vtk"
+    meshio.Mesh(1e3 * NODES, [("tetra", TETRAHEDRA)]).write(path)
+    return MechanicalModel.from_file(path, fixed_box=(-1.0, 1.0, -1.0, 1.0, -1.0, 1.0))
+
+
+def reset(**options):
+    env = gymnasium.make(REACH, backend="fem")
+    try:
+        env.reset(seed=0, options=options)
+    finally:
+        env.close()
+
+
+def config(folder, model, name, *overrides):
+    """Load a configuration of the repository, or one made of plain data, with overrides."""
+    path = ROOT / "configs" / name if isinstance(name, str) else folder / "x.yaml"
+    if not isinstance(name, str):
+        path.write_text(yaml.safe_dump(name))
+    return load_config(path, model, overrides)
+
+
+TRAIN, FINGER, STRENGTH = "agents/finger_reach.yaml", "codesign/finger_reach.yaml", "design/finger_strength.yaml"
+ZONE = "codesign/finger_zone.yaml"
+
+# Mistake -> (what makes it, given a temporary folder; the message, in which * stands for any text)
+MISTAKES = {
+    # Units
+    "body in millimetres": (
+        lambda _: body(1e3 * NODES),
+        "the body measures 100 x 20 x 20 m, more than 10 m; did you mean metres? (for nodes in millimetres pass "
+        "1e-3 * nodes)",
+    ),
+    "effector in millimetres": (
+        lambda _: body().add_effector("tip", np.array([100.0, 10.0, 10.0])),
+        "effector 'tip' at [100.0, 10.0, 10.0] m lies 101 m outside the body, which is 0.104 m long; did you "
+        "mean metres?",
+    ),
+    "cable in millimetres": (
+        lambda _: body().add_cable("cable", np.array([[20.0, 10.0, 10.0], [90.0, 10.0, 10.0]]), np.zeros(3)),
+        "a guide of cable 'cable' at [90.0, 10.0, 10.0] m lies 91 m outside the body, which is 0.104 m long; "
+        "did you mean metres?",
+    ),
+    "effector a kilometre away": (
+        lambda _: body().add_effector("tip", np.array([1000.0, 0.0, 0.0])),
+        "effector 'tip' at [1000.0, 0.0, 0.0] m lies 1e+03 m outside the body, which is 0.104 m long; did you "
+        "mean metres?",
+    ),
+    "mesh file in millimetres without its unit": (
+        lambda f: from_file(f),
+        "the body measures 100 x 20 x 20 m, more than 10 m; did you mean metres? (for a file in millimetres "
+        "pass unit='mm')",
+    ),
+    "goal in millimetres": (
+        lambda _: reset(goal=[0.0, 50.0, -90.0]),
+        "goal = [0.0, 50.0, -90.0] m is 102.8 m away from the effector of robot 'finger', whose size is * m; "
+        "did you mean metres?",
+    ),
+    "design in millimetres": (
+        lambda _: reset(design={"length": 40.0}),
+        "design variable 'length' = 40 m is out of bounds; allowed: 0.038 to 0.042 m",
+    ),
+    "Poisson's ratio in percent": (
+        lambda _: body(poisson_ratio=45.0),
+        "poisson_ratio = 45.0 must be inside (-1, 0.5)",
+    ),
+    # Names
+    "robot": (
+        lambda _: make_robot("fingr"),
+        "unknown robot 'fingr'; did you mean 'finger'? allowed: finger, diamond, *",
+    ),
+    "robot option": (
+        lambda _: make_robot("finger", cabels=1),
+        "robot 'finger': unknown option 'cabels'; did you mean 'cables'? allowed: cables, mesh_size, *",
+    ),
+    "robot option of the wrong type": (
+        lambda _: make_robot("finger", cables="two"),
+        "robot 'finger': option cables = 'two' must be an integer",
+    ),
+    "environment": (
+        lambda f: config(f, TrainConfig, TRAIN, "environment.id=FingerReach"),
+        "config '*': environment*: unknown environment 'FingerReach'; did you mean 'SoftGym/FingerReach-v0'?",
+    ),
+    "backend": (
+        lambda _: gymnasium.make(REACH, backend="femm"),
+        "unknown backend 'femm'; did you mean 'fem'? allowed: fem, surrogate, hybrid",
+    ),
+    "task option": (
+        lambda _: gymnasium.make(REACH, task_options={"spred": 0.1}),
+        "task 'reach': unknown option 'spred'; did you mean 'spread'? allowed: goals, command_low, spread",
+    ),
+    "design variable": (
+        lambda _: reset(design={"lenght": 0.04}),
+        "unknown design variable 'lenght'; did you mean 'length'? allowed: length, height, *",
+    ),
+    "material": (
+        lambda _: body(material="neohooke"),
+        "unknown material 'neohooke'; did you mean 'stable_neo_hookean'? allowed: corotational, stable_neo_hookean",
+    ),
+    "element": (
+        lambda _: body(element="quadratc"),
+        "unknown element 'quadratc'; did you mean 'quadratic'? allowed: linear, averaged, quadratic",
+    ),
+    "configuration key": (
+        lambda f: config(f, TrainConfig, TRAIN, "sac.gama=0.9"),
+        "config '*': sac: unknown key 'gama'; did you mean 'gamma'? allowed: learning_rate, *",
+    ),
+    "variable of a study": (
+        lambda f: config(f, StudyConfig, FINGER, "variables=[heigth]"),
+        "config '*': *unknown design variable 'heigth'; did you mean 'height'? allowed: length, height, *",
+    ),
+    "objective": (
+        lambda f: config(f, StudyConfig, FINGER, "objective=mean_distanse"),
+        "config '*': *unknown objective 'mean_distanse'*mean_distance*",
+    ),
+    "sampler": (
+        lambda f: config(f, StudyConfig, FINGER, "sampler.name=tpee"),
+        "config '*': sampler.name: must be 'tpe', 'cmaes', 'gp', 'nsgaii', 'qmc' or 'random', got 'tpee'",
+    ),
+    "metric of a design search": (
+        lambda f: config(f, OptimiseConfig, STRENGTH, "objectives=[{metric: contact_forse}]"),
+        "config '*': objectives.0.metric: unknown metric 'contact_forse'; did you mean 'contact_force'?*",
+    ),
+    "configuration of another verb": (
+        lambda f: config(f, CalibrationConfig, TRAIN),
+        "config '*': missing required keys *fit, data (and * more problems)",
+    ),
+    # Values
+    "empty configuration": (
+        lambda f: config(f, FitConfig, {}),
+        "config '*': missing required keys robot, data",
+    ),
+    "configuration that is a list": (
+        lambda f: config(f, FitConfig, ["robot", "finger"]),
+        "config '*' must be a mapping of keys to values, got a list",
+    ),
+    "number that is not finite": (
+        lambda f: config(f, TrainConfig, TRAIN, "sac.gamma=.nan"),
+        "config '*': sac.gamma: must be a finite number, got nan",
+    ),
+    "design that is not a number": (
+        lambda _: reset(design={"length": float("nan")}),
+        "design variable 'length' = nan is not finite; allowed: 0.038 to 0.042 m",
+    ),
+    "goal that is not finite": (
+        lambda _: reset(goal=[0.0, float("nan"), -0.09]),
+        "goal must be finite, got *nan*",
+    ),
+    "goal of two coordinates": (
+        lambda _: reset(goal=[0.0, 0.09]),
+        "goal must have shape (3) or (p, 3), got (2,)",
+    ),
+    "negative mass": (
+        lambda _: body(total_mass=-0.1),
+        "total_mass = -0.1 kg must be positive and finite",
+    ),
+    "missing file": (
+        lambda f: MechanicalModel.from_file(f / "body.msh", fixed_box=(0, 1, 0, 1, 0, 1)),
+        "mesh file '*body.msh' does not exist",
+    ),
+    "nothing clamped": (
+        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=NODES[:, 0] > 1.0),
+        "no node is fixed: the body could float away; pass the clamped nodes as 'fixed'",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistake_ends_with_one_line(mistake, tmp_path):
+    call, expected = MISTAKES[mistake]
+    with pytest.raises((SoftGymError, ValueError, gymnasium.error.Error)) as caught:
+        call(tmp_path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert fnmatch.fnmatchcase(message, expected.replace("[", "[[]")), message
