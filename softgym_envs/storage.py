@@ -1,4 +1,4 @@
-"""Files that are either whole or absent, and where caches live."""
+"""Files that are either complete or absent, and the location of caches."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open a temporary file beside ``path`` and move it there when the block ends without an error."""
+    """Yield a temporary file that replaces ``path`` when the block ends without an error."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -37,7 +37,7 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
 
 
 def read_npz(path: str | Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Read arrays by name from an npz file, without pickle.
+    """Return arrays by name from an npz file, without unpickling objects.
 
     Raises:
         DataError: if the file is missing, truncated or lacks an array.
@@ -55,10 +55,10 @@ def read_npz(path: str | Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read a JSON file.
+    """Return the content of a JSON file.
 
     Raises:
-        DataError: if the file is missing, truncated or no JSON.
+        DataError: if the file is missing, truncated or not valid JSON.
     """
     try:
         return json.loads(Path(path).read_text())
@@ -125,7 +125,7 @@ class JsonLines:
 
 
 def cache_directory(name: str) -> Path:
-    """Folder of a cache: ``$SOFTGYM_CACHE`` if set, else the user's cache folder."""
+    """Return the folder of a cache, below ``$SOFTGYM_CACHE`` if that is set, else below the user's cache folder."""
     root = os.environ.get("SOFTGYM_CACHE")
     if root is None:
         from platformdirs import user_cache_dir

@@ -1,1 +1,1 @@
-"""Pictures and recordings of robots. Nothing here is imported by physics, environments or agents unless they draw."""
+"""Images and recordings of robots; other packages import it only when they draw."""

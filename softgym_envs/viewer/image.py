@@ -1,4 +1,4 @@
-"""Pictures of a robot: the ``rgb_array`` mode of environments, and stills for reports."""
+"""Images of a robot: the ``rgb_array`` mode of environments, and stills for reports."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.scene import STUB, Scene
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
-__all__ = ["ImageRenderer", "render_bodies", "render_body"]
-
 
 class ImageRenderer:
-    """Draws states of a robot off screen, always from the same place.
+    """Renders states of a robot off screen with a fixed camera.
 
-    Shown are the body with its clamped base dark, the cables (amber to red with tension; grey and wavy if slack) with
-    a bead on their pulled end, the effectors (blue), the goal (green) and its path, before a wall with a scale grid.
-    Cables, effectors and goal shine through the body faintly where they are inside or behind it.
+    An image shows the body with its clamped base in dark grey, the cables (amber to red with tension; grey and wavy if
+    slack) with a bead on their pulled end, the effectors (blue), the goal (green) and its path, in front of a wall with
+    a scale grid. Cables, effectors and goal remain faintly visible where the body hides them.
 
     Args:
-        robot: the family of bodies; the camera sees its baseline body at rest and with its actuators at their ends.
+        robot: the family of bodies. The camera view contains the baseline body at rest and with its actuators at their
+            limits.
         size: width and height [pixels].
 
     Raises:
@@ -46,16 +45,16 @@ class ImageRenderer:
         goal: np.ndarray,
         distance: float | None = None,
     ) -> np.ndarray:
-        """Return a picture, shape (height, width, 3) uint8.
+        """Return an image of a state, shape (height, width, 3) uint8.
 
-        A state without nodes is drawn in the shape that a finite-element model takes at its displacements.
+        A state without nodes is drawn in the shape of a finite-element model with the same actuator displacements.
 
         Args:
             design: the body.
             state: its state.
             path: all goals of the episode [m], shape (p, 3).
-            goal: the present goal [m], shape (3,).
-            distance: to the goal as the task counts it [m]; default all three coordinates.
+            goal: the current goal [m], shape (3,).
+            distance: distance to the goal as the task measures it [m]; default: Euclidean.
         """
         scene = self._open()
         model = self._shapes.load(design)
@@ -67,7 +66,7 @@ class ImageRenderer:
         if distance is None:
             distance = float(np.linalg.norm(state.effector[0] - goal))
         scene.set_text(f"distance {1e3 * distance:.1f} mm")
-        return scene.picture()
+        return scene.image()
 
     def render_body(
         self,
@@ -77,12 +76,12 @@ class ImageRenderer:
         ghost: Mapping[str, float] | None = None,
         text: str = "",
     ) -> np.ndarray:
-        """Return a still of a body without a task, shape (height, width, 3) uint8.
+        """Return an image of a body without a task, shape (height, width, 3) uint8.
 
         Args:
             design: the body; missing variables take their baseline.
-            command: actuator displacements, shape (n_a,), default at rest.
-            ghost: another body, drawn pale behind it at the same command, for comparison.
+            command: actuator displacements, shape (n_a,); default: at rest.
+            ghost: another body for comparison, drawn pale behind the first one at the same command.
             text: a caption.
         """
         scene = self._open()
@@ -96,10 +95,10 @@ class ImageRenderer:
         scene.set_state(x, self._shapes.state)
         scene.set_goal(None, None)
         scene.set_text(text)
-        return scene.picture()
+        return scene.image()
 
     def close(self) -> None:
-        """Free the window. A later picture opens a new one."""
+        """Close the window. A later image opens a new one."""
         if self._scene is not None:
             self._scene.close()
             self._scene = None
@@ -108,7 +107,7 @@ class ImageRenderer:
         if self._scene is None:
             baseline, lower, upper = self.robot.design_space.baseline, self.robot.lower, self.robot.upper
             model = self._shapes.load(baseline)
-            # At rest, each actuator alone at its end, and all together, which moves a body in other ways.
+            # At rest, with each actuator alone at its limit, and with all of them, which deforms a body differently.
             seen = []
             for command in (None, *np.where(np.eye(len(upper), dtype=bool), upper, lower), upper):
                 x = self._shapes.at(baseline, command)
@@ -127,7 +126,7 @@ def render_body(
     ghost: Mapping[str, float] | None = None,
     text: str = "",
 ) -> np.ndarray:
-    """Return a still of one body, shape (height, width, 3) uint8; see `ImageRenderer.render_body`."""
+    """Return an image of one body, shape (height, width, 3) uint8; see `ImageRenderer.render_body`."""
     return render_bodies(robot, [design], command, size, ghost=ghost, texts=[text])
 
 
@@ -140,23 +139,23 @@ def render_bodies(
     ghost: Mapping[str, float] | None = None,
     texts: Sequence[str] | None = None,
 ) -> np.ndarray:
-    """Return stills of several bodies side by side, seen from the same place, shape (height, k * width, 3) uint8.
+    """Return images of several bodies side by side with one camera, shape (height, k * width, 3) uint8.
 
     Args:
         robot: the family of bodies.
         designs: k bodies.
-        command: actuator displacements of all, shape (n_a,), default at rest.
-        size: width and height of one picture [pixels].
-        ghost: a body drawn pale behind each.
+        command: actuator displacements of all bodies, shape (n_a,); default: at rest.
+        size: width and height of one image [pixels].
+        ghost: a body drawn pale behind each body.
         texts: k captions.
     """
     renderer = ImageRenderer(robot, size)
     try:
         captions = [""] * len(designs) if texts is None else texts
-        pictures = [
+        images = [
             renderer.render_body(design, command, ghost=ghost, text=text)
             for design, text in zip(designs, captions, strict=True)
         ]
     finally:
         renderer.close()
-    return np.concatenate(pictures, axis=1)
+    return np.concatenate(images, axis=1)

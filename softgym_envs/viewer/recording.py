@@ -1,4 +1,4 @@
-"""Recordings of rollouts that the rerun viewer plays: ``rerun rollout.rrd``. Writing one needs no window."""
+"""Recordings of rollouts for the rerun viewer (``rerun rollout.rrd``), written without a window."""
 
 from __future__ import annotations
 
@@ -19,12 +19,10 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.scene import COLORS, STUB, tension_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
-__all__ = ["RolloutRecorder", "record_comparison", "record_rollout"]
-
 Agent = Callable[[np.ndarray, SoftRobotEnv], np.ndarray]
 """Maps an observation and the environment, unwrapped, to an action."""
 
-# What an actuator's displacement is plotted in, the factor to it, and the unit of its effort.
+# By the unit of an actuator: unit of the plotted displacement, factor to that unit, unit of the effort.
 _PLOTTED: dict[str, tuple[str, float, str]] = {
     "m": ("mm", 1e3, "N"),
     "m3": ("ml", 1e6, "Pa"),
@@ -35,18 +33,18 @@ _PLOTTED: dict[str, tuple[str, float, str]] = {
 class RolloutRecorder:
     """Writes the states of one rollout to an ``.rrd`` file on the timeline ``step``.
 
-    Use it as a context manager: the file is there, whole, when the block ends, and not at all if it ends in an error.
+    Use it as a context manager: the file is complete when the block ends, and does not exist if the block fails.
 
-    Logged are ``world/body`` (mesh), ``world/cables/<actuator>``, ``world/effectors``, ``world/goal``, ``world/path``
-    (all in metres), ``plots/distance`` [mm], ``plots/reward``, and for each actuator ``plots/displacement/<actuator>``
-    and ``plots/effort/<actuator>`` (mm and N for cables).
+    The recording contains ``world/body`` (mesh), ``world/cables/<actuator>``, ``world/effectors``, ``world/goal`` and
+    ``world/path`` (all in metres), ``plots/distance`` [mm], ``plots/reward``, and for each actuator
+    ``plots/displacement/<actuator>`` and ``plots/effort/<actuator>`` (mm and N for cables).
 
     Args:
         robot: the family of bodies.
-        path: file to write; folders are made.
+        path: file to write; missing folders are created.
         name: name of the recording in the viewer.
-        roles: names of several rollouts to be seen side by side; all entities of one then lie under its name. `log`
-            writes to the rollout that `begin` named last.
+        roles: names of several rollouts that are shown side by side. The entities of a rollout lie under its name, and
+            `log` writes to the rollout of the last `begin`.
     """
 
     def __init__(
@@ -60,7 +58,7 @@ class RolloutRecorder:
         self.begin(self.roles[0])
 
     def begin(self, role: str) -> None:
-        """Write to the rollout of this role from now on."""
+        """Select the rollout that `log` writes to."""
         self._root = f"{role}/" if role else ""
         self._model: MechanicalModel | None = None
         self._goals: np.ndarray | None = None
@@ -70,7 +68,7 @@ class RolloutRecorder:
         import rerun.blueprint as blueprint
 
         self._stream = rerun.RecordingStream("softgym_envs")
-        # Only the timeline of the control steps: wall-clock time means nothing here.
+        # The control steps are the only timeline; wall-clock time is meaningless here.
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
         roots = [f"{role}/" if role else "" for role in self.roles]
@@ -126,11 +124,11 @@ class RolloutRecorder:
         Args:
             step: control step.
             design: the body.
-            state: its state; one without nodes is drawn in the shape of a finite-element model.
-            goal: the present goal [m], shape (3,).
+            state: its state; a state without nodes is drawn in the shape of a finite-element model.
+            goal: the current goal [m], shape (3,).
             path: all goals of the episode [m], shape (p, 3).
-            reward: reward that led to the state, none after a reset.
-            distance: to the goal as the task counts it [m]; default all three coordinates.
+            reward: reward of the step to this state; None after a reset.
+            distance: distance to the goal as the task measures it [m]; default: Euclidean.
         """
         import rerun
 
@@ -214,21 +212,21 @@ def record_rollout(
     options: Mapping[str, Any] | None = None,
     steps: int | None = None,
 ) -> dict[str, Any]:
-    """Run one episode and write it to an ``.rrd`` file, which is whole when this returns.
+    """Run one episode, write it to an ``.rrd`` file and return its result.
 
     Args:
-        env: a `SoftRobotEnv`, wrapped or not; it is reset first and stays open.
+        env: a `SoftRobotEnv`, wrapped or not. It is reset first and not closed.
         agent: maps an observation and ``env.unwrapped`` to an action.
         path: file to write.
         seed: seed of the reset.
         options: options of the reset.
-        steps: largest number of steps; default the time limit of the environment.
+        steps: largest number of steps; default: the time limit of the environment.
 
     Returns:
         ``return`` (sum of rewards), ``final_distance`` [m], ``success`` at the last step, and ``steps``.
 
     Raises:
-        ValueError: if the environment is no `SoftRobotEnv`, or has no time limit and ``steps`` is missing.
+        ValueError: if the environment is not a `SoftRobotEnv`, or has no time limit while ``steps`` is None.
     """
     name = Path(path).stem if env.spec is None else env.spec.id
     with RolloutRecorder(_body_of(env).robot, path, name=name) as recorder:
@@ -243,23 +241,23 @@ def record_comparison(
     seed: int | None = 0,
     steps: int | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Run one episode for each of several agents, bodies or goals, and write them side by side to one ``.rrd`` file.
+    """Run episodes of several agents, bodies or goals and write them side by side to one ``.rrd`` file.
 
     Args:
         env: as for `record_rollout`.
-        rollouts: agent and options of the reset, by the name shown.
+        rollouts: agent and options of the reset, by the name to show.
         path: file to write.
         seed: seed of every reset.
-        steps: largest number of steps; default the time limit of the environment.
+        steps: largest number of steps; default: the time limit of the environment.
 
     Returns:
-        What `record_rollout` returns, by name.
+        Results as of `record_rollout`, by name.
 
     Raises:
         ValueError: as `record_rollout`, and if there are no rollouts.
     """
     if not rollouts:
-        raise ValueError("rollouts must hold at least one, got none")
+        raise ValueError("rollouts is empty; pass at least one agent by name")
     with RolloutRecorder(_body_of(env).robot, path, roles=tuple(rollouts)) as recorder:
         found = {}
         for role, (agent, options) in rollouts.items():
@@ -271,14 +269,14 @@ def record_comparison(
 def _body_of(env: gymnasium.Env) -> SoftRobotEnv:
     body = env.unwrapped
     if not isinstance(body, SoftRobotEnv):
-        raise ValueError(f"only rollouts of SoftRobotEnv can be recorded, got {type(body).__name__}")
+        raise ValueError(f"only rollouts of a SoftRobotEnv can be recorded, got {type(body).__name__}")
     return body
 
 
 def _limit(env: gymnasium.Env, steps: int | None) -> int:
     limit = env.spec.max_episode_steps if steps is None and env.spec is not None else steps
     if limit is None:
-        raise ValueError("the environment has no time limit: pass the number of steps as 'steps'")
+        raise ValueError("the environment has no time limit; pass the largest number of steps as 'steps'")
     return limit
 
 

@@ -1,4 +1,4 @@
-"""The stage that pictures are taken of: a window off screen and everything in it, made once and moved afterwards."""
+"""Off-screen scene of a robot: all its objects are created once and moved for every image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from softgym_envs.viewer.surface import BodySurface, cable_lines, surface_kinds
 if TYPE_CHECKING:
     import pyvista
 
-__all__ = ["COLORS", "STUB", "Scene", "tension_color"]
 
 Color = tuple[int, int, int]
 
@@ -34,16 +33,16 @@ COLORS: dict[str, Color] = {
     "goal": (20, 165, 90),
     "text": (75, 82, 95),
 }
-"""Colours of everything drawn, 0 to 255; recordings use the same."""
+"""Colours of all objects, 0 to 255, in images and recordings."""
 
-# Directions from the body to the camera and to the lights. Bending bodies bend in the y-z plane, seen along x.
+# Directions from the body to the camera and to the lights. The camera looks along x because bodies bend in the y-z plane.
 _CAMERA = np.array([1.0, 0.45, 0.28])
 _LIGHT = np.array([1.0, -0.20, 0.50])
 _FILL = np.array([0.3, 1.0, 0.4])
 _VIEW_ANGLE = np.radians(18.0)
 
 STUB = 0.06
-"""Length of an unpulled cable outside the body, in sizes of the robot."""
+"""Length of an unpulled cable outside the body, relative to the size of the robot."""
 
 
 def tension_color(share: float) -> Color:
@@ -61,13 +60,13 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _fit(cloud: np.ndarray, backward: np.ndarray, angle: float, aspect: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return position and focal point [m] of an upright camera that just sees a cloud (n, 3).
+    """Return position and focal point [m] of the nearest upright camera that sees a whole cloud of points (n, 3).
 
     Args:
         cloud: points [m].
         backward: unit vector from the scene to the camera.
         angle: vertical view angle [rad].
-        aspect: width over height of the picture.
+        aspect: width over height of the image.
     """
     right = _unit(np.cross([0.0, 0.0, 1.0], backward))
     up = np.cross(backward, right)
@@ -83,7 +82,7 @@ def _fit(cloud: np.ndarray, backward: np.ndarray, angle: float, aspect: float) -
 
 
 class _Part:
-    """One mesh on the stage and, if ``faint`` > 0, its faint copy in the layer before all others."""
+    """One mesh of the scene and, if ``faint`` > 0, its faint copy in the front layer."""
 
     def __init__(
         self,
@@ -114,7 +113,7 @@ class _Part:
                 specular_power=25.0,
                 opacity=alpha,
                 line_width=line_width,
-                # Only the near side of a translucent thing, or it would be seen through itself.
+                # Draw only the near side of a translucent mesh, so that its far side does not shine through.
                 culling="back" if alpha < 1.0 and lit else "none",
             )
             actor = pyvista.Actor(mapper=self.mapper, prop=look)
@@ -123,7 +122,7 @@ class _Part:
             self.actors.append(actor)
 
     def show(self, mesh: pyvista.PolyData | None, color: Color | None = None) -> None:
-        """Draw a mesh from now on, or nothing for None."""
+        """Show a mesh, or nothing for None."""
         visible = mesh is not None and mesh.n_points > 0
         if visible:
             self.mapper.dataset = mesh
@@ -134,12 +133,12 @@ class _Part:
 
 
 class Scene:
-    """A robot before a wall with a grid.
+    """A robot in front of a wall with a grid.
 
     Args:
         robot: the robot.
         size: width and height [pixels].
-        cloud: all places the body is expected to reach [m], shape (n, 3); the camera is placed to see them.
+        cloud: points that the camera must see [m], shape (n, 3).
     """
 
     def __init__(self, robot: Robot, size: tuple[int, int], cloud: np.ndarray) -> None:
@@ -163,7 +162,7 @@ class Scene:
         self._ball = pyvista.Sphere(radius=1.0, theta_resolution=24, phi_resolution=16)
         self._model: MechanicalModel | None = None
         self._text: Any = None
-        if size[1] >= 200:  # smaller captions could not be read
+        if size[1] >= 200:  # smaller captions would be illegible
             self._text = self._caption("", size, "left")
             self._caption(f"grid {1e3 * self._spacing:g} mm", size, "right")
 
@@ -174,7 +173,7 @@ class Scene:
         from vtkmodules.vtkCommonCore import vtkLogger
         from vtkmodules.vtkRenderingCore import vtkRenderer
 
-        # Without a display VTK complains about that before it falls back to a window off screen.
+        # Without a display, VTK prints an error before it falls back to an off-screen window.
         verbosity = vtkLogger.GetCurrentVerbosityCutoff()
         vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
         try:
@@ -183,7 +182,7 @@ class Scene:
             )
             self.plotter.background_color = pyvista.Color(COLORS["background"])
             self.plotter.enable_anti_aliasing("msaa", multi_samples=4)
-            # Three layers, each with a depth of its own: wall, shadow and ghost; body and all; the faint copies.
+            # Three layers with separate depth buffers: wall, shadow and ghost; the robot; the faint copies.
             self.back, self.middle, self.front = self.plotter.renderer, vtkRenderer(), vtkRenderer()
             self.window = cast(Any, self.plotter.render_window)
             for renderer in (self.middle, self.front):
@@ -224,7 +223,7 @@ class Scene:
         self._side = _unit(np.cross([0.0, 0.0, 1.0], _CAMERA))
 
     def _draw_wall(self, aspect: float, cloud: np.ndarray) -> None:
-        """Draw a grid in the y-z plane behind the body, fading outwards into the background."""
+        """Draw a grid in the y-z plane behind the body that fades into the background."""
         import pyvista
 
         self._wall = float(cloud[:, 0].min()) - 0.15 * self._length
@@ -248,10 +247,10 @@ class Scene:
         actor.prop.lighting, actor.prop.line_width = False, 1.3 * self._line
         self.back.AddActor(actor)
 
-    # -- what moves -------------------------------------------------------------------------------------------------
+    # -- moving objects ---------------------------------------------------------------------------------------------
 
     def set_body(self, model: MechanicalModel, x: np.ndarray) -> None:
-        """Draw a body at node positions [m] (n, 3); the surface is made anew only for another model."""
+        """Draw a body at node positions [m] (n, 3). The surface is rebuilt only for another model."""
         if model is not self._model:
             self._model = model
             self._surface = BodySurface(model)
@@ -269,14 +268,14 @@ class Scene:
         _move(self._skin, points, self._surface.normals(points))
         light = -_LIGHT / _LIGHT[0]
         flat = points + (points[:, :1] - self._wall) * light
-        # Just behind the grid.
+        # Slightly behind the grid, so that the grid stays visible.
         flat[:, 0] = self._wall - 2e-3 * self._length
         _move(self._flat, flat)
-        # Just before the skin, towards the camera.
+        # Slightly in front of the skin, so that the edges stay visible.
         _move(self._seams, self._surface.shape(x) + 2e-3 * self._length * _unit(_CAMERA))
 
     def set_ghost(self, model: MechanicalModel | None, x: np.ndarray | None = None) -> None:
-        """Draw another body at node positions [m] (n, 3) as a pale shape behind everything, or none for None."""
+        """Draw another body at node positions [m] (n, 3) as a pale shape in the background, or no body for None."""
         if model is None or x is None:
             self._ghost.show(None)
             return
@@ -287,7 +286,7 @@ class Scene:
         self._ghost.show(mesh)
 
     def set_state(self, x: np.ndarray, state: State) -> None:
-        """Draw cables and effectors of the body set last: node positions [m] (n, 3) and its state."""
+        """Draw cables and effectors of the current body at node positions [m] (n, 3) in a state."""
         assert self._model is not None
         lines = cable_lines(self._model, x, state, stub=STUB * self._length, side=tuple(self._side))
         for row in self._cables.keys() - lines.keys():
@@ -305,7 +304,7 @@ class Scene:
         self._effectors.show(self._balls(state.effector, 0.026 * self._length))
 
     def set_goal(self, goal: np.ndarray | None, path: np.ndarray | None) -> None:
-        """Draw the goal [m] (3,), and its path [m] (p, 3) if it moves; nothing for None."""
+        """Draw the goal [m] (3,) and, if it moves, its path [m] (p, 3); None hides them."""
         self._goal.show(None if goal is None else self._balls(goal[None], 0.034 * self._length))
         self._trail.show(None if path is None or len(path) < 2 else _polyline(path))
 
@@ -314,8 +313,8 @@ class Scene:
         if self._text is not None:
             self._text.input = text
 
-    def picture(self) -> np.ndarray:
-        """Take the picture, shape (height, width, 3) uint8."""
+    def image(self) -> np.ndarray:
+        """Return an image of the scene, shape (height, width, 3) uint8."""
         self.window.Render()
         return np.array(self.plotter.screenshot(return_img=True), dtype=np.uint8)
 

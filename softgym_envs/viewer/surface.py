@@ -1,4 +1,4 @@
-"""What there is to draw of a robot: the boundary of its body, its cables, and its shape at a state."""
+"""Geometry of a robot to draw: the surface of its body, its cables, and its shape in a state."""
 
 from __future__ import annotations
 
@@ -19,33 +19,23 @@ from softgym_envs.robots.base import Robot
 if TYPE_CHECKING:
     import pyvista
 
-__all__ = [
-    "BodySurface",
-    "ShapeFinder",
-    "body_surface",
-    "cable_lines",
-    "commanded_displacement",
-    "slacken",
-    "surface_kinds",
-]
-
 
 class BodySurface:
-    """Boundary of a body, cut along its sharp edges so that everything else can be shaded smoothly.
+    """Surface of a body, split along its sharp edges so that the rest can be shaded smoothly.
 
-    Drawn are the solids and the skins of beams and rigid parts. Points of the surface are numbered as in `shape`.
+    It consists of the boundary of the solids and the skins of beams and rigid parts. `shape` numbers its points.
 
     Args:
         model: the body.
-        feature_angle: an edge is sharp if its two faces differ by more at rest [rad].
+        feature_angle: an edge is sharp if the normals of its two faces at rest differ by more [rad].
 
     Attributes:
         faces: points of the triangles, shape (t, 3).
         nodes: point of each surface vertex, shape (v,); a point on a sharp edge has several vertices.
         triangles: corner vertices, shape (t, 3).
         edges: point pairs of the sharp edges, shape (s, 2).
-        clamped: triangles whose points are all held, shape (t,).
-        rigid: triangles of rigid objects, shape (t,).
+        clamped: mask of the triangles whose points are all fixed, shape (t,).
+        rigid: mask of the triangles of rigid objects, shape (t,).
     """
 
     def __init__(self, model: MechanicalModel, feature_angle: float = np.pi / 6) -> None:
@@ -65,7 +55,7 @@ class BodySurface:
         flags = [np.full(len(skin.triangles), skin.rigid) for skin in model.skins]
         self.rigid = np.concatenate([np.zeros(solid, dtype=bool), *flags])
 
-        # Half edges (t, 3) sorted by their node pair: the two faces of an edge are neighbours in that order.
+        # Sort the half edges (t, 3) by their node pair, which makes the two faces of an edge neighbours.
         tails, heads = corners, np.roll(corners, -1, axis=1)
         key = (np.minimum(tails, heads) * len(rest) + np.maximum(tails, heads)).ravel()
         order = np.argsort(key, kind="stable")
@@ -76,8 +66,8 @@ class BodySurface:
         smooth = np.einsum("ij,ij->i", normals[one // 3], normals[other // 3]) > np.cos(feature_angle)
         self.edges = np.column_stack([tails.ravel(), heads.ravel()])[one[~smooth]]
 
-        # Corners of triangles are one vertex if they share their node across a smooth edge. The neighbour runs
-        # along the edge the other way, so the tail of one half edge is the head of the other.
+        # Corners of triangles become one vertex if they share a node across a smooth edge. The neighbour traverses the
+        # edge in the opposite direction, so that the tail of one half edge is the head of the other.
         a, b = one[smooth], other[smooth]
         after = np.roll(np.arange(3 * len(corners)).reshape(-1, 3), -1, axis=1).ravel()
         rows, columns = np.concatenate([a, after[a]]), np.concatenate([after[b], b])
@@ -96,7 +86,7 @@ class BodySurface:
         return self.shape(x)[self.nodes]
 
     def normals(self, points: np.ndarray) -> np.ndarray:
-        """Return unit normals (v, 3) at vertices [m] (v, 3): area-weighted means of the faces around them."""
+        """Return unit normals (v, 3) at vertices [m] (v, 3): area-weighted means of the adjacent faces."""
         faces = np.repeat(_face_normals(points, self.triangles), 3, axis=0)
         corners = self.triangles.ravel()
         total = np.column_stack([np.bincount(corners, faces[:, d], minlength=len(points)) for d in range(3)])
@@ -104,7 +94,7 @@ class BodySurface:
 
 
 def surface_kinds(surface: BodySurface) -> np.ndarray:
-    """Return what each triangle belongs to, shape (t,): 0 the body, 1 its clamp, 2 an object."""
+    """Return the kind of each triangle, shape (t,): 0 for the body, 1 for its clamped part, 2 for a rigid object."""
     return np.where(surface.rigid, 2, surface.clamped.astype(int))
 
 
@@ -118,7 +108,7 @@ def body_surface(model: MechanicalModel, x: np.ndarray | None = None) -> pyvista
 
     Args:
         model: the body.
-        x: node positions [m], shape (n, 3); default at rest.
+        x: node positions [m], shape (n, 3); default: at rest.
 
     Returns:
         A mesh with point normals, the point array ``node`` and the cell array ``clamped``.
@@ -137,7 +127,7 @@ def body_surface(model: MechanicalModel, x: np.ndarray | None = None) -> pyvista
 def cable_lines(
     model: MechanicalModel, x: np.ndarray, state: State, *, stub: float, side: Sequence[float] = (0.0, 1.0, 0.0)
 ) -> dict[int, np.ndarray]:
-    """Return what is seen of the cables at a state: a polyline [m] (p, 3) from the pulled end to the anchor.
+    """Return the visible line of each cable in a state: a polyline [m] (p, 3) from the pulled end to the anchor.
 
     Args:
         model: the body.
@@ -147,7 +137,7 @@ def cable_lines(
         side: direction of the waves of a slack cable, shape (3,).
 
     Returns:
-        Polylines by actuator row; actuators that are no cables are left out.
+        Polylines by actuator row; other actuators than cables are left out.
     """
     lines, row = {}, 0
     pulled = commanded_displacement(state)
@@ -162,22 +152,22 @@ def cable_lines(
 
 
 def commanded_displacement(state: State) -> np.ndarray:
-    """Return how far each actuator is driven, shape (n_a,), whatever the mode of the command was.
+    """Return the displacement of the actuator drives, shape (n_a,), for commands of displacements and efforts.
 
-    That is the reached displacement, except of a slack cable, whose path shortens further than it is pulled.
+    It equals the displacement of the state except for a slack cable, whose path shortens further than it is pulled.
     """
     return np.where(state.slack, state.command, state.displacement)
 
 
 def slacken(path: np.ndarray, excess: float, side: Sequence[float], count: int = 12) -> np.ndarray:
-    """Lay a cable that is longer than its path into waves, so that slack can be seen; a taut one is returned as is.
+    """Return the path of a cable with waves that show its slack; a taut cable is returned unchanged.
 
-    Each segment of length L takes its share e of the excess as a sine of one period: to second order its length
-    grows by ``(pi a)^2 / L``, hence the amplitude ``a = sqrt(e L) / pi``.
+    Each segment of length L takes its share e of the excess as a sine of one period. To second order the sine lengthens
+    it by ``(pi a)^2 / L``, hence the amplitude ``a = sqrt(e L) / pi``.
 
     Args:
         path: polyline [m], shape (p, 3).
-        excess: length to lose [m].
+        excess: length of the cable minus length of the path [m].
         side: direction of the waves, shape (3,).
         count: points per segment.
 
@@ -191,7 +181,7 @@ def slacken(path: np.ndarray, excess: float, side: Sequence[float], count: int =
     tangents = segments / lengths[:, None]
     across = np.asarray(side) - tangents * (tangents @ np.asarray(side))[:, None]
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
-    # Beyond a quarter of the segment the formula fails and the picture with it.
+    # The formula fails beyond a quarter of the segment.
     amplitude = np.minimum(lengths * np.sqrt(excess / lengths.sum()) / np.pi, 0.25 * lengths)
     s = np.arange(count) / count
     waves = np.sin(2.0 * np.pi * s)[None, :, None] * (amplitude[:, None] * across)[:, None, :]
@@ -200,7 +190,7 @@ def slacken(path: np.ndarray, excess: float, side: Sequence[float], count: int =
 
 
 class ShapeFinder:
-    """Gives the nodes of a state: its own, or, where the backend knows none, those of a finite-element model.
+    """Returns the nodes of a state: its own nodes, or those of a finite-element model if the backend computes none.
 
     Args:
         robot: the family of bodies.
@@ -212,7 +202,7 @@ class ShapeFinder:
         self._target: np.ndarray | None = None
 
     def load(self, design: Mapping[str, float] | None = None) -> MechanicalModel:
-        """Return the mechanical model of a design, built only if the design is not the present one.
+        """Return the mechanical model of a design, which is rebuilt only if the design has changed.
 
         Raises:
             DesignError: for a malformed design.
@@ -227,7 +217,7 @@ class ShapeFinder:
 
     @property
     def state(self) -> State:
-        """State of the finite-element model, wherever `at` sent it last."""
+        """State of the finite-element model after the last call of `at`."""
         return self._present.state
 
     def nodes(self, design: Mapping[str, float], state: State) -> np.ndarray:
@@ -239,7 +229,7 @@ class ShapeFinder:
     def at(self, design: Mapping[str, float] | None, displacement: np.ndarray | None = None) -> np.ndarray:
         """Return the nodes [m] (n, 3) of a design at actuator displacements (n_a,), by default at rest.
 
-        Where no equilibrium is found they are those of the last shape: a picture should not end a rollout.
+        If no equilibrium is found, the last shape is returned, because an image should not end a rollout.
         """
         self.load(design)
         self._move(displacement)
@@ -267,7 +257,7 @@ class ShapeFinder:
             return
         except ConvergenceError:
             pass
-        try:  # a long way from the last shape may fail where the way from rest does not
+        try:  # the step from the last shape may be too long, while the one from rest converges
             backend.reset()
             backend.step(self._target)
         except ConvergenceError:
