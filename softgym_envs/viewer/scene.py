@@ -35,7 +35,7 @@ COLORS: dict[str, Color] = {
 }
 """Colours of all objects, 0 to 255, in images and recordings."""
 
-# Directions from the body to the camera and to the lights. The camera looks along x because bodies bend in the y-z plane.
+# Directions from the body to the camera and to the lights. Bodies bend in the y-z plane, so the camera looks along x.
 _CAMERA = np.array([1.0, 0.45, 0.28])
 _LIGHT = np.array([1.0, -0.20, 0.50])
 _FILL = np.array([0.3, 1.0, 0.4])
