@@ -23,7 +23,11 @@ def _metric_name(value: Any) -> Any:
     if isinstance(value, Metric):
         function = value.function
         name = value.name if METRICS.get(value.name) is value else f"{function.__module__}:{function.__qualname__}"
-        if find_metric(name) is not value:
+        try:
+            found = find_metric(name)
+        except ValueError:
+            found = None
+        if found is not value:
             raise ValueError(f"metric '{value.name}' is not found as '{name}'; define it at the top of a module")
         return name
     if isinstance(value, str):

@@ -54,7 +54,8 @@ class Measurements:
                 and of the efforts.
             rng: generator of the noise.
         """
-        spread = np.sqrt(np.nanmean((self.effector - self.effector.mean(axis=0)) ** 2))
+        away = self.effector - self.effector.mean(axis=0)
+        spread = np.sqrt(np.nanmean(away**2)) if np.isfinite(away).any() else 0.0
         noisy = replace(self, effector=self.effector + rng.normal(0.0, relative * spread, self.effector.shape))
         if self.driven == "displacement":
             size = np.sqrt(np.mean(self.effort**2))

@@ -255,7 +255,9 @@ def find_metric(name: str | Metric) -> Metric:
     if name in METRICS:
         return METRICS[name]
     if ":" not in name:
-        raise ValueError(unknown_name("metric", name, METRICS) + ", or a metric of your own as my_module:my_metric")
+        message = unknown_name("metric", name, METRICS)
+        own = "" if message.endswith("?") else ", or a metric of your own as my_module:my_metric"
+        raise ValueError(message + own)
     found = import_object("metric", name)
     if not isinstance(found, Metric):
         raise ValueError(

@@ -183,7 +183,7 @@ class LearnedMisfit(Misfit):
         """Return efforts and effectors with the force of the plane, from the tangent at the free state (eq. 4.16)."""
         n = effort.shape[1]
         normal = torch.as_tensor(self.parameters.normal)
-        rest = self.net(design[:1], torch.zeros((1, n), dtype=torch.float64))[1][0, :3]
+        rest = self.net(design, torch.zeros_like(effort))[1][:, :3]
         held = torch.as_tensor(~free)
         W_an = W[:, :n, n : n + 3] @ normal
         A = torch.where(held[:, :, None] & held[:, None, :], W[:, :n, :n], torch.eye(n, dtype=torch.float64))
