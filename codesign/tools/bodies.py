@@ -42,12 +42,14 @@ def check_metrics(robot: Robot, metrics: Sequence[str | Metric], backend: str) -
     """Return metrics by name.
 
     Raises:
-        ConfigError: for an unknown or repeated metric, or one that the backend or the robot does not provide.
+        ConfigError: for no metric, an unknown or repeated one, or one that the backend or the robot does not provide.
     """
     try:
         found = find_metrics(tuple(metrics))
     except ValueError as error:
         raise ConfigError(str(error)) from None
+    if not found:
+        raise ConfigError("name at least one metric")
     for metric in found:
         if metric.needs in ("body", "sensors") and backend != "fem":
             raise ConfigError(f"metric '{metric.name}' needs backend 'fem', got '{backend}'")

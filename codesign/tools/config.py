@@ -210,7 +210,7 @@ class OptimiseConfig(Config):
 
     name: FolderName
     bodies: BodiesConfig
-    objectives: tuple[ObjectiveConfig, ...] = Field(min_length=1)
+    objectives: tuple[ObjectiveConfig, ...]
     solver: Annotated[SearchConfig | GradientConfig, Field(discriminator="method")]
     workers: int = Field(default=1, ge=1)
 
@@ -255,7 +255,7 @@ class SensitivityConfig(Config):
 
     name: FolderName
     bodies: BodiesConfig
-    metrics: tuple[MetricName, ...] = Field(min_length=1)
+    metrics: tuple[MetricName, ...]
     method: Literal["oat", "morris", "sobol"] = "oat"
     levels: int = Field(default=2, ge=2)
     samples: int = Field(default=64, ge=2)

@@ -136,7 +136,7 @@ WRONG_SOLVERS = [
 
 
 def one_line(error):
-    return "\n" not in str(error.value)
+    return "\n" not in str(error.value) and "more problem" not in str(error.value)
 
 
 @pytest.mark.parametrize(("metric", "message"), WRONG_METRICS)
@@ -160,6 +160,11 @@ def test_wrong_solvers(importable, solver, message):
     with pytest.raises(ConfigError, match=message) as error:
         optimisation(["own_metrics:mass"], solver=solver)
     assert one_line(error)
+
+
+def test_no_metric():
+    with pytest.raises(ConfigError, match="name at least one metric"):
+        optimisation([])
 
 
 def test_options_need_a_search_and_a_robot():
