@@ -19,7 +19,7 @@ def family_goals(config: StudyConfig, count: int) -> np.ndarray:
 
     The bodies differ from the baseline of the study in the variables ``goals.vary``.
     """
-    from softgym_envs.backends.surrogate import settle
+    from softgym_envs.backends.surrogate import solve_displacements
     from softgym_envs.surrogate.pretrained import pretrained_model
 
     robot, goals = config.robot, config.goals
@@ -31,7 +31,9 @@ def family_goals(config: StudyConfig, count: int) -> np.ndarray:
     commands = rng.uniform(low, robot.upper, (count, len(low)))
     model = pretrained_model(robot, config.environment.backend_options.get("weights"))
     unilateral = robot.unilateral
-    settled = settle(model, model.context(np.array(designs)), commands, np.zeros_like(commands), unilateral)
+    settled = solve_displacements(
+        model, model.context(np.array(designs)), commands, np.zeros_like(commands), unilateral
+    )
     return settled.effector[:, :3]
 
 

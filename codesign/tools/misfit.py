@@ -15,7 +15,7 @@ from codesign.tools.measurements import Measurements
 from codesign.tools.parameters import Parameters
 from codesign.variables import split_values
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.backends.surrogate import released, settle
+from softgym_envs.backends.surrogate import solve_displacements, solve_efforts
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import Context
@@ -145,10 +145,10 @@ class LearnedMisfit(Misfit):
         given = command.detach().numpy()
         context = Context.shared(model.context(quantities.design[:1].detach().numpy()), len(self.data))
         if self.data.driven == "effort":
-            settled = released(model, context, given, self._reached)
+            settled = solve_efforts(model, context, given, self._reached)
             free, target = np.ones(given.shape, dtype=bool), command
         else:
-            settled = settle(model, context, given, self._reached, self._unilateral)
+            settled = solve_displacements(model, context, given, self._reached, self._unilateral)
             free, target = settled.slack, torch.zeros_like(command)
         if not settled.converged.all():
             raise ConvergenceError("the surrogate finds no state for some of the measured commands")

@@ -1,33 +1,15 @@
-"""Backends: one interface, several physics. A new backend needs its file and one row in `BACKENDS`."""
-
-from __future__ import annotations
+"""Backends: one interface, several physics. A new backend needs its file and one row in `registry.BACKENDS`."""
 
 from typing import TYPE_CHECKING
 
-from softgym_envs.registry import Registry
+from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from softgym_envs.backends.backend import Backend
-    from softgym_envs.robots.base import Robot
+    from softgym_envs.backends.backend import Backend as Backend
+    from softgym_envs.backends.backend import State as State
+    from softgym_envs.backends.registry import BACKENDS as BACKENDS
+    from softgym_envs.backends.registry import make_backend as make_backend
 
-__all__ = ["BACKENDS", "make_backend"]
-
-BACKENDS = Registry(
-    "backend",
-    {
-        "fem": "softgym_envs.backends.fem:FEMBackend",
-        "surrogate": "softgym_envs.backends.surrogate:SurrogateBackend",
-        "hybrid": "softgym_envs.backends.hybrid:HybridBackend",
-    },
-    base="softgym_envs.backends.backend:Backend",
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__, {"backend": ["Backend", "State"], "registry": ["BACKENDS", "make_backend"]}
 )
-"""Backends by name."""
-
-
-def make_backend(name: str, robot: Robot, **options: object) -> Backend:
-    """Return a backend for a robot by its registry name.
-
-    Raises:
-        ValueError: for an unknown name or a wrong option.
-    """
-    return BACKENDS.make(name, robot, **options)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -13,28 +14,41 @@ from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.dynamics import Motion
 from softgym_envs.robots.base import Robot
 
-__all__ = ["Backend", "State"]
+
+class _Evaluated:
+    """Field of `State` that also takes a function, which is called when the field is first read."""
+
+    def __get__(self, state: State | None, owner: type[State]) -> CondensedModel:
+        if state is None:
+            raise AttributeError("condensed")  # tells `dataclass` that the field has no default
+        value = state.__dict__["condensed"]
+        if not isinstance(value, CondensedModel):
+            value = state.__dict__["condensed"] = value()
+        return value
+
+    def __set__(self, state: State, value: CondensedModel | Callable[[], CondensedModel]) -> None:
+        state.__dict__["condensed"] = value
 
 
 @dataclass(frozen=True)
 class State:
-    """What is known of a robot at an equilibrium.
+    """A robot at an equilibrium, or at an instant of its motion.
 
     Attributes:
         command: commanded displacements or efforts, shape (n_a,).
-        displacement: reached actuator displacements [m, ...], shape (n_a,); larger than commanded where slack.
+        displacement: reached actuator displacements [m, ...], shape (n_a,); larger than commanded for slack cables.
         effort: actuator efforts [N, ...], shape (n_a,).
         effector: effector positions [m], shape (k, 3).
-        slack: actuators that hang slack, shape (n_a,).
-        condensed: condensed model at the state.
-        bonds: forces in the bonds of the body, in the order of its model [N], empty where it has none.
-        velocity: of the effectors [m/s], shape (k, 3); zero without dynamics.
-        motion: time, velocities and energies of the body, where the backend knows dynamics.
-        stable: the state is stable whatever drives the actuators (always True on the surrogate, which knows no other);
-            in dynamics it is the tangent of the time step, with its inertia, that is positive definite.
-        uncertainty: of the effector [m]: 95 % of errors are smaller, where a learned model knows; 0 for FEM.
-        trusted: the state lies where the backend knows what it says; always True for FEM.
-        nodes: deformed nodes [m], shape (n, 3), where the backend has them.
+        slack: which actuators are slack, shape (n_a,).
+        condensed: condensed model at the state; learned models evaluate it when it is first read.
+        bonds: forces in the bonds of the body [N], in the order of its model; empty if it has none.
+        velocity: effector velocities [m/s], shape (k, 3); zero without dynamics.
+        motion: time, velocities and energies of the body; None without dynamics.
+        stable: the equilibrium is stable whether displacements or efforts are commanded (always True on the
+            surrogate). In dynamics: the tangent of the time step, including inertia, is positive definite.
+        uncertainty: bound on the error of the effector [m] that 95 % of a learned model's errors keep; 0 for FEM.
+        trusted: the state lies where the learned model may be trusted; always True for FEM.
+        nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
     """
 
     command: np.ndarray
@@ -42,7 +56,7 @@ class State:
     effort: np.ndarray
     effector: np.ndarray
     slack: np.ndarray
-    condensed: CondensedModel
+    condensed: _Evaluated = _Evaluated()
     nodes: np.ndarray | None = None
     velocity: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
     motion: Motion | None = None
@@ -51,16 +65,23 @@ class State:
     uncertainty: float = 0.0
     trusted: bool = True
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy holds the condensed model itself, not the learned model it is evaluated by.
+        return {**self.__dict__, "condensed": self.condensed}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
 
 class Backend(ABC):
-    """Physics of one robot: ``reset(design) -> State``, ``step(command) -> State``.
+    """Physics of one robot: ``reset(design)`` and ``step(command)`` return a `State`.
 
     Attributes:
-        robot: the family of bodies.
-        design: the present complete design.
-        state: the present state.
-        moving: states have velocities that matter.
-        takes_force: `step` can push the effector.
+        robot: the robot, a family of bodies.
+        design: the current design.
+        state: the current state.
+        moving: states have velocities.
+        takes_force: `step` takes a force on the effector.
     """
 
     moving: bool = False
@@ -71,7 +92,7 @@ class Backend(ABC):
 
     @abstractmethod
     def reset(self, design: Mapping[str, float] | None = None) -> State:
-        """Go to the rest equilibrium of a design (default: the present one). Nothing is rebuilt if it is the same.
+        """Go to the equilibrium at rest of a design (default: the current one). The same design is not rebuilt.
 
         Raises:
             DesignError: for a malformed design.
@@ -80,15 +101,15 @@ class Backend(ABC):
 
     @abstractmethod
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        """Go to the equilibrium under a command, shape (n_a,), from the present one.
+        """Go from the current equilibrium to that under a command, shape (n_a,).
 
         Args:
             command: actuator displacements, or efforts.
-            mode: ``"displacement"`` or ``"effort"``; an effort on an actuator that cannot push is not negative.
-            force: on the first effector [N], shape (3,), or None.
+            mode: ``"displacement"`` or ``"effort"``. Efforts of actuators that cannot push must not be negative.
+            force: force on the first effector [N], shape (3,), or None.
 
         Raises:
-            ConvergenceError: if no equilibrium is found; the present state is kept.
+            ConvergenceError: if no equilibrium is found; the current state is kept.
             ValueError: for a malformed command.
         """
 
@@ -102,4 +123,4 @@ class Backend(ABC):
 
     @abstractmethod
     def restore(self, state: State) -> None:
-        """Go back to a state of the present design."""
+        """Go back to a state of the current design."""

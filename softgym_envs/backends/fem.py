@@ -14,31 +14,29 @@ from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.statics import Equilibrium, Statics
 from softgym_envs.robots.base import Robot
 
-__all__ = ["FEMBackend"]
 
-
-def _let_fall(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
-    """Find an equilibrium that Newton's method does not, by the motion towards it: slow, and heavily damped."""
-    fall = Dynamics(model, step=0.02, stiffness_damping=0.02, tolerance=1e-8)
+def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
+    """Find an equilibrium that Newton's method misses, by a slow, heavily damped motion towards it."""
+    motion_solver = Dynamics(model, step=0.02, stiffness_damping=0.02, tolerance=1e-8)
     for _ in range(200):
-        motion = fall.advance(command, mode)
+        motion = motion_solver.advance(command, mode)
         if np.abs(motion.velocity).max() * model.kinematics.dof_scale.max() < 1e-3:
             break
-    statics.restore(fall.x, fall.effort)
+    statics.restore(motion_solver.x, motion_solver.effort)
     return statics.solve(command, mode)
 
 
 class FEMBackend(Backend):
-    """The finite-element model: static equilibria with exact ``W``, or its motion.
+    """States from finite elements: static equilibria with exact ``W``, or motion in time.
 
-    An actuator whose effort would exceed its ``max_effort`` is driven by that effort instead, until the command lies on
-    the other side.
+    An actuator whose effort would exceed its ``max_effort`` is driven by that effort instead, until its command asks
+    for less.
 
     Args:
-        robot: the family of bodies.
+        robot: the robot.
         design: first design; missing variables take their baseline.
-        dynamics: step in time. The body still starts at its static equilibrium.
-        control_step: time of one `step` [s].
+        dynamics: step in time, starting from the static equilibrium.
+        control_step: duration of one `step` [s].
         time_step: largest physical time step [s]; commands are ramped over those of a control step.
         scheme: time integration, see `Dynamics`.
         mass_damping: Rayleigh's alpha [1/s].
@@ -90,15 +88,15 @@ class FEMBackend(Backend):
             try:
                 rest = statics.solve(zero, self.robot.rest_mode)
             except ConvergenceError:
-                rest = _let_fall(model, statics, zero, self.robot.rest_mode)
+                rest = _relax_dynamically(model, statics, zero, self.robot.rest_mode)
             if self.robot.rest_mode == "effort" and model.loads.any():
-                # Loads would drag the actuators along; they are held.
+                # Loads would move the actuators, so they are held.
                 rest = statics.solve(zero)
             self._dynamics = Dynamics(model, **self._options) if self.moving else None
             self._rest = self._state(rest, zero, still=True)
             self.model, self._statics, self.design = model, statics, complete
         self.restore(self._rest)
-        self._mode = "displacement"  # of the present state's command
+        self._mode = "displacement"  # mode of the current state's command
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
@@ -116,7 +114,7 @@ class FEMBackend(Backend):
                 self.state = self._advance(command, mode, load)
             self._mode = mode
         except BaseException:
-            # Whatever stopped it, the present state stands.
+            # Whatever stopped it, the current state is kept.
             self._go_back(kept)
             raise
         return self.state
@@ -138,8 +136,13 @@ class FEMBackend(Backend):
             self._go_back(kept)
 
     def restore(self, state: State) -> None:
-        """Go back to a state; in dynamics with its velocities, while time, work and a scheme's history start anew."""
-        assert state.nodes is not None
+        """Go back to a state; in dynamics with its velocities, but with time, work and the scheme's history reset.
+
+        Raises:
+            ValueError: for a state of another backend, which has no deformed nodes.
+        """
+        if state.nodes is None:
+            raise ValueError("the state has no deformed nodes; finite elements can only restore their own states")
         effort = np.concatenate([state.condensed.effort, state.bonds])
         self._statics.restore(state.nodes, effort)
         if self._dynamics is not None:
@@ -151,14 +154,14 @@ class FEMBackend(Backend):
         return None if self._dynamics is None else self._dynamics.snapshot
 
     def _go_back(self, motion: tuple | None) -> None:
-        """Take back what happened since the present state; of a motion also what a state does not hold."""
+        """Undo everything since the current state; ``motion`` is the part of a motion that a state does not hold."""
         self.restore(self.state)
         if self._dynamics is not None and motion is not None:
             self._dynamics.snapshot = motion
 
     def _advance(self, command: np.ndarray, mode: str, load: np.ndarray | None) -> State:
         assert self._dynamics is not None
-        # From where an actuator was told to be, which one that gave way has not reached.
+        # Ramps start at the last command, which a saturated actuator has not reached.
         start = self.state.effort
         if mode == "displacement":
             start = self.state.command if self._mode == mode else self.state.displacement
@@ -168,7 +171,7 @@ class FEMBackend(Backend):
         return self._state(motion.equilibrium, command, motion)
 
     def _drive(self, solver: Any, command: np.ndarray, mode: str, load: np.ndarray | None) -> Any:
-        """One solve, in which actuators give way at their largest effort."""
+        """Solve once, with actuators saturated at their largest effort."""
         go = solver.advance if isinstance(solver, Dynamics) else solver.solve
         if not self._limited or mode == "effort":
             if mode == "effort":
@@ -178,7 +181,7 @@ class FEMBackend(Backend):
         saturated, sign = np.abs(present) >= self._max_effort * (1.0 - 1e-9), np.sign(present)
         count = len(command)
         for attempt in range(2 * count + 2):
-            # One that gives way is released when its command asks for less than it has.
+            # A saturated actuator is released when its command asks for less than it has reached.
             target = np.where(saturated, sign * self._max_effort, command)
             modes = ["effort" if s else "displacement" for s in saturated]
             kept = (solver.x, solver.effort, getattr(solver, "snapshot", None))
@@ -186,7 +189,7 @@ class FEMBackend(Backend):
             equilibrium = found.equilibrium if isinstance(found, Motion) else found
             effort, reached = equilibrium.effort[: len(command)], equilibrium.delta[: len(command)]
             over = ~saturated & (np.abs(effort) > self._max_effort)
-            # In the end none is released any more, so that this ends.
+            # Stop releasing actuators after a while, so that the loop terminates.
             back = saturated & (sign * (command - reached) < 0.0) & (attempt <= count)
             if not (over.any() or back.any()):
                 break

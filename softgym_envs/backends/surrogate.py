@@ -3,38 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
+from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_model
 
-__all__ = ["Settled", "SurrogateBackend", "at_rest", "released", "settle"]
-
-#: Largest step left when a search ends [quarter of the actuator range]: 3e-7 m for a cable of 20 mm. Single precision
-#: does not carry much farther.
+#: A search ends when its next step is below this [quarter of the actuator range]: 3e-7 m for a cable of 20 mm. Single
+#: precision does not allow much less.
 TOLERANCE = 5e-5
 
 
 @dataclass(frozen=True)
-class Settled:
-    """Batched states.
+class BatchState:
+    """States of B rows.
 
     Attributes:
         displacement: reached actuator displacements, shape (B, n_a).
         effort: actuator efforts, shape (B, n_a).
         effector: effector coordinates [m], shape (B, n_e).
-        slack: slack actuators, shape (B, n_a).
-        converged: whether the state was found, shape (B,); the other rows are not to be used.
-        uncertainty: of the effector [m], shape (B,).
-        trusted: whether the model knows the state, shape (B,).
+        slack: which actuators are slack, shape (B, n_a).
+        converged: whether the state was found, shape (B,); other rows must not be used.
+        uncertainty: uncertainty of the effector [m], shape (B,).
+        trusted: whether the model may be trusted, shape (B,).
     """
 
     displacement: np.ndarray
@@ -46,8 +45,8 @@ class Settled:
     trusted: np.ndarray
 
 
-def released(model: SurrogateModel, context: Context, effort: np.ndarray, start: np.ndarray) -> Settled:
-    """Find the states under efforts (B, n_a), by Newton's method from displacements ``start`` (B, n_a)."""
+def solve_efforts(model: SurrogateModel, context: Context, effort: np.ndarray, start: np.ndarray) -> BatchState:
+    """Return the states under efforts (B, n_a), by Newton's method from displacements ``start`` (B, n_a)."""
     displacement = start.copy()
     limit = model.span
     for _ in range(50):
@@ -57,20 +56,20 @@ def released(model: SurrogateModel, context: Context, effort: np.ndarray, start:
         if not moving.any():
             break
         displacement = displacement + np.clip(step, -limit, limit) * moving[:, None]
-    return Settled(
+    return BatchState(
         displacement, found, effector, np.zeros(found.shape, bool), ~moving, *model.trust(context, displacement, spread)
     )
 
 
-def at_rest(model: SurrogateModel, context: Context, unilateral: np.ndarray) -> Settled:
-    """Bodies without effort; where loads would drag the actuators along, with actuators held at zero."""
+def rest_state(model: SurrogateModel, context: Context, unilateral: np.ndarray) -> BatchState:
+    """Return the states of bodies without effort, or with actuators held at zero if loads would move them."""
     zero = np.zeros((len(context.slot), model.count))
     if model.card.get("loaded", False):
-        return settle(model, context, zero, zero, unilateral)
-    return released(model, context, zero, zero)
+        return solve_displacements(model, context, zero, zero, unilateral)
+    return solve_efforts(model, context, zero, zero)
 
 
-def settle(
+def solve_displacements(
     model: SurrogateModel,
     context: Context,
     target: np.ndarray,
@@ -79,20 +78,20 @@ def settle(
     slack: np.ndarray | None = None,
     *,
     max_iterations: int = 25,
-) -> Settled:
-    """Find the states under commanded displacements, with cables that cannot push.
+) -> BatchState:
+    """Return the states under commanded displacements, with cables that cannot push.
 
-    A taut state is one evaluation of the model. Where a cable would have to push, the displacement it reaches is
-    found by Newton's method on the complementarity problem, with the model's own W.
+    If all cables are taut, one evaluation of the model is enough. Where a cable would have to push, Newton's method on
+    the complementarity problem finds the displacement that it reaches, with the model's own W.
 
     Args:
         model: the learned condensed model.
         context: prepared bodies.
         target: commanded displacements, shape (B, n_a).
-        start: displacements reached before, shape (B, n_a): where the search begins for slack cables.
+        start: displacements reached before, shape (B, n_a); the search for slack cables starts there.
         unilateral: actuators that cannot push, shape (n_a,).
-        slack: actuators slack before, shape (B, n_a).
-        max_iterations: bound on the search; it mostly ends after two or three.
+        slack: which actuators were slack before, shape (B, n_a).
+        max_iterations: limit of the search, which usually takes two or three.
     """
     guess = target if slack is None else np.where(slack, np.maximum(start, target), target)
     displacement, effort, converged = model.search(context, target, guess, unilateral, TOLERANCE, max_iterations)
@@ -100,17 +99,97 @@ def settle(
     loose = unilateral & (displacement > target + (10.0 * TOLERANCE) * model.span)
     if loose.any():
         effort = np.where(loose, 0.0, np.where(unilateral, np.maximum(effort, 0.0), effort))
-    return Settled(displacement, effort, effector, loose, converged, *model.trust(context, displacement, spread))
+    return BatchState(displacement, effort, effector, loose, converged, *model.trust(context, displacement, spread))
+
+
+class SurrogateBody:
+    """One body on a learned model: its states at rest and under commands.
+
+    Args:
+        model: the learned model.
+        design: the body.
+    """
+
+    def __init__(self, model: SurrogateModel, design: Design) -> None:
+        self.model, self.design = model, design
+        self._context, self._unilateral = model.context(design.array[None]), model.robot.unilateral
+
+    def rest(self) -> State:
+        """Return the state at rest.
+
+        Raises:
+            ConvergenceError: if the search does not find it.
+        """
+        found = rest_state(self.model, self._context, self._unilateral)
+        if not found.converged[0]:
+            raise ConvergenceError(f"the surrogate does not find the rest of {self.design}")
+        return self._state(np.zeros(self.model.count), found)
+
+    def solve(self, command: np.ndarray, mode: str, start: State) -> State:
+        """Return the state under a command; the search begins at ``start``.
+
+        Raises:
+            ConvergenceError: if the search does not find it.
+            ValueError: for a malformed command.
+        """
+        command = np.asarray(command, dtype=float)
+        if command.shape != (self.model.count,) or not np.isfinite(command).all():
+            raise ValueError(f"command must be {self.model.count} finite numbers, got {command.tolist()}")
+        place = start.displacement[None]
+        if mode == "displacement":
+            found = solve_displacements(
+                self.model, self._context, command[None], place, self._unilateral, start.slack[None]
+            )
+        elif mode == "effort":
+            if (command[self._unilateral] < 0.0).any():
+                raise ValueError(f"efforts {command.tolist()} must not be negative: the actuators cannot push")
+            found = solve_efforts(self.model, self._context, command[None], place)
+        else:
+            raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
+        if not found.converged[0]:
+            raise ConvergenceError(f"the surrogate does not find a state under {mode}s {command.tolist()}")
+        return self._state(command, found)
+
+    def _state(self, command: np.ndarray, found: BatchState) -> State:
+        displacement, effort, effector = found.displacement[0], found.effort[0], found.effector[0]
+        return State(
+            command=command.copy(),
+            displacement=displacement,
+            effort=effort,
+            effector=effector.reshape(-1, 3),
+            slack=found.slack[0],
+            # Agents that do not read W do not pay for it.
+            condensed=partial(_condensed, self.model, self._context, displacement, effort, effector),
+            velocity=np.zeros((len(effector) // 3, 3)),
+            uncertainty=float(found.uncertainty[0]),
+            trusted=bool(found.trusted[0]),
+        )
+
+
+def _condensed(
+    model: SurrogateModel, context: Context, displacement: np.ndarray, effort: np.ndarray, effector: np.ndarray
+) -> CondensedModel:
+    """Condensed model of a state: W of the network, and the state itself, in which slack cables have no effort."""
+    W = model.compliance(context, displacement[None])[0]
+    full = np.concatenate([effort, np.zeros(len(effector))])
+    return CondensedModel(W, np.concatenate([displacement, effector]) - W @ full, full, model.roles, model.rows)
 
 
 class SurrogateBackend(Backend):
     """States from a learned condensed model.
 
     Args:
-        robot: the family of bodies.
+        robot: the robot.
         design: first design; missing variables take their baseline.
         weights: folder of weights; default the shipped ones.
         members: how many members of the ensemble to use, fewer for speed; default all.
+
+    Attributes:
+        model: the learned model.
+
+    Raises:
+        WeightsError: if there are no weights for the robot, or they are damaged.
+        ValueError: for a robot whose energy is not convex.
     """
 
     def __init__(
@@ -122,93 +201,29 @@ class SurrogateBackend(Backend):
     ) -> None:
         if not robot.convex:
             raise ValueError(
-                f"robot '{robot.name}' alone has no state that a search finds by its commands; its learned model is a "
-                "part of grippers (softgym_envs.control.CoupledFingers), or use backend='fem'"
+                f"robot '{robot.name}' has a non-convex energy and cannot run on the surrogate alone; use "
+                "backend='fem', or its learned model as part of a gripper (softgym_envs.control.CoupledFingers)"
             )
         self.robot = robot
         self.model = pretrained_model(robot, weights, members)
-        self._unilateral = robot.unilateral
-        self.design = None  # type: ignore[assignment]  # until the first reset
+        self._body: SurrogateBody | None = None
         self.reset(robot.design_space.complete(design))
 
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)
-        if complete != self.design:
-            self._context = self.model.context(complete.array[None])
-            self.design = complete
-            rest = at_rest(self.model, self._context, self._unilateral)
-            if not rest.converged[0]:
-                raise ConvergenceError(f"the surrogate finds no rest of design {complete}")
-            self._rest = self._state(np.zeros(self.model.count), rest)
+        if self._body is None or complete != self.design:
+            body = SurrogateBody(self.model, complete)
+            self._rest = body.rest()
+            self._body, self.design = body, complete
         self.state = self._rest
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
         if force is not None and np.any(force):
-            raise ValueError("the surrogate knows no forces on effectors; use backend='fem'")
-        command = np.asarray(command, dtype=float)
-        if command.shape != (self.model.count,) or not np.isfinite(command).all():
-            raise ValueError(f"command must be {self.model.count} finite numbers, got {command.tolist()}")
-        if mode == "displacement":
-            settled = settle(
-                self.model,
-                self._context,
-                command[None],
-                self.state.displacement[None],
-                self._unilateral,
-                self.state.slack[None],
-            )
-            if not settled.converged[0]:
-                raise ConvergenceError(f"the surrogate finds no state for commands {command.tolist()}")
-        elif mode == "effort":
-            if (command[self._unilateral] < 0.0).any():
-                raise ValueError(f"efforts {command.tolist()} must not be negative: the actuators cannot push")
-            settled = released(self.model, self._context, command[None], self.state.displacement[None])
-            if not settled.converged[0]:
-                raise ConvergenceError(f"the surrogate finds no displacement for efforts {command.tolist()}")
-        else:
-            raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
-        self.state = self._state(command, settled)
+            raise ValueError("the surrogate does not support forces on effectors; use backend='fem'")
+        assert self._body is not None
+        self.state = self._body.solve(command, mode, self.state)
         return self.state
 
     def restore(self, state: State) -> None:
         self.state = state
-
-    def _state(self, command: np.ndarray, settled: Settled) -> State:
-        return _SurrogateState(
-            model=self.model,
-            context=self._context,
-            command=command.copy(),
-            displacement=settled.displacement[0],
-            effort=settled.effort[0],
-            effector=settled.effector[0].reshape(-1, 3),
-            slack=settled.slack[0],
-            uncertainty=float(settled.uncertainty[0]),
-            trusted=bool(settled.trusted[0]),
-        )
-
-
-class _SurrogateState(State):
-    """A state whose condensed model is evaluated when it is asked for: agents that do not look at W do not pay."""
-
-    def __init__(self, model: SurrogateModel, context: Context, **fields: np.ndarray | float) -> None:
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "velocity", np.zeros_like(self.effector))
-        object.__setattr__(self, "bonds", np.zeros(0))
-        object.__setattr__(self, "_source", (model, context))
-
-    def __reduce__(self) -> tuple[type[State], tuple]:
-        # A copy is a plain state: the model is not carried along.
-        return State, tuple(getattr(self, field.name) for field in fields(State))
-
-    @cached_property
-    def condensed(self) -> CondensedModel:
-        model, context = self.__dict__["_source"]
-        batch = model.condensed(context, self.displacement[None])
-        # Slack cables carry no effort, whatever the network's last digits say.
-        effort = batch.effort[0].copy()
-        effort[: model.count] = self.effort
-        delta = np.concatenate([self.displacement, self.effector.ravel()])
-        W = batch.compliance[0]
-        return CondensedModel(W, delta - W @ effort, effort, batch.roles, batch.rows)

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from softgym_envs.backends.surrogate import Settled, at_rest, settle
+from softgym_envs.backends.surrogate import BatchState, rest_state, solve_displacements
 from softgym_envs.envs.options import EnvironmentOptions, check_counts, check_reset_options, set_up
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
@@ -108,7 +108,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self._trusted = np.ones(num_envs, dtype=bool)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._changed = np.zeros(num_envs, dtype=bool)  # bodies that were given in reset and are not the fixed one
-        rest = at_rest(self.model, self._context.rows(np.zeros(1, dtype=np.int64)), self._unilateral)
+        rest = rest_state(self.model, self._context.rows(np.zeros(1, dtype=np.int64)), self._unilateral)
         self._take_rest(np.arange(num_envs), rest)
 
     def _draw_evenly(self, rng: np.random.Generator, index: np.ndarray) -> np.ndarray:
@@ -120,9 +120,9 @@ class SoftRobotVectorEnv(VectorEnv):
         """Prepare the models of changed designs."""
         context = self.model.context(self.designs[index])
         self._context.put(index, context)
-        self._take_rest(index, at_rest(self.model, context, self._unilateral))
+        self._take_rest(index, rest_state(self.model, context, self._unilateral))
 
-    def _take_rest(self, index: np.ndarray, rest: Settled) -> None:
+    def _take_rest(self, index: np.ndarray, rest: BatchState) -> None:
         if not rest.converged.all():
             lost = self.designs[index[np.flatnonzero(~rest.converged)[0]]].tolist()
             design = dict(zip(self.design_space.names, lost, strict=True))
@@ -180,7 +180,7 @@ class SoftRobotVectorEnv(VectorEnv):
 
     def _kinematics(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
         context = self._context.rows(index)
-        found = settle(self.model, context, commands, np.zeros_like(commands), self._unilateral)
+        found = solve_displacements(self.model, context, commands, np.zeros_like(commands), self._unilateral)
         return np.where(found.converged[:, None], found.effector[:, :3], np.nan)
 
     # -- what controllers look at -----------------------------------------------------------------------------------
@@ -245,7 +245,9 @@ class SoftRobotVectorEnv(VectorEnv):
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
         command = self.spaces.command(actions, self._command)
-        settled = settle(self.model, self._context, command, self._displacement, self._unilateral, self._slack)
+        settled = solve_displacements(
+            self.model, self._context, command, self._displacement, self._unilateral, self._slack
+        )
         self._converged = settled.converged.copy()
         if settled.converged.all():
             self._command, self._displacement = command, settled.displacement
