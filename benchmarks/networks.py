@@ -168,7 +168,8 @@ def _run(path: Path, case: str, name: str, data: dict[str, dict[str, np.ndarray]
     from softgym_envs.surrogate.data.states import training_states
     from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.networks import network_module
-    from softgym_envs.surrogate.training import Trainer, test_errors
+    from softgym_envs.surrogate.trainer import Trainer
+    from softgym_envs.surrogate.training import measure_errors
 
     torch.set_num_threads(1)
     robot = make_robot(CASES[case]["robot"], **CASES[case]["robot_options"])
@@ -188,7 +189,7 @@ def _run(path: Path, case: str, name: str, data: dict[str, dict[str, np.ndarray]
     )
     seconds = time.process_time() - start
     model = module.Model(robot, tensors, {})
-    errors = test_errors(model, data["test"])
+    errors = measure_errors(model, data["test"])
     one = model.context(data["test"]["design"][:1])
     row = data["test"]["displacement"][:1]
     model.state(one, row)
@@ -224,7 +225,7 @@ def _track(path: Path, case: str, data: dict[str, dict[str, np.ndarray]], size: 
     from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.model import card_of
     from softgym_envs.surrogate.online import save_model
-    from softgym_envs.surrogate.training import Trainer
+    from softgym_envs.surrogate.trainer import Trainer
 
     torch.set_num_threads(1)
     robot = make_robot(CASES[case]["robot"], **CASES[case]["robot_options"])

@@ -284,7 +284,8 @@ def train_small_surrogate(
     from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.model import card_of
     from softgym_envs.surrogate.online import save_model
-    from softgym_envs.surrogate.training import Trainer, domain_of
+    from softgym_envs.surrogate.trainer import Trainer
+    from softgym_envs.surrogate.training import domain_of
 
     training = sample_states(robot, states, 0, limit=limit, sequence="halton")
     validation = sample_states(robot, max(states // 3, 20), 1, limit=limit)

@@ -12,10 +12,12 @@ ROOT = Path(__file__).parents[1]
 # A package joins this list when its __init__ uses `lazy_exports`.
 PACKAGES = [
     "softgym_envs",
+    "softgym_envs.backends",
     "softgym_envs.control",
     "softgym_envs.envs",
     "softgym_envs.mechanics",
     "softgym_envs.robots",
+    "softgym_envs.surrogate",
 ]
 
 

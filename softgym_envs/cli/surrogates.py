@@ -20,10 +20,10 @@ def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...])
     The datasets are train, validation and test. An interrupted run continues where it stopped.
     """
     from softgym_envs.config import load_config
-    from softgym_envs.surrogate.training import FitConfig, generate
+    from softgym_envs.surrogate.training import FitConfig, generate_datasets
 
     with options.resumable():
-        data = generate(load_config(config, FitConfig, overrides), folder, progress=not quiet)
+        data = generate_datasets(load_config(config, FitConfig, overrides), folder, progress=not quiet)
     for split, columns in data.items():
         click.echo(f"{split}: {len(columns['rest'])} states of {int(columns['rest'].sum())} designs")
 

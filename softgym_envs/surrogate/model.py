@@ -25,8 +25,6 @@ from softgym_envs.surrogate.domain import Domain
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.networks import network_module
 
-__all__ = ["Context", "SurrogateModel", "card_of", "load_model"]
-
 FORMAT = 2
 
 

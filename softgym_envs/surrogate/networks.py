@@ -5,8 +5,6 @@ from __future__ import annotations
 from importlib import import_module
 from types import ModuleType
 
-__all__ = ["NETWORKS", "network_module"]
-
 NETWORKS: dict[str, str] = {
     "potential": "softgym_envs.surrogate.potential",
     "residual": "softgym_envs.surrogate.baselines.residual",

@@ -45,8 +45,6 @@ from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.training import make_targets, potential_loss, stack_members, unstack_members
 
-__all__ = ["StateStore", "check_ensemble", "fine_tune", "is_of", "rehearsal_states", "save_model"]
-
 #: Of the new states one in so many is kept from all members, to check them.
 KEPT = 8
 

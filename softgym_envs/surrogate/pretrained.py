@@ -10,8 +10,6 @@ from softgym_envs.errors import WeightsError
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import SurrogateModel, load_model
 
-__all__ = ["pretrained_folder", "pretrained_model", "shipped_robots"]
-
 _ROOT = Path(__file__).parent / "weights"
 
 

@@ -25,9 +25,6 @@ from softgym_envs.surrogate.model import SurrogateModel, card_of, load_model
 from softgym_envs.surrogate.networks import NETWORKS, network_module
 from softgym_envs.surrogate.trainer import Trainer
 
-__all__ = ["FitConfig", "fit", "generate", "test_errors"]
-
-
 SPLITS = ("train", "validation", "test")
 
 BUCKLING = 0.01
@@ -103,7 +100,7 @@ class FitConfig(Config):
     seed: int = 0
 
 
-def test_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[str, float]:
+def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[str, float]:
     """Errors of a model on a dataset, in metres and relative.
 
     ``effector`` is the distance between predicted and FEM effector at the same reached displacement; ``compliance``
@@ -169,7 +166,9 @@ def domain_of(
     return domain
 
 
-def generate(config: FitConfig, data_folder: str | Path, *, progress: bool = True) -> dict[str, dict[str, np.ndarray]]:
+def generate_datasets(
+    config: FitConfig, data_folder: str | Path, *, progress: bool = True
+) -> dict[str, dict[str, np.ndarray]]:
     """Generate the datasets ``train``, ``validation`` and ``test`` of a surrogate, or take up what is there."""
     if not (Path(data_folder) / "config.yaml").exists():  # what is there stands until the data are accepted
         save_resolved(data_folder, config)
@@ -207,7 +206,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
 
     folder, data_folder = Path(folder), Path(data_folder)
     robot = make_robot(config.robot, **config.robot_options)
-    data = generate(config, data_folder, progress=progress)
+    data = generate_datasets(config, data_folder, progress=progress)
     digest = hashlib.sha256()
     for split in data.values():
         for column in split.values():
@@ -232,7 +231,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     tensors, histories = module.train(robot, states["train"], states["validation"], trainer)
     seconds = time.perf_counter() - start
     model = module.Model(robot, tensors, {})
-    errors = test_errors(model, data["test"])
+    errors = measure_errors(model, data["test"])
     card = {
         **card_of(robot, config.network.kind),
         "config": config.model_dump(mode="json", exclude={"executor"}),

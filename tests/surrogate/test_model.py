@@ -22,7 +22,8 @@ from softgym_envs.surrogate.networks import NETWORKS
 from softgym_envs.surrogate.potential import kernels
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
-from softgym_envs.surrogate.training import FitConfig, Trainer, fit, generate
+from softgym_envs.surrogate.trainer import Trainer
+from softgym_envs.surrogate.training import FitConfig, fit, generate_datasets
 from softgym_envs.testing import random_states, untrained_potential
 
 CABLES = (1, 2)
@@ -439,10 +440,10 @@ def test_splits_are_of_different_states():
 def test_a_refused_run_leaves_the_configuration_of_the_data(tmp_path):
     config = {"robot": "finger", "robot_options": {"cables": 1}, "workers": 1}
     asked = [FitConfig.model_validate({**config, "data": splits(train={"states": states})}) for states in (4, 5)]
-    generate(asked[0], tmp_path, progress=False)
+    generate_datasets(asked[0], tmp_path, progress=False)
     before = (tmp_path / "config.yaml").read_text()
     with pytest.raises(DataError, match="another dataset"):
-        generate(asked[1], tmp_path, progress=False)
+        generate_datasets(asked[1], tmp_path, progress=False)
     assert (tmp_path / "config.yaml").read_text() == before
 
 

@@ -9,8 +9,6 @@ import numpy as np
 from softgym_envs.surrogate.data.states import full_compliance
 from softgym_envs.surrogate.model import Context, SurrogateModel
 
-__all__ = ["DirectModel"]
-
 
 class DirectModel(SurrogateModel):
     """A model whose outputs are those of `States.entries`. W is symmetric but not kept positive definite."""

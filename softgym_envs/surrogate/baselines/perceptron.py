@@ -9,8 +9,6 @@ import numpy as np
 
 from softgym_envs.errors import WeightsError
 
-__all__ = ["layers", "mean_scale", "perceptron", "standardise", "weights"]
-
 
 def layers(tensors: Mapping[str, np.ndarray], prefix: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """Weights (in, out) and biases of a perceptron by its prefix, in single precision."""

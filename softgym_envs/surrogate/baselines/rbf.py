@@ -19,8 +19,6 @@ from softgym_envs.surrogate.baselines.perceptron import mean_scale, standardise
 from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.model import Context
 
-__all__ = ["Model", "Options", "train"]
-
 
 class Options(Config):
     """Hyper-parameters."""

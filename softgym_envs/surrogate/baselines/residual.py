@@ -16,8 +16,6 @@ from softgym_envs.surrogate.baselines.perceptron import layers, mean_scale, perc
 from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.model import Context, SurrogateModel
 
-__all__ = ["Model", "Options", "train"]
-
 
 class Options(Config):
     """Hyper-parameters."""

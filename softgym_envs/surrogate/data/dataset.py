@@ -20,7 +20,6 @@ from softgym_envs.version import __version__
 if TYPE_CHECKING:
     from filelock import AcquireReturnProxy
 
-__all__ = ["COLUMNS", "generate_dataset", "load_dataset"]
 
 COLUMNS = ("design", "displacement", "effort", "effector", "compliance", "rest")
 _FORMAT = 2

@@ -20,8 +20,6 @@ from softgym_envs.mechanics.solvers.statics import Equilibrium, Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.features import learned_variables
 
-__all__ = ["SEQUENCES", "SamplingPlan", "path_order", "sample_group", "select_states"]
-
 SEQUENCES = ("halton", "sobol", "latin", "random")
 """How points are spread: scrambled Halton and Sobol sequences, a Latin hypercube, independent draws."""
 

@@ -11,8 +11,6 @@ from softgym_envs.errors import DataError
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.features import Features
 
-__all__ = ["States", "full_compliance", "stable_rows", "training_states"]
-
 #: Largest growth of the actuators' compliance over that at rest of states that are learned.
 GROWTH = 10.0
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from softgym_envs.mechanics.condensation import effort_unit
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
 
 FORMATS = (".h", ".onnx")
 """Endings of the files that can be written."""
-
-_EFFORTS = {"m": "N", "m3": "Pa", "rad": "N m"}
-"""Unit of the effort that does work on a displacement of a unit."""
 
 
 def check_path(path: str | Path, ending: str) -> Path:
@@ -44,7 +42,7 @@ def actuator_records(model: Model) -> list[dict[str, Any]]:
             "low": a.low,
             "high": a.high,
             "unit": a.unit,
-            "effort_unit": _EFFORTS.get(a.unit, f"J/{a.unit}"),
+            "effort_unit": effort_unit(a.unit),
         }
         for a in model.robot.actuators
     ]
