@@ -1,6 +1,6 @@
 """Run the Python blocks of a page as one script: ``python docs/run_page.py PAGE FOLDER``.
 
-The blocks share a namespace and run in the folder. A block with a title is a file: it is written there, to be imported.
+The blocks share a namespace and run in the folder. A block with a title is written there as a file, to be imported.
 """
 
 from __future__ import annotations
@@ -10,11 +10,9 @@ import re
 import sys
 from pathlib import Path
 
-__all__ = ["code_blocks", "run_page"]
-
 
 def code_blocks(page: Path, language: str = "python") -> list[tuple[str, str, int]]:
-    """Return title (or ``""``), text and first line of each fenced block of a language."""
+    """Return the title (or ``""``), text and first line number of each fenced block of a language."""
     text = page.read_text()
     pattern = rf'^```{language}(?: title="([^"]+)")?\n(.*?)^```$'
     return [
@@ -24,7 +22,7 @@ def code_blocks(page: Path, language: str = "python") -> list[tuple[str, str, in
 
 
 def run_page(page: Path, folder: Path) -> None:
-    """Run the blocks of a page in a folder; best in a process of its own, for a page may register things."""
+    """Run the blocks of a page in a folder. Use a separate process, because a page may register things."""
     os.chdir(folder)
     sys.path.insert(0, str(folder))
     namespace: dict[str, object] = {"__name__": "__page__"}

@@ -33,7 +33,7 @@ generate = load("generate")  # puts its folder on the search path
 writing, api = (importlib.import_module(f"site_{name}") for name in ("writing", "api"))
 robots, environments = (importlib.import_module(f"site_{name}") for name in ("robots", "environments"))
 code_blocks = load("run_page").code_blocks
-PAGES = sorted(DOCS.rglob("*.md"))
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 
 
 def test_names_of_pages():
@@ -123,6 +123,7 @@ def test_what_a_page_says_itself_wins():
 
 @pytest.mark.parametrize("page", [p for p in PAGES if code_blocks(p)], ids=lambda p: p.stem)
 def test_the_code_of_a_page_runs(page, tmp_path):
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     done = subprocess.run(
         [sys.executable, "-W", "error", str(DOCS / "run_page.py"), str(page), str(tmp_path)],
         capture_output=True,
