@@ -59,7 +59,8 @@ def headlines() -> str:
 
 
 def _ends(row: dict[str, Any]) -> list[str]:
-    return [f"{row['baseline [mm]']:.2f} mm", f"→ {row['winner [mm]']:.2f} mm"]
+    # No-break spaces keep numbers and units together.
+    return [f"{row['baseline [mm]']:.2f}\u00a0mm", f"→\u00a0{row['winner [mm]']:.2f}\u00a0mm"]
 
 
 def codesign() -> str:
