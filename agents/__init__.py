@@ -1,1 +1,29 @@
-"""Agents: SAC training and evaluation, baselines (random, inverse QP)."""
+"""Agents: SAC training, evaluation and baselines (inverse QP, random actions)."""
+
+from typing import TYPE_CHECKING
+
+from softgym_envs._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from agents.config import EnvironmentConfig as EnvironmentConfig
+    from agents.config import TrainConfig as TrainConfig
+    from agents.evaluation import Evaluation as Evaluation
+    from agents.evaluation import evaluate as evaluate
+    from agents.evaluation import make_agent as make_agent
+    from agents.evaluation import sample_goals as sample_goals
+    from agents.export import export_policy_onnx as export_policy_onnx
+    from agents.policy import Policy as Policy
+    from agents.training import train as train
+    from agents.vec_env import SB3VecEnv as SB3VecEnv
+
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "config": ["EnvironmentConfig", "TrainConfig"],
+        "evaluation": ["Evaluation", "evaluate", "make_agent", "sample_goals"],
+        "export": ["export_policy_onnx"],
+        "policy": ["Policy"],
+        "training": ["train"],
+        "vec_env": ["SB3VecEnv"],
+    },
+)

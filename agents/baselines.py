@@ -15,14 +15,12 @@ from softgym_envs.envs.tasks.base import Task
 from softgym_envs.errors import ConvergenceError, WeightsError
 from softgym_envs.robots.base import Robot
 
-__all__ = ["BASELINES", "PI_GAINS", "Agent", "InverseQPAgent", "make_baseline", "make_controller"]
-
 Agent = Callable[[np.ndarray, Any], np.ndarray]
 """``agent(observation, env.unwrapped) -> action``."""
 
 PI_GAINS = (0.1, 0.3)
-"""Proportional and integral gain per control step. The plant answers a correction within one step, so that the integral
-alone leaves 0.7^k of an error after k steps; the gains of the thesis (0.01 and 0.002) are for many calls a goal."""
+"""Proportional and integral gain per control step. The plant responds to a correction within one step, so the integral
+alone leaves 0.7^k of an error after k steps. The gains in the thesis (0.01 and 0.002) are for many calls per goal."""
 
 
 def make_controller(robot: Robot, task: Task) -> InverseQP:
@@ -31,15 +29,15 @@ def make_controller(robot: Robot, task: Task) -> InverseQP:
 
 
 class InverseQPAgent:
-    """The inverse QP on the condensed model of the plant's present state; in dynamics, of its next time step."""
+    """Inverse QP on the condensed model of the plant's present state; in dynamics, on that of its next time step."""
 
     def __init__(self) -> None:
         self._controllers: WeakKeyDictionary[Any, InverseQP] = WeakKeyDictionary()
 
     def __call__(self, observation: Any, env: Any) -> np.ndarray:
-        """Return the action, shape (n_a,), in the state of ``env``; where no command is found, that of standing still.
+        """Return the action in the state of ``env``, shape (n_a,); it holds the command if the QP finds no other.
 
-        An episode begins where no actuator is commanded.
+        A state in which no actuator is commanded begins an episode.
         """
         present = env.state.command
         if env not in self._controllers or not present.any():
@@ -58,7 +56,7 @@ class InverseQPAgent:
 
 
 class StaticQPAgent(InverseQPAgent):
-    """The inverse QP on the static equilibrium under the present command: it knows no momentum."""
+    """Inverse QP on the static equilibrium under the present command, which disregards momentum."""
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
         still = env.backend.probe(present) if env.backend.moving else env.state
@@ -66,13 +64,13 @@ class StaticQPAgent(InverseQPAgent):
 
 
 class ModelQPAgent(InverseQPAgent):
-    """The inverse QP on a model of the plant that sees its commands only: the surrogate's, open loop or with PI.
+    """Inverse QP on the surrogate, which only sees the commands: open loop, or closed by a PI controller.
 
-    On FEM, as on a physical robot, the model is then not the plant. Robots without a surrogate are predicted by their
-    static equilibrium.
+    On FEM, as on a physical robot, the model then differs from the plant. For robots without a surrogate, the static
+    equilibrium of the plant replaces it.
 
     Args:
-        closed: move the goal by a PI on the measured effector (thesis Algorithm 2).
+        closed: shift the goal by a PI controller on the measured effector (thesis, algorithm 2).
     """
 
     def __init__(self, closed: bool) -> None:
@@ -80,12 +78,12 @@ class ModelQPAgent(InverseQPAgent):
         self._closed = closed
         self._models: WeakKeyDictionary[Any, Backend | None] = WeakKeyDictionary()
         self._corrections: WeakKeyDictionary[Any, PICorrection] = WeakKeyDictionary()
-        self._asked: WeakKeyDictionary[Any, np.ndarray] = WeakKeyDictionary()
+        self._previous_goals: WeakKeyDictionary[Any, np.ndarray] = WeakKeyDictionary()
 
     def _begin(self, env: Any) -> None:
         super()._begin(env)
         self._corrections[env] = PICorrection(*PI_GAINS)
-        self._asked[env] = env.goal
+        self._previous_goals[env] = env.goal
         if env not in self._models:
             try:
                 self._models[env] = SurrogateBackend(env.robot, env.design)
@@ -104,9 +102,9 @@ class ModelQPAgent(InverseQPAgent):
         if not self._closed:
             return controller.solve(expected.condensed, env.goal, present, expected.slack)
         axes, correction = env.task.axes, self._corrections[env]
-        # The effector is where the last goal sent it: a goal that has moved on since is no error of the model.
-        error = axes * (self._asked[env] - env.state.effector[0])
-        self._asked[env] = env.goal
+        # The effector follows the previous goal; the motion of the goal since then is not an error of the model.
+        error = axes * (self._previous_goals[env] - env.state.effector[0])
+        self._previous_goals[env] = env.goal
         aim = correction.correct(env.goal, env.goal - error)
         command = controller.solve(expected.condensed, aim, present, expected.slack)
         model = expected.condensed
@@ -136,11 +134,11 @@ def make_baseline(name: str, seed: int = 0) -> Agent:
     """Return an agent that needs no training.
 
     Args:
-        name: ``"qp"``, the inverse QP on the condensed model of the plant's present state, which in dynamics is that of
-            the next time step; ``"qp_static"``, on the static equilibrium under the present command, which knows no
-            momentum; ``"qp_model"``, on the surrogate, whatever the plant is; ``"qp_pi"``, that with a PI on the
-            measured effector; ``"random"``.
-        seed: of the random agent.
+        name: ``"qp"``: inverse QP on the condensed model of the plant's present state, in dynamics of its next time
+            step; ``"qp_static"``: on the static equilibrium under the present command, without momentum;
+            ``"qp_model"``: on the surrogate, whatever the plant is; ``"qp_pi"``: that with a PI controller on the
+            measured effector; ``"random"``: uniform actions.
+        seed: seed of the random agent.
 
     Raises:
         ValueError: for an unknown name.

@@ -158,7 +158,7 @@ class EnvironmentConfig(Config):
 
 
 class SACConfig(Config):
-    """Hyper-parameters of soft actor-critic, named as in stable-baselines3."""
+    """Hyperparameters of soft actor-critic, named as in stable-baselines3."""
 
     learning_rate: float = Field(default=1e-3, gt=0)
     final_learning_rate: float = Field(default=1e-4, gt=0, description="reached linearly at the last step")
@@ -172,7 +172,10 @@ class SACConfig(Config):
     ent_coef: float | str = "auto"
     target_entropy: float | Literal["auto"] = "auto"
     hindsight: float = Field(
-        default=0.0, ge=0, le=1, description="share of samples whose goal is an effector reached later; 0.8 is k = 4"
+        default=0.0,
+        ge=0,
+        le=1,
+        description="share of samples with a position reached later as goal; 0.8 is k = 4",
     )
 
     @field_validator("ent_coef")
@@ -204,7 +207,7 @@ class TrainConfig(Config):
     steps: int = Field(default=40_000, gt=0, description="environment steps, over all sub-environments")
     num_envs: int = Field(default=16, gt=0)
     seed: int = Field(default=0, ge=0)
-    initial: str | None = Field(default=None, description="policy to start from: a file or the name of a shipped one")
+    initial: str | None = Field(default=None, description="initial policy: a file or the name of a shipped one")
     evaluation_episodes: int = Field(default=64, gt=0)
     report_every: int = Field(default=4_000, gt=0, description="environment steps between evaluations")
 
@@ -216,27 +219,26 @@ class TrainConfig(Config):
 
 
 def check_hindsight(sac: SACConfig, environment: EnvironmentConfig) -> None:
-    """Raise ValueError for hindsight goals on top of the QP."""
-    # What was done held the QP's action for the goal of then; it says nothing about another goal.
+    """Raise ValueError for hindsight goals with a residual agent."""
+    # The stored actions contain the QP's action for the original goal, so they do not fit another goal.
     if sac.hindsight and environment.residual_scale:
         raise ValueError(
-            f"sac.hindsight = {sac.hindsight:g} cannot be had on top of the QP "
-            f"(environment.residual_scale = {environment.residual_scale:g}), whose action depends on the goal; "
-            "allowed: 0"
+            f"sac.hindsight = {sac.hindsight:g} cannot be combined with environment.residual_scale = "
+            f"{environment.residual_scale:g}: the QP's action depends on the goal; allowed: 0"
         )
 
 
 def check_start(key: str, sac: SACConfig, end: str, steps: int) -> None:
-    """Raise ValueError for a training that ends before its first update.
+    """Raise ValueError for a training that would end before its first update.
 
     Args:
-        key: of ``learning_starts``, for the message.
+        key: key of ``learning_starts``, for the message.
         sac: hyper-parameters.
-        end: key of ``steps``, for the message.
+        end: key of the number of steps, for the message.
         steps: environment steps of the training.
     """
     if sac.learning_starts >= steps:
         raise ValueError(
-            f"{key} = {sac.learning_starts} is not below {end} = {steps}: nothing would be learned; "
+            f"{key} = {sac.learning_starts} must be below {end} = {steps}, or nothing would be learned; "
             f"allowed: 0 to {steps - 1}"
         )

@@ -15,9 +15,6 @@ from agents.config import EnvironmentConfig
 from agents.policy import Policy
 from softgym_envs.errors import DataError
 
-AGENTS = BASELINES
-"""Names of agents that need no training."""
-
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -149,7 +146,7 @@ def _total_cost(evaluations: Sequence[Evaluation]) -> _Cost:
 def sample_goals(
     environment: EnvironmentConfig, count: int, seed: int, design: dict[str, float] | None = None
 ) -> np.ndarray:
-    """Draw goals (count, p, 3) [m] as the task of an environment does, for a body (default: the environment's)."""
+    """Draw goals [m] (count, p, 3) as the task of an environment does, for a body; default the environment's."""
     env = environment.make()
     try:
         paths = []
@@ -164,7 +161,7 @@ def sample_goals(
 def evaluation_set(
     environment: EnvironmentConfig, count: int, seed: int
 ) -> tuple[list[dict[str, float]] | None, np.ndarray]:
-    """Draw ``count`` bodies and goals [m] (count, p, 3) as an environment does; no bodies where it has but one."""
+    """Draw ``count`` bodies and goals [m] (count, p, 3) as an environment does; None if it has a single body."""
     if not environment.sample_design:
         return None, sample_goals(environment, count, seed)
     env = environment.make()
@@ -181,10 +178,10 @@ def make_agent(agent: str | Path, seed: int = 0) -> Agent:
     """Return ``agent(observation, env.unwrapped) -> action``.
 
     Args:
-        agent: one of `AGENTS`, see `agents.baselines.make_baseline`, or a policy file or the name of a shipped one.
-        seed: of the random agent.
+        agent: one of `BASELINES`, see `make_baseline`; or a policy file, or the name of a shipped policy.
+        seed: seed of the random agent.
     """
-    if agent in AGENTS:
+    if agent in BASELINES:
         return make_baseline(str(agent), seed)
     return _acting(Policy(agent))
 
@@ -204,11 +201,14 @@ def evaluate(
     """Run one episode per goal.
 
     Args:
-        agent: one of `AGENTS`, or the path of a policy.
-        environment: where; its ``backend`` decides the physics. Its ``residual_scale`` counts for policies only.
+        agent: one of `BASELINES`, a policy file, or the name of a shipped policy.
+        environment: the environment; its ``residual_scale`` applies to policies only.
         goals: goals or paths of goals [m], shape (n, 3) or (n, p, 3).
-        design: the body, or one for each goal (default: the environment's).
+        design: the body, or one for each goal; default the environment's.
         seed: seed of the random agent and of the environment.
+
+    Returns:
+        The outcome, whose times include making the environment.
 
     Raises:
         ConfigError: if the policy was trained for another environment, see `Policy.check_environment`.
@@ -228,7 +228,7 @@ def _evaluate(
 ) -> Evaluation:
     goals = np.asarray(goals, dtype=float)
     goals = goals[:, None, :] if goals.ndim == 2 else goals
-    if agent in AGENTS:
+    if agent in BASELINES:
         act = make_baseline(str(agent), seed)
         environment = environment.model_copy(update={"residual_scale": 0.0})
     else:
@@ -270,7 +270,7 @@ def _evaluate_batch(
     design: dict[str, float] | Sequence[dict[str, float]] | None,
     seed: int,
 ) -> Evaluation:
-    """All episodes at once on the batched surrogate environment."""
+    """Run all episodes at once on the batched surrogate environment."""
     count = len(goals)
     env = environment.make_vec(count, sample_design=False)
     columns = {name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "length")}

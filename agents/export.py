@@ -1,4 +1,4 @@
-"""Trained policies outside Python: ONNX graphs that take what sensors give, in SI units."""
+"""Export of policies as ONNX graphs, whose inputs are measurements in SI units."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from softgym_envs.version import __version__
 if TYPE_CHECKING:
     from softgym_envs.envs.spaces import AgentSpaces
 
-__all__ = ["export_policy_onnx"]
 
 OPSET, IR_VERSION = 17, 8
-"""What the graph is written in: that of the surrogates' graphs."""
+"""Version of the ONNX operators and file format, the same as for surrogates."""
 
 
 def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
@@ -27,21 +26,21 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
 
     Inputs, all float32 and in SI units, for any number B of states at once: ``command``, ``displacement`` and
     ``effort`` of the actuators (B, n_a), ``effector`` and ``goal`` [m] (B, 3), in dynamics the effector's ``velocity``
-    [m/s] (B, 3), and ``design`` (B, k) for a policy that sees its body. Outputs are the ``action`` (B, n_a) in [-1, 1]
-    and the ``next_command`` (B, n_a) it stands for, within rates and ranges. A policy that acts on top of the inverse
-    QP has no ``next_command``: its action is to be added to that of a QP. The metadata name environment, actuators,
-    design variables and the steps of the training.
+    [m/s] (B, 3), and ``design`` (B, k) for a policy that observes its body. Outputs are the ``action`` (B, n_a) in
+    [-1, 1] and the resulting ``next_command`` (B, n_a), within rates and ranges. A policy trained with
+    ``residual_scale`` has no ``next_command``: the caller adds its action to that of a QP. The metadata name
+    environment, actuators, design variables and training steps.
 
     Args:
         policy: a policy, its file, or the name of a shipped one.
-        path: where to, ending with ``.onnx``.
+        path: output file, ending with ``.onnx``.
 
     Returns:
         The path.
 
     Raises:
         WeightsError: if the policy cannot be read.
-        ValueError: for another ending, or where ``onnx`` is not installed.
+        ValueError: for another ending, or if ``onnx`` is not installed.
     """
     path = Path(path)
     if path.suffix != ".onnx":
@@ -51,7 +50,7 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
     except ImportError:
         raise ValueError("ONNX files need the package onnx: pip install 'softgym-envs[onnx]'") from None
     policy = policy if isinstance(policy, Policy) else Policy(policy)
-    config = EnvironmentConfig.model_validate(policy.card["config"]["environment"])
+    config = policy.environment
     env = config.make()
     spaces: AgentSpaces = env.unwrapped.spaces  # type: ignore[attr-defined]
     env.close()
@@ -62,7 +61,7 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
 
 
 class _Nodes:
-    """Writes nodes and constants of a graph."""
+    """Builder of the nodes and constants of a graph."""
 
     def __init__(self, onnx: Any) -> None:
         self.onnx = onnx
@@ -151,7 +150,7 @@ def _graph(policy: Policy, spaces: AgentSpaces, config: EnvironmentConfig, onnx:
 
 
 def _unit_design(spaces: AgentSpaces, g: _Nodes) -> str:
-    """Design variables in [-1, 1], as the observation shows them."""
+    """Add the nodes that scale design variables to [-1, 1]; return their output."""
     variables = [spaces.robot.design_space[name] for name in spaces.design_names]
     is_log = np.array([variable.log for variable in variables])
     low, high = (np.array([getattr(variable, end) for variable in variables]) for end in ("low", "high"))

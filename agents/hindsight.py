@@ -1,4 +1,4 @@
-"""Hindsight goals: an episode that missed its goal shows how to reach the places where it came."""
+"""Hindsight experience replay: an episode that missed its goal shows how to reach the places that it visited."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from stable_baselines3.common.vec_env import VecNormalize
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.base import Task
 
-__all__ = ["HindsightBuffer"]
-
 
 class HindsightBuffer(ReplayBuffer):
-    """A replay buffer of flat observations in which a share of the samples gets another goal (HER, strategy future).
+    """Replay buffer of flat observations that gives a share of the samples another goal (HER, strategy "future").
 
-    The other goal is an effector reached at or after the transition in the same episode, and the reward is what the
-    task gives for it (Andrychowicz et al., 2017). Their k goals for each stored transition are a share of k / (k + 1).
+    The other goal is a position that the effector reached at or after the transition in the same episode; the task
+    computes the reward for it (Andrychowicz et al., Hindsight experience replay, 2017). Their k goals for each stored
+    transition correspond to a share of k / (k + 1).
 
     Args:
         *args: as for `ReplayBuffer`.
         spaces: layout of the observations.
-        task: gives rewards; its goal stays where it is during an episode.
-        share: of samples with another goal.
+        task: computes rewards; its goal must not move during an episode.
+        share: share of samples with another goal.
         **kwargs: as for `ReplayBuffer`.
 
     Attributes:
-        ends: position of the last transition of each stored one's episode, -1 while it runs, shape (size, num_envs).
+        ends: for each stored transition, the position of the last one in its episode; -1 while the episode runs; shape
+            (size, num_envs).
 
     Raises:
-        ValueError: for a task whose goal moves: what followed then belongs to other goals.
+        ValueError: for a task whose goal moves, as later positions then belong to other goals.
     """
 
     def __init__(self, *args: Any, spaces: AgentSpaces, task: Task, share: float, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if task.horizon != 1:
-            raise ValueError(f"hindsight = {share} needs a goal that stays; task '{task.name}' moves it; allowed: 0")
+            raise ValueError(f"hindsight = {share} needs a fixed goal, task '{task.name}' moves it; allowed: 0")
         self.spaces, self.task, self.share = spaces, task, share
         self.ends = np.full((self.buffer_size, self.n_envs), -1, dtype=np.int64)
 
@@ -53,13 +53,13 @@ class HindsightBuffer(ReplayBuffer):
     ) -> None:
         """Store one transition of every environment."""
         position = self.pos
-        # What is overwritten no longer belongs to its episode; the rest of that episode keeps its end.
+        # The overwritten transition leaves its episode; the others of that episode keep their end.
         self.ends[position] = -1
         super().add(obs, next_obs, action, reward, done, infos)
         self._end(np.flatnonzero(done), position)
 
     def cut(self) -> None:
-        """End all running episodes: the environments are about to be reset."""
+        """End all running episodes because the environments are about to be reset."""
         if self.pos > 0 or self.full:
             self._end(np.arange(self.n_envs), (self.pos - 1) % self.buffer_size)
 
@@ -73,7 +73,7 @@ class HindsightBuffer(ReplayBuffer):
                 k = (k - 1) % self.buffer_size
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        columns = np.random.randint(0, self.n_envs, len(batch_inds))  # noqa: NPY002 - as stable-baselines3 does
+        columns = np.random.randint(0, self.n_envs, len(batch_inds))  # noqa: NPY002 - the generator of stable-baselines3
         ends = self.ends[batch_inds, columns]
         newest = (self.pos - 1) % self.buffer_size
         left = (np.where(ends < 0, newest, ends) - batch_inds) % self.buffer_size
@@ -83,15 +83,14 @@ class HindsightBuffer(ReplayBuffer):
         following = self.next_observations[batch_inds, columns]
         rewards = self.rewards[batch_inds, columns].copy()
 
-        # A reward of exactly zero is that of a step that was not found; no goal makes it better.
+        # A reward of exactly zero marks a step without an equilibrium, which no goal improves.
         chosen = np.flatnonzero((draws[1] < self.share) & (rewards != 0.0))
         goals = self.spaces.observed_effector(self.next_observations[later[chosen], columns[chosen]])
         observations[chosen] = self.spaces.with_goal(observations[chosen], goals)
         reached = following[chosen]
         following[chosen] = self.spaces.with_goal(reached, goals)
-        distance = self.task.distance(self.spaces.observed_effector(reached), goals)
-        terms = self.task.reward_terms(distance, self.spaces.observed_effort_share(reached))
-        rewards[chosen] = np.prod(list(terms.values()), axis=0)
+        effector, effort_share = self.spaces.observed_effector(reached), self.spaces.observed_effort_share(reached)
+        rewards[chosen] = self.task.rate(effector, goals, effort_share)[2]
 
         ended = self.dones[batch_inds, columns] * (1.0 - self.timeouts[batch_inds, columns])
         return ReplayBufferSamples(

@@ -1,8 +1,8 @@
-"""Bodies and policy that learn together, in one training: who draws the body of each episode.
+"""Design proposers: bodies and policy that learn together in one training.
 
-A policy that sees the body is trained on many of them; a proposer decides which. `CriticProposer` looks at what the
-critic says of a body (Luck, Ben Amor and Calandra 2019, arXiv:1911.06832); `DistributionProposer` keeps a mixture of
-Gaussians over bodies that moves to those with larger returns (Schaff et al. 2019, arXiv:1801.01432).
+A policy that observes the body is trained on many bodies, and a proposer draws them. `CriticProposer` prefers bodies
+that the critic values (Luck, Ben Amor and Calandra 2019, arXiv:1911.06832); `DistributionProposer` moves a mixture of
+Gaussians over bodies towards larger returns (Schaff et al. 2019, arXiv:1801.01432).
 """
 
 from __future__ import annotations
@@ -19,29 +19,28 @@ from softgym_envs.storage import read_json, write_json
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
 
-__all__ = ["PROPOSERS", "CriticProposer", "DesignProposer", "DistributionProposer"]
-
 
 class DesignProposer(ABC):
     """Draws the bodies of training episodes, in unit coordinates [-1, 1] of the sampled variables.
 
-    `agents.training.train` calls `attach` once, `begin` before each stretch of training, `save` after it, and `finish`.
+    `agents.training.train` calls `attach` once, `begin` before and `save` after each part of the training, and `finish`
+    at the end.
     """
 
     def attach(self, model: SAC, config: TrainConfig, folder: Path) -> None:
-        """Take over the drawing of bodies, where an earlier run of the same training stopped.
+        """Draw the bodies of a training from now on, continuing where an interrupted run stopped.
 
         Raises:
             ValueError: if the environment does not sample bodies.
         """
         if not config.environment.sample_design:
-            raise ValueError("joint training needs environment.sample_design: the names of the variables to optimise")
+            raise ValueError("joint training needs environment.sample_design, the names of the variables to optimise")
         env: Any = model.get_env()
         vector = env.env.unwrapped
         self.config, self.folder = config, folder
         self.names: tuple[str, ...] = tuple(vector.sampled_variables)
         self.size = len(self.names)
-        #: Bodies of the present and of the last episode of each sub-environment.
+        #: Bodies of the present and of the previous episode of each sub-environment.
         self._bodies = np.zeros((2, vector.num_envs, self.size))
         vector.design_sampler = self._sample
         env.on_episode = self._ended
@@ -54,48 +53,48 @@ class DesignProposer(ABC):
         return drawn
 
     def _ended(self, index: int, total: float) -> None:
-        # The next episode of this sub-environment has begun, so its body is already the last but one.
+        # The next episode of this sub-environment has already begun, so this one is the previous.
         self.episode(self._bodies[1, index].copy(), total)
 
     def finish(self, model: SAC) -> None:
-        """Write the most promising bodies, ``bodies.json`` [unit coordinates]."""
+        """Write the most promising bodies to ``bodies.json``, in unit coordinates."""
         found = self.best(model, 32)
         write_json(self.folder / "bodies.json", {"names": list(self.names), "bodies": found.tolist()})
 
-    def restore(self, model: SAC) -> None:  # noqa: B027 - proposers without a memory need none of these
-        """Take up what `save` left at the model's step."""
+    def restore(self, model: SAC) -> None:  # noqa: B027 - optional, for proposers with a state
+        """Restore what `save` wrote at the model's step."""
 
     def begin(self, model: SAC) -> None:  # noqa: B027
-        """A stretch of training begins."""
+        """Prepare for the next part of the training."""
 
     def save(self, step: int) -> None:  # noqa: B027
-        """A stretch of training has ended at ``step``; keep what `restore` needs."""
+        """Write what `restore` needs to continue from ``step``."""
 
     def episode(self, body: np.ndarray, total: float) -> None:  # noqa: B027
-        """An episode with a body ended with this return."""
+        """Learn from the return of an episode."""
 
     @abstractmethod
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Bodies of ``count`` episodes, shape (count, k)."""
+        """Draw the bodies of ``count`` episodes, shape (count, k)."""
 
     @abstractmethod
     def best(self, model: SAC, count: int) -> np.ndarray:
-        """The most promising bodies so far, best first, shape (<= count, k)."""
+        """Return the most promising bodies so far, best first, shape (<= count, k)."""
 
 
 class CriticProposer(DesignProposer):
-    """The critic as judge of bodies it was never asked to build.
+    """Proposes bodies whose first states the critic values most.
 
-    Every other episode explores with a body drawn evenly; the rest have bodies that a cross-entropy search finds best
-    by the critic's value of their first states. The search costs no environment step, and starts from the weights
-    alone, so a resumed training draws the same bodies.
+    A share of the episodes explores with uniformly drawn bodies; the others use the best bodies of a cross-entropy
+    search on the critic's value. The search takes no environment steps and depends on the weights alone, so a resumed
+    training draws the same bodies.
 
     Args:
-        explore: share of episodes with an even draw.
-        candidates: bodies in each of the generations of the search.
-        generations: of the search.
+        explore: share of episodes with a uniform draw.
+        candidates: bodies in each generation of the search.
+        generations: number of generations.
         goals: first states per body.
-        warmup: environment steps before the critic is asked.
+        warmup: environment steps before the first search.
     """
 
     def __init__(
@@ -134,17 +133,17 @@ class CriticProposer(DesignProposer):
 
 
 class DistributionProposer(DesignProposer):
-    """A mixture of Gaussians over bodies, moved by the natural gradient of the expected rank of the returns.
+    """Proposes bodies from a mixture of Gaussians that follows the natural gradient of the expected rank of returns.
 
-    Ranks in place of returns and natural steps are those of separable natural evolution strategies (Wierstra et al.
-    2014, JMLR 15, 949); the mixture and its learning beside the policy are those of Schaff et al.
+    Ranks in place of returns and natural steps come from separable natural evolution strategies (Wierstra et al. 2014,
+    JMLR 15, 949); the mixture that learns along with the policy comes from Schaff et al.
 
     Args:
-        components: Gaussians.
-        batch: episodes behind each step.
-        warmup: environment steps with an even draw, in which the policy learns to move at all.
-        rate: size of the steps of the means; 1 is that of the reference.
-        smallest: standard deviation (unit coordinates) below which none falls.
+        components: number of Gaussians.
+        batch: episodes per step of the mixture.
+        warmup: environment steps with a uniform draw, in which the policy learns its first motions.
+        rate: step size of the means, relative to the reference.
+        smallest: lower bound of the standard deviations, in unit coordinates.
     """
 
     def __init__(
@@ -171,7 +170,7 @@ class DistributionProposer(DesignProposer):
 
     def begin(self, model: SAC) -> None:
         self._warm = model.num_timesteps >= self.warmup
-        self._episodes = []  # all episodes start anew here, so none is counted twice after a stop
+        self._episodes = []  # all episodes restart here, so none is counted twice after an interruption
 
     def save(self, step: int) -> None:
         write_json(
@@ -186,7 +185,7 @@ class DistributionProposer(DesignProposer):
 
     @property
     def weights(self) -> np.ndarray:
-        """Share of each component, shape (components,)."""
+        """Weight of each component, shape (components,)."""
         shifted = np.exp(self.logits - self.logits.max())
         return shifted / shifted.sum()
 
@@ -225,7 +224,7 @@ class DistributionProposer(DesignProposer):
         self.logits = self.logits + rate_spread * (utility @ (share - weights))
 
     def best(self, model: SAC, count: int) -> np.ndarray:
-        """The means, heaviest first, then draws."""
+        """Return the means, those of the largest weights first, and then draws."""
         means = self.means[np.argsort(-self.weights)]
         rng = np.random.default_rng([self.config.seed, int(model.num_timesteps)])
         component = rng.choice(self.components, size=max(0, count - len(means)), p=self.weights)
@@ -240,14 +239,14 @@ PROPOSERS: dict[str, type[DesignProposer]] = {"critic": CriticProposer, "distrib
 def critic_values(
     model: SAC, environment: EnvironmentConfig, names: tuple[str, ...], bodies: np.ndarray, goals: int
 ) -> np.ndarray:
-    """Mean over goals of the smaller critic's value of the first state of an episode, under the mean action.
+    """Return the mean over goals of the smaller critic's value of the first state of an episode, under the mean action.
 
     Args:
-        model: policy and critics that see the body.
-        environment: where; its goals are drawn with a fixed seed, the same for every body.
+        model: policy and critics that observe the body.
+        environment: the environment; its goals are drawn with a fixed seed, the same for every body.
         names: variables of the bodies.
-        bodies: in unit coordinates, shape (n, k).
-        goals: number of them.
+        bodies: bodies in unit coordinates, shape (n, k).
+        goals: number of goals.
 
     Returns:
         Values, shape (n,).
@@ -264,7 +263,7 @@ def critic_values(
         ]
         one: Any = environment.make_vec(goals, sample_design=False)
         one.reset(seed=0)
-        paths = np.asarray(one.unwrapped._paths)
+        paths = np.asarray(one.unwrapped.paths)
         one.close()
         observation, _ = env.reset(
             seed=0,

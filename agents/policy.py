@@ -1,4 +1,4 @@
-"""Trained policies as files: safetensors and JSON, run without torch."""
+"""Trained policies: files in safetensors and JSON, evaluated without torch."""
 
 from __future__ import annotations
 
@@ -14,17 +14,15 @@ from softgym_envs.errors import ConfigError, DataError, WeightsError
 from softgym_envs.registry import class_path
 from softgym_envs.storage import atomic_write, read_json, write_json
 
-__all__ = ["Policy", "policy_path", "read_tensors", "save_policy"]
-
 FORMAT = 1
 _SHIPPED = Path(__file__).parent / "weights"
 
 
 def policy_path(policy: str | Path) -> Path:
-    """Return the file of a policy: a path, or the name of one that ships in ``agents/weights``.
+    """Return the file of a policy, given its path or the name of a policy in ``agents/weights``.
 
     Raises:
-        WeightsError: if there is neither.
+        WeightsError: if there is no such file or shipped policy.
     """
     path = Path(policy)
     if path.suffix == ".safetensors":
@@ -39,7 +37,7 @@ def policy_path(policy: str | Path) -> Path:
 
 
 def save_policy(path: Path, tensors: dict[str, np.ndarray], card: dict[str, Any]) -> None:
-    """Write ``policy.safetensors`` and its JSON card beside it, whose ``config`` is that of the training."""
+    """Write ``policy.safetensors`` and beside it its JSON card, whose ``config`` is that of the training."""
     from safetensors.numpy import save
 
     with atomic_write(path) as stream:
@@ -64,17 +62,18 @@ def read_tensors(path: str | Path) -> dict[str, np.ndarray]:
 
 
 class Policy:
-    """The mean action of a SAC actor.
+    """Policy that takes the mean action of a trained SAC actor.
 
     Args:
         path: ``policy.safetensors``, with its card beside it, or the name of a shipped policy.
 
     Attributes:
+        path: its file.
         card: its JSON card.
-        environment: where it was trained.
-        hidden: weights (d, w) and biases (w,) of the hidden layers.
-        mean: those of the last layer.
-        observation_size: d of the first one.
+        environment: the environment of the training.
+        hidden: weights (d, w) and biases (w,) of each hidden layer.
+        mean: weights and biases of the last layer.
+        observation_size: number of inputs.
 
     Raises:
         WeightsError: if a file is missing, damaged or of another version.
@@ -89,10 +88,10 @@ class Policy:
         except DataError as error:
             raise WeightsError(f"policy card {error}") from None
         if not isinstance(self.card, dict) or self.card.get("format") != FORMAT:
-            raise WeightsError(f"policy card '{card}' is not of format {FORMAT}")
+            raise WeightsError(f"policy card '{card}' must have format {FORMAT}")
         config = self.card.get("config")
         if not isinstance(config, dict) or not isinstance(config.get("environment"), dict):
-            raise WeightsError(f"policy card '{card}' lacks config.environment, where the policy was trained")
+            raise WeightsError(f"policy card '{card}' lacks config.environment, the environment of the training")
         try:
             self.environment = check_config(EnvironmentConfig, config["environment"], f"policy card '{card}'")
         except ConfigError as error:
@@ -109,12 +108,12 @@ class Policy:
         self.observation_size = int((self.hidden[0][0] if self.hidden else self.mean[0]).shape[0])
 
     def check_environment(self, environment: EnvironmentConfig) -> None:
-        """Refuse an environment in which observations or actions mean something else than where it was trained.
+        """Refuse an environment in which observations or actions have another meaning than in the training.
 
-        Backend, body, goals and ID may differ, as long as robot and task are the same.
+        Backend, body, goals and ID may differ if robot and task are the same.
 
         Raises:
-            ConfigError: naming the key, its value and that of the policy.
+            ConfigError: with the key, its value and that of the policy.
         """
         own = _meaning(self.environment)
         for key, (meaning, shown) in _meaning(environment).items():

@@ -1,4 +1,4 @@
-"""Tables and learning curves from stored runs (`agents.sweep` makes them)."""
+"""Tables and learning curves of stored runs, which `agents.sweep` writes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from agents.statistics import Estimate, crossed_estimate, stratified_estimate
 from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json
 
-__all__ = ["StoredRuns", "draw_curves", "load_runs", "table"]
-
 RESULTS = Path(__file__).parent / "results"
-"""Stored runs of the configurations that ship."""
+"""Stored runs of the configurations in ``configs/agents``."""
 
 AGENTS = {
     "sac": "SAC",
@@ -31,13 +29,13 @@ AGENTS = {
 
 @dataclass(frozen=True)
 class StoredRuns:
-    """All seeds of one configuration, and the agents that need no training on the same goals.
+    """All seeds of one configuration, and the baselines on the same goals.
 
     Attributes:
-        name: of the configuration.
-        environment: what was trained on.
-        runs: contents of ``seed<k>.json``, by seed.
-        baselines: contents of ``baselines.json``, empty where it is missing.
+        name: name of the configuration.
+        environment: environment of the training.
+        runs: the trainings, by seed.
+        baselines: evaluations of the baselines, empty if they were not run.
     """
 
     name: str
@@ -46,10 +44,10 @@ class StoredRuns:
     baselines: dict[str, Any]
 
     def scores(self, agent: str, backend: str, column: str) -> np.ndarray | None:
-        """One column of the final evaluation, shape (seeds, goals), or None where it was not made.
+        """Return one column of the final evaluation, shape (seeds, goals), or None if there is no such evaluation.
 
         Args:
-            agent: ``"sac"`` or the name of a baseline, of which there is one row.
+            agent: ``"sac"``, or the name of a baseline, which has a single row.
             backend: ``"own"`` for that of the environment, or ``"fem"``.
             column: ``"distances"``, ``"mean_distances"``, ``"returns"`` or ``"successes"``.
         """
@@ -66,7 +64,7 @@ class StoredRuns:
 
     @property
     def horizon(self) -> int:
-        """Steps of an episode, so that a return divided by it is at most 1."""
+        """Steps of an episode, the largest possible return."""
         return self.environment.row.max_episode_steps
 
 
@@ -74,7 +72,7 @@ def load_runs(folder: str | Path = RESULTS) -> list[StoredRuns]:
     """Read ``<config>/seed<k>.json`` and ``<config>/baselines.json`` of a folder.
 
     Raises:
-        DataError: if there are none, or a file cannot be read.
+        DataError: if there are no such files, or one cannot be read.
     """
     folder = Path(folder)
     found = []
@@ -85,7 +83,9 @@ def load_runs(folder: str | Path = RESULTS) -> list[StoredRuns]:
             environment = EnvironmentConfig.model_validate(runs[0]["config"]["environment"])
             found.append(StoredRuns(place.name, environment, runs, read_json(path) if path.exists() else {}))
     if not found:
-        raise DataError(f"'{folder}' holds no results (<config>/seed<k>.json); make them with python -m agents.sweep")
+        raise DataError(
+            f"'{folder}' contains no results (<config>/seed<k>.json); create them with python -m agents.sweep"
+        )
     return found
 
 
@@ -93,18 +93,18 @@ def _read_run(path: Path) -> dict[str, Any]:
     run = read_json(path)
     wanted = {"seed", "config", "curve", "evaluations", "horizon"}
     if not isinstance(run, dict) or not wanted <= run.keys():
-        raise DataError(f"'{path}' is no result of a training: it must hold {', '.join(sorted(wanted))}")
+        raise DataError(f"'{path}' is not the result of a training: it must contain {', '.join(sorted(wanted))}")
     return run
 
 
 def table(runs: list[StoredRuns]) -> str:
-    """Markdown: distances and success on the environment's own backend and on FEM, and all environments together."""
+    """Return Markdown tables of distances and success rates on the backend of the training and on FEM, and overall."""
     seeds = sorted({len(entry.runs) for entry in runs})
     text = [
         f"Interquartile means over all seeds ({' or '.join(map(str, seeds))}) and goals, with 95 % bootstrap intervals "
-        "over both (too short for three seeds that differ much: they cover about 80 %). Distances in mm: to the "
-        "goal at the end of an episode, or the mean along a path (track tasks, marked *). The step of the policy was "
-        "chosen on other goals.\n"
+        "over both (with three seeds that differ much, they cover only about 80 %). Distances are in mm: to the "
+        "goal at the end of an episode, or the mean along a path (track tasks, marked *). Policies were chosen on "
+        "other goals.\n"
     ]
     for backend, title in (("own", "On the backend of the training"), ("fem", "The same policies on FEM")):
         shown = [entry for entry in runs if backend == "own" or entry.environment.backend != "fem"]
@@ -143,11 +143,11 @@ def _present(estimate: Estimate, digits: int = 3) -> str:
 
 
 def _together(runs: list[StoredRuns]) -> str:
-    """Returns as a share of the largest, over environments: one task each, its plain configuration."""
+    """Return the table of returns over all environments, with the plain configuration of each task."""
     plain = [entry for entry in runs if not entry.environment.residual_scale and not entry.environment.sample_design]
     lines = [
-        "Return as a share of the largest possible one; interquartile mean over seeds and the plain configurations "
-        "(intervals: seeds resampled within each).\n",
+        "Return as a share of the largest possible return; interquartile mean over seeds and the plain configurations "
+        "(the intervals resample the seeds of each configuration).\n",
         "| backend | " + " | ".join(AGENTS.values()) + " |",
         "|---" * (len(AGENTS) + 1) + "|",
     ]
@@ -165,19 +165,20 @@ def _together(runs: list[StoredRuns]) -> str:
         lines.append(f"| {word} | " + " | ".join(cells) + " |")
     return (
         "\n".join(lines)
-        + "\n\nIn parentheses: how many environments; those with fewer seeds than the others are left out."
+        + "\n\nIn parentheses: number of environments; those with fewer seeds than the others are left out."
     )
 
 
 def draw_curves(runs: list[StoredRuns], path: str | Path, columns: int = 4) -> Path:
-    """Draw the mean return of the evaluations during training, a panel for each configuration: every seed and the mean.
+    """Draw the learning curves of every seed and their mean, in a panel for each configuration.
 
-    The dashed line is the inverse QP on the goals of the final evaluation.
+    The curves are mean returns of the evaluations during training; the dashed line is the inverse QP on the goals of
+    the final evaluation.
 
     Args:
-        runs: what to draw.
-        path: picture, its ending names the format.
-        columns: of panels.
+        runs: the runs.
+        path: image file; its ending selects the format.
+        columns: number of columns of panels.
 
     Returns:
         The path.

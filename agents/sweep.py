@@ -2,10 +2,10 @@
 
     python -m agents.sweep --configs configs/agents/*.yaml --seeds 0 1 2 --processes 16 --folder results/agents
 
-Trainings go to ``FOLDER/runs/<config>/seed<k>``, what `agents.results` reads to ``FOLDER/results/<config>``:
-``seed<k>.json`` for each policy and ``baselines.json`` for the agents that need no training, all on the same unseen
-goals. A finished part is not run again, and a training that was killed goes on from its checkpoint; what another
-configuration or another number of goals left in the folder is refused.
+Trainings go to ``FOLDER/runs/<config>/seed<k>``. Results, which `agents.results` reads, go to
+``FOLDER/results/<config>``: ``seed<k>.json`` for each policy and ``baselines.json`` for the agents that need no
+training, all on the same unseen goals. Finished jobs are not repeated, and an interrupted training resumes from its
+checkpoint. A folder with results of another configuration or number of goals is refused.
 """
 
 from __future__ import annotations
@@ -28,14 +28,12 @@ from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.executors import parallel_map
 from softgym_envs.storage import read_json, write_json
 
-__all__ = ["evaluate_baselines", "sweep", "train_and_evaluate", "unseen_goals"]
-
 TEST_SEED = 2_000_003
-"""Seed of the goals that no training and no choice of a policy sees."""
+"""Seed of the goals that are used neither in trainings nor to choose policies."""
 
 
 def unseen_goals(environment: EnvironmentConfig, count: int) -> tuple[list[dict[str, float]] | None, np.ndarray]:
-    """Bodies (None: the one body) and goals [m] (n, p, 3) of the final evaluation; n = 1 where all are the same."""
+    """Return bodies (None: the one body) and goals [m] (n, p, 3) of the final evaluation; n = 1 if all are equal."""
     from agents.evaluation import evaluation_set
 
     designs, goals = evaluation_set(environment, count, TEST_SEED)
@@ -47,7 +45,7 @@ def unseen_goals(environment: EnvironmentConfig, count: int) -> tuple[list[dict[
 def _evaluations(
     environment: EnvironmentConfig, agents: dict[str, str | Path], goals: int, fem_goals: int
 ) -> dict[str, dict[str, Any]]:
-    """Evaluate agents on the environment's backend and on FEM: ``{backend: {agent: columns}}``, SI."""
+    """Evaluate agents on the environment's backend and on FEM: ``{backend: {agent: evaluation}}``, SI."""
     from agents.evaluation import evaluate
 
     counts = _counts(environment, goals, fem_goals)
@@ -76,7 +74,7 @@ def _evaluations(
 
 
 def _counts(environment: EnvironmentConfig, goals: int, fem_goals: int) -> dict[str, int]:
-    """Number of goals on each backend that agents are evaluated on."""
+    """Return the number of goals for each backend that agents are evaluated on."""
     own = environment.backend
     asked = {"fem": fem_goals} if own == "fem" else {own: goals, "fem": fem_goals}
     return {backend: count for backend, count in asked.items() if count > 0}
@@ -110,22 +108,22 @@ def _finished(result: Path, config: TrainConfig, goals: int, fem_goals: int) -> 
             backend: len(next(iter(agents.values()))["distances"]) for backend, agents in stored["evaluations"].items()
         }
     except (KeyError, TypeError, AttributeError, StopIteration) as error:
-        raise DataError(f"{where} is not one of a sweep: {type(error).__name__} {error}") from None
+        raise DataError(f"{where} is not the result of a sweep: {type(error).__name__} {error}") from None
     other = difference(old, config)
     asked = _counts(config.environment, goals, fem_goals)
     if other is None and found != asked:
-        # A task whose goals are all the same is evaluated on one.
+        # A task whose goals are all equal is evaluated on one of them.
         if set(found.values()) == {1} and len(unseen_goals(config.environment, 2)[1]) == 1:
             asked = dict.fromkeys(asked, 1)
         if found != asked:
             other = f"goals = {found}, got {asked}"
     if other is not None:
-        raise DataError(f"{where} is of another sweep: {other}; use another folder")
+        raise DataError(f"{where} belongs to another sweep: {other}; choose another folder")
     return True
 
 
 def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goals: int) -> Path:
-    """Train one configuration with one seed and evaluate its policy; returns the file of the result."""
+    """Train one configuration with one seed, evaluate its policy and return the file of the result."""
     from agents.policy import Policy
     from agents.training import train
 
@@ -154,7 +152,7 @@ def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goal
 
 
 def evaluate_baselines(path: Path, folder: Path, goals: int, fem_goals: int) -> Path:
-    """Evaluate the agents that need no training on the goals of a configuration; returns the file of the result."""
+    """Evaluate the agents that need no training on the goals of a configuration; return the file of the result."""
     result = folder / "results" / path.stem / "baselines.json"
     config = load_config(path, TrainConfig)
     if _finished(result, config, goals, fem_goals):
@@ -174,7 +172,7 @@ def evaluate_baselines(path: Path, folder: Path, goals: int, fem_goals: int) -> 
 
 
 def _attempt(function: Callable[..., Path], arguments: tuple[Any, ...]) -> tuple[str, str | None]:
-    """Run a job; an error of one must not end the others."""
+    """Run a job and return its label and traceback, so that the error of one job does not end the others."""
     label = " ".join(str(a) for a in arguments[:2] if not isinstance(a, Path)) or "baselines"
     label = f"{arguments[0].stem} {label}"
     try:
@@ -185,7 +183,7 @@ def _attempt(function: Callable[..., Path], arguments: tuple[Any, ...]) -> tuple
 
 
 def _cost(config: TrainConfig) -> float:
-    """Rough CPU seconds of a training, to begin with the longest."""
+    """Return the rough CPU time of a training [s]; the longest trainings run first."""
     step = 0.02 if config.environment.backend == "fem" else 1e-4
     return config.steps * (step + 0.005 * config.sac.gradient_steps / config.num_envs)
 
@@ -199,19 +197,18 @@ def sweep(
     goals: int = 100,
     fem_goals: int = 10,
 ) -> int:
-    """Run every configuration with every seed, and the baselines of each; returns how many jobs failed.
+    """Run every configuration with every seed, and its baselines; return the number of failed jobs.
 
     Args:
         configs: YAML files of `TrainConfig`.
-        seeds: of the trainings.
-        processes: at a time.
-        folder: where everything goes.
-        goals: unseen goals on surrogates.
-        fem_goals: unseen goals on FEM: of environments that are on FEM themselves the only ones, of others beside
-            those on the surrogate, where 0 is none.
+        seeds: seeds of the trainings.
+        processes: number of processes.
+        folder: folder of all results.
+        goals: number of unseen goals on the surrogate.
+        fem_goals: number of unseen goals on FEM; 0 skips FEM for environments on the surrogate.
 
     Raises:
-        ConfigError: before anything runs, if a file is not valid or an environment would be evaluated on no goal.
+        ConfigError: before anything runs, if a file is not valid or an environment would not be evaluated.
         DataError: before anything runs, if the folder holds results of another configuration or number of goals.
     """
     loaded = {path: load_config(path, TrainConfig) for path in configs}
@@ -229,7 +226,7 @@ def sweep(
             jobs.append((0.0, evaluate_baselines, (path, folder, goals, fem_goals)))
     before = len(loaded) * (len(seeds) + 1) - len(jobs)
     if before:
-        print(f"{before} jobs were finished before", flush=True)
+        print(f"{before} jobs are already finished", flush=True)
     jobs.sort(key=lambda job: -job[0])
     begun, failed = time.perf_counter(), 0
     finished = parallel_map(_attempt, [job[1:] for job in jobs], processes)
@@ -246,15 +243,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--goals", type=int, default=100, help="unseen goals on surrogates")
+    parser.add_argument("--goals", type=int, default=100, help="number of unseen goals on the surrogate")
     parser.add_argument(
         "--fem-goals",
         type=int,
         default=10,
-        help="unseen goals on FEM, also of environments trained there; 0 for none, where all are on surrogates",
+        help="number of unseen goals on FEM; 0 skips FEM for environments on the surrogate",
     )
     given = parser.parse_args(arguments)
-    # Read by the worker processes, which are started afterwards.
+    # Worker processes, which start later, read these variables.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
     if find_spec("platformdirs") is None:

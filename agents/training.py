@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from agents.joint import DesignProposer
 
-__all__ = ["cpu_before", "train"]
 
 EVALUATION_SEED = 1_000_003
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "ends")
@@ -40,29 +39,29 @@ def train(
     proposer: DesignProposer | None = None,
     progress: bool = True,
 ) -> Path:
-    """Train a SAC policy, or go on with an interrupted training in ``folder``.
+    """Train a SAC policy, or resume an interrupted training in ``folder``.
 
-    Writes ``policy.safetensors`` (actor and critics) with its card, ``curve.csv``, TensorBoard logs where TensorBoard
-    is installed, and a ``checkpoint.safetensors`` from which a run that was stopped resumes as if it had not been
-    (weights, optimiser moments, replay buffer and random states; all episodes start anew after each evaluation). The
-    policy is the one with the largest mean return among those that were evaluated; the card names its step, and the CPU
-    time of all processes that the training took.
+    Writes ``policy.safetensors`` (actor and critics) with its card, ``curve.csv``, and TensorBoard logs if TensorBoard
+    is installed. Until the end, ``checkpoint.safetensors`` holds weights, optimiser moments, replay buffer and random
+    states, so that a resumed training gives the same policy as an uninterrupted one (all episodes restart after each
+    evaluation). The policy is the evaluated one with the largest mean return; the card gives its step, and the CPU time
+    of all processes that took part in the training.
 
     Args:
-        config: what to train.
-        folder: where the results go.
-        initial: policy to start from (actor and critics): a file or the name of a shipped one; overrides that of the
+        config: configuration of the training.
+        folder: folder of the results.
+        initial: initial policy (actor and critics): a file or the name of a shipped one; replaces that of the
             configuration.
-        report: called after each evaluation with its step and outcome, and when a training goes on with those of the
-            last, as it may have ended before that call; True stops the training early.
-        proposer: draws the sampled bodies, and learns along with the policy; default: evenly over their box.
+        report: called with step and outcome after each evaluation, and on resuming with those of the last one, for
+            which it may not have been called; returning True stops the training.
+        proposer: draws the sampled bodies and learns along with the policy; default a uniform draw from the box.
         progress: show a progress bar.
 
     Returns:
         The path of ``policy.safetensors``.
 
     Raises:
-        ValueError: if the environment cannot be made; a new folder is then not begun.
+        ValueError: if the environment cannot be made; a new folder is then not created.
         ConfigError: if ``initial`` was trained for another environment, or the folder's configuration cannot be read.
         DataError: if the folder holds the training of another configuration.
         WeightsError: if ``initial`` or a checkpoint is damaged or does not fit.
@@ -80,7 +79,7 @@ def train(
     if begun:
         other = difference(load_config(resolved, TrainConfig), config)
         if other is not None:
-            raise DataError(f"'{folder}' holds a training with another configuration: {other}; use a new folder")
+            raise DataError(f"'{folder}' holds a training with another configuration: {other}; choose a new folder")
         if result.exists():
             return result
 
@@ -100,7 +99,7 @@ def train(
     if proposer is not None:
         proposer.attach(model, config, folder)
     designs, goals = evaluation_set(config.environment, config.evaluation_episodes, EVALUATION_SEED)
-    if not begun:  # wrong values have shown themselves: only now is the folder taken
+    if not begun:  # after all checks, so that wrong values do not leave a folder behind
         save_resolved(folder, config)
     _log_to(model, folder)
 
@@ -126,7 +125,7 @@ def train(
                     "mean_return": outcome.mean_return,
                 }
             )
-            # A proposer leaves the bodies of the evaluation behind: its policy is the last one.
+            # A proposer concentrates on other bodies than those of the evaluation, so its last policy counts.
             if proposer is not None or curve[-1]["mean_return"] >= max(row["mean_return"] for row in curve):
                 best = _weights(model)
             bar.set_postfix_str(f"success {outcome.success_rate:.0%}, distance {1e3 * outcome.mean_distance:.2f} mm")
@@ -157,18 +156,18 @@ def train(
 
 
 def cpu_before(policy: Path, began: float) -> float:
-    """CPU time [s] that earlier processes spent on a training which this one took up.
+    """Return the CPU time [s] that earlier processes spent on a training that this process resumed.
 
     Args:
         policy: what `train` returned.
-        began: ``time.process_time()`` before that call.
+        began: ``time.process_time()`` before the call of `train`.
     """
     card = read_json(policy.with_suffix(".json"))
     return max(0.0, card.get("cpu_seconds", 0.0) - (time.process_time() - began))
 
 
 def _best_step(curve: list[dict[str, float]]) -> int:
-    """Step of the evaluation with the largest mean return, the last of equal ones."""
+    """Return the step of the evaluation with the largest mean return, the last one among equals."""
     return int(max(curve, key=lambda row: (row["mean_return"], row["step"]))["step"])
 
 
@@ -206,14 +205,14 @@ def _make_model(config: TrainConfig) -> SAC:
         device="cpu",
         **buffer,
     )
-    # stable-baselines3 counts progress within one call of learn(); ours spans the whole training.
+    # stable-baselines3 measures progress within one call of learn(), but a training consists of many.
     fall = sac.final_learning_rate - sac.learning_rate
     model.lr_schedule = lambda _: sac.learning_rate + fall * min(model.num_timesteps / config.steps, 1.0)
     return model
 
 
 def _log_to(model: SAC, folder: Path) -> None:
-    """Write the model's log to a folder, where TensorBoard is installed."""
+    """Write the model's log to a folder if TensorBoard is installed."""
     from stable_baselines3.common.logger import configure
 
     formats = ["tensorboard"] if find_spec("tensorboard") else []
@@ -221,7 +220,7 @@ def _log_to(model: SAC, folder: Path) -> None:
 
 
 def _learn(model: SAC, target: int, bar: Any) -> None:
-    """Advance to ``target`` steps from new episodes, showing them on the bar."""
+    """Train up to ``target`` steps, beginning with new episodes, and show progress on the bar."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Tick(BaseCallback):
@@ -229,7 +228,7 @@ def _learn(model: SAC, target: int, bar: Any) -> None:
             bar.update(self.training_env.num_envs)
             return True
 
-    # A resumed run cannot go on with running episodes and generators in other processes, so no run does.
+    # A resumed run cannot restore running episodes or the generators of other processes, so every run restarts them.
     model._last_obs = None
     if model.num_timesteps:
         seeds = np.random.SeedSequence([model.seed or 0, model.num_timesteps])
@@ -296,7 +295,7 @@ def _save_checkpoint(
         if hasattr(buffer, name):
             tensors[f"buffer/{name}"] = getattr(buffer, name)[:filled]
     tensors["random/torch"] = torch.get_rng_state().numpy()
-    _, keys, *position = np.random.get_state()  # noqa: NPY002 - stable-baselines3 samples with the global generator
+    _, keys, *position = np.random.get_state()  # noqa: NPY002 - generator of stable-baselines3
     tensors["random/numpy"] = np.asarray(keys)
     meta = {
         "step": int(model.num_timesteps),
@@ -315,10 +314,10 @@ def _save_checkpoint(
 
 
 def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, np.ndarray], Evaluation, float]:
-    """Take up a checkpoint.
+    """Restore a model from a checkpoint.
 
     Returns:
-        The learning curve, the weights of the best policy so far, the last evaluation, and the CPU time spent [s].
+        Learning curve, weights of the best policy so far, last evaluation, and CPU time spent so far [s].
     """
     import torch
     from safetensors import safe_open

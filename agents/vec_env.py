@@ -1,4 +1,4 @@
-"""The batched environment as stable-baselines3 wants it."""
+"""Batched environments for stable-baselines3."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env import VecEnv
 
-__all__ = ["SB3VecEnv"]
-
 
 class SB3VecEnv(VecEnv):
     """Adapter from a `gymnasium.vector.VectorEnv` with same-step autoreset to a stable-baselines3 `VecEnv`.
 
     Raises:
-        ValueError: for another autoreset mode, whose first observations stable-baselines3 would take for steps.
+        ValueError: for another autoreset mode, whose resets stable-baselines3 would count as steps.
     """
 
     def __init__(self, env: VectorEnv) -> None:
@@ -27,7 +25,7 @@ class SB3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions: np.ndarray | None = None
         self._seed: int | None = None
-        #: Called at the end of each episode with its sub-environment and its return.
+        #: Called at the end of each episode with the index of its sub-environment and its return.
         self.on_episode: Callable[[int, float], None] = lambda index, total: None
 
     def reset(self) -> np.ndarray:
@@ -67,7 +65,7 @@ class SB3VecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        # stable-baselines3 asks for render_mode of any environment; other names must exist.
+        # stable-baselines3 reads render_mode from every environment; other attributes must exist.
         value = getattr(self.env, attr_name, None) if attr_name == "render_mode" else getattr(self.env, attr_name)
         return [value] * len(list(self._get_indices(indices)))
 

@@ -55,9 +55,10 @@ def evaluate(
 
     CONFIG is the file of their training.
     """
+    from agents.baselines import BASELINES
     from agents.config import TrainConfig
-    from agents.evaluation import AGENTS, sample_goals
     from agents.evaluation import evaluate as run
+    from agents.evaluation import sample_goals
     from agents.policy import Policy
     from softgym_envs.config import load_config, provenance
     from softgym_envs.storage import write_json
@@ -67,7 +68,7 @@ def evaluate(
     if goals < 1:
         raise ConfigError(f"--goals {goals} must be at least 1")
     for agent in agents:  # reject a wrong policy before the others are evaluated
-        if agent not in AGENTS:
+        if agent not in BASELINES:
             Policy(agent).check_environment(environment)
     points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
     results: list[dict[str, Any]] = []

@@ -41,14 +41,15 @@ def rollout(
 ) -> None:
     """Run one episode and print its result."""
     import softgym_envs  # noqa: F401 - registers the IDs
+    from agents.baselines import BASELINES
     from agents.config import EnvironmentConfig
-    from agents.evaluation import AGENTS, make_agent
+    from agents.evaluation import make_agent
     from agents.policy import Policy
     from softgym_envs.config import check_config
 
     chosen = options.design_of(design)
     # A policy needs the observations and actions of its training.
-    policy = None if agent in AGENTS else Policy(agent)
+    policy = None if agent in BASELINES else Policy(agent)
     trained = {} if policy is None else policy.environment.model_dump()
     config = check_config(EnvironmentConfig, {**trained, "id": environment}, "rollout")
     if policy is not None:

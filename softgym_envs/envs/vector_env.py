@@ -201,6 +201,11 @@ class SoftRobotVectorEnv(VectorEnv):
         return self.task.goals(self._paths, self._counts, self._steps)
 
     @property
+    def paths(self) -> np.ndarray:
+        """Goals of the present episodes [m], shape (num_envs, p, 3)."""
+        return self._paths
+
+    @property
     def condensed(self) -> CondensedModel:
         """Condensed models of the present states, evaluated when asked for; leading shape (num_envs,)."""
         batch = self.model.condensed(self._context, self._displacement)

@@ -154,5 +154,5 @@ def test_hindsight_on_top_of_the_qp_is_refused():
 
 def test_a_moving_goal_is_refused():
     env = EnvironmentConfig(id="SoftGym/DiamondTrack-v0").make_vec(2)
-    with pytest.raises(ValueError, match=r"hindsight = 0\.5 needs a goal that stays; task 'track'"):
+    with pytest.raises(ValueError, match=r"hindsight = 0\.5 needs a fixed goal, task 'track'"):
         make_buffer(env, share=0.5)

@@ -142,7 +142,7 @@ def test_a_sweep_refuses_results_of_another(swept, tmp_path):
     given = {"goals": 5, "fem_goals": 2}
     other = tmp_path / "tiny.yaml"
     other.write_text(TINY.replace("gradient_steps: 1", "gradient_steps: 2"))
-    with pytest.raises(DataError, match=r"seed0\.json' is of another sweep: sac\.gradient_steps = 1, got 2"):
+    with pytest.raises(DataError, match=r"seed0\.json' belongs to another sweep: sac\.gradient_steps = 1, got 2"):
         sweep.sweep([other], [0], 1, out, **given)
     other.write_text(TINY.replace("v0}", "v0, action_mode: absolute}"))
     with pytest.raises(DataError, match=r"baselines\.json' .*: environment\.action_mode = 'increment', got 'absolute'"):
@@ -156,7 +156,7 @@ def test_a_sweep_refuses_results_of_another(swept, tmp_path):
         sweep.sweep([swept / "tiny.yaml"], [1], 1, tmp_path / "moved", **given)
     for text in ("{", "[]", '{"environment": {"id": "SoftGym/FingerReach-v0"}}'):
         (moved / "seed1.json").write_text(text)
-        with pytest.raises(DataError, match=r"seed1\.json' (cannot be read|is not one of a sweep)"):
+        with pytest.raises(DataError, match=r"seed1\.json' (cannot be read|is not the result of a sweep)"):
             sweep.sweep([swept / "tiny.yaml"], [1], 1, tmp_path / "moved", **given)
 
 
@@ -215,7 +215,7 @@ def test_the_table_and_the_curves(swept, tmp_path):
     assert "seeds (2)" in text
     picture = draw_curves(runs, tmp_path / "curves.png")
     assert picture.read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(DataError, match="holds no results"):
+    with pytest.raises(DataError, match="contains no results"):
         load_runs(tmp_path)
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "seed0.json").write_text("{")

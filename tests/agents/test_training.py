@@ -176,7 +176,7 @@ def test_a_wrong_environment_takes_no_folder(option, tmp_path):
 
 
 def test_a_training_that_would_learn_nothing_is_refused():
-    with pytest.raises(ValueError, match=r"sac\.learning_starts = 1000 is not below steps = 1000.*allowed: 0 to 999"):
+    with pytest.raises(ValueError, match=r"sac\.learning_starts = 1000 must be below steps = 1000.*allowed: 0 to 999"):
         TrainConfig.model_validate({"environment": {"id": "SoftGym/FingerReach-v0"}, "steps": 1000})
 
 
@@ -258,7 +258,7 @@ def test_damaged_policies(trained, tmp_path):
     card = broken.with_suffix(".json")
     for text, message in (
         ("{", "cannot be read"),
-        ('{"format": 2}', "is not of format 1"),
+        ('{"format": 2}', "must have format 1"),
         ('{"format": 1}', r"lacks config\.environment"),
         ('{"format": 1, "config": {"environment": {"id": "Foo"}}}', "unknown environment 'Foo'"),
     ):
