@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from softgym_envs.designs import DesignSpace as DesignSpace
     from softgym_envs.designs import DesignVariable as DesignVariable
     from softgym_envs.envs.registration import ENVIRONMENTS as ENVIRONMENTS
+    from softgym_envs.envs.registration import register_environment as register_environment
+    from softgym_envs.envs.tasks.registry import register_task as register_task
     from softgym_envs.errors import ConfigError as ConfigError
     from softgym_envs.errors import ConvergenceError as ConvergenceError
     from softgym_envs.errors import DataError as DataError
@@ -29,7 +31,8 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "designs": ["Design", "DesignSpace", "DesignVariable"],
-        "envs.registration": ["ENVIRONMENTS"],
+        "envs.registration": ["ENVIRONMENTS", "register_environment"],
+        "envs.tasks.registry": ["register_task"],
         "errors": [
             "ConfigError",
             "ConvergenceError",
