@@ -108,6 +108,8 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
     from softgym_envs.config import load_config
 
     study = load_config(config, CalibrationConfig, overrides)
+    if not Path(study.data).exists() and (beside := config.parent / study.data).exists():
+        study = study.model_copy(update={"data": str(beside)})
     folder = Path("results") / study.name if folder is None else folder
     result = run(study, folder)
     for name, value in {**{name: result.design[name] for name in study.fit}, **result.nuisances}.items():

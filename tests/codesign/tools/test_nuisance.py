@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from codesign.tools.box import Box
 from codesign.tools.calibration import calibrate, make_misfit
 from codesign.tools.config import CalibrationConfig
 from codesign.tools.contact import Plane
-from codesign.tools.measurements import measure
+from codesign.tools.measurements import measure, write_measurements
 from codesign.tools.misfit import LearnedMisfit
 from codesign.tools.nuisance import ContactConfig, OffsetConfig
 from codesign.tools.parameters import Parameters
-from softgym_envs.config import check_config
+from softgym_envs.cli.codesign import calibrate as calibrate_command
+from softgym_envs.config import check_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.robots import make_robot
 
@@ -141,6 +144,21 @@ def test_a_robot_option_is_fitted_on_fem():
         "test",
     )  # fmt: skip
     assert calibrate(config, data=data).design["robot.button_force"] == pytest.approx(1.4, rel=1e-4)
+
+
+def test_the_command_reads_data_beside_its_configuration(finger, tensions, tmp_path, monkeypatch):
+    folder, elsewhere = tmp_path / "study", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    write_measurements(folder / "tensions.csv", finger, tensions)
+    config = configured("young_modulus", nuisances={"zero": OFFSET}, data="tensions.csv", level=None)
+    save_resolved(folder, config)
+    done = CliRunner().invoke(calibrate_command, ["--config", str(folder / "config.yaml"), "--folder", "out"])
+    assert done.exit_code == 0, done.output
+    assert "young_modulus = 2.2" in done.output and "zero = 0." in done.output
+    assert json.loads((elsewhere / "out" / "result.json").read_text())["nuisances"]["zero"] == pytest.approx(
+        0.8, abs=0.03
+    )
 
 
 @pytest.mark.parametrize(
