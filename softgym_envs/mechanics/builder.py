@@ -1,4 +1,4 @@
-"""Putting bodies together: solids, beams and rigid parts become one model."""
+"""ModelBuilder: solids, beams and rigid parts become one model."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from softgym_envs.mechanics.solids import Fixed, solid_part
 
 
 class ModelBuilder:
-    """Collects parts, then builds a `MechanicalModel`. Each part returns where its rows begin.
+    """Collects parts and builds a `MechanicalModel` from them. Adding a part returns its first row.
 
     Args:
         gravity: acceleration [m/s2], shape (3,).
-        floating: allow bodies that nothing holds.
+        floating: allow bodies that no fixed node holds.
         solver: name of the linear solver.
     """
 
@@ -67,9 +67,9 @@ class ModelBuilder:
         Args:
             position: [m], shape (3,).
             rotation: matrix (3, 3), default identity.
-            fixed: origin held, all of it or by axis of space.
-            fixed_spin: spin held, all of it or by axis of space.
-            on: first row of another frame that this one is fixed to.
+            fixed: whether the origin is held, as a whole or by axis of space.
+            fixed_spin: whether the rotation is held, as a whole or by axis of space.
+            on: first row of another frame on which this one is mounted.
 
         Returns:
             Its first row.
@@ -78,7 +78,7 @@ class ModelBuilder:
         mask[0] = fixed
         start = self._append(frame_rows(position, rotation), mask)
         if on is not None and on not in self._frames:
-            raise ValueError(f"there is no frame at row {on} to mount on; frames: {self._frames}")
+            raise ValueError(f"no frame begins at row {on} to mount on; frames begin at {self._frames}")
         if on is not None:
             self._mounted.setdefault(self._frames.index(on), []).append(start)
             return start
@@ -87,7 +87,7 @@ class ModelBuilder:
         return start
 
     def carry(self, frame: int, rows: np.ndarray) -> None:
-        """Let mesh nodes move with the frame at a row."""
+        """Attach mesh nodes to the frame at a row, so that they move with it."""
         if frame not in self._frames:
             raise ValueError(f"no frame begins at row {frame}; frames begin at {self._frames}")
         index = self._frames.index(frame)
@@ -96,17 +96,17 @@ class ModelBuilder:
     def add_beam(self, frames: Sequence[int] | np.ndarray, *, section: Section | list[Section], **options) -> None:
         """Add beam elements along frames that were added before; options as for `Beam`."""
         known = {*self._frames, *(row for rows in self._mounted.values() for row in rows)}
-        strange = [int(row) for row in frames if int(row) not in known]
-        if strange:
-            raise ValueError(f"there is no frame at row {strange[0]} for a beam; frames: {sorted(known)}")
+        unknown = [int(row) for row in frames if int(row) not in known]
+        if unknown:
+            raise ValueError(f"no frame begins at row {unknown[0]} for a beam; frames begin at {sorted(known)}")
         self._parts.append((Beam, np.asarray(frames, dtype=np.int64), {"section": section, **options}))
 
     def add_mass(self, frame: int, mass: float, inertia: np.ndarray) -> None:
-        """Give the rigid part at a frame its mass [kg] and its inertia along the directors [kg m2], shape (3, 3)."""
+        """Give the rigid part at a frame a mass [kg] and an inertia along the directors [kg m2], shape (3, 3)."""
         self._parts.append((RigidBody, np.array(frame), {"mass": mass, "inertia": inertia}))
 
     def build(self) -> MechanicalModel:
-        """Return the model. Blocks come in the order in which they were added."""
+        """Return the model, with its blocks in the order in which they were added."""
         nodes = np.vstack(self._rows)
         blocks = [kind(nodes, topology, **options) for kind, topology, options in self._parts]  # type: ignore[call-arg]
         return MechanicalModel(

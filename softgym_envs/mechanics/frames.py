@@ -1,9 +1,9 @@
-"""Frames: rigid parts and beam nodes, and all that they carry.
+"""Frames: rigid parts and beam nodes, and everything that they carry.
 
 A frame takes four rows of the position array ``x``: its origin and its three directors (the columns of its rotation
-matrix). Every other thing about it is linear in these rows: a point of a rigid part is ``origin + sum X_k d_k``, a
-beam's strains are products of rows. So elements and constraints treat all rows alike, and one kinematic map says how
-rows move: directors, and mesh nodes that a frame carries, follow the frame's six degrees of freedom,
+matrix). Everything else about a frame is linear in these rows: a point of a rigid part is ``origin + sum X_k d_k``, a
+beam's strains are products of rows. So elements and constraints treat all rows alike, and one kinematic map describes
+how rows move: directors, and mesh nodes that a frame carries, follow the frame's six degrees of freedom,
 
     x = c p + r,  r = sum_k X_k d_k,    dx = c dp + w x r,    d2x = w x (w x r)
 
@@ -72,7 +72,7 @@ def _displace(x, rows, carried, owner, moves, arm, translation, turn, out):
             for i in range(3):
                 for j in range(3):
                     turned[k, i] += turn[f, i, j] * x[rows[f] + 1 + k, j]
-        # Round-off must not add up over a long motion.
+        # Orthonormalise, so that round-off does not accumulate over a long motion.
         for k in range(3):
             for m in range(3):
                 gram[k, m] = turned[k, 0] * turned[m, 0] + turned[k, 1] * turned[m, 1] + turned[k, 2] * turned[m, 2]
@@ -144,7 +144,7 @@ class Frames:
         nodes: rest rows [m], shape (n, 3).
         rows: first row (the origin) of each frame, shape (f,).
         carried: mesh nodes that move with a frame: index of the frame -> rows.
-        mounted: frames that are fixed to another one, and are none of ``rows``: index of the frame -> first rows.
+        mounted: frames that are fixed to another one, and not among ``rows``: index of the frame -> first rows.
 
     Attributes:
         rows: as given.
@@ -170,7 +170,7 @@ class Frames:
         for table, mount in ((carried or {}, False), (mounted or {}, True)):
             for frame, ids in table.items():
                 if not 0 <= frame < count:
-                    raise ValueError(f"rows are carried by frame {frame}, the model has {count}")
+                    raise ValueError(f"rows are carried by frame {frame}, but the model has {count} frames")
                 first = np.unique(np.asarray(ids, dtype=np.int64))
                 parts.append((np.full(len(first), frame), first, 1.0))
                 if mount:
@@ -180,7 +180,7 @@ class Frames:
         self.carried = np.concatenate([rows for _, rows, _ in parts]).astype(np.int64)
         taken = np.concatenate([self.rows, self.carried])
         if len(np.unique(taken)) != len(taken) or (len(taken) and taken.max() >= len(nodes)):
-            raise ValueError("frames overlap, or a row is carried by two frames")
+            raise ValueError("two frames overlap, or a row is carried by two frames")
         bases = np.array([nodes[row + 1 : row + 4] for row in self.rows]).reshape(count, 3, 3)
         if not np.allclose(bases @ np.swapaxes(bases, 1, 2), np.eye(3), atol=1e-9):
             raise ValueError("the directors of a frame are not orthonormal")
@@ -209,7 +209,7 @@ class Frames:
 
 
 class KinematicMap:
-    """How the independent degrees of freedom move carried rows, with fixed index structure.
+    """Linear map from the equations to the motion of carried rows, with a fixed sparsity pattern.
 
     Args:
         frames: the frames.
@@ -245,11 +245,11 @@ class KinematicMap:
         )
         #: Its transpose, on the same data.
         self.transposed = self.matrix.T
-        # The same with the identity of the free equations before it.
+        # Terms of the map with the identity of the equations before it.
         self._start = np.concatenate([np.arange(size), size + pointers])
         self._column = np.concatenate([np.arange(size), np.array(columns, dtype=np.int64)])
         self._coefficient = np.ones(len(self._column))
-        # Spin block of each frame that gets the second derivative of its carried rows.
+        # Pairs of spins of each frame to which the second derivative of its carried rows is added.
         pairs = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
         self._spin = spin
         self.spin_pairs = np.array(
@@ -259,10 +259,10 @@ class KinematicMap:
 
     def __setstate__(self, state: dict) -> None:
         self.__dict__.update(state)
-        self.transposed = self.matrix.T  # a copy has to share its data, too
+        self.transposed = self.matrix.T  # also in a copy, both must share their data
 
     def linearise(self, x: np.ndarray) -> np.ndarray:
-        """Bring the map to positions ``x`` (n, 3); returns the vectors r of the carried rows, shape (c, 3)."""
+        """Update the map at positions ``x`` (n, 3) and return the vectors r of the carried rows, shape (c, 3)."""
         arms = self.frames.arms(x)
         data = self._sign * arms.ravel()[self._source] + self._constant
         self.matrix.data[:] = data

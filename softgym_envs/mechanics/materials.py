@@ -14,8 +14,6 @@ from numba import njit
 
 from softgym_envs.errors import unknown_name
 
-__all__ = ["MATERIALS", "Corotational", "Material", "StableNeoHookean", "lame_parameters", "resolve_material"]
-
 
 def lame_parameters(young_modulus: float, poisson_ratio: float) -> tuple[float, float]:
     """Return Lame's (mu, lambda) [Pa] of Young's modulus [Pa] and Poisson's ratio.
@@ -220,7 +218,7 @@ def _stable_neo_hookean(F, mu, lame, energy, stress, tangent):
         for k in range(9):
             ic += f[k] * f[k]
         energy[e] = 0.5 * m * (ic - 3.0) + 0.5 * la * (J - alpha) ** 2 - 0.5 * m * math.log(ic + 1.0)
-        # The value at rest is not zero; shift so that the undeformed energy is.
+        # Shift the energy so that it is zero at rest.
         energy[e] -= 0.5 * la * (1.0 - alpha) ** 2 - 0.5 * m * math.log(4.0)
         a = m * (1.0 - 1.0 / (ic + 1.0))
         b = la * (J - alpha)

@@ -1,4 +1,4 @@
-"""Surfaces of beams and rigid parts, for pictures and export; they have no part in the mechanics."""
+"""Surfaces of beams and rigid parts, for pictures and export; they do not affect the mechanics."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import numpy as np
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.beams import Beam
 
-__all__ = ["Skin", "box_skin", "tube_skin"]
-
 
 @dataclass(frozen=True)
 class Skin:
@@ -20,7 +18,7 @@ class Skin:
     Attributes:
         points: the vertices, as points of frames (v of them).
         triangles: vertex indices, seen counter-clockwise from outside, shape (t, 3).
-        rigid: it is an object, not a part of the soft body.
+        rigid: whether it is a rigid object rather than a part of the soft body.
     """
 
     points: EmbeddedPoints
@@ -34,7 +32,7 @@ def tube_skin(beam: Beam, nodes: np.ndarray, outline: np.ndarray) -> Skin:
     Args:
         beam: the beam.
         nodes: rest rows [m], shape (n, 3).
-        outline: corners [m] along d_2 and d_3, counter-clockwise, shape (k, 2) or, one for each frame, (c, k, 2).
+        outline: corners [m] along d_2 and d_3, counter-clockwise, shape (k, 2), or (c, k, 2) for one outline per frame.
     """
     count = len(beam.chain)
     corners = np.broadcast_to(np.asarray(outline, dtype=float), (count, *np.shape(outline)[-2:]))

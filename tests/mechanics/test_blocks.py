@@ -372,7 +372,7 @@ def test_beams_of_other_shapes_are_refused():
         ({"order": 3}, "order = 3 of the beam is unknown"),
         ({"order": 2}, "a beam of order 2 needs 2 k . 1 frames, got 4"),
         ({"chain": [0]}, "got 1"),
-        ({"order": 1, "chain": [0, 0]}, "lie in one place"),
+        ({"order": 1, "chain": [0, 0]}, "two frames of a beam coincide"),
         ({"order": 1, "section": [Section.circle(0.01)]}, "3 elements, got 1 sections"),
         ({"order": 1, "young_modulus": 0.0}, "young_modulus = 0.0 Pa"),
         ({"order": 1, "young_modulus": np.nan}, "young_modulus"),

@@ -474,7 +474,7 @@ def test_bond_ties_one_point_to_one_point(mesh):
     nodes, tetrahedra = mesh
     two = EmbeddedPoints(np.full((2, 3), 0.5), nodes, tetrahedra)
     for pair in ((two, two), (two, np.zeros(3))):
-        with pytest.raises(ValueError, match="bond 'b' ties one point to one point"):
+        with pytest.raises(ValueError, match="bond 'b' needs exactly one point on each side"):
             Bond("b", *pair)
 
 

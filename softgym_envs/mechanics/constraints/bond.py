@@ -7,11 +7,9 @@ import numpy as np
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 
-__all__ = ["Bond"]
-
 
 class Bond(Constraint):
-    """Point ``first`` minus point ``second`` [m], held at ``gap`` by a force [N] on the first and its reaction.
+    """Point ``first`` minus point ``second`` [m], held at ``gap`` by a force [N] on the first and its opposite.
 
     Bilateral, without friction or rotation: a ball joint. Under the role ``"b"`` of a model it is always held, and is
     eliminated from the condensed model.
@@ -44,7 +42,7 @@ class Bond(Constraint):
                 f"gap and position of bond '{name}' must be three finite numbers, got {self._anchor.tolist()}"
             )
         if any(len(points.node_ids) != 1 for points in (first, second) if isinstance(points, EmbeddedPoints)):
-            raise ValueError(f"bond '{name}' ties one point to one point")
+            raise ValueError(f"bond '{name}' needs exactly one point on each side")
         self._ids, self._weights = np.concatenate(ids), np.concatenate(weights)
         nodes, slot = np.unique(self._ids, return_inverse=True)
         self.dofs = (3 * nodes[:, None] + np.arange(3)).ravel()

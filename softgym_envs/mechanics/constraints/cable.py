@@ -8,8 +8,6 @@ from numba import njit
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 
-__all__ = ["Cable"]
-
 
 @njit(cache=True, error_model="numpy")
 def _cable_points(x, ids, weights, pull, points):
@@ -85,7 +83,7 @@ class Cable(Constraint):
         name: identifier.
         embedding: the points in order from the pull point to the anchor.
         pull_point: fixed point where the cable leaves the body [m], shape (3,).
-        unilateral: a real cable cannot push. False lets it, as some published scenes do.
+        unilateral: a real cable cannot push. False allows it, as some published models do.
 
     Raises:
         ValueError: if two successive points coincide.

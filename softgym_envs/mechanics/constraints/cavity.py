@@ -9,9 +9,6 @@ from numba import njit
 
 from softgym_envs.mechanics.constraints.constraint import Constraint
 
-__all__ = ["Cavity", "enclosed_volume"]
-
-
 # The cone of a quadratic triangle (corners a, b, c, midside nodes ab, bc, ca) has the volume sum w det(x_i, x_j, x_k)
 # / 6 over these triples: the integral of x . (x_s x x_t) / 3 with its shape functions, exactly.
 _TRIPLES = np.array(list(combinations(range(6), 3)))
@@ -19,13 +16,13 @@ _WEIGHTS = np.array([2, 3, -5, -5, 5, 5, -3, 4, 24, 4, -5, 3, -5, -24, -4, 4, 4,
 
 
 def enclosed_volume(x: np.ndarray, triangles: np.ndarray) -> float:
-    """Volume [m3] inside a closed surface of triangles (k, 3), positive if they are seen counter-clockwise outside."""
+    """Volume [m3] inside a closed surface of triangles (k, 3), positive if seen counter-clockwise from outside."""
     return _weighted_volume(x, triangles, np.ones(len(triangles)))
 
 
 def _weighted_volume(x: np.ndarray, triples: np.ndarray, weights: np.ndarray) -> float:
     a, b, c = (x[triples[:, i]] for i in range(3))
-    centre = x[triples[0, 0]]  # any; near the surface it keeps round-off small
+    centre = x[triples[0, 0]]  # any point near the surface keeps round-off small
     return float(np.einsum("i,ij,ij->", weights, a - centre, np.cross(b - centre, c - centre)) / 6.0)
 
 

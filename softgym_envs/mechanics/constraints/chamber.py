@@ -8,8 +8,6 @@ from numba import njit
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 
-__all__ = ["Chamber"]
-
 
 @njit(cache=True, error_model="numpy")
 def _line_length(x, ids, weights, slot, gradient):
@@ -101,7 +99,7 @@ class Chamber(Constraint):
         return np.array([self.area * (length - self.rest_length)]), self.area * self._gradient[None, :]
 
     def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
-        # Rows depend on each other within an element only.
+        # Only rows of the same element depend on each other.
         dofs = (3 * self._rows[:, :, None] + np.arange(3)).reshape(len(self._rows), -1)
         k = dofs.shape[1]
         return np.repeat(dofs, k, axis=1).ravel(), np.tile(dofs, (1, k)).ravel()

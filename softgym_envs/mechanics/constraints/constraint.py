@@ -12,14 +12,14 @@ from softgym_envs.mechanics.condensation import Row, point_rows
 class Constraint(ABC):
     """A function ``delta(x)`` of the nodes with ``size`` rows and a work-conjugate effort per row.
 
-    An effort is positive when it does positive work on a growing delta (``mechanics`` sign convention).
+    An effort is positive when it does positive work while delta grows.
 
     Attributes:
         name: identifier within a model.
         size: number of rows.
         dofs: degrees of freedom of the full node array (3 * node + axis) it depends on, shape (k,).
         unilateral: the effort cannot be negative when displacement-driven (a cable cannot push).
-        unit: units of displacement and effort, for people.
+        unit: units of displacement and effort, for tables.
     """
 
     name: str

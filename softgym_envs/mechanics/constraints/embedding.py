@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["EmbeddedPoints"]
-
 
 class EmbeddedPoints:
     """Points that move with a tetrahedral mesh.
@@ -19,7 +17,7 @@ class EmbeddedPoints:
         tetrahedra: corner indices, shape (m, 4).
         hint: elements from which points outside the mesh are extrapolated, shape (p,). The nearest element can
             change abruptly when a mesh of the same topology is moved; a fixed one keeps the point's motion smooth.
-        gradients: of the last three barycentric coordinates [1/m], shape (m, 3, 3), where they are known already.
+        gradients: of the last three barycentric coordinates [1/m], shape (m, 3, 3), if they are known already.
 
     Attributes:
         points: reference positions [m], shape (p, 3).
@@ -59,7 +57,7 @@ class EmbeddedPoints:
 
     @classmethod
     def from_weights(cls, node_ids: np.ndarray, weights: np.ndarray, nodes: np.ndarray) -> EmbeddedPoints:
-        """Points that are given linear combinations of rows: ids (p, k) and weights (p, k)."""
+        """Return points that are given as linear combinations of rows: ids (p, k) and weights (p, k)."""
         points = cls.__new__(cls)
         points.node_ids = np.atleast_2d(np.asarray(node_ids, dtype=np.int64))
         points.weights = np.atleast_2d(np.asarray(weights, dtype=float))
@@ -69,7 +67,7 @@ class EmbeddedPoints:
 
     @classmethod
     def in_frame(cls, row: int, local: np.ndarray, nodes: np.ndarray) -> EmbeddedPoints:
-        """Points of a rigid part at coordinates [m] (p, 3) along the directors of the frame at a row."""
+        """Return points of a rigid part at coordinates [m] (p, 3) along the directors of the frame at a row."""
         local = np.atleast_2d(np.asarray(local, dtype=float))
         ids = np.tile(row + np.arange(4), (len(local), 1))
         return cls.from_weights(ids, np.column_stack([np.ones(len(local)), local]), nodes)

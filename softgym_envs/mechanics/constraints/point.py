@@ -7,8 +7,6 @@ import numpy as np
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 
-__all__ = ["Point"]
-
 
 class Point(Constraint):
     """The three coordinates of one embedded point; delta [m] is its position, effort [N] a force on it."""

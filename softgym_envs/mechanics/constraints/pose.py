@@ -1,4 +1,4 @@
-"""One coordinate of the pose of a frame, counted from rest."""
+"""One coordinate of the pose of a frame, relative to rest."""
 
 from __future__ import annotations
 
@@ -6,25 +6,23 @@ import numpy as np
 
 from softgym_envs.mechanics.constraints.constraint import Constraint
 
-__all__ = ["Pose"]
-
 
 class Pose(Constraint):
-    """One of the six coordinates of a frame: where its origin has gone, or how far it has turned.
+    """One of the six coordinates of a frame: a displacement of its origin, or a component of its rotation.
 
     The first three are the displacement of the origin [m]; their efforts [N] are a force at it. The last three are the
-    components of ``sin(angle) * axis`` [1] of the turn from rest, the axial vector of the skew part of its matrix
+    components of ``sin(angle) * axis`` [1] of the rotation from rest, the axial vector of the skew part of its matrix
     ``R``:
 
         s = 1/2 sum_k D_k x d_k,    D_k and d_k the directors at rest and now.
 
-    It is linear in the directors (no second derivative), and tells turns apart up to 90 degrees. Its efforts [N m] are
-    conjugate to ``s``: ``h`` is the torque ``(tr(R) I - R)^T h / 2``, which near rest is ``h`` itself.
+    It is linear in the directors (no second derivative), and unique for rotations of up to 90 degrees. The efforts
+    ``h`` [N m] are conjugate to ``s``: their torque is ``(tr(R) I - R)^T h / 2``, which near rest is ``h`` itself.
 
     Args:
         name: identifier.
         row: first row of the frame.
-        component: 0, 1, 2 for x, y, z of the origin; 3, 4, 5 for the turn about x, y, z.
+        component: 0, 1, 2 for x, y, z of the origin; 3, 4, 5 for the rotation about x, y, z.
         nodes: rest rows [m], shape (n, 3).
     """
 

@@ -8,14 +8,12 @@ import numpy as np
 
 from softgym_envs.mechanics.constraints.constraint import Constraint
 
-__all__ = ["Servo"]
-
 
 class Servo(Constraint):
-    """Angle of a frame about an axis fixed in space; delta [rad] counts from rest, effort [N m] is the torque.
+    """Angle of a frame about an axis fixed in space; delta [rad] is zero at rest, effort [N m] is the torque.
 
-    The angle is that of one director's projection on the plane across the axis, between -pi and pi. The frame's other
-    motions are held elsewhere (a fixed origin and spin); a frame that tilts out of the plane is still measured.
+    The angle is that of one director's projection onto the plane normal to the axis, between -pi and pi. The frame's
+    other motions must be held (fixed origin and spin); the angle is still measured if the frame tilts out of the plane.
 
     Args:
         name: identifier.

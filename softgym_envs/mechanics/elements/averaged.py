@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 from numba import njit
 
-from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra, _add_forces, _deformation_gradients, _viscosity
-
-__all__ = ["AveragedTetrahedra"]
+from softgym_envs.mechanics.elements.tetrahedra import (
+    SolidOptions,
+    Tetrahedra,
+    add_forces,
+    deformation_gradients,
+    viscosity,
+)
 
 
 @njit(cache=True)
@@ -57,7 +61,7 @@ class AveragedTetrahedra(Tetrahedra):
     Args: as for `Tetrahedra`.
     """
 
-    def __init__(self, nodes: np.ndarray, connectivity: np.ndarray, **options: Any) -> None:
+    def __init__(self, nodes: np.ndarray, connectivity: np.ndarray, **options: Unpack[SolidOptions]) -> None:
         super().__init__(nodes, connectivity, **options)
         m = len(self.connectivity)
         used, slot = np.unique(self.connectivity, return_inverse=True)
@@ -94,7 +98,7 @@ class AveragedTetrahedra(Tetrahedra):
     def add(
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
-        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
+        deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
         inverted = self.material.evaluate(self._F, self.mu, self._zero, self._energy, self._stress, self._tangent)
         if inverted:
             return np.inf, inverted
@@ -104,7 +108,7 @@ class AveragedTetrahedra(Tetrahedra):
         lame = self._nodal_sum(self.lame) / self._node_volumes
         pressure = (lame * mean)[self._slot].mean(axis=1)
         self._stress += pressure[:, None] * slope
-        _add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
+        add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
         if values is not None:
             assert scatter is not None
             self._tangent += pressure[:, None, None] * curvature
@@ -116,9 +120,9 @@ class AveragedTetrahedra(Tetrahedra):
         return float(self._energy @ self.volumes + 0.5 * (lame * mean**2) @ self._node_volumes), 0
 
     def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
-        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
+        deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
         # F^-T is the gradient of the rate of dilation.
-        _viscosity(self._F, self.mu, self._zero, self._stress, self._tangent)
+        viscosity(self._F, self.mu, self._zero, self._stress, self._tangent)
         self._add_stiffness(self._tangent, values, scatter)
         _patch_gradients(self._element_slots, self._shares, self.gradients, self._stress, self._patch_gradient)
         lame = self._nodal_sum(self.lame)

@@ -6,7 +6,7 @@ frame,
 
     Gamma_i = d_i . r' - (d_i . r')_0,      K_1 = (d_3 . d_2' - d_2 . d_3') / 2 - (...)_0   (and cyclic),
 
-with d_1 along the axis. They are objective (a rigid motion strains nothing), independent of the path, and quadratic in
+with d_1 along the axis. They are objective (a rigid motion causes no strain), independent of the path, and quadratic in
 the rows of ``x``, so that energy, forces and exact tangent are polynomials of low degree; the frames turn directors
 into rotations. Reduced integration (one Gauss point for two nodes, two for three) avoids shear locking.
 """
@@ -22,8 +22,6 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.block import ElementBlock, lower_pairs
 from softgym_envs.mechanics.elements.tetrahedra import check_density, element_masses
 
-__all__ = ["Beam", "Section"]
-
 
 @dataclass(frozen=True)
 class Section:
@@ -34,7 +32,7 @@ class Section:
         inertia: second moments of area about d_2 and d_3 [m4].
         torsion: torsion constant [m4].
         shear: shear correction factors along d_2 and d_3.
-        mass_area: area of the material [m2] where that is more than what carries load; default the same.
+        mass_area: area of the material [m2], if more than ``area`` has mass.
     """
 
     area: float
@@ -214,7 +212,7 @@ def _cross(a, b, factor, out):
 
 @njit(cache=True, error_model="numpy")
 def _add_warped(x, step, rows, shape, slope, weights, out):
-    """The tangent is turned by the exponential of the spin and strained by what is left of the step."""
+    """Turn the tangent by the exponential of the spin, and strain it by the remainder of the step."""
     spin = np.empty(3)
     tangent = np.empty(3)
     strained = np.empty(3)
@@ -264,7 +262,7 @@ class Beam(ElementBlock):
             as in ``nodes``, however curved.
 
     Raises:
-        ValueError: for a chain of a wrong length, or two frames in one place.
+        ValueError: for a chain of a wrong length, or two frames that coincide.
     """
 
     def __init__(
@@ -301,7 +299,7 @@ class Beam(ElementBlock):
         tangents = np.einsum("qa,mad->mqd", local, rest[self.rows])
         speed = np.linalg.norm(tangents, axis=2)
         if not (speed > 1e-12).all():
-            raise ValueError("two frames of a beam lie in one place")
+            raise ValueError("two frames of a beam coincide")
         self._slope = local / speed[:, :, None]
         self.weights = gauss * speed
         young = np.broadcast_to(np.asarray(young_modulus, dtype=float), (m,))

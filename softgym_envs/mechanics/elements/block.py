@@ -6,8 +6,6 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-__all__ = ["ElementBlock", "lower_pairs"]
-
 
 def lower_pairs(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of the lower triangles, each (m, k (k + 1) / 2), of elements with degrees of freedom ``dofs`` (m, k)."""
@@ -18,8 +16,8 @@ def lower_pairs(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class ElementBlock(ABC):
     """Elements of one kind: an energy of the rows of ``x`` with its gradient and exact tangent.
 
-    Degrees of freedom are numbered ``3 * row + axis`` over all rows of ``x``, whether they are free, fixed or carried
-    by a frame: which they are is the model's business.
+    Degrees of freedom are numbered ``3 * row + axis`` over all rows of ``x``. Blocks do not know which of them are
+    free, fixed or carried by a frame.
 
     Attributes:
         nodes_used: rows of ``x`` that the elements touch, shape (u,).
@@ -55,20 +53,20 @@ class ElementBlock(ABC):
             scatter: one array for each of `stencils`, of its shape.
 
         Returns:
-            The elastic energy [J] and the number of inverted elements; with any, the outputs are not to be used.
+            The elastic energy [J] and the number of inverted elements; if there are any, the outputs are meaningless.
         """
 
     @abstractmethod
     def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
-        """Add the stiffness against strain rates at positions ``x`` (n, 3), the elastic one at rest: for damping.
+        """Add the stiffness against strain rates at positions ``x`` (n, 3), for damping; at rest it is the elastic one.
 
-        Never negative, and rigid motions have no part in it. The tangent itself has neither property under stress: a
-        damping by it would push what is compressed.
+        It is never negative and does not resist rigid motions. Under stress the tangent has neither property: damping
+        with it would drive compressed parts.
         """
 
     @abstractmethod
     def nodal_masses(self, count: int) -> np.ndarray:
-        """Share of the mass [kg] that gravity pulls at each of ``count`` rows, shape (count,)."""
+        """Mass [kg] on which gravity acts at each of ``count`` rows, shape (count,)."""
 
     @abstractmethod
     def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

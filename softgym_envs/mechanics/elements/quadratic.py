@@ -1,24 +1,22 @@
-"""Ten-node tetrahedra: the reference for accuracy, and a cure for locking."""
+"""Ten-node tetrahedra: the most accurate solid elements, which hardly lock."""
 
 from __future__ import annotations
 
 import math
+from typing import Unpack
 
 import numpy as np
 from numba import njit
 
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, element_masses, orient_corners
-from softgym_envs.mechanics.materials import Material
-
-__all__ = ["QuadraticTetrahedra", "add_midside_nodes", "quadratic_triangles", "split_triangles"]
+from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, SolidOptions, element_masses, orient_corners
 
 EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
 """Corners at the ends of the edges on which midside nodes 4 to 9 lie."""
 
 
 def add_midside_nodes(nodes: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Make quadratic elements of linear ones: nodes (n, 3) and tetrahedra (m, 4) -> (n + edges, 3) and (m, 10)."""
+    """Turn linear elements into quadratic ones: nodes (n, 3) and tetrahedra (m, 4) -> (n + edges, 3) and (m, 10)."""
     pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
     edges, which = np.unique(pairs, axis=0, return_inverse=True)
     middle = 0.5 * (nodes[edges[:, 0]] + nodes[edges[:, 1]])
@@ -45,8 +43,8 @@ def quadratic_triangles(triangles: np.ndarray, tetrahedra: np.ndarray) -> np.nda
 def split_triangles(triangles: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """Split boundary triangles (k, 3) of corners into four at the midside nodes of tetrahedra (m, 10): (4 k, 3).
 
-    For pictures. A cavity is better given `quadratic_triangles`: pressure on split ones is not spread as the elements'
-    shape functions ask for, which spoils their accuracy.
+    For pictures. Use `quadratic_triangles` for a cavity: on split triangles the pressure is not distributed according
+    to the elements' shape functions, which spoils their accuracy.
     """
     parts = quadratic_triangles(triangles, tetrahedra)[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]]
     return parts.reshape(-1, 3)
@@ -126,31 +124,19 @@ def _add_tangent(connectivity, points, gradients, weights, tangent, scatter, out
 class QuadraticTetrahedra(SolidBlock):
     """A block of quadratic (ten-node) tetrahedra of one material, with straight or curved edges.
 
-    Four Gauss points. Free of the locking of linear tetrahedra in bending, and nearly so as Poisson's ratio nears 0.5.
+    Four Gauss points. Does not lock in bending as linear tetrahedra do, and hardly as Poisson's ratio nears 0.5.
 
     Args:
         nodes: rest positions [m], shape (n, 3).
         connectivity: corners, then midside nodes of the edges 01, 12, 02, 03, 13, 23, shape (m, 10); see
             `add_midside_nodes`.
-        material: a `Material` or its name.
-        young_modulus: [Pa], scalar or shape (m,).
-        poisson_ratio: scalar or shape (m,), inside (-1, 0.5).
-        density: [kg/m3].
+        **options: material, young_modulus, poisson_ratio and density, see `SolidBlock`.
 
     Raises:
         ValueError: for a degenerate or negatively oriented element, an index out of range or an unknown material.
     """
 
-    def __init__(
-        self,
-        nodes: np.ndarray,
-        connectivity: np.ndarray,
-        *,
-        material: str | Material = "corotational",
-        young_modulus: float | np.ndarray = 3.0e6,
-        poisson_ratio: float | np.ndarray = 0.3,
-        density: float = 1100.0,
-    ) -> None:
+    def __init__(self, nodes: np.ndarray, connectivity: np.ndarray, **options: Unpack[SolidOptions]) -> None:
         connectivity = np.array(connectivity, dtype=np.int64)
         if connectivity.ndim != 2 or connectivity.shape[1] != 10:
             raise ValueError(f"quadratic tetrahedra must have shape (m, 10), got {connectivity.shape}")
@@ -174,15 +160,7 @@ class QuadraticTetrahedra(SolidBlock):
                 raise ValueError(f"quadratic tetrahedron {int(np.argmin(determinant))} is inverted by its edges")
             gradients[:, q] = np.einsum("ak,mkd->mad", local, np.linalg.inv(jacobian))
             weights[:, q] = determinant / 24.0
-        super().__init__(
-            connectivity,
-            gradients.reshape(-1, 10, 3),
-            weights.ravel(),
-            material=material,
-            young_modulus=young_modulus,
-            poisson_ratio=poisson_ratio,
-            density=density,
-        )
+        super().__init__(connectivity, gradients.reshape(-1, 10, 3), weights.ravel(), **options)
 
     def embed(self, points: np.ndarray, nodes: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
         # Barycentric coordinates of the corners: exact for straight edges.

@@ -6,8 +6,6 @@ import numpy as np
 
 from softgym_envs.mechanics.elements.block import ElementBlock, lower_pairs
 
-__all__ = ["RigidBody", "box_inertia", "sphere_inertia"]
-
 
 def box_inertia(mass: float, half_extents: np.ndarray) -> np.ndarray:
     """Inertia tensor [kg m2] of a box about its centre, shape (3, 3)."""
@@ -30,7 +28,7 @@ class RigidBody(ElementBlock):
         inertia: about the centre of mass, along the directors [kg m2], shape (3, 3).
 
     Raises:
-        ValueError: for a mass or an inertia that no body can have.
+        ValueError: for a mass that is not positive, or an inertia that no body can have.
     """
 
     volume = 0.0
@@ -45,7 +43,7 @@ class RigidBody(ElementBlock):
         # Kinetic energy in terms of directors: 1/2 sum_kl E_kl d_k' . d_l' with Euler's tensor E.
         self._euler = 0.5 * np.trace(inertia) * np.eye(3) - inertia
         if np.linalg.eigvalsh(self._euler)[0] < -1e-9 * np.trace(inertia):
-            raise ValueError(f"no body has the inertia {inertia.tolist()} kg m2: it breaks the triangle inequality")
+            raise ValueError(f"inertia {inertia.tolist()} kg m2 violates the triangle inequality: no body has it")
         self.row = int(row)
         self.mass = float(mass)
         self.nodes_used = self.row + np.arange(4)

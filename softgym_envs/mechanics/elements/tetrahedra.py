@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numba import njit
@@ -13,7 +14,8 @@ from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_
 
 
 @njit(cache=True, error_model="numpy")
-def _deformation_gradients(x, connectivity, points, gradients, F):
+def deformation_gradients(x, connectivity, points, gradients, F):
+    """Fill the deformation gradients ``F`` (m q, 9) at the quadrature points."""
     for q in range(gradients.shape[0]):
         e = q // points
         for i in range(9):
@@ -26,7 +28,7 @@ def _deformation_gradients(x, connectivity, points, gradients, F):
 
 
 @njit(cache=True, error_model="numpy")
-def _add_forces(connectivity, points, gradients, weights, stress, out):
+def add_forces(connectivity, points, gradients, weights, stress, out):
     """Add the gradient of the energy to ``out``, shape (n, 3)."""
     for q in range(gradients.shape[0]):
         e = q // points
@@ -67,7 +69,7 @@ def _add_tangent(gradients, volumes, tangent, scatter, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _viscosity(F, mu, lame, inverse, out):
+def viscosity(F, mu, lame, inverse, out):
     """Second derivative (m, 9, 9) of ``mu D : D + lame / 2 (tr D)^2``, D = sym(F' F^-1), by F'; and F^-T (m, 9)."""
     rate = np.empty((6, 9))
     for e in range(F.shape[0]):
@@ -253,8 +255,17 @@ def check_density(density: float) -> float:
     return float(density)
 
 
+class SolidOptions(TypedDict, total=False):
+    """Elasticity and density of a block of solid elements: keyword arguments of `SolidBlock`, which describes them."""
+
+    material: str | Material
+    young_modulus: float | np.ndarray
+    poisson_ratio: float | np.ndarray
+    density: float
+
+
 class SolidBlock(ElementBlock):
-    """What blocks of solid elements share: material, quadrature and the warping of steps.
+    """Base of the blocks of solid elements: material, quadrature and warping of steps.
 
     Args:
         connectivity: node indices, shape (m, k).
@@ -272,10 +283,10 @@ class SolidBlock(ElementBlock):
         gradients: np.ndarray,
         weights: np.ndarray,
         *,
-        material: str | Material,
-        young_modulus: float | np.ndarray,
-        poisson_ratio: float | np.ndarray,
-        density: float,
+        material: str | Material = "corotational",
+        young_modulus: float | np.ndarray = 3.0e6,
+        poisson_ratio: float | np.ndarray = 0.3,
+        density: float = 1100.0,
     ) -> None:
         self.material = resolve_material(material)
         self.density = check_density(density)
@@ -323,19 +334,19 @@ class SolidBlock(ElementBlock):
     def add(
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
-        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
+        deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
         inverted = self.material.evaluate(self._F, self.mu, self.lame, self._energy, self._stress, self._tangent)
         if inverted:
             return np.inf, inverted
-        _add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
+        add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
         if values is not None:
             assert scatter is not None
             self._add_stiffness(self._tangent, values, scatter)
         return float(self._energy @ self.weights), 0
 
     def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
-        _deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
-        _viscosity(self._F, self.mu, self.lame, self._stress, self._tangent)
+        deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
+        viscosity(self._F, self.mu, self.lame, self._stress, self._tangent)
         self._add_stiffness(self._tangent, values, scatter)
 
     @abstractmethod
@@ -360,39 +371,18 @@ class Tetrahedra(SolidBlock):
     Args:
         nodes: rest positions [m], shape (n, 3).
         connectivity: corner indices, shape (m, 4). Negatively oriented elements are turned.
-        material: a `Material` or its name.
-        young_modulus: [Pa], scalar or shape (m,).
-        poisson_ratio: scalar or shape (m,), inside (-1, 0.5).
-        density: [kg/m3].
+        **options: material, young_modulus, poisson_ratio and density, see `SolidBlock`.
 
     Raises:
         ValueError: for a degenerate element, an index out of range or an unknown material.
     """
 
-    def __init__(
-        self,
-        nodes: np.ndarray,
-        connectivity: np.ndarray,
-        *,
-        material: str | Material = "corotational",
-        young_modulus: float | np.ndarray = 3.0e6,
-        poisson_ratio: float | np.ndarray = 0.3,
-        density: float = 1100.0,
-    ) -> None:
-        material = resolve_material(material)
+    def __init__(self, nodes: np.ndarray, connectivity: np.ndarray, **options: Unpack[SolidOptions]) -> None:
         connectivity, volumes, _ = orient_corners(nodes, connectivity)
         corners = nodes[connectivity]
         inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
         gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
-        super().__init__(
-            connectivity,
-            gradients,
-            volumes,
-            material=material,
-            young_modulus=young_modulus,
-            poisson_ratio=poisson_ratio,
-            density=density,
-        )
+        super().__init__(connectivity, gradients, volumes, **options)
 
     def embed(self, points: np.ndarray, nodes: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
         return EmbeddedPoints(points, nodes, self.connectivity, hint, gradients=self.gradients[:, 1:])

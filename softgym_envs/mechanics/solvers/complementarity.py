@@ -1,19 +1,17 @@
-"""Small linear complementarity problems: which cables are taut."""
+"""Small linear complementarity problems, which decide which cables are taut."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-__all__ = ["solve_complementarity", "solve_rows"]
-
 
 @njit(cache=True, error_model="numpy")
 def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
-    """Fill y (m,) with the efforts where the actuators of ``slack`` carry none.
+    """Fill y (m,) with the efforts if the actuators in ``slack`` carry none.
 
-    Returns the actuators that contradict it, which would have to push or, slack, would fall short of their commands;
-    -1 if those that are not slack have no definite W. Sets of actuators are bits of an integer.
+    Returns the actuators that contradict this: taut ones that would have to push, and slack ones that would fall short
+    of their commands; -1 if W of the taut ones is not positive definite. Sets of actuators are bits of an integer.
     """
     m = len(gap)
     k = 0
@@ -45,7 +43,7 @@ def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
             value = gap[i]
             for j in range(m):
                 value += W[i, j] * y[j]
-            if not value >= -tolerance:  # nor where it is NaN
+            if not value >= -tolerance:  # true for NaN, too
                 wrong |= 1 << i
         elif unilateral[i] and not y[i] >= 0.0:
             wrong |= 1 << i
@@ -56,7 +54,7 @@ def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
 def solve_row(W, gap, unilateral, y, a, index):
     """Fill y (m,) with the consistent efforts; False if there are none.
 
-    ``a`` (m, m + 1) and ``index`` (m,), of integers, are room to work in.
+    ``a``, shape (m, m + 1), and ``index``, integers of shape (m,), are work arrays.
     """
     m = len(gap)
     scale, bilateral = 0.0, 0
@@ -65,7 +63,7 @@ def solve_row(W, gap, unilateral, y, a, index):
         if not unilateral[i]:
             bilateral |= 1 << i
     tolerance = 1e-12 * scale
-    # All taut at first; whoever contradicts it changes sides. Two or three rounds nearly always settle it.
+    # Start with all taut and switch every actuator that contradicts this; two or three rounds nearly always suffice.
     slack = 0
     for _ in range(2 * m):
         wrong = _with_slack(slack, W, gap, unilateral, tolerance, y, a, index)
@@ -74,7 +72,7 @@ def solve_row(W, gap, unilateral, y, a, index):
         if wrong < 0:
             break
         slack ^= wrong
-    # These rounds may go in circles, and a W that is not definite breaks them off: then every set is tried.
+    # The rounds may cycle, and they end early if W is not definite: then try every set.
     for slack in range(1 << m):
         if not slack & bilateral and _with_slack(slack, W, gap, unilateral, tolerance, y, a, index) == 0:
             return True
@@ -83,7 +81,7 @@ def solve_row(W, gap, unilateral, y, a, index):
 
 @njit(cache=True, error_model="numpy")
 def _solve(W, gap, unilateral, y, found):
-    """Row by row."""
+    """Solve the problems one by one."""
     count, m = gap.shape
     a, index = np.empty((m, m + 1)), np.empty(m, dtype=np.int64)
     for b in range(count):
@@ -91,13 +89,15 @@ def _solve(W, gap, unilateral, y, found):
 
 
 def solve_rows(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `solve_complementarity`, and return which rows have a solution, shape (B,); the others are not to be used.
+    """Solve as `solve_complementarity` does, but return which rows have a solution, shape (B,), instead of raising.
+
+    The efforts of the other rows are meaningless.
 
     Raises:
         ValueError: for more than 16 actuators.
     """
     if gap.shape[1] > 16:
-        raise ValueError(f"at most 16 actuators can be told taut from slack, got {gap.shape[1]}")
+        raise ValueError(f"complementarity problems have at most 16 actuators, got {gap.shape[1]}")
     y, found = np.empty_like(gap), np.empty(len(gap), dtype=bool)
     _solve(W, gap, unilateral, y, found)
     return y, found
@@ -106,8 +106,8 @@ def solve_rows(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray) -> tuple[
 def solve_complementarity(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
     """Solve ``W y + gap = 0`` for bilateral rows, ``0 <= y _|_ W y + gap >= 0`` for unilateral ones.
 
-    With W positive definite exactly one set of taut actuators is consistent. It is found by block principal pivoting
-    (Kostreva 1978): all rows that contradict a set change sides at once; where that goes in circles, by trying all.
+    If W is positive definite, exactly one set of taut actuators is consistent. It is found by block principal pivoting
+    (Kostreva 1978), which switches all rows that contradict a set at once; if this cycles, all sets are tried.
 
     Args:
         W: symmetric positive definite matrices, shape (B, m, m).

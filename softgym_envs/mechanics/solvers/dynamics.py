@@ -1,16 +1,16 @@
 """Implicit time stepping of solids, beams and rigid parts together.
 
-The mass matrix is constant between rows (see `frames`: directors carry the rotary inertia), and inertia joins the
-static equilibrium at the end of the step: the same Newton method, constraints, bonds and cables that cannot push. The
-condensed model is that of the thesis' dynamic case (eq. 2.5-2.13), where ``A`` holds mass and damping of the step.
+A time step adds inertia to the static equilibrium at its end; Newton's method, constraints, bonds and unilateral cables
+are those of `Statics`. The mass matrix between rows is constant (see `frames`: directors carry the rotary inertia).
+The condensed model is that of the dynamic case (thesis, eq. 2.5-2.13): ``A`` includes mass and damping of the step.
 
 * ``"euler"``: implicit Euler in its variational form, the minimum of ``E(x) + |x - x_n - h v_n|_M^2 / (2 h^2)`` over
-  what the frames allow. First order, damps what moves fast. Its tangent is symmetric and exact, so ``W`` is the
-  derivative of where the step ends.
+  the motions that frames allow. First order; it damps fast motions. Its tangent is symmetric and exact, so ``W`` is the
+  derivative of the end of the step.
 * ``"generalised_alpha"``: second order, with a chosen damping of the fastest motions (Chung and Hulbert 1993; for
   frames and constraints Arnold and Bruels 2007, Bruels and Cardona 2010). ``spectral_radius`` 1 is the trapezoidal
-  rule, which damps nothing. The tangent leaves out the gyroscopic terms of turning frames: Newton's method converges
-  linearly on them, and ``W`` is exact but for them.
+  rule, which does not damp. The tangent omits the gyroscopic terms of rotating frames: Newton's method then converges
+  linearly, and ``W`` lacks these terms.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Motion:
         potential: elastic energy and potential of the dead loads [J].
         work: done by actuators and driven contacts since the start [J].
         dissipated: by Rayleigh damping since the start [J].
-        substeps: time steps that were needed; more than one where the step had to be cut.
+        substeps: time steps that were needed; more than one if the step had to be divided.
     """
 
     equilibrium: Equilibrium
@@ -60,18 +60,18 @@ class Motion:
 
 
 class Dynamics(Statics):
-    """Follows the motion of a model under changing commands.
+    """Computes the motion of a model under changing commands.
 
     Args:
         model: the body.
         step: time step [s].
         scheme: a name of `SCHEMES`.
-        spectral_radius: of the generalised alpha scheme: 1 damps nothing, 0 all that the step does not resolve.
+        spectral_radius: of the generalised alpha scheme; 1 does not damp, 0 damps all that the step does not resolve.
         mass_damping: Rayleigh's alpha [1/s].
-        stiffness_damping: Rayleigh's beta [s], on the stiffness against strain rates at the start of each step.
+        stiffness_damping: Rayleigh's beta [s], applied to the stiffness against strain rates at the start of each step.
         lumped: lump the masses.
-        tolerance: largest correction of any node left at convergence [m].
-        max_iterations: Newton iterations per load increment.
+        tolerance: largest remaining correction of any node at convergence [m].
+        max_iterations: limit of Newton iterations per load increment.
         max_cuts: how often a step that cannot be solved is halved.
 
     Attributes:
@@ -119,7 +119,7 @@ class Dynamics(Statics):
         self.rest()
 
     def rest(self) -> None:
-        """Stop all motion where the body is; time and energies start anew."""
+        """Stop all motion in the present shape, and set time and energies to zero."""
         self.velocity = np.zeros_like(self.x)
         self.time = 0.0
         self._history: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
@@ -143,7 +143,7 @@ class Dynamics(Statics):
 
     @property
     def snapshot(self) -> tuple:
-        """All that a step starts from; assign it to take steps back."""
+        """Everything that a step starts from; assign it to undo steps."""
         return (
             self.x,
             self.effort,

@@ -8,8 +8,6 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
-__all__ = ["CholmodSolver", "LinearSolver", "SuperLUSolver", "make_solver"]
-
 
 class LinearSolver(ABC):
     """Solver for symmetric matrices of one fixed sparsity pattern.
@@ -44,12 +42,12 @@ class LinearSolver(ABC):
         """Solve for the columns of ``rhs``, shape (n, k), with the last factorisation."""
 
     def condense(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``H^T A^-1 H``, shape (k, k), for columns ``H`` (n, k), and what `expand` needs, shape (n, k)."""
+        """Return ``H^T A^-1 H`` (k, k) for columns ``H`` (n, k), and an array ``half`` (n, k) for `expand`."""
         solved = self.solve(columns)
         return columns.T @ solved, solved
 
     def expand(self, vector: np.ndarray) -> np.ndarray:
-        """Return ``A^-1 H s``, shape (n,), for ``vector = half @ s`` with the second result of `condense`."""
+        """Return ``A^-1 H s``, shape (n,), for ``vector = half @ s`` with the array ``half`` of `condense`."""
         return vector
 
 
@@ -78,7 +76,7 @@ class CholmodSolver(LinearSolver):
 
     @property
     def positive_definite(self) -> bool:
-        return True  # it factorises no other
+        return True  # `factorise` fails on all other matrices
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         solution = self._matrix(np.asfortranarray(rhs))
@@ -86,7 +84,7 @@ class CholmodSolver(LinearSolver):
         return np.asarray(solution)
 
     def condense(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # With P A P^T = L L^T half of the work will do: H^T A^-1 H = Y^T Y, L Y = P H.
+        # With P A P^T = L L^T half of the work suffices: H^T A^-1 H = Y^T Y, L Y = P H.
         half = self._matrix(np.asfortranarray(columns))
         self._cholmod.solve(self._factor, half, sys=7)  # P
         self._cholmod.solve(self._factor, half, sys=4)  # L
@@ -138,7 +136,7 @@ def make_solver(name: str, indptr: np.ndarray, indices: np.ndarray) -> LinearSol
 
     Raises:
         ValueError: for an unknown name.
-        ImportError: if ``"cholmod"`` is asked for and cvxopt is not installed.
+        ImportError: if ``"cholmod"`` is requested and cvxopt is not installed.
     """
     if name not in ("auto", "cholmod", "superlu"):
         raise ValueError(f"unknown linear solver '{name}'; allowed: auto, cholmod, superlu")

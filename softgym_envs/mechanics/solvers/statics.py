@@ -1,10 +1,10 @@
 """Static equilibrium of displacement- and effort-driven actuators.
 
-Newton's method on the KKT system by the Schur complement: the tangent is factorised once per iteration, solved for
-the few constraint columns, and ``W`` is there. Step lengths follow the affine-invariant natural monotonicity test
-of Deuflhard (Newton Methods for Nonlinear Problems, 2004, algorithm NLEQ-ERR): a step is accepted when the
-simplified Newton correction that follows it is smaller, which needs no scaling between forces and displacements.
-Displacement-driven cables are unilateral: each correction solves a small linear complementarity problem.
+Newton's method solves the KKT system through its Schur complement: each iteration factorises the tangent once and
+solves for the few constraint columns, which also gives ``W``. Step lengths follow the affine-invariant natural
+monotonicity test of Deuflhard (Newton Methods for Nonlinear Problems, 2004, algorithm NLEQ-ERR): a step is accepted
+when the simplified Newton correction that follows it is smaller, which needs no scaling between forces and
+displacements. Displacement-driven cables are unilateral: each correction solves a small linear complementarity problem.
 Bonds are driven rows that are always held at zero.
 """
 
@@ -33,8 +33,8 @@ class Equilibrium:
         delta: constraint values of all rows, bonds last, shape (size,).
         effort: efforts of all rows, bonds last, shape (size,).
         slack: per actuator row, True where a unilateral actuator hangs slack.
-        stable: the tangent is positive definite: the state is stable whatever drives the actuators. Where it is not, a
-            displacement-driven state may still be.
+        stable: whether the tangent is positive definite. Then the state is stable however its actuators are driven;
+            otherwise it can still be stable while they are driven in displacement.
         iterations: Newton iterations spent, over all load increments.
         increments: load increments used.
     """
@@ -50,7 +50,7 @@ class Equilibrium:
 
 
 class AppliedLoads(TypedDict, total=False):
-    """Loads besides the actuators, keyword arguments of `Statics.solve`, where they are explained."""
+    """Loads besides those of the actuators: keyword arguments of `Statics.solve`, which describes them."""
 
     effector_force: Sequence[float] | np.ndarray | None
     contact: Sequence[float] | np.ndarray | None
@@ -62,34 +62,34 @@ class NewtonFailure(Exception):
 
 
 def _complementary_step(W: np.ndarray, gap: np.ndarray, effort: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
-    """Steps of driven efforts that close ``gap`` where a row is bilateral, and in which no unilateral row pushes."""
+    """Return steps of driven efforts that close ``gap`` in bilateral rows, and with which no unilateral row pushes."""
     if not unilateral.any():
         return np.linalg.solve(W, -gap)
     if unilateral.all():
         return solve_complementarity(W[None], (gap - W @ effort)[None], unilateral)[0] - effort
-    loose, firm = np.flatnonzero(unilateral), np.flatnonzero(~unilateral)
+    one_way, both_ways = np.flatnonzero(unilateral), np.flatnonzero(~unilateral)
     offset = gap - W @ effort
-    # Bilateral rows are eliminated: only the few others are a question of taut or slack.
-    below, right = firm[:, None], loose[:, None]
-    reduced = np.linalg.solve(W[below, firm], np.column_stack([W[below, loose], offset[firm]]))
-    across = W[right, firm] @ reduced
+    # Eliminate the bilateral rows: only the few others can be taut or slack.
+    below, right = both_ways[:, None], one_way[:, None]
+    reduced = np.linalg.solve(W[below, both_ways], np.column_stack([W[below, one_way], offset[both_ways]]))
+    across = W[right, both_ways] @ reduced
     new = np.empty_like(effort)
-    new[loose] = solve_complementarity(
-        (W[right, loose] - across[:, :-1])[None],
-        (offset[loose] - across[:, -1])[None],
-        np.ones(len(loose), dtype=bool),
+    new[one_way] = solve_complementarity(
+        (W[right, one_way] - across[:, :-1])[None],
+        (offset[one_way] - across[:, -1])[None],
+        np.ones(len(one_way), dtype=bool),
     )[0]
-    new[firm] = -(reduced[:, :-1] @ new[loose] + reduced[:, -1])
+    new[both_ways] = -(reduced[:, :-1] @ new[one_way] + reduced[:, -1])
     return new - effort
 
 
 class Statics:
-    """Follows the equilibrium of a model under changing commands, starting each solve from the last state.
+    """Finds the equilibria of a model under changing commands, starting each solve from the last state.
 
     Args:
         model: the body.
-        tolerance: largest correction of any node left at convergence [m].
-        max_iterations: Newton iterations per load increment.
+        tolerance: largest remaining correction of any node at convergence [m].
+        max_iterations: limit of Newton iterations per load increment.
         max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the way.
 
     Attributes:
@@ -251,7 +251,7 @@ class Statics:
             target: one value per actuator row: displacement [m, m3, ...] or effort [N, Pa, ...].
             mode: ``"displacement"`` or ``"effort"`` for all actuators, or one of them per row.
             effector_force: loads on the effector rows [N], shape (n_e,); default none.
-            contact: of the contact rows, shape (n_c,): forces [N], or positions [m] that they are driven to; default
+            contact: forces on the contact rows [N], or positions [m] that they are driven to, shape (n_c,); default
                 no force.
             contact_mode: ``"effort"`` (forces) or ``"displacement"`` (driven positions).
 
@@ -260,7 +260,7 @@ class Statics:
             is then larger than commanded, and their effort is zero.
 
         Raises:
-            ConvergenceError: with the fraction of the increment that was reached; the last converged state is kept.
+            ConvergenceError: if no equilibrium is found; the last converged state is kept.
             ValueError: for a wrong shape, a non-finite value, an unknown mode, or a negative effort on an actuator that
                 cannot push.
         """
@@ -299,7 +299,7 @@ class Statics:
         if not linear.current and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
-        # The path goes from the present values.
+        # Commands are ramped from the present values.
         start = self.effort.copy()
         start[driven] = linear.delta[driven]
         done, size, iterations, increments = 0.0, 1.0, 0, 0
