@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.errors import DataError
+from softgym_envs.errors import DataError, unknown_name
 from softgym_envs.mechanics.volume_meshing import fill_surface
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
@@ -35,7 +35,7 @@ def unit_factor(scale: float | None, unit: str | None) -> float:
     if scale is not None and unit is not None:
         raise ValueError(f"pass either scale or unit, got scale = {scale:g} and unit = '{unit}'")
     if unit is not None and unit not in UNITS:
-        raise ValueError(f"unknown unit '{unit}'; allowed: {', '.join(UNITS)}")
+        raise ValueError(unknown_name("unit", unit, UNITS))
     if scale is not None and not (np.isfinite(scale) and scale > 0.0):
         raise ValueError(f"scale = {scale} must be positive and finite")
     return UNITS[unit] if unit is not None else scale if scale is not None else 1.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -109,10 +108,7 @@ def _element_values(
         out = np.full(count, np.nan)
         for region, value in values.items():
             if region not in regions:
-                near = get_close_matches(str(region), regions, n=1)
-                hint = f"; did you mean '{near[0]}'?" if near else ""
-                found = ", ".join(map(str, regions)) or "none"
-                raise ValueError(f"{name}: unknown region '{region}'; regions of the mesh: {found}{hint}")
+                raise ValueError(f"{name}: {unknown_name('region', region, regions)}")
             out[regions[region]] = value
         missing = np.flatnonzero(np.isnan(out))
         if len(missing):

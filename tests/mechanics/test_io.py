@@ -157,7 +157,7 @@ def test_unit_and_scale_say_the_same(tmp_path, mesh_in_millimetres):
         np.testing.assert_array_equal(read_mesh(path, unit=unit).nodes, read_mesh(path, scale=scale).nodes)
     with pytest.raises(ValueError, match="pass either scale or unit, got scale = 0.001 and unit = 'mm'"):
         read_mesh(path, unit="mm", scale=1e-3)
-    with pytest.raises(ValueError, match="unknown unit 'km'; allowed: m, cm, mm, in"):
+    with pytest.raises(ValueError, match="unknown unit 'km'; .*allowed: m, cm, mm, in"):
         read_mesh(path, unit="km")
     with pytest.raises(ValueError, match="scale = 0.0 must be positive"):
         read_mesh(path, scale=0.0)
@@ -238,7 +238,7 @@ def test_modulus_by_region_by_element_and_by_place(halves):
 @pytest.mark.parametrize(
     ("modulus", "message"),
     [
-        ({"stif": 1e6, "soft": 1e5}, "unknown region 'stif'; regions of the mesh: .*; did you mean 'stiff'?"),
+        ({"stif": 1e6, "soft": 1e5}, r"young_modulus: unknown region 'stif'; did you mean 'stiff'\? allowed: .*soft"),
         ({"soft": 1e5}, "young_modulus gives no value for 12 of 24 elements, in the regions stiff"),
         ([1e5, 1e6], r"young_modulus must be one number, or one for each of the 24 elements, got shape \(2,\)"),
         (lambda c: 1e5 * c, r"young_modulus must be .* got shape \(24, 3\)"),
