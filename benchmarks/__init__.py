@@ -1,1 +1,1 @@
-"""Speed and accuracy tables; run by one command, never part of the tests."""
+"""Benchmarks of speed and accuracy, run by `softgym bench`; their results are kept in results.json."""

@@ -1,4 +1,4 @@
-"""How accurate: surrogate against FEM."""
+"""Accuracy of the surrogates, compared with FEM."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ ELASTICITIES = ((5000, 0.47, 0.91), (1000, 0.45, 0.29), (7000, 0.40, 0.90), (300
 
 
 def test_set(folder: str | Path = "results/test_set", workers: int = 2) -> dict[str, object]:
-    """Errors of the shipped weights on their test sets, whose FEM states are solved anew; minutes for some robots.
+    """Errors of the shipped weights on their test sets, whose FEM states are solved again (minutes for some robots).
 
-    States that `stable_rows` leaves out of training, about to buckle or beyond, are apart from the others.
+    States that `stable_rows` excludes from training, because they are about to buckle, are reported separately.
     """
     from softgym_envs.config import load_config
     from softgym_envs.robots import make_robot
@@ -78,10 +78,10 @@ def test_set(folder: str | Path = "results/test_set", workers: int = 2) -> dict[
 
 
 def positive_definite(count: int = 1_000_000) -> dict[str, object]:
-    """A million random states of every robot: is W symmetric positive definite, and the derivative of delta?
+    """Check in a million random states of every robot that W is positive definite and the derivative of delta.
 
-    The derivative is that of the predicted state by central differences, in the last 10,000 of them and relative to the
-    largest entry of the same state; the network computes in single precision.
+    The derivative of the predicted state is taken by central differences in the last 10,000 states. Errors are relative
+    to the largest entry of the same state; the network computes in single precision.
     """
     from softgym_envs.robots import make_robot
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
@@ -89,7 +89,7 @@ def positive_definite(count: int = 1_000_000) -> dict[str, object]:
     result: dict[str, object] = {}
     for variant, (name, options) in shipped_robots().items():
         robot = make_robot(name, **options)
-        if not robot.convex:  # not claimed of it
+        if not robot.convex:  # its energy is not convex
             continue
         model = pretrained_model(robot)
         rng = np.random.default_rng(0)
@@ -148,7 +148,7 @@ def design_gradients(bodies: int = 12) -> dict[str, object]:
         for _ in range(bodies):
             design = {k: v.low + rng.uniform(0.05, 0.95) * (v.high - v.low) for k, v in space.variables.items()}
             try:
-                # Held where real cables get it: taut, or hanging slack.
+                # Hold the actuators where real cables can be: taut or slack.
                 statics = Statics(robot.build(design))
                 statics.solve(np.zeros(len(robot.actuators)), robot.rest_mode)
                 held = statics.solve(robot.displacements(rng.random((1, net.model.count)))[0]).condensed.delta.a
@@ -257,7 +257,7 @@ def slack_states() -> dict[str, object]:
 def mesh_motion() -> dict[str, object]:
     """Noise of W_aa along a design line (joint height 5 to 8 mm, 31 designs): moved meshes against new ones.
 
-    The noise is the standard deviation of the third differences, which a smooth curve does not have, over the mean.
+    The noise is the standard deviation of the third differences, which vanish for a smooth curve, over the mean.
     """
     from softgym_envs.backends.fem import FEMBackend
     from softgym_envs.robots import make_robot

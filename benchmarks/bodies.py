@@ -18,7 +18,7 @@ Mapping = Callable[[np.ndarray], np.ndarray]
 
 
 def shell_octant(count: int, layers: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Octant of the region 1 <= |x| + |y| + |z| <= 2: nodes (n, 3), tetrahedra (m, 4), triangles of the inner face."""
+    """Return nodes (n, 3), tetrahedra (m, 4) and inner triangles of the octant of 1 <= |x| + |y| + |z| <= 2."""
     ids, face = {}, []
     for i in range(count + 1):
         for j in range(count + 1 - i):
@@ -32,7 +32,7 @@ def shell_octant(count: int, layers: int) -> tuple[np.ndarray, np.ndarray, np.nd
     tetrahedra = []
     for layer in range(layers):
         low, high = surface + layer * len(points), surface + (layer + 1) * len(points)
-        # Prisms whose sides are cut from the lower node of lowest number: neighbours agree.
+        # Cut the sides of each prism from its lowest-numbered lower node, so that neighbours match.
         for k in range(3):
             tetrahedra.append(np.column_stack([low[:, : k + 1], high[:, k:]]))
     return nodes, np.concatenate(tetrahedra), np.array(triangles)
@@ -51,7 +51,7 @@ def solid(
     mapping: Mapping,
     **options,
 ) -> MechanicalModel:
-    """A body of one element on a mapped mesh; midside nodes are mapped, too, so edges may be curved.
+    """Return a body of one element kind on a mapped mesh; midside nodes are mapped too, so edges may be curved.
 
     Args:
         mesh: nodes (n, 3) and tetrahedra (m, 4) before the mapping.
@@ -68,7 +68,7 @@ def solid(
 
 
 def traction(model: MechanicalModel, selected: Callable[[np.ndarray], np.ndarray], force: np.ndarray) -> np.ndarray:
-    """Nodal loads (n, 3) of a uniform traction with a total ``force`` [N] on the outer faces of selected nodes (n,)."""
+    """Return nodal loads (n, 3) of a uniform traction, total ``force`` [N], on the outer faces of selected nodes."""
     connectivity = model.solids[0].connectivity
     corners = connectivity[:, :4]
     faces = corners[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
@@ -77,7 +77,7 @@ def traction(model: MechanicalModel, selected: Callable[[np.ndarray], np.ndarray
     outer = outer[selected(model.nodes)[outer].all(axis=1)]
     x = model.nodes[outer]
     areas = 0.5 * np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
-    if connectivity.shape[1] == 10:  # corners carry nothing of a uniform traction, midside nodes a third each
+    if connectivity.shape[1] == 10:  # a uniform traction loads only the midside nodes, a third each
         outer = quadratic_triangles(outer, connectivity)[:, 3:]
     loads = np.zeros_like(model.nodes)
     np.add.at(loads, outer, areas[:, None, None] / (3.0 * areas.sum()) * force)
@@ -85,7 +85,7 @@ def traction(model: MechanicalModel, selected: Callable[[np.ndarray], np.ndarray
 
 
 def linear_response(model: MechanicalModel, loads: np.ndarray) -> np.ndarray:
-    """Displacements [m] (n, 3) under small loads [N] (n, 3): one solve with the tangent at rest."""
+    """Return displacements [m] (n, 3) under small loads [N] (n, 3): one solve with the tangent at rest."""
     tangent = Linearisation(model)
     assert tangent.update(model.nodes, np.zeros(model.assembly.size))
     free = model.kinematics.free_dofs
@@ -97,7 +97,7 @@ def linear_response(model: MechanicalModel, loads: np.ndarray) -> np.ndarray:
 def clamped_beam(
     curve: Callable[[float], tuple[np.ndarray, np.ndarray]], elements: int, order: int, section: Section, **options
 ) -> MechanicalModel:
-    """A beam along a curve on [0, 1] (position, rotation), clamped at 0, with an effector at 1."""
+    """Return a beam along a curve on [0, 1] (position, rotation), clamped at 0, with an effector at 1."""
     body = ModelBuilder()
     places = np.linspace(0.0, 1.0, order * elements + 1)
     frames = [body.add_frame(*curve(t), fixed=t == 0.0, fixed_spin=t == 0.0) for t in places]
@@ -108,19 +108,19 @@ def clamped_beam(
 
 
 def straight(length: float) -> Callable[[float], tuple[np.ndarray, np.ndarray]]:
-    """A line along x, for `clamped_beam`."""
+    """Return a line along x, for `clamped_beam`."""
     return lambda t: (np.array([length * t, 0.0, 0.0]), np.eye(3))
 
 
 def sphere_octant(count: int, element: str, *, split: bool = False, **options) -> MechanicalModel:
-    """An octant of a thick sphere (radii 1 and 2) on its planes of symmetry.
+    """Return an octant of a thick sphere (radii 1 and 2) on its planes of symmetry.
 
     Actuator: the pressure in the cavity, closed by flat triangles between the inner edge and the centre.
 
     Args:
         count: cells along an edge, and through the wall.
         element: a name of `SOLIDS`.
-        split: whether the cavity of quadratic elements is of split triangles, not of quadratic ones.
+        split: close the cavity of quadratic elements with split instead of quadratic triangles.
         **options: of the element block.
     """
     nodes, tetrahedra, inner = shell_octant(count, count)
@@ -139,7 +139,7 @@ def sphere_octant(count: int, element: str, *, split: bool = False, **options) -
     )
     edges = {(a, b): middle for a, b, middle in np.concatenate(sides).tolist()}
     rim = {edge: middle for edge, middle in edges.items() if edge[::-1] not in edges}
-    # The centre and the middles of its spokes belong to no element: such nodes are held.
+    # The centre and the middles of its spokes belong to no element and are therefore held.
     centre, corners = len(nodes), sorted({a for a, _ in rim})
     spoke = {a: centre + 1 + k for k, a in enumerate(corners)}
     nodes = np.vstack([nodes, np.zeros((1, 3)), 0.5 * nodes[corners]])

@@ -1,8 +1,8 @@
-"""How far right does the Tetrapod come? Controllers, an optimised swing, and learned policies.
+"""How far to the right the Tetrapod gets with controllers, an optimised swing and learned policies.
 
-``softgym bench carry`` compares them. ``python -m benchmarks.carry`` searches the swing anew: servo angles through a
-few knots, found by differential evolution on the finite elements, for the farthest point that the centre passes. It
-knows what is reachable at all, and takes half an hour.
+``softgym bench carry`` compares them. ``python -m benchmarks.carry`` searches the swing again (half an hour): servo
+angles through a few knots, optimised by differential evolution on finite elements for the farthest point of the
+centre. It shows what can be reached at all.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def make(payload: float) -> gymnasium.Env:
 
 
 def episode(env: gymnasium.Env, act) -> tuple[float, float, float]:
-    """Farthest and last position to the right [mm], and the return, of one episode."""
+    """Return the farthest and the last position to the right [mm], and the return, of one episode."""
     observation, _ = env.reset(seed=0)
     reached, total, ended = [], 0.0, False
     while not ended:
@@ -38,7 +38,11 @@ def episode(env: gymnasium.Env, act) -> tuple[float, float, float]:
 
 
 def swing(parameters: np.ndarray):
-    """Agent that moves the servos through knots: (front, both sides, back) angles over pi / 2, shape (3 KNOTS,)."""
+    """Return an agent that moves the servos through knots.
+
+    Args:
+        parameters: (front, both sides, back) angles over pi / 2 at each knot, shape (3 KNOTS,).
+    """
     angles = 0.5 * np.pi * np.asarray(parameters).reshape(KNOTS, 3)[:, [0, 1, 2, 1]]
     times = np.linspace(0.0, 0.6 * STEPS, KNOTS + 1)
     step = iter(range(1, STEPS + 1))
@@ -53,7 +57,7 @@ def swing(parameters: np.ndarray):
 
 
 def search(payload: float, generations: int = 8, members: int = 2, seed: int = 0) -> dict[str, object]:
-    """Search the swing that comes farthest; about ``12 members (generations + 1)`` episodes."""
+    """Search for the swing that gets farthest, in about ``12 members (generations + 1)`` episodes."""
     from scipy.optimize import differential_evolution
     from tqdm import tqdm
 

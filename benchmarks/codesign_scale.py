@@ -1,4 +1,4 @@
-"""Co-design sweeps whose processes are killed and whose database is restarted; and where their time goes.
+"""Studies whose processes are killed and whose database is restarted; and where the time of a study goes.
 
 ``softgym bench codesign_kills codesign_profile`` (ten minutes).
 """
@@ -37,7 +37,7 @@ PLAIN = {
     "environment": {"id": "SoftGym/FingerReach-v0"},
     "variables": ["height", "joint_height"],
     "workers": WORKERS,
-    # No body twice, by which one that ran twice is told; a Gaussian process comes back to a corner of the box.
+    # TPE proposes no body twice, so a repeated body reveals a trial that ran twice; a Gaussian process repeats corners.
     "sampler": {"name": "tpe"},
     "heartbeat": 10.0,
     "finalists": {"count": 0},
@@ -47,7 +47,7 @@ TRAINED = {"strategy": "scratch", "trials": 8, "goals": {"count": 40, "unseen_co
 
 
 def finished(folder: StudyFolder, storage: StudyStorage) -> dict[int, Any]:
-    """Result of every finished trial, by number, as the storage tells it; of the journal, as the folder does."""
+    """Result of every finished trial, by number, from the database, or for a journal from the folder."""
     trials = storage.patiently(lambda: open_study(folder, storage).get_trials(deepcopy=False))
     ended = [trial for trial in trials if trial.state.name in ("COMPLETE", "PRUNED")]
     return {
@@ -56,11 +56,11 @@ def finished(folder: StudyFolder, storage: StudyStorage) -> dict[int, Any]:
 
 
 def faults(folder: StudyFolder, seen: dict[int, Any]) -> list[str]:
-    """What is wrong with a sweep that ended; nothing if every finished trial was kept once and none was lost.
+    """Return what is wrong with a finished sweep; empty if every finished trial was kept exactly once.
 
     Args:
         folder: the study.
-        seen: results that were seen finished on the way, by number.
+        seen: results that were finished at some point during the sweep, by number.
     """
     trials = open_study(folder).get_trials(deepcopy=False)
     counted = [trial for trial in trials if trial.state.name != "FAIL"]
@@ -71,11 +71,11 @@ def faults(folder: StudyFolder, seen: dict[int, Any]) -> list[str]:
     found += [f"trial {t.number} is {t.state.name}" for t in counted if t.state.name not in ("COMPLETE", "PRUNED")]
     found += [f"trial {number} was lost or changed" for number, r in seen.items() if records.get(number) != r]
     unpaired = set(records) ^ {trial.number for trial in counted}
-    found += [f"trial {number} and its result are not both there" for number in unpaired]
+    found += [f"trial {number} has no result, or its result has no trial" for number in unpaired]
     for trial in counted:
         record = records.get(trial.number)
         if record is not None and (record["number"], record["scores"]) != (trial.number, trial.values):
-            found.append(f"trial {trial.number} has the result of another one")
+            found.append(f"trial {trial.number} has the result of another trial")
     for what, keys in (
         ("origin", [trial.user_attrs["origin"] for trial in counted]),
         ("body", [tuple(trial.params.values()) for trial in counted]),
@@ -85,14 +85,14 @@ def faults(folder: StudyFolder, seen: dict[int, Any]) -> list[str]:
 
 
 class Sweep:
-    """Worker processes, one for each folder of a study, that are killed now and then.
+    """Worker processes, one for each folder of a study, that are killed at random moments.
 
     Args:
-        folders: of one study; several with a database.
-        seed: of the moments at which they are killed.
+        folders: of one study; several if its storage is a database.
+        seed: of the moments of the kills.
 
     Attributes:
-        seen: results that were seen finished, by number.
+        seen: finished results, by number.
     """
 
     def __init__(self, folders: Sequence[StudyFolder], seed: int) -> None:
@@ -100,7 +100,7 @@ class Sweep:
         self.seen: dict[int, Any] = {}
         self._storage = folders[0].open_storage()
         self._rng = np.random.default_rng(seed)
-        self._context = multiprocessing.get_context("forkserver")  # what workers import is imported once
+        self._context = multiprocessing.get_context("forkserver")  # imports of the workers run once
         self._context.set_forkserver_preload(
             [
                 "codesign.scheduling.worker",
@@ -122,11 +122,11 @@ class Sweep:
             process.join()
 
     def run_for(self, trials: int) -> None:
-        """Run until so many further trials are finished, or the study is, and a random moment longer."""
+        """Run until this many more trials, or all trials, are finished, and for a random moment longer."""
         total = self.folders[0].config.trials
         goal = min(len(self.seen) + trials, total)
         while len(self.seen) < goal:
-            for index, folder in enumerate(self.folders):  # also those that ended as there was nothing to claim
+            for index, folder in enumerate(self.folders):  # or they ended for want of a trial
                 if index not in self._processes or not self._processes[index].is_alive():
                     self._processes[index] = self._context.Process(target=_work, args=(str(folder.path),), daemon=True)
                     self._processes[index].start()
@@ -173,7 +173,7 @@ def _killed_sweep(storage: str, seed: int) -> dict[str, object]:
         for attempt in range(KILLS + 1):
             last = attempt == KILLS
             goal = TRIALS if last else len(seen) + int(rng.integers(0, 20))
-            # A goal that is reached already is a kill while processes start.
+            # If the goal is already reached, the kill hits processes that are starting.
             pause = rng.uniform(0.0, 8.0 if goal == len(seen) else 1.0)
             with subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True) as process:
                 while process.poll() is None and len(seen) < goal:
@@ -206,12 +206,12 @@ def _killed_sweep(storage: str, seed: int) -> dict[str, object]:
 
 
 def kills() -> dict[str, object]:
-    """Sweeps of 200 trials, killed ten times and continued: on the journal, and on PostgreSQL that is restarted too."""
+    """Studies of 200 trials, killed ten times and continued, with a journal and with a restarted PostgreSQL."""
     return {**_killed_sweep(JOURNAL, seed=0), **_killed_sweep("postgresql", seed=1)}
 
 
 def _timed_worker(path: str, output: str, started: str) -> None:
-    """A worker, started at a time, that writes down how long it was inside training, evaluation and the ledger [s]."""
+    """Run a worker and write how long it was inside training, evaluation and the queue [s]."""
     import agents.training
     import codesign.phases.trial
     import codesign.scheduling.worker

@@ -1,13 +1,13 @@
-"""Compare the compliance of the Diamond at rest with the one SOFA computed on the same mesh.
+"""Compare the rest compliance of the Diamond with the one that SOFA computed on the same mesh.
 
 The mesh comes from the SoftRobots plugin of SOFA (LGPL) and is not part of this project: pass the folder that holds
 ``diamond_mesh.npz`` and ``diamond_W.json``.
 
     python -m benchmarks.compare_sofa_diamond FOLDER
 
-At rest SOFA's W and the exact one are the same: without tension its tangent leaves nothing out. One row differs for
-another reason. The anchor of the north cable lies outside the mesh, where it is extrapolated from one element; SOFA
-takes another element than the nearest one, which is taken here. With SOFA's element that row agrees, too.
+At rest, without tension, SOFA's tangent is complete, so both compliances should agree. One row differs: the anchor of
+the north cable lies outside the mesh and is extrapolated from one element. This project takes the nearest element,
+SOFA another one; with SOFA's element that row agrees as well.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ CABLES = ("north", "west", "south", "east")
 
 
 def build_diamond(mesh: dict[str, np.ndarray], *, same_elements: bool) -> MechanicalModel:
-    """Make the Diamond: E 180 kPa, nu 0.45, no mass, four cables that may push, the effector at the top.
+    """Return the Diamond: E 180 kPa, nu 0.45, no mass, four cables that may push, the effector at the top.
 
     Args:
         mesh: arrays of ``diamond_mesh.npz``, in mm.
-        same_elements: extrapolate cable anchors outside the mesh from the elements SOFA took, not from the nearest.
+        same_elements: extrapolate cable anchors outside the mesh from the elements SOFA took instead of the nearest.
     """
     model = MechanicalModel.from_mesh(
         mesh["nodes"] * 1e-3,
@@ -55,7 +55,7 @@ def build_diamond(mesh: dict[str, np.ndarray], *, same_elements: bool) -> Mechan
 
 
 def compare(folder: str | Path) -> dict[str, dict[str, float]]:
-    """Largest difference of each row of W at rest, relative to the row's largest entry, by choice of elements.
+    """Return the largest difference in each row of W at rest, relative to its largest entry, by choice of elements.
 
     Raises:
         DataError: if a file is missing or damaged.

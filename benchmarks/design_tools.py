@@ -1,4 +1,4 @@
-"""The design tools on the thesis' own problems: optima of section 4.5.3, calibration, and the front of Figure 3.6."""
+"""The design tools on problems of the thesis: optima (sec. 4.5.3), calibration, and the front of fig. 3.6."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _shown(design: dict[str, float]) -> list[float]:
 
 
 def optima() -> dict[str, object]:
-    """Dexterity and strength of the one-cable finger (eq. 4.15 to 4.17): gradient and TPE from every corner of the box.
+    """Dexterity and strength of the one-cable finger (thesis, eq. 4.15 to 4.17), by gradient and TPE from every corner.
 
     Designs are length, height and joint height [mm]; angles are in rad, forces in N.
     """
@@ -142,9 +142,9 @@ def calibration() -> dict[str, object]:
 
 
 def sensor_front() -> dict[str, object]:
-    """Front of the sensorized finger (thesis, Fig. 3.6): 1500 designs with NSGA-II; goes on where it was stopped.
+    """Front of the sensorized finger (thesis, fig. 3.6): 1500 designs with NSGA-II; resumes.
 
-    Volume changes are in mm3, angles in degrees. It works in ``results/sensorized_finger_front``.
+    Volume changes are in mm3, angles in degrees. Files are kept in ``results/sensorized_finger_front``.
     """
     from benchmarks.sensor_finger import DESIGNS
     from codesign.tools.config import OptimiseConfig

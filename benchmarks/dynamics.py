@@ -35,7 +35,7 @@ GRAVITY = (0.0, 0.0, -9.81)
 def solid_bar(
     *, clamped: bool, cells: Sequence[int] = (8, 2, 2), element: str = "linear", young_modulus: float = 1e6, **options
 ) -> MechanicalModel:
-    """A bar of 0.2 x 0.02 x 0.02 m along x, clamped at x = 0 or free."""
+    """Return a bar of 0.2 x 0.02 x 0.02 m along x, clamped at x = 0 or free."""
     nodes, tetrahedra = box_mesh(cells=cells)
     fixed = (nodes[:, 0] == 0.0) & clamped
     body = ModelBuilder(floating=not clamped, **options)
@@ -48,7 +48,7 @@ def solid_bar(
 
 
 def rod(*, clamped: bool, elements: int = 8, order: int = 2, radius: float = 0.01, **options) -> MechanicalModel:
-    """A round beam of 1 m along x, clamped at x = 0 or free."""
+    """Return a round beam of 1 m along x, clamped at x = 0 or free."""
     body = ModelBuilder(floating=not clamped, **options)
     frames = [
         body.add_frame([s, 0.0, 0.0], fixed=clamped and s == 0.0, fixed_spin=clamped and s == 0.0)
@@ -62,7 +62,7 @@ def rod(*, clamped: bool, elements: int = 8, order: int = 2, radius: float = 0.0
 
 
 def rigid_box(**options) -> MechanicalModel:
-    """A free box of 1 kg with half-extents 0.1, 0.2 and 0.4 m."""
+    """Return a free box of 1 kg with half-extents 0.1, 0.2 and 0.4 m."""
     body = ModelBuilder(floating=True, **options)
     frame = body.add_frame([0.0, 0.0, 0.0])
     body.add_mass(frame, 1.0, box_inertia(1.0, np.array([0.1, 0.2, 0.4])))
@@ -106,7 +106,7 @@ def conservation(steps: int = 1000) -> list[Row]:
     }
     for name, (model, step, spin) in bodies.items():
         solver = Dynamics(model, step=step, scheme="generalised_alpha", spectral_radius=1.0)
-        # A drift sideways, so that the linear momentum is not zero.
+        # Drift sideways, so that the linear momentum is not zero.
         velocity = waves(model, spin)
         velocity[: len(model.kinematics.free_dofs)] += 0.1 * (model.kinematics.free_dofs % 3 == 0)
         solver.launch(velocity)
@@ -133,9 +133,9 @@ def conservation(steps: int = 1000) -> list[Row]:
 
 
 def swinging(model: MechanicalModel, speed: float, **options) -> Dynamics:
-    """The motion of a clamped body from rest, with velocities of its first mode and this one [m/s] at its tip.
+    """Return a clamped body that starts with the velocities of its first mode, scaled to this tip speed [m/s].
 
-    Nothing that a step cannot resolve is in it at first.
+    The start contains no motion that a step cannot resolve.
     """
     _, modes = eigenmodes(model, lumped=False, count=1)
     solver = Dynamics(model, tolerance=1e-12, **options)
@@ -166,7 +166,7 @@ SPIN = np.array([0.3, 3.0, 0.2])
 def order(levels: Sequence[int] = (64, 128, 256), fine: int = 2048) -> list[Row]:
     """Tips of cantilevers in a large swing against a fine step; the rotation of a free box against Euler's equations.
 
-    Steps per run; error: over the way that the tip goes, or of the rotation matrix.
+    Settings are steps per run. Errors are relative to the path of the tip, or those of the rotation matrix.
     """
     rows = []
     bodies = {
@@ -213,7 +213,7 @@ def eigenmodes(model: MechanicalModel, lumped: bool, count: int = 20) -> tuple[n
     tangent, indptr, indices = assembled.tangent.copy(), assembly.indptr, assembly.indices
     lower = csc_matrix((tangent, indices, indptr)).toarray()
     stiffness = lower + np.tril(lower, -1).T
-    # Each equation moves rows; the mass matrix is one of the rows.
+    # The mass matrix acts on rows, so find how each equation moves them.
     motions = np.array([model.kinematics.row_velocity(model.nodes, unit) for unit in np.eye(model.equations)])
     matrix = model.assembly.mass_matrix(lumped).rows
     mass = np.einsum("and,bnd->ab", motions, np.array([matrix @ motion for motion in motions]))
@@ -238,7 +238,7 @@ def frequencies(elements: int = 16, cells: int = 40) -> list[Row]:
     for order_, lumped in ((2, False), (2, True), (1, False), (1, True)):
         model = rod(clamped=True, elements=elements * (3 - order_), order=order_, radius=0.005)
         found, _ = eigenmodes(model, lumped)
-        # Every bending mode comes twice, once for each direction.
+        # Every bending mode appears twice, once for each direction.
         values = found[[0, 2, 4]] / (2.0 * np.pi)
         for k, (value, reference) in enumerate(zip(values, exact, strict=True)):
             setting = f"beam of order {order_}, {'lumped' if lumped else 'consistent'}"
@@ -281,7 +281,7 @@ def pendulum(count: int, spin: Sequence[float], *, joint: str = "bond", **option
     Args:
         count: number of bars.
         spin: about the axes of space.
-        joint: how the first bar is held: ``"bond"``, or ``"frame"``: its frame is on one at the fixed point.
+        joint: how the first bar is held: by a ``"bond"``, or by a ``"frame"`` at the fixed point that carries it.
         **options: of `Dynamics`.
     """
     body = ModelBuilder(gravity=GRAVITY, floating=joint == "bond")
@@ -326,7 +326,7 @@ def pendulum_exact(count: int, spin: Sequence[float], duration: float) -> np.nda
             inertia = turns[k] @ np.diag(moments) @ turns[k].T
             matrix[a, a], matrix[b, b] = np.eye(3), inertia
             right[a], right[b] = GRAVITY, -np.cross(w[k], inertia @ w[k])
-            # The upper end of bar k keeps the place of the lower end of the bar before.
+            # The upper end of bar k is joined to the lower end of the bar before.
             for bar, sign in ((k, 1.0), (k - 1, -1.0)):
                 if bar < 0:
                     continue
@@ -395,7 +395,7 @@ def rigid(levels: Sequence[int] = (50, 100, 200, 400)) -> list[Row]:
 
 
 def pulled_bar(**options) -> MechanicalModel:
-    """A hanging bar of 0.2 m with a cable off its axis and an effector at its tip."""
+    """Return a hanging bar of 0.2 m with a cable off its axis and an effector at its tip."""
     nodes, tetrahedra = box_mesh(cells=(2, 2, 8))
     body = ModelBuilder(gravity=GRAVITY)
     nodes = nodes * [0.02, 0.02, 0.2]
@@ -410,7 +410,7 @@ def pulled_bar(**options) -> MechanicalModel:
 
 
 def pulled_bar_at_rest(**options) -> Dynamics:
-    """The bar hanging still under its weight, the cable held."""
+    """Return the bar at rest under its weight, with the cable held."""
     model = pulled_bar()
     rest = Statics(model, tolerance=1e-13).solve([0.0])
     solver = Dynamics(model, tolerance=1e-13, **options)
@@ -424,7 +424,7 @@ DAMPING = {"mass_damping": 0.5, "stiffness_damping": 0.01}
 def compliance(scheme: str = "euler") -> list[Row]:
     """W of a step in the middle of a motion against central differences of the efforts; error relative to its size.
 
-    Mixed units: every row and column is measured by its own diagonal entry.
+    Units are mixed, so every row and column is scaled by its diagonal entry.
     """
     rows = []
     machines: dict[str, tuple[Callable[..., Dynamics], np.ndarray, float]] = {
@@ -436,7 +436,7 @@ def compliance(scheme: str = "euler") -> list[Row]:
             solver = build(step=0.01, scheme=scheme, **damping)
             n = len(pull)
             for k in range(8):
-                # Starts smoothly: the second order scheme would rattle, and steps would be cut.
+                # Start smoothly: otherwise the second-order scheme oscillates and divides its steps.
                 motion = solver.advance(0.5 * (1.0 - np.cos(0.6 * np.pi * (k + 1) / 8.0)) * pull)
             effort = motion.equilibrium.effort[: n + 3]
             kept = solver.snapshot
@@ -462,9 +462,9 @@ def compliance(scheme: str = "euler") -> list[Row]:
 
 
 def book_keeping(levels: Sequence[int] = (50, 100, 200)) -> list[Row]:
-    """What is missing from work = change of energy + dissipated, over the work, while actuators move for 0.5 s.
+    """Error of the balance work = change of energy + dissipation, over the work, while actuators move for 0.5 s.
 
-    Implicit Euler loses energy; the missing part is its own damping, positive and falling with the step.
+    Implicit Euler loses energy by numerical damping, so its error is positive and falls with the step.
     """
     rows = []
     machines: dict[str, tuple[Callable[..., Dynamics], np.ndarray]] = {
@@ -479,7 +479,7 @@ def book_keeping(levels: Sequence[int] = (50, 100, 200)) -> list[Row]:
                     solver = build(step=0.5 / steps, scheme=scheme, **damping)
                     start = sum(solver.energies())
                     for k in range(steps):
-                        # Starts and ends smoothly.
+                        # Start and end smoothly.
                         motion = solver.advance(0.5 * (1.0 - np.cos(np.pi * (k + 1) / steps)) * pull)
                     missing = (motion.work - (motion.energy - start) - motion.dissipated) / motion.work
                     kind = "Rayleigh damping" if damping else "no damping"

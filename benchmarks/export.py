@@ -1,4 +1,4 @@
-"""How fast exported models are: the C header compiled, the ONNX graph, and embedded control on them; one thread."""
+"""Speed of exported models on one thread: the compiled C header, the ONNX graph, and embedded control on them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FLAGS = {
 
 EFFORT_WEIGHT, STEP_WEIGHT = 1e-5, 1e-3
 
-# Times of many calls, and thesis Algorithm 2 as a whole: the quadratic program has bounds and rates of efforts only and
+# Times of many calls, and the whole of algorithm 2 (thesis): the quadratic program has bounds and rates of efforts only and
 # is solved by an active-set method, with the objective of `softgym_envs.control.InverseQP`.
 _SOURCE = r"""
 #define _POSIX_C_SOURCE 199309L
@@ -276,7 +276,7 @@ def _onnx_speed(model: Any, displacement: np.ndarray, folder: Path) -> dict[str,
 
 
 def _control_speed(model: Any, context: Any, library: ctypes.CDLL, efforts: np.ndarray) -> dict[str, object]:
-    """Rates of thesis Algorithm 2 along a path: controller in Python on either model, and all of it in C."""
+    """Rates of thesis, algorithm 2 along a path: controller in Python on either model, and all of it in C."""
     from softgym_envs.control import EmbeddedLoop, InverseQP
 
     count = model.count
@@ -352,7 +352,7 @@ def _measure(model: Any) -> dict[str, object]:
         result["size of the header's constants [kB]"] = _constant_bytes(folder / "model.h") / 1e3
         one = displacement[:1].astype(float)
         for name, work in (("state", model.state), ("condensed", model.condensed)):
-            work(context, one)  # compiles what is not yet
+            work(context, one)  # the first call compiles
             result[f"Python {name}, batch 1 [us]"] = 1e6 * _median_seconds(partial(work, context, one), 500)
         result |= _onnx_speed(model, displacement, folder)
         efforts = model.state(context.shared(context, calls), displacement.astype(float))[0]

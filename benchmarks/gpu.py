@@ -1,4 +1,4 @@
-"""Environment steps a second of `TorchVectorEnv`: ``python -m benchmarks.gpu [--device cuda] [--num-envs 100000]``."""
+"""Speed of `TorchVectorEnv` in steps per second: ``python -m benchmarks.gpu [--device cuda] [--num-envs 100000]``."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _seconds(work: Callable[[], object], repeats: int, device: torch.device) -> 
 
 
 def measure(identifier: str, num_envs: int, device: torch.device, *, steps: int, repeats: int, **options: Any) -> dict:
-    """Time steps with random actions inside an episode, and the beginning of all episodes at once.
+    """Time steps with random actions inside an episode, and a reset of all episodes at once.
 
     Args:
         identifier: environment ID.
@@ -60,7 +60,7 @@ def measure(identifier: str, num_envs: int, device: torch.device, *, steps: int,
         **options: of `TorchVectorEnv`.
 
     Returns:
-        Seconds of a step and of a reset; environment steps a second with one reset for each episode of the ID's
+        Seconds of a step and of a reset; environment steps per second with one reset for each episode of the ID's
         length, and without resets; seconds until the first step was done; memory [bytes] on a CUDA device.
     """
     if device.type == "cuda":

@@ -1,4 +1,4 @@
-"""Learning online: a surrogate that knows a quarter of what the task asks, with finite elements at hand."""
+"""Online learning: a surrogate trained on a quarter of the displacements that the task needs, backed by FEM."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BAD = 1e-3
 
 
 def flagging(model, data: dict[str, np.ndarray], limit: float) -> dict[str, object]:
-    """Which errors above 1 mm a model flags outside the box ``limit``, and what it flags in vain inside."""
+    """Return the share of errors above 1 mm that a model flags outside ``limit``, and its false alarms inside."""
     context = model.context(data["design"])
     _, effector, spread = model.state(context, data["displacement"])
     uncertainty, trusted = model.trust(context, data["displacement"], spread)
@@ -44,7 +44,7 @@ def flagging(model, data: dict[str, np.ndarray], limit: float) -> dict[str, obje
 
 
 def _follow(env: gymnasium.Env, goals: np.ndarray) -> list[np.ndarray]:
-    """Run the inverse QP to each goal; returns the last command of each episode."""
+    """Run the inverse QP to each goal and return the last command of each episode."""
     from agents.evaluation import make_agent
 
     act, last = make_agent("qp"), []
@@ -62,7 +62,7 @@ def hybrid() -> dict[str, object]:
     """FingerReach beyond what the surrogate was trained on: FEM calls of the hybrid backend, errors, flagged states.
 
     The surrogate knows two cables of the baseline finger up to 10 mm; the goals need 10 to 20 mm of both. The inverse
-    QP goes to 40 of them on the hybrid backend, which learns between episodes, and on the finite elements.
+    QP drives to 40 of them on the hybrid backend, which learns between episodes, and on FEM.
     """
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.backends.fem import FEMBackend

@@ -2,8 +2,8 @@
 
     python -m benchmarks.networks results/networks 2
 
-makes the data (one body each: the Soft Finger with two cables and the Diamond, as in thesis 4.3.1), trains every
-network on parts of it in so many processes, and writes one JSON per run; it resumes where it was stopped. The runs
+makes the data (one body each: the Soft Finger with two cables and the Diamond, as in the thesis, sec. 4.3.1), trains
+every network on parts of it in this many processes, and writes one JSON per run; it resumes. The runs
 that this repository keeps are in ``benchmarks/data/networks.json``; ``softgym bench networks`` shows them.
 """
 
@@ -214,7 +214,7 @@ def _run(path: Path, case: str, name: str, data: dict[str, dict[str, np.ndarray]
 
 
 def _track(path: Path, case: str, data: dict[str, dict[str, np.ndarray]], size: int, folder: Path) -> Path:
-    """Tracking with a network that learned ``size`` states chosen by k-means (thesis 5.3)."""
+    """Tracking with a network that learned ``size`` states chosen by k-means (thesis, sec. 5.3)."""
     import torch
 
     from benchmarks.robots import predicted_path
@@ -246,7 +246,7 @@ def _track(path: Path, case: str, data: dict[str, dict[str, np.ndarray]], size: 
 
 
 def main(folder: Path, workers: int = 1) -> None:
-    """Make what is missing, and write all runs to ``benchmarks/data/networks.json``, also when it is stopped."""
+    """Train what is missing, and write all runs to ``benchmarks/data/networks.json``, even if interrupted."""
     from softgym_envs.executors import parallel_map
 
     runs = folder / "runs"

@@ -21,6 +21,7 @@ import json
 import re
 import sys
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,9 @@ from softgym_envs.errors import DataError
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = (ROOT / "benchmarks" / "data" / "recorded.json", ROOT / "benchmarks" / "results.json")
 """Later files win: a benchmark that has been run replaces a recorded result."""
+
+DERIVED = ("networks", "strategies")
+"""Benchmarks that evaluate a data file of their own, in a second."""
 
 MARKER = re.compile(r"(<!-- bench: (?P<key>.+?) -->)(?P<text>.*?)(<!-- /bench -->)", re.DOTALL)
 FORMAT = re.compile(r"(?P<pick>min|max)? *(?:\[(?P<item>\d+)\])? *(?P<form>.*)")
@@ -47,10 +51,8 @@ def results(benchmark: str) -> dict[str, Any]:
     Raises:
         DataError: if the benchmark has no recorded results.
     """
-    if benchmark == "networks":  # evaluated from its own data file, in a second
-        from benchmarks.networks import networks
-
-        return networks()
+    if benchmark in DERIVED:
+        return getattr(import_module(f"benchmarks.{benchmark}"), benchmark)()
     try:
         return records()[benchmark]["results"]
     except KeyError:

@@ -1,4 +1,4 @@
-"""A PostgreSQL server of its own: a temporary folder, a free port of this machine, gone at the end."""
+"""A temporary PostgreSQL server in its own folder, on a free port of this machine."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pathlib import Path
 __all__ = ["PostgresServer", "find_programs", "temporary_server"]
 
 ACCOUNT = "postgres"
-"""Who runs the server where we are root, which it refuses to be run by; the package of Debian makes this account."""
+"""Account that runs the server if we are root, whom PostgreSQL refuses; Debian's package creates it."""
 
 
 def find_programs() -> Path | None:
-    """Folder of ``initdb`` and ``pg_ctl``, or None. Debian keeps them off the search path."""
+    """Return the folder of ``initdb`` and ``pg_ctl``, or None. Debian keeps them off the search path."""
     places = [Path(found).resolve().parent for found in [shutil.which("initdb"), shutil.which("pg_ctl")] if found]
     debian = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: float(path.parent.name), reverse=True)
     for place in (*places, *debian):
@@ -85,7 +85,7 @@ class PostgresServer:
 
 @contextmanager
 def temporary_server() -> Iterator[PostgresServer]:
-    """A running server for the time of a block.
+    """Run a server inside a ``with`` block.
 
     Raises:
         FileNotFoundError: if PostgreSQL is not installed.

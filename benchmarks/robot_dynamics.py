@@ -1,4 +1,4 @@
-"""How robots behave in dynamics: slow motions against statics, and the Tetrapod under loads and random actions."""
+"""Robots in dynamics: slow motions compared with statics, and the Tetrapod under loads and random actions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from softgym_envs.robots import make_robot
 
 
 def tetrapod_at_rest(design: dict[str, float] | None = None, **options) -> Dynamics:
-    """The Tetrapod hanging still, servos held at zero."""
+    """Return the Tetrapod at rest, with servos held at zero."""
     model = make_robot("tetrapod").build(design)
     rest = Statics(model, tolerance=1e-13).solve(np.zeros(4))
     solver = Dynamics(model, tolerance=1e-12, **options)
@@ -35,7 +35,7 @@ ROBOTS: dict[str, tuple[dict[str, object], list[float]]] = {
 
 
 def quasi_static(names: Sequence[str] = tuple(ROBOTS), rest: int = 60) -> list[Row]:
-    """Distance [m] of the effector from its static equilibrium after a slow command and ``rest`` control steps of calm.
+    """Distance [m] of the effector from its static equilibrium after a slow command and ``rest`` further control steps.
 
     Rayleigh damping: 5 / s of the masses, 0.01 s of the stiffness; one time step in each control step.
     """
@@ -96,7 +96,7 @@ def workspace(values: Sequence[float] = (-1.0, 0.0, 1.0)) -> list[Row]:
 
 
 def fall(solver: Dynamics, seconds: float = 4.0) -> Motion:
-    """Let a body go on until it hardly moves, or for so many seconds."""
+    """Step a body until it hardly moves, but no longer than this many seconds."""
     servos = len(solver.model.constraints["a"])
     for _ in range(round(seconds / solver.step)):
         motion = solver.advance(np.zeros(servos))

@@ -1,4 +1,4 @@
-"""Published trajectories, followed on the finite elements, and the published compliance of the Stiff-Flop."""
+"""Published trajectories, followed with finite elements, and the published compliance of the Stiff-Flop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PUBLISHED_COMPLIANCE = {
     "W_xx": 0.0393,
     "W_yy": 11.59,
 }
-"""Rest compliance of the Stiff-Flop (thesis 4.4): volumes in mm3, lengths in mm, pressures in kPa, forces in mN."""
+"""Rest compliance of the Stiff-Flop (thesis, sec. 4.4), in mm3, mm, kPa and mN."""
 
 
 class _Timer:
@@ -68,8 +68,8 @@ def _follow(
         name: of the case.
         robot_name: registry name.
         goals: [m], shape (p, 3), or their number along the reference path.
-        approach: goals on the straight way from rest to the first one; they do not count.
-        calls: of the controller for each goal.
+        approach: number of goals on the straight line from rest to the first goal; their errors do not count.
+        calls: number of controller calls for each goal.
         weights: of the coordinates of the effector.
         options: of the robot.
     """
@@ -115,9 +115,9 @@ def _embedded_trunk(
     Args:
         name: of the case.
         stiffness: of the plant over that of the model.
-        encoders: measure the volumes of the chambers; without, the model predicts them (thesis Algorithm 2).
+        encoders: measure the volumes of the chambers; otherwise the model predicts them (thesis, algorithm 2).
         gains: proportional and integral gain per call of the closed loop, or None.
-        calls: of the controller for each goal.
+        calls: number of controller calls for each goal.
     """
     from softgym_envs.backends.fem import FEMBackend
     from softgym_envs.control import EmbeddedLoop, InverseQP, PICorrection
@@ -191,7 +191,7 @@ def predicted_path(
 ) -> dict[str, float]:
     """Follow the reference path on the surrogate alone, with its predicted states, and replay the commands on FEM.
 
-    The way to the first goal does not count. Distances are along the coordinates a goal is about (``goal_axes``).
+    Errors on the way to the first goal do not count. Distances are along the coordinates of the goal (``goal_axes``).
 
     Returns:
         The largest distance of prediction and FEM, and of FEM and goal [mm].
@@ -220,7 +220,7 @@ def predicted_path(
 
 
 def predicted_tracking() -> dict[str, object]:
-    """Reference paths followed on the shipped surrogates with predicted states: how far FEM is from the prediction."""
+    """Reference paths followed on the shipped surrogates with predicted states: distance of FEM from the prediction."""
     from softgym_envs.robots import make_robot
     from softgym_envs.surrogate.pretrained import shipped_robots
 
@@ -228,7 +228,7 @@ def predicted_tracking() -> dict[str, object]:
     for variant, (name, options) in shipped_robots().items():
         if not make_robot(name, **options).convex:  # a part of grippers: see `shared_finger`
             continue
-        # The published circle of the Diamond asks for cables that push.
+        # The published circle of the Diamond needs cables that push.
         given = {**options, "unilateral": False} if name == "diamond" else options
         result |= {f"{variant}: {k}": v for k, v in predicted_path(name, options=given).items()}
     return result
@@ -311,7 +311,7 @@ def rest_compliance() -> dict[str, float]:
 
 
 def _serial_beam(area: float, offset: float, section: float, inertia: float) -> np.ndarray:
-    """The same from the theory of slender beams: a clamped one of four pieces in series, without shear.
+    """The same by beam theory: a slender clamped beam of four pieces in series, without shear.
 
     Args:
         area: of a pair of chambers [mm2].
@@ -343,8 +343,8 @@ def _serial_beam(area: float, offset: float, section: float, inertia: float) -> 
 def infer_section() -> np.ndarray:
     """Chamber area, offset, section and inertia [mm] whose slender beam has the published compliance.
 
-    Four numbers against twelve entries; the least sum of sixth powers of the relative errors, so that the largest
-    counts.
+    Fits four numbers to twelve entries by the sum of the sixth powers of the relative errors, which the largest error
+    dominates.
     """
     from scipy.optimize import least_squares
 
@@ -357,7 +357,7 @@ def infer_section() -> np.ndarray:
 
 
 def stiff_flop() -> dict[str, object]:
-    """Rest compliance of the Stiff-Flop against the published one, and where its four inferred dimensions come from."""
+    """Rest compliance of the Stiff-Flop against the published one, and its four inferred dimensions."""
     from softgym_envs.robots import stiff_flop as robot
 
     result: dict[str, object] = {}

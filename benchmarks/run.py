@@ -1,4 +1,4 @@
-"""``softgym bench`` (or ``make bench``): run benchmarks, print them, and keep the results in one JSON file."""
+"""``softgym bench`` (or ``make bench``): run benchmarks, print their results and record them in one JSON file."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
 
 
 def run(names: Sequence[str], output: str | Path) -> dict[str, dict[str, object]]:
-    """Run the named benchmarks (default: all) and write each result, with what made it, to a JSON file.
+    """Run the named benchmarks (default: all) and write each result with its provenance to a JSON file.
 
-    Results of other benchmarks that the file holds already stay, with the commit that made them.
+    The file keeps its results of other benchmarks, with the commit that made them.
 
     Raises:
-        ConfigError: for an unknown name, or a file that is something else.
+        ConfigError: for an unknown name, or a file with other contents.
     """
     for name in names:
         if name not in BENCHMARKS:

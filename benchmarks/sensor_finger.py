@@ -1,4 +1,4 @@
-"""Compare the sensorized finger with the published study of its design (thesis, section 3.3).
+"""Compare the sensorized finger with the published study of its design (thesis, sec. 3.3).
 
 ``softgym bench sensor_finger`` computes the published tables and times. The 400 designs that the authors of the study
 recorded are not part of this project: pass the file that holds them, a CSV with the columns ``trial``, the seven
@@ -6,8 +6,8 @@ variables [mm, rad], ``obj0`` (volume change [mm3]) and ``obj1`` (bending angle 
 
     python -m benchmarks.sensor_finger TRIALS.csv
 
-goes through them (and on from where it was stopped), writes ``results/sensor_finger.csv`` and
-``results/sensor_finger.json``, and prints how both agree. What it found is kept in ``benchmarks/data``.
+evaluates them (and resumes), writes ``results/sensor_finger.csv`` and
+``results/sensor_finger.json``, and prints how well both agree. Its results are kept in ``benchmarks/data``.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ DESIGNS: dict[str, dict[str, float]] = {
         "plateau_height": 3.86 * MM,
     },
 }
-"""Thesis, Fig. 3.3: the initial design and the two that were built."""
+"""The initial design and the two that were built (thesis, fig. 3.3)."""
 
 TABLE = {"baseline": (41.5, 21.1), "slim": (29.7, 28.13), "large": (153.1, 19.1)}
-"""Thesis, Table 3.1: volume change [mm3] and bending angle [deg], simulated."""
+"""Simulated values of the thesis (table 3.1): volume change [mm3] and bending angle [deg]."""
 
 NAMES = {
     "JointSlopeAngle": "slope",
@@ -107,10 +107,10 @@ def draw_refined(**lengths: float) -> None:
 
 
 class SourceFinger(SensorizedFinger):
-    """The finger as the scenes of the study have it.
+    """The finger as in the scenes of the study.
 
     Args:
-        mass: total mass under gravity along -z [kg]; the scenes have 0.1 kg whatever the volume.
+        mass: total mass under gravity along -z [kg]; the scenes have 0.1 kg for every volume.
         refined: mesh as `draw_refined` does.
         **options: as for `SensorizedFinger`.
     """
@@ -138,7 +138,7 @@ def published() -> dict[str, object]:
     """Sensorized finger: table 3.1 and table 3.5 of the thesis, and the time of a design."""
     kinds = {
         "7 mm": SensorizedFinger(meshing="remesh"),
-        # What the scene of the built fingers sets.
+        # Settings of the scene of the built fingers.
         "as built": SourceFinger(refined=True, cable_clearance=1.0 * MM),
         "3 mm": SensorizedFinger(meshing="remesh", mesh_size=3.0 * MM),
     }
@@ -150,7 +150,7 @@ def published() -> dict[str, object]:
             readings = robot.readings(design | elasticity)
             angle = math.degrees(readings.bending_angle)
             result[f"{name}: {kind} [uL, deg]"] = [round(1e9 * readings.volume_change, 1), round(angle, 2)]
-    # The initial finger has its cable 3 mm above the bellows (17.75 mm) where the study does not move it with them.
+    # The study keeps the cable of the initial finger at 17.75 mm, 3 mm above the bellows.
     readings = SensorizedFinger(meshing="remesh", cable_clearance=3.0 * MM).readings()
     angle = math.degrees(readings.bending_angle)
     result["baseline: 7 mm, cable at 17.75 mm [uL, deg]"] = [round(1e9 * readings.volume_change, 1), round(angle, 2)]

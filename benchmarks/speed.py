@@ -1,4 +1,4 @@
-"""How fast: medians on one thread."""
+"""Speed: medians on one thread."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def fem_step() -> dict[str, object]:
 class _Shares:
     """Adds up the seconds spent in the parts of finite-element steps while it is entered as a context.
 
-    What one part calls of another counts for the outer one.
+    Time that one part spends in another counts for the outer part.
     """
 
     def __init__(self) -> None:
@@ -156,7 +156,7 @@ def _environment_speed(identifier: str, options: dict[str, object], steps: int, 
         for _ in range(8):  # away from rest, where half of the actuators would be slack
             env.step(np.full(env.action_space.shape or 1, 0.3, dtype=np.float32))
 
-    reset(0)  # compiles what is not yet
+    reset(0)  # the first call compiles
     resets.clear()
     with _Shares() as shares:
         for repeat in range(repeats):
@@ -191,7 +191,7 @@ def _environment_speed(identifier: str, options: dict[str, object], steps: int, 
 def fem_speed() -> dict[str, object]:
     """Every environment on FEM under random actions, W included: on its own mesh and on a finer one.
 
-    The finer one has elements of a tenth of the volume, or ten times as many where a robot counts them.
+    The finer mesh has elements of a tenth of the volume, or ten times as many where a robot option sets their number.
     """
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.envs.registration import ENVIRONMENTS
@@ -231,7 +231,7 @@ def notched_beam() -> dict[str, object]:
 
 
 def surrogate_ids() -> list[str]:
-    """Environments whose physics is a surrogate unless told otherwise."""
+    """Return the IDs whose default backend is the surrogate."""
     from softgym_envs.envs.registration import ENVIRONMENTS
 
     return [identifier for identifier, row in ENVIRONMENTS.items() if row.backend == "surrogate"]
@@ -258,7 +258,7 @@ print(json.dumps(count * actions / sorted(laps)[2]))
 
 
 def surrogate_step() -> dict[str, object]:
-    """Surrogate environment steps per second, random increments, resets counted; batches in one and two processes."""
+    """Surrogate environment steps per second, random increments, resets included; batches in one and two processes."""
     import gymnasium
 
     import softgym_envs  # noqa: F401 - registers the IDs
@@ -322,7 +322,7 @@ def memory() -> dict[str, object]:
         "env.reset(seed=0)\n"
         "for _ in range(60):\n"
         "    if env.step(env.action_space.sample())[3]: env.reset()\n"
-        # Not ru_maxrss, which a process inherits from the one that started it.
+        # A child process inherits ru_maxrss from its parent, so read its own peak.
         "peak = next(line for line in open('/proc/self/status') if line.startswith('VmHWM'))\n"
         "print(json.dumps(int(peak.split()[1]) / 1024))\n"
     )

@@ -1,15 +1,15 @@
-"""Co-design strategies on equal questions: regret against environment steps and CPU time, three repeats each.
+"""Co-design strategies compared on one question: regret by environment steps and CPU time, three repeats each.
 
     python -m benchmarks.strategies results/strategies 2
 
 First the ground truth: 64 bodies of the Soft Finger (4 x 4 x 4 over length, height, joint height), each with a policy
-trained until it improves no more, in the work zone of ``configs/codesign/finger_reach.yaml``. Then every strategy,
-three times with other seeds. Everything lies in the folder, and a second call goes on where the first was stopped. The
-numbers that this repository keeps are in ``benchmarks/data/strategies.json``; ``softgym bench strategies`` shows them.
+trained until it stops improving, in the work zone of ``configs/codesign/finger_reach.yaml``. Then every strategy,
+three times with other seeds. Everything is kept in the folder, and a second call resumes the first.
+The numbers that this repository keeps are in ``benchmarks/data/strategies.json``; ``softgym bench strategies`` shows them.
 
-The score of a body between those of the grid is that of the inverse QP, which is cheap, plus what the trained policies
-lack to it, interpolated (thin plate spline). Regret is the part of the way from the baseline body to the best one that
-is left: 100 % at the baseline, 0 % at the best.
+The score of a body between those of the grid is that of the inverse QP, which is cheap, plus the interpolated gap
+between it and the trained policies (thin plate spline). Regret is the part of the way from the baseline body to the best
+one that is left: 100 % at the baseline, 0 % at the best.
 """
 
 from __future__ import annotations
@@ -83,21 +83,21 @@ STRATEGIES: dict[str, dict[str, Any]] = {
         "sampler": {"name": "gp"},
         "goals": {"count": 12},
     },
-    "policy as judge": {"strategy": "policy", "policy": "finger_reach_designs", "trials": 30},
-    "policy as judge, Gaussian process": {
+    "shared policy": {"strategy": "policy", "policy": "finger_reach_designs", "trials": 30},
+    "shared policy, Gaussian process": {
         "strategy": "policy",
         "policy": "finger_reach_designs",
         "trials": 30,
         "sampler": {"name": "gp"},
     },
-    "policy as judge, Gaussian process, 12 goals (default)": {
+    "shared policy, Gaussian process, 12 goals (default)": {
         "strategy": "policy",
         "policy": "finger_reach_designs",
         "trials": 30,
         "sampler": {"name": "gp"},
         "goals": {"count": 12},
     },
-    "policy as judge, Wilcoxon": {
+    "shared policy, Wilcoxon": {
         "strategy": "policy",
         "policy": "finger_reach_designs",
         "trials": 30,
@@ -109,7 +109,7 @@ STRATEGIES: dict[str, dict[str, Any]] = {
 
 
 def _question(**changes: Any) -> Any:
-    """The study of the question with other values."""
+    """Return the study of the question with some values replaced."""
     from codesign.config import StudyConfig
 
     base = load_config(QUESTION, StudyConfig).model_dump(mode="json")
@@ -181,7 +181,7 @@ def _run_study(path: Path, name: str, repeat: int) -> Path:
             {
                 "design": trial["design"],
                 "score": trial["score"],
-                # The inverse QP that every trial is also scored by is not needed, so it does not count.
+                # Every trial is also scored by the inverse QP; strategies do not need that score, so it does not count.
                 "steps": trial["training_steps"] + reports + evaluation.get("steps", 0),
                 "cpu_seconds": trial["cpu_seconds"] - (0.0 if trial["agent"] == "qp" else trial["qp"]["cpu_seconds"]),
             }
@@ -197,7 +197,7 @@ def _call(function: Callable[..., Path], arguments: tuple) -> Path:
 
 
 def main(folder: Path, workers: int = 1) -> None:
-    """Make what is missing, and write all to ``benchmarks/data/strategies.json``, also when it is stopped."""
+    """Compute what is missing, and write everything to ``benchmarks/data/strategies.json``, even if interrupted."""
     from softgym_envs.executors import parallel_map
 
     folder = folder.resolve()
@@ -218,7 +218,7 @@ def main(folder: Path, workers: int = 1) -> None:
 
 
 def collect(folder: Path) -> None:
-    """Write what is there to ``benchmarks/data/strategies.json``."""
+    """Write the finished runs to ``benchmarks/data/strategies.json``."""
     truth = [json.loads(path.read_text()) for path in sorted((folder / "truth").glob("*.json"))]
     runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*/*/regret.json"))]
     kept = {**provenance(), "truth": [_short(point) for point in truth], "runs": runs}
@@ -228,7 +228,7 @@ def collect(folder: Path) -> None:
 
 
 def _rounded(value: Any) -> Any:
-    """Plain data with seven digits: more would only fill the repository."""
+    """Return plain data rounded to seven digits, to keep the file small."""
     if isinstance(value, float):
         return float(f"{value:.7g}")
     if isinstance(value, list):
@@ -283,7 +283,7 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
     def key_of(design: dict[str, float]) -> tuple[float, ...]:
         return tuple(np.round(unit_of(design), 5).tolist())
 
-    # The truth does not change, so that scores which were kept need no second look.
+    # The ground truth has not changed, so kept scores are still valid.
     kept = json.loads(KEPT.read_text()) if KEPT.exists() else {"truth": [], "runs": []}
     same = kept["truth"] == _rounded([_short(point) for point in truth])
     known = {key_of(t["design"]): t["true_score"] for run in kept["runs"] for t in run["trials"]} if same else {}
@@ -319,7 +319,7 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
 
 
 def _steps_to(curve: list[list[float]], limit: float) -> float:
-    """Environment steps from which on the regret keeps a limit: a noisy score may lead away from a good body again."""
+    """Return the environment steps after which the regret stays below a limit; a noisy score may raise it again."""
     reached = float("inf")
     for steps, _, regret in reversed(curve):
         if regret > limit:
@@ -331,8 +331,8 @@ def _steps_to(curve: list[list[float]], limit: float) -> float:
 def strategies() -> dict[str, object]:
     """Regret of the co-design strategies by environment steps: median of the repeats (smallest to largest)."""
     kept = json.loads(KEPT.read_text())
-    if strange := sorted({run["name"] for run in kept["runs"]} - STRATEGIES.keys()):
-        raise DataError(f"'{KEPT.name}' has runs of unknown strategies: {', '.join(strange)}")
+    if unknown := sorted({run["name"] for run in kept["runs"]} - STRATEGIES.keys()):
+        raise DataError(f"'{KEPT.name}' has runs of unknown strategies: {', '.join(unknown)}")
     result: dict[str, object] = {
         "bodies of the ground truth": len(kept["truth"]),
         "baseline, true score [mm]": 1e3 * kept["baseline"],

@@ -62,7 +62,7 @@ def patch(levels: Sequence[int] = (2, 3, 4)) -> list[Row]:
 def cantilever(solids: Sequence[int] = (1, 2, 4), beams: Sequence[int] = (1, 2, 4)) -> list[Row]:
     """Small deflection of a 10 : 1 bar under end shear against Timoshenko's beam; Poisson's ratio 0.
 
-    Without lateral contraction the clamp of a solid holds what the clamp of a beam holds.
+    Without lateral contraction, the clamps of solids and beams constrain the same motions.
     """
     length, width, young = 10.0, 1.0, 1.0
     section = Section.rectangle(width, width)
@@ -117,7 +117,7 @@ def elastica(levels: Sequence[int] = (4, 8, 16), loads: Sequence[float] = (1.0, 
     """Tip of a cantilever under a dead end load against the elastica; error: distance of the tip / L.
 
     A round section with r = L / 2000: at P L^2 / (E I) = 10 it stretches by 6e-7 and shears by 2e-6. Elements of order
-    1 are half as long, so that both orders have as many frames.
+    1 are half as long, so both orders have the same number of frames.
     """
     length, radius = 1.0, 0.5e-3
     section = Section.circle(radius)
@@ -142,7 +142,7 @@ def circle(levels: Sequence[int] = (8, 16, 32)) -> list[Row]:
     """Pure bending of a straight beam to a full circle; value and error: distance between its ends / L.
 
     The moment comes from two chambers at opposite sides of the axis under opposite pressures, p A (y - (-y)). Elements
-    of order 1 are half as long, so that both orders have as many frames.
+    of order 1 are half as long, so both orders have the same number of frames.
     """
     length, radius, offset, area = 1.0, 1e-2, 0.05, 1e-4
     section = Section.circle(radius)
@@ -297,10 +297,11 @@ def _cook(levels: Sequence[int], element: str, poisson_ratio: float) -> list[Row
 
 
 def sphere(levels: Sequence[int] = (2, 4, 8), ratios: Sequence[float] = (0.3, 0.499)) -> list[Row]:
-    """Lame's thick sphere under internal pressure in small strain: radii 1 and 2, E = 1.
+    """Lamé's thick sphere under internal pressure in small strain: radii 1 and 2, E = 1.
 
     Value: mean radial displacement of the inner surface per unit pressure, by the growth of the cavity. For comparison,
-    quadratic elements whose cavity is of split triangles. Linear elements are half as large, for as many unknowns.
+    quadratic elements whose cavity consists of split triangles. Linear elements are half as large, for about as many
+    unknowns.
     """
     rows = []
     for nu in ratios:
@@ -328,7 +329,7 @@ def sphere(levels: Sequence[int] = (2, 4, 8), ratios: Sequence[float] = (0.3, 0.
 def cavity_work(levels: Sequence[int] = (2, 4, 8), count: int = 2) -> list[Row]:
     """Integral of p dV along a path (Simpson's rule) against the elastic energy; the sphere's volume grows by 60 %.
 
-    Levels: steps of the path. Pressure-driven, the integral is p V less that of V dp.
+    Levels: steps of the path. If pressure-driven, the integral is p V minus that of V dp.
     """
     rows = []
     for element in SOLIDS:
