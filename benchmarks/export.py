@@ -27,8 +27,8 @@ FLAGS = {
 
 EFFORT_WEIGHT, STEP_WEIGHT = 1e-5, 1e-3
 
-# Times of many calls, and the whole of algorithm 2 (thesis): the quadratic program has bounds and rates of efforts only and
-# is solved by an active-set method, with the objective of `softgym_envs.control.InverseQP`.
+# Times of many calls, and the whole of algorithm 2 (thesis): the quadratic program has only bounds and rates of
+# efforts and is solved by an active-set method, with the objective of `softgym_envs.control.InverseQP`.
 _SOURCE = r"""
 #define _POSIX_C_SOURCE 199309L
 #include <time.h>

@@ -4,12 +4,12 @@
 
 First the ground truth: 64 bodies of the Soft Finger (4 x 4 x 4 over length, height, joint height), each with a policy
 trained until it stops improving, in the work zone of ``configs/codesign/finger_reach.yaml``. Then every strategy,
-three times with other seeds. Everything is kept in the folder, and a second call resumes the first.
-The numbers that this repository keeps are in ``benchmarks/data/strategies.json``; ``softgym bench strategies`` shows them.
+three times with other seeds. Everything is kept in the folder, and a second call resumes the first. The numbers that
+this repository keeps are in ``benchmarks/data/strategies.json``; ``softgym bench strategies`` shows them.
 
 The score of a body between those of the grid is that of the inverse QP, which is cheap, plus the interpolated gap
-between it and the trained policies (thin plate spline). Regret is the part of the way from the baseline body to the best
-one that is left: 100 % at the baseline, 0 % at the best.
+between it and the trained policies (thin plate spline). Regret is the part of the way from the baseline body to the
+best one that is left: 100 % at the baseline, 0 % at the best.
 """
 
 from __future__ import annotations
