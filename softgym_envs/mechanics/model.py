@@ -10,7 +10,6 @@ import numpy as np
 
 from softgym_envs.mechanics.assembly import Assembly
 from softgym_envs.mechanics.constraints import Cable, Cavity, Constraint, EmbeddedPoints, Point
-from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, quadratic_triangles
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, check_nodes
@@ -19,8 +18,8 @@ from softgym_envs.mechanics.io import read_mesh
 from softgym_envs.mechanics.kinematics import Kinematics
 from softgym_envs.mechanics.materials import Material
 from softgym_envs.mechanics.skins import Skin
-from softgym_envs.mechanics.solids import MAX_BODY_SIZE, Fixed, PerElement, check_size, solid_part
-from softgym_envs.mechanics.surfaces import encloses, inner_surfaces
+from softgym_envs.mechanics.solids import MAX_BODY_SIZE, Fixed, PerElement, check_distance, check_size, solid_part
+from softgym_envs.mechanics.surfaces import cavity_around
 from softgym_envs.mechanics.warping import Warping
 
 
@@ -40,7 +39,7 @@ class MechanicalModel:
         mounted: frames fixed to another one, and not among ``frames``: index of the frame -> their first rows.
         fixed_spin: boolean mask of spin components (about the axes of space) that frames do not have, shape (f,) or
             (f, 3); default none.
-        floating: allow bodies that nothing holds: in dynamics inertia does, in statics bonds must.
+        floating: allow bodies without fixed nodes; in statics bonds must then hold them.
         gravity: acceleration [m/s2], shape (3,).
         solver: name of the linear solver, see `make_solver`.
 
@@ -185,7 +184,7 @@ class MechanicalModel:
         Raises:
             DataError: if the file is missing or unreadable, or its surface is open or intersects itself.
             MeshingError: if gmsh cannot be used, or takes too long.
-            ValueError: if nothing is fixed, or the body is larger than ``max_size``.
+            ValueError: if no node is fixed, or the body is larger than ``max_size``.
         """
         mesh = read_mesh(path, scale=scale, unit=unit, mesh_size=mesh_size, time_limit=time_limit)
         check_size(mesh.nodes, options.get("max_size", MAX_BODY_SIZE), "for a file in millimetres pass unit='mm'")
@@ -215,24 +214,14 @@ class MechanicalModel:
         Raises:
             ValueError: if a point lies more than the size of the body away from it.
         """
-        self._check_distance(points, name, 1.0)
-        return self.solids[block].embed(points, self.nodes, hint)
+        solid = self.solids[block]
+        check_distance(points, self._solid_nodes, name, 1.0)
+        return solid.embed(points, self.nodes, hint)
 
-    def _check_distance(self, points: np.ndarray, name: str, sizes: float) -> None:
-        """Refuse points [m] (p, 3) that lie more than so many body sizes outside the box around all solids."""
-        corners = np.unique(np.concatenate([solid.corners.ravel() for solid in self.solids]))
-        low, high = self.nodes[corners].min(axis=0), self.nodes[corners].max(axis=0)
-        size = float(np.linalg.norm(high - low))
-        points = np.atleast_2d(np.asarray(points, dtype=float))
-        if points.shape[1] != 3:
-            raise ValueError(f"{name} must have coordinates of shape (p, 3), got {points.shape}")
-        away = np.linalg.norm(points - np.clip(points, low, high), axis=1)
-        if away.max(initial=0.0) > sizes * size:
-            worst = int(np.argmax(away))
-            raise ValueError(
-                f"{name} at {points[worst].tolist()} m lies {away[worst]:.3g} m outside the body, "
-                f"which is {size:.3g} m long; did you mean metres?"
-            )
+    @property
+    def _solid_nodes(self) -> np.ndarray:
+        """Corner nodes of all solids [m], shape (k, 3)."""
+        return self.nodes[np.unique(np.concatenate([solid.corners.ravel() for solid in self.solids]))]
 
     def add(self, role: str, constraint: Constraint) -> Constraint:
         """Add a constraint under a role letter: a actuator, e effector, c contact, s sensor, b bond."""
@@ -265,7 +254,7 @@ class MechanicalModel:
         Raises:
             ValueError: if a guide lies more than the size of the body away from it, or the pull point ten times that.
         """
-        self._check_distance(pull_point, f"the pull point of cable '{name}'", 10.0)
+        check_distance(pull_point, self._solid_nodes, f"the pull point of cable '{name}'", 10.0)
         embedding = self.embed(points, hint, block=block, name=f"a guide of cable '{name}'")
         cable = Cable(name, embedding, pull_point, unilateral=unilateral)
         self.add("a", cable)
@@ -293,24 +282,16 @@ class MechanicalModel:
         if (surface is None) == (inside is None):
             raise ValueError(f"cavity '{name}' needs either its 'surface' or a point 'inside' it")
         solid = self.solids[block]
-        triangles = np.asarray(surface) if surface is not None else self._cavity_around(name, np.array(inside), solid)
+        if surface is None:
+            check_distance(np.asarray(inside), self._solid_nodes, f"the point inside cavity '{name}'", 1.0)
+            triangles = cavity_around(self.nodes, solid.corners, np.asarray(inside), name)
+        else:
+            triangles = np.asarray(surface)
         if isinstance(solid, QuadraticTetrahedra) and triangles.ndim == 2 and triangles.shape[1] == 3:
             triangles = quadratic_triangles(triangles, solid.connectivity)
         cavity = Cavity(name, triangles, self.nodes)
         self.add("a", cavity)
         return cavity
-
-    def _cavity_around(self, name: str, point: np.ndarray, solid: SolidBlock) -> np.ndarray:
-        """Surface (k, 3) of the cavity of a solid that encloses a point [m] (3,)."""
-        self._check_distance(point, f"the point inside cavity '{name}'", 1.0)
-        found = inner_surfaces(self.nodes, solid.corners)
-        around = [piece for piece in found if encloses(self.nodes, piece, point)]
-        if not around:
-            middles = [np.round(self.nodes[np.unique(piece)].mean(axis=0), 4).tolist() for piece in found]
-            known = f"its cavities lie around {middles} m" if found else "it has none, or they are open to the outside"
-            raise ValueError(f"no closed cavity of the body encloses {point.tolist()} m for '{name}'; {known}")
-        # An island in a cavity may have a cavity of its own: the smallest one is meant.
-        return min(around, key=lambda piece: abs(enclosed_volume(self.nodes, piece)))
 
     def add_effector(self, name: str, point: np.ndarray, *, hint: np.ndarray | None = None, block: int = 0) -> Point:
         """Add an effector at a material point [m] (3,) of a solid."""

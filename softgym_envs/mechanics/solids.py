@@ -99,6 +99,32 @@ def check_size(nodes: np.ndarray, max_size: float, hint: str) -> None:
         raise ValueError(f"the body measures {spans} m, more than {max_size:g} m; did you mean metres? ({hint})")
 
 
+def check_distance(points: np.ndarray, nodes: np.ndarray, name: str, sizes: float) -> None:
+    """Refuse points that lie more than so many body sizes outside the box around a body.
+
+    Args:
+        points: [m], shape (p, 3) or (3,).
+        nodes: of the body [m], shape (n, 3).
+        name: what the points are, for the message.
+        sizes: limit in units of the diagonal of the box.
+
+    Raises:
+        ValueError: with the point that lies farthest outside.
+    """
+    points = np.atleast_2d(np.asarray(points, dtype=float))
+    if points.shape[1] != 3:
+        raise ValueError(f"{name} must have coordinates of shape (p, 3), got {points.shape}")
+    low, high = nodes.min(axis=0), nodes.max(axis=0)
+    size = float(np.linalg.norm(high - low))
+    away = np.linalg.norm(points - np.clip(points, low, high), axis=1)
+    if away.max(initial=0.0) > sizes * size:
+        worst = int(np.argmax(away))
+        raise ValueError(
+            f"{name} at {points[worst].tolist()} m lies {away[worst]:.3g} m outside the body, "
+            f"which is {size:.3g} m long; did you mean metres?"
+        )
+
+
 def _element_values(
     name: str, values: PerElement, nodes: np.ndarray, tetrahedra: np.ndarray, regions: Mapping[str, np.ndarray]
 ) -> float | np.ndarray:

@@ -49,6 +49,28 @@ def encloses(nodes: np.ndarray, triangles: np.ndarray, point: np.ndarray) -> boo
     return abs(2.0 * np.arctan2(volume, across).sum()) > 2.0 * np.pi
 
 
+def cavity_around(nodes: np.ndarray, tetrahedra: np.ndarray, point: np.ndarray, name: str) -> np.ndarray:
+    """Return the surface (k, 3) of the cavity of a mesh that encloses a point.
+
+    Args:
+        nodes: positions [m], shape (n, 3).
+        tetrahedra: corner indices of positively oriented tetrahedra, shape (m, 4).
+        point: [m], shape (3,).
+        name: of the cavity, for the message.
+
+    Raises:
+        ValueError: if no closed cavity encloses the point.
+    """
+    found = inner_surfaces(nodes, tetrahedra)
+    around = [piece for piece in found if encloses(nodes, piece, point)]
+    if not around:
+        middles = [np.round(nodes[np.unique(piece)].mean(axis=0), 4).tolist() for piece in found]
+        known = f"its cavities lie around {middles} m" if found else "it has none, or they are open to the outside"
+        raise ValueError(f"no closed cavity of the body encloses {point.tolist()} m for '{name}'; {known}")
+    # A part inside a cavity may have a cavity itself: the smallest one is meant.
+    return min(around, key=lambda piece: abs(enclosed_volume(nodes, piece)))
+
+
 @njit(cache=True, error_model="numpy")
 def _pierces(start, end, a, b, c, tolerance):
     """Whether the open segment from ``start`` to ``end`` crosses the inside of a triangle (Moeller and Trumbore)."""

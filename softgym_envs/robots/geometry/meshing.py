@@ -70,18 +70,10 @@ class BodyMesh:
         Returns:
             Triangles (k, 3) of each cavity, seen counter-clockwise from inside it.
         """
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import connected_components
+        from softgym_envs.mechanics.elements.tetrahedra import orient_corners
+        from softgym_envs.mechanics.surfaces import inner_surfaces
 
-        from softgym_envs.mechanics.constraints.cavity import enclosed_volume
-
-        triangles = self.surface()
-        pairs = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
-        graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(self.nodes),) * 2)
-        _, piece = connected_components(graph, directed=False)
-        pieces = [triangles[piece[triangles[:, 0]] == number] for number in np.unique(piece[triangles[:, 0]])]
-        # Material lies inside the hull and outside the cavities: the volume within a cavity counts negative.
-        hollow = [part for part in pieces if enclosed_volume(self.nodes, part) < 0.0]
+        hollow = inner_surfaces(self.nodes, orient_corners(self.nodes, self.tetrahedra)[0])
         middle = np.array([self.nodes[np.unique(part)].mean(axis=0) for part in hollow]).reshape(-1, 3)
         grid = 1e-2 * np.ptp(self.nodes, axis=0).max()
         order = np.lexsort([middle @ np.asarray(across), np.round(middle @ np.asarray(along) / grid)])
