@@ -1,8 +1,9 @@
-"""The natively batched environment on the surrogate: one matrix product steps all bodies."""
+"""SoftRobotVectorEnv: environments on the surrogate that step all bodies together."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -76,9 +77,9 @@ class SoftRobotVectorEnv(VectorEnv):
         self.model = pretrained_model(self.robot, **setup.backend_options)
         self.max_episode_steps = max_episode_steps if max_episode_steps is not None else np.iinfo(np.int64).max
         self._fixed_design, self.sampled_variables = setup.design, setup.sampled
-        #: Draws the sampled variables, in unit coordinates [-1, 1], for sub-environments ``index``: shape
+        #: Draws the sampled variables of sub-environments ``index`` in unit coordinates [-1, 1], shape
         #: (len(index), number of sampled variables). Replace it to draw bodies in another way.
-        self.design_sampler: Callable[[np.random.Generator, np.ndarray], np.ndarray] = self._draw_evenly
+        self.design_sampler: Callable[[np.random.Generator, np.ndarray], np.ndarray] = self._draw_uniformly
         self.spaces = setup.spaces()
         self.single_action_space = self.spaces.action_space
         self.single_observation_space = self.spaces.observation_space
@@ -86,32 +87,20 @@ class SoftRobotVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
         self._unilateral = self.robot.unilateral
-        n = len(self.robot.actuators)
         self.designs = np.tile(self._fixed_design.array, (num_envs, 1))
         # One body for all, until they differ.
         self._context = Context.shared(self.model.context(self.designs[:1]), num_envs)
-        self._rest_effort = np.zeros((num_envs, n))
-        self._rest_displacement = np.zeros((num_envs, n))
-        self._rest_uncertainty = np.zeros(num_envs)
-        self._rest_trusted = np.ones(num_envs, dtype=bool)
-        self._rest_effector = np.zeros((num_envs, 3))
         self._unit_design = np.zeros((num_envs, len(setup.shown)))
-        self._command = np.zeros((num_envs, n))
-        self._displacement = np.zeros((num_envs, n))
-        self._effort = np.zeros((num_envs, n))
-        self._effector = np.zeros((num_envs, 3))
-        self._slack = np.zeros((num_envs, n), dtype=bool)
+        self._command = np.zeros((num_envs, len(self.robot.actuators)))
         self._paths = np.zeros((num_envs, 1, 3))
         self._counts = np.ones(num_envs, dtype=np.int64)  # goals in each path
-        self._converged = np.ones(num_envs, dtype=bool)
-        self._uncertainty = np.zeros(num_envs)
-        self._trusted = np.ones(num_envs, dtype=bool)
         self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._changed = np.zeros(num_envs, dtype=bool)  # bodies that were given in reset and are not the fixed one
+        self._changed = np.zeros(num_envs, dtype=bool)  # bodies given in reset that differ from the fixed one
         rest = rest_state(self.model, self._context.rows(np.zeros(1, dtype=np.int64)), self._unilateral)
-        self._take_rest(np.arange(num_envs), rest)
+        self._rest, self._state = _repeat(rest, num_envs), _repeat(rest, num_envs)
+        self._set_rest(np.arange(num_envs), rest)
 
-    def _draw_evenly(self, rng: np.random.Generator, index: np.ndarray) -> np.ndarray:
+    def _draw_uniformly(self, rng: np.random.Generator, index: np.ndarray) -> np.ndarray:
         return rng.uniform(-1.0, 1.0, (len(self.sampled_variables), len(index))).T
 
     # -- bodies -----------------------------------------------------------------------------------------------------
@@ -120,16 +109,14 @@ class SoftRobotVectorEnv(VectorEnv):
         """Prepare the models of changed designs."""
         context = self.model.context(self.designs[index])
         self._context.put(index, context)
-        self._take_rest(index, rest_state(self.model, context, self._unilateral))
+        self._set_rest(index, rest_state(self.model, context, self._unilateral))
 
-    def _take_rest(self, index: np.ndarray, rest: BatchState) -> None:
+    def _set_rest(self, index: np.ndarray, rest: BatchState) -> None:
         if not rest.converged.all():
             lost = self.designs[index[np.flatnonzero(~rest.converged)[0]]].tolist()
             design = dict(zip(self.design_space.names, lost, strict=True))
-            raise ConvergenceError(f"the surrogate finds no rest of design {design}")
-        self._rest_displacement[index], self._rest_effort[index] = rest.displacement, rest.effort
-        self._rest_effector[index] = rest.effector[:, :3]
-        self._rest_uncertainty[index], self._rest_trusted[index] = rest.uncertainty, rest.trusted
+            raise ConvergenceError(f"the surrogate finds no equilibrium at rest of design {design}")
+        _put(self._rest, index, rest)
         for column, name in enumerate(self.spaces.design_names):
             values = self.designs[index, self.design_space.names.index(name)]
             self._unit_design[index, column] = self.design_space[name].to_unit(values)
@@ -160,13 +147,8 @@ class SoftRobotVectorEnv(VectorEnv):
             self._begin_bodies(index)
             self._changed[index] = False
         self._command[index] = 0.0
-        self._displacement[index] = self._rest_displacement[index]
-        self._effort[index] = self._rest_effort[index]
-        self._effector[index] = self._rest_effector[index]
-        self._slack[index] = False
-        self._uncertainty[index] = self._rest_uncertainty[index]
-        self._trusted[index] = self._rest_trusted[index]
-        self._converged[index] = True
+        _put(self._state, index, _rows(self._rest, index))
+        self._state.slack[index] = False
         self._steps[index] = 0
         if goal is not None:
             paths = goal
@@ -183,7 +165,7 @@ class SoftRobotVectorEnv(VectorEnv):
         found = solve_displacements(self.model, context, commands, np.zeros_like(commands), self._unilateral)
         return np.where(found.converged[:, None], found.effector[:, :3], np.nan)
 
-    # -- what controllers look at -----------------------------------------------------------------------------------
+    # -- for controllers --------------------------------------------------------------------------------------------
 
     @property
     def command(self) -> np.ndarray:
@@ -192,8 +174,8 @@ class SoftRobotVectorEnv(VectorEnv):
 
     @property
     def slack(self) -> np.ndarray:
-        """Actuators that hang slack, shape (num_envs, n_a)."""
-        return self._slack
+        """Whether each actuator is slack, shape (num_envs, n_a)."""
+        return self._state.slack
 
     @property
     def goals(self) -> np.ndarray:
@@ -207,11 +189,11 @@ class SoftRobotVectorEnv(VectorEnv):
 
     @property
     def condensed(self) -> CondensedModel:
-        """Condensed models of the present states, evaluated when asked for; leading shape (num_envs,)."""
-        batch = self.model.condensed(self._context, self._displacement)
+        """Condensed models of the present states, evaluated at each access; leading shape (num_envs,)."""
+        batch = self.model.condensed(self._context, self._state.displacement)
         effort, delta = batch.effort.copy(), batch.delta.array
-        # Slack cables carry no effort, whatever the network's last digits say.
-        effort[:, : self.model.count] = self._effort
+        # Slack cables carry no effort; the network's may differ from zero by rounding.
+        effort[:, : self.model.count] = self._state.effort
         free = delta - np.einsum("bij,bj->bi", batch.compliance, effort)
         return CondensedModel(batch.compliance, free, effort, batch.roles, batch.rows)
 
@@ -244,34 +226,27 @@ class SoftRobotVectorEnv(VectorEnv):
         """Apply actions (num_envs, n_a) in [-1, 1].
 
         Raises:
-            ValueError: for actions of a wrong shape or ones that are not finite.
+            ValueError: for actions of a wrong shape or that are not finite.
         """
         actions = self.spaces.check_action(actions)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
         command = self.spaces.command(actions, self._command)
-        settled = solve_displacements(
-            self.model, self._context, command, self._displacement, self._unilateral, self._slack
+        present = self._state
+        state = solve_displacements(
+            self.model, self._context, command, present.displacement, self._unilateral, present.slack
         )
-        self._converged = settled.converged.copy()
-        if settled.converged.all():
-            self._command, self._displacement = command, settled.displacement
-            self._effort, self._slack, self._effector = settled.effort, settled.slack, settled.effector[:, :3]
-            self._uncertainty, self._trusted = settled.uncertainty, settled.trusted
-        else:  # rows without a state stay where they were, and their episodes end
-            found = settled.converged[:, None]
-            self._command = np.where(found, command, self._command)
-            self._displacement = np.where(found, settled.displacement, self._displacement)
-            self._effort = np.where(found, settled.effort, self._effort)
-            self._slack = np.where(found, settled.slack, self._slack)
-            self._effector = np.where(found, settled.effector[:, :3], self._effector)
-            self._uncertainty = np.where(settled.converged, settled.uncertainty, self._uncertainty)
-            self._trusted = np.where(settled.converged, settled.trusted, self._trusted)
+        found = state.converged.copy()
+        if found.all():
+            self._command, self._state = command, replace(state, converged=found)
+        else:  # rows without an equilibrium keep their state, and their episodes end
+            self._command = np.where(found[:, None], command, self._command)
+            self._state = replace(_choose(found, state, present), converged=found)
         self._steps += 1
         info, reward = self._info()
         observation = self._observe()
-        reward = np.where(self._converged, reward, 0.0)
-        truncated = (self._steps >= self.max_episode_steps) | ~self._converged
+        reward = np.where(found, reward, 0.0)
+        truncated = (self._steps >= self.max_episode_steps) | ~found
         ended = np.flatnonzero(truncated)
         if len(ended):
             final_info = info
@@ -285,29 +260,51 @@ class SoftRobotVectorEnv(VectorEnv):
         return observation, reward, np.zeros(self.num_envs, dtype=bool), truncated, info
 
     def _observe(self) -> np.ndarray:
+        state = self._state
         return self.spaces.observe(
-            self._command, self._displacement, self._effort, self._effector, self.goals, self._unit_design
+            self._command, state.displacement, state.effort, state.effector[:, :3], self.goals, self._unit_design
         )
 
     def _info(self) -> tuple[dict[str, Any], np.ndarray]:
-        goals = self.goals
-        distance, terms, reward = self.task.rate(self._effector, goals, self.spaces.effort_share(self._effort))
-        present = np.ones(self.num_envs, dtype=bool)
+        state, goals = self._state, self.goals
+        effector = state.effector[:, :3]
+        distance, terms, reward = self.task.rate(effector, goals, self.spaces.effort_share(state.effort))
+        every = np.ones(self.num_envs, dtype=bool)
         info: dict[str, Any] = {
-            "effector": self._effector.copy(),
+            "effector": effector.copy(),
             "goal": goals.copy(),
             "distance": distance,
             "is_success": distance < self.task.success_distance,
             "reward_terms": terms,
-            "displacement": self._displacement.copy(),
-            "effort": self._effort.copy(),
-            "stable": present,
-            "uncertainty": self._uncertainty.copy(),
-            "trusted": self._trusted.copy(),
-            "converged": self._converged.copy(),
+            "stable": every,
         }
-        info |= {f"_{name}": present for name in tuple(info)}
+        for name in ("displacement", "effort", "uncertainty", "trusted", "converged"):
+            info[name] = getattr(state, name).copy()
+        info |= {f"_{name}": every for name in tuple(info)}
         return info, reward
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Nothing to free."""
+        """Do nothing: there is nothing to free."""
+
+
+_FIELDS = tuple(field.name for field in fields(BatchState))
+
+
+def _repeat(state: BatchState, count: int) -> BatchState:
+    """Return ``count`` copies of the state of one row."""
+    return BatchState(*(np.repeat(getattr(state, name), count, axis=0) for name in _FIELDS))
+
+
+def _rows(state: BatchState, index: np.ndarray) -> BatchState:
+    return BatchState(*(getattr(state, name)[index] for name in _FIELDS))
+
+
+def _put(state: BatchState, index: np.ndarray, new: BatchState) -> None:
+    for name in _FIELDS:
+        getattr(state, name)[index] = getattr(new, name)
+
+
+def _choose(found: np.ndarray, new: BatchState, old: BatchState) -> BatchState:
+    """Return ``new`` in the rows that are found, ``old`` in the others."""
+    pairs = ((getattr(new, name), getattr(old, name)) for name in _FIELDS)
+    return BatchState(*(np.where(found if a.ndim == 1 else found[:, None], a, b) for a, b in pairs))

@@ -53,8 +53,8 @@ def test_agrees_with_numpy(identifier, sampled):
     slack = 0
     for _ in range(25):
         compare(reference, env, rng.uniform(-1.0, 1.0, env_shape(env)).astype(np.float32))
-        slack += (reference._slack & env._state["slack"].numpy()).sum()
-        np.testing.assert_array_equal(env._state["slack"], reference._slack)
+        slack += (reference.slack & env._state["slack"].numpy()).sum()
+        np.testing.assert_array_equal(env._state["slack"], reference.slack)
     if env.robot.unilateral.any():
         assert slack > 20
     else:
