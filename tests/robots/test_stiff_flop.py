@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
+from benchmarks.robots import PUBLISHED_COMPLIANCE
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.control import InverseQP
 from softgym_envs.errors import DesignError
@@ -19,23 +20,11 @@ ACTUATED = UL * np.array([18.0, 4.0, 9.0, 6.0, 15.0, 2.0])
 # Steps that make the two kinds of rows move alike: pressures [Pa], forces [N].
 STEPS = np.array([30.0] * 6 + [3e-6] * 3)
 
-# Published (thesis 4.4): volumes in mm3, lengths in mm, pressures in kPa, forces in mN.
-PUBLISHED = {
-    "W_aa base, same pair": 0.3057,
-    "W_aa base, two pairs": 0.0640,
-    "W_aa tip, same pair": 0.5293,
-    "W_aa tip, two pairs": 0.1028,
-    "W_xa base": 0.0429,
-    "W_xa tip": 0.0734,
-    "W_ya base": 1.0065,
-    "W_ya tip": 0.7085,
-    "W_za base, first pair": -1.162,
-    "W_za base, other pairs": 0.581,
-    "W_za tip, first pair": -0.818,
-    "W_za tip, other pairs": 0.409,
-    "W_xx": 0.0393,
-    "W_yy": 11.59,
-}
+# The entries of the first pair of chambers along z; the other two pairs have half of it, with the opposite sign.
+PUBLISHED = {name: value for name, value in PUBLISHED_COMPLIANCE.items() if not name.startswith("W_za")}
+for module in ("base", "tip"):
+    first = -PUBLISHED_COMPLIANCE[f"W_za {module}"]
+    PUBLISHED |= {f"W_za {module}, first pair": first, f"W_za {module}, other pairs": -0.5 * first}
 
 
 @pytest.fixture(scope="module")
