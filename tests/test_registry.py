@@ -143,7 +143,7 @@ def test_a_class_without_a_name_is_refused(registry):
         ("disc", {"filled": 1}, "option filled = 1 must be true or false"),
         ("disc", {"at": [1.0]}, r"option at = \[1.0\] must be 2 numbers"),
     ],
-    ids=str,
+    ids=lambda value: value if isinstance(value, str) else None,
 )
 def test_each_mistake_has_its_line(registry, name, options, message):
     with pytest.raises(ValueError, match=message):
