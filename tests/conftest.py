@@ -28,7 +28,7 @@ DATA = Path(__file__).parent / "data"
 # -- slow tests ---------------------------------------------------------------------------------------------------
 
 SLOW_TESTS = Path(__file__).parent / "slow_tests.txt"
-SLOW = 0.4
+SLOW = 0.3
 """A test function whose cases take longer than this together is slow [s]."""
 
 
