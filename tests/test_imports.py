@@ -1,4 +1,4 @@
-"""Who imports whom: rooms import downwards only, and the suite is imported without anything heavy."""
+"""Structure of the code: layers of packages, light imports, no import circles, no private imports, short files."""
 
 from __future__ import annotations
 
@@ -119,3 +119,89 @@ def test_importing_the_suite_is_light(module):
 def test_the_light_import_registers_the_environments():
     statement = "import gymnasium, softgym_envs; assert any(i.startswith('SoftGym/') for i in gymnasium.registry)"
     assert loaded_by(statement) == []
+
+
+# -- structure ----------------------------------------------------------------------------------------------------
+
+STRUCTURED = ("softgym_envs", "agents")  # packages without circles, private imports and long files
+MODULES = {module_name(path): path for package in STRUCTURED for path in (ROOT / package).rglob("*.py")}
+MAX_LINES = 600
+
+
+def module_of(name, modules):
+    """The module that an imported dotted name belongs to: itself, or the module that defines it."""
+    while name and name not in modules:
+        name = name.rpartition(".")[0]
+    return name
+
+
+def import_graph(modules):
+    """Module -> modules that it imports anywhere, also inside functions and for type checkers."""
+    return {
+        module: {module_of(name, modules) for name, _, _ in imports_of(path)} - {module, ""}
+        for module, path in modules.items()
+    }
+
+
+def circles(graph):
+    """Groups of modules that import each other, directly or through others (Tarjan's algorithm)."""
+    index, low, stack, found = {}, {}, [], []
+
+    def visit(module):
+        index[module] = low[module] = len(index)
+        stack.append(module)
+        for other in sorted(graph[module]):
+            if other not in index:
+                visit(other)
+                low[module] = min(low[module], low[other])
+            elif other in stack:
+                low[module] = min(low[module], index[other])
+        if low[module] == index[module]:
+            group = stack[stack.index(module) :]
+            del stack[stack.index(module) :]
+            if len(group) > 1:
+                found.append(sorted(group))
+
+    for module in sorted(graph):
+        if module not in index:
+            visit(module)
+    return found
+
+
+def private_imports(path):
+    """Underscore names that a file imports from other modules of this project, with their lines."""
+    for name, _, line in imports_of(path):
+        parts = name.split(".")
+        if any(part.startswith("_") and not part.startswith("__") for part in parts) and "_lazy" not in parts:
+            yield f"line {line}: {name}"
+
+
+def test_no_circles():
+    """Neither at import time nor by imports inside functions or for type checkers."""
+    assert circles(import_graph(MODULES)) == []
+
+
+@pytest.mark.parametrize("path", MODULES.values(), ids=module_name)
+def test_names_with_an_underscore_stay_in_their_module(path):
+    assert list(private_imports(path)) == []
+
+
+@pytest.mark.parametrize("path", MODULES.values(), ids=module_name)
+def test_files_are_short(path):
+    assert len(path.read_text().splitlines()) <= MAX_LINES
+
+
+def test_the_checkers_see_circles_and_private_names(tmp_path):
+    sources = {
+        "agents.one": "def f():\n    from agents import two\n",
+        "agents.two": "from agents.three import _hidden, shown\n",
+        "agents.three": "import agents.one\n",
+        "agents.four": "from agents.one import f\n",
+    }
+    modules = {}
+    for name, text in sources.items():
+        modules[name] = tmp_path / f"{name}.py"
+        modules[name].write_text(text)
+    assert circles(import_graph(modules)) == [["agents.one", "agents.three", "agents.two"]]
+    found = {name: list(private_imports(path)) for name, path in modules.items()}
+    assert found == {**dict.fromkeys(sources, []), "agents.two": ["line 1: agents.three._hidden"]}
