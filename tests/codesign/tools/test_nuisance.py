@@ -68,7 +68,7 @@ def test_intervals_allow_for_nuisance_parameters(tensions):
 
 
 def test_poisson_ratio_distance_of_the_object_and_zero_of_the_sensor(finger):
-    """The three unknowns of the thesis, sec. 3.4.5, from the efforts of a finger that meets an object on its way."""
+    """The three unknowns of the thesis, sec. 3.4.5, from the efforts of a finger that pushes against an object."""
     commands = np.linspace(0.001, 0.010, 8)[:, None]
     truth = {"poisson_ratio": 0.46}
     data = measure(finger, truth, commands, plane=Plane(0.022, (0.0, 1.0, 0.0)))
@@ -121,7 +121,7 @@ def test_derivatives_of_residuals_with_nuisance_parameters(finger, driven):
 
 
 def test_the_zero_of_an_imposed_displacement(finger):
-    """A cable that starts 1 mm too short pulls more than its encoder says."""
+    """A cable that starts 1 mm too short pulls more than its encoder reads."""
     data = measure(finger, {}, np.array(COMMANDS) + 0.001)
     data = replace(data, displacement=data.displacement - 0.001)
     zero = {"kind": "offset", "column": "cable_1_displacement", "bounds": [-0.002, 0.002], "unit": "m"}

@@ -1,4 +1,4 @@
-"""Design along gradients: descents end where nothing in the box is better."""
+"""Optimisation along gradients: descents end at optima of the box."""
 
 import json
 
@@ -39,7 +39,7 @@ def test_every_corner_leads_to_the_dexterity_optimum():
     assert value >= dense.values.max() - 1e-9
 
 
-def test_several_starts_tell_local_optima_apart():
+def test_several_starts_find_several_local_optima():
     config = configured({"metric": "normal_force"})
     cost = cost_of(config)
     ends = np.array([descend(cost, corner).cost for corner in cost.box.corners()])
@@ -47,7 +47,7 @@ def test_several_starts_tell_local_optima_apart():
 
 
 def test_target_and_weights(tmp_path):
-    """Eq. 4.15: the distance to an unreachable angle orders bodies as the angle does; weights move along the front."""
+    """An unreachable target (eq. 4.15) ranks bodies as its maximum does; weights move the optimum along the front."""
     by_target = optimise(configured({"metric": "bending_angle", "goal": 1.57}, check=False))
     by_goal = optimise(configured({"metric": "bending_angle", "goal": "maximize"}, check=False))
     for name in BODIES["variables"]:

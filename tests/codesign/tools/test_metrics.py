@@ -35,11 +35,11 @@ def test_formulas_of_the_thesis_on_fem(finger, on_fem):
     tip, W = state.effector[0], state.condensed.W
     assert on_fem["bending_angle"] == pytest.approx(math.acos(abs(tip[2]) / np.linalg.norm(rest)))
     assert on_fem["angular_displacement"] == pytest.approx(math.acos(abs(tip[2]) / np.linalg.norm(tip)))
-    # Eq. 4.16 as printed, with delta_c counted from rest.
+    # Thesis, eq. 4.16 as printed, with delta_c measured from rest.
     free = state.condensed.delta_free
     B = W.ea @ np.linalg.inv(W.aa) @ W.ae - W.ee
     force = np.linalg.inv(B) @ (W.ea @ np.linalg.inv(W.aa) @ (np.array([PULL]) - free.a) + free.e - rest)
-    assert on_fem["contact_force"] == pytest.approx(abs(force[1]), rel=1e-4)  # the way is y but for the mesh
+    assert on_fem["contact_force"] == pytest.approx(abs(force[1]), rel=1e-4)  # it moves along y
     assert on_fem["normal_force"] == pytest.approx(abs((tip - rest)[1] / B[1, 1]), rel=1e-4)
     assert on_fem["tip_stiffness"] == pytest.approx(1.0 / np.linalg.eigvalsh(-B)[-1])
     assert on_fem["effort"] == pytest.approx(state.effort[0])
@@ -47,8 +47,8 @@ def test_formulas_of_the_thesis_on_fem(finger, on_fem):
     assert on_fem["material_volume"] == pytest.approx(finger.build().volume)
 
 
-def test_normal_force_is_that_of_a_tip_blocked_across(finger, on_fem):
-    """The tangent's answer against the equilibrium with a force that holds the tip where it was."""
+def test_normal_force_is_that_of_a_tip_blocked_sideways(finger, on_fem):
+    """The force from the tangent against the equilibrium in which a force holds the tip in place."""
     backend = FEMBackend(finger)
     rest, force = backend.state.effector[0, 1], np.zeros(3)
     for _ in range(20):
@@ -95,7 +95,7 @@ def test_sensorized_finger_reads_what_the_robot_reads():
     assert found["angular_displacement"] == pytest.approx(readings.bending_angle)
 
 
-def test_what_cannot_be_asked_for(finger):
+def test_unavailable_metrics_and_wrong_actuations(finger):
     for metrics, options, words in (
         (["beauty"], {}, "unknown metric 'beauty'; allowed: bending_angle"),
         (["volume_change"], {}, "needs a robot with sensing cavities, got 'finger'"),

@@ -1,4 +1,4 @@
-"""Calibration: variables come back from simulated measurements; malformed files say what is wrong."""
+"""Calibration recovers variables from simulated measurements; malformed files are refused with a reason."""
 
 import json
 from dataclasses import replace
@@ -25,7 +25,7 @@ def finger():
 
 @pytest.fixture(scope="module")
 def positions(finger):
-    """Tip positions at 0, 5 and 10 mm of cable, nu 0.47 (thesis 4.5.3)."""
+    """Tip positions at 0, 5 and 10 mm of cable, nu 0.47 (thesis, sec. 4.5.3)."""
     data = measure(finger, {"poisson_ratio": 0.47}, [[0.0], [0.005], [0.010]])
     return replace(data, effort=np.full_like(data.effort, np.nan))
 
@@ -59,7 +59,7 @@ def test_young_modulus_from_efforts(pulled):
     assert result.design["young_modulus"] == pytest.approx(2.2e6, rel=0.01)
 
 
-def test_tpe_comes_near_what_the_gradient_finds(positions):
+def test_tpe_agrees_with_the_gradient(positions):
     by_gradient = calibrate(configured("poisson_ratio", level=None), data=positions)
     by_tpe = calibrate(configured("poisson_ratio", method="tpe", trials=80, level=None), data=positions)
     assert by_tpe.design["poisson_ratio"] == pytest.approx(by_gradient.design["poisson_ratio"], abs=5e-4)
@@ -77,8 +77,8 @@ class Line(Misfit):
         return (self.residuals(point + 1e-6) - self.residuals(point - 1e-6))[:, None] / 2e-6
 
 
-def test_intervals_cover_the_truth_as_often_as_they_say(finger):
-    """Of 100 intervals of 80 %, 80 +- 4 are expected; outside 68 to 92 lie fewer than 0.3 % of such experiments."""
+def test_intervals_have_their_nominal_coverage(finger):
+    """80 of 100 intervals of 80 % should cover the truth; fewer than 68 or more than 92 has a chance of 0.3 %."""
     rng = np.random.default_rng(4)
     box = Box(finger.design_space, ["young_modulus"])
     command, truth, covered = np.linspace(0.0, 0.01, 8)[:, None], 4e6, 0
@@ -101,7 +101,7 @@ def test_an_interval_under_noise(pulled):
 
 
 def test_intervals_of_two_variables(finger):
-    """With tensions measured beside positions, both are known, each a little less than if the other were."""
+    """Tensions and positions determine both variables, each less precisely than if the other one were known."""
     data = measure(finger, {"young_modulus": 2.2e6, "poisson_ratio": 0.46}, [[0.004], [0.008], [0.012]])
     data = data.with_noise(0.003, np.random.default_rng(1))
     truth = {"poisson_ratio": 0.46}
@@ -125,7 +125,7 @@ def test_derivatives_of_residuals(finger, positions, pulled, driven):
 
 
 def test_slack_cables_of_the_surrogate():
-    """A command that leaves one cable slack: the body is where FEM has it."""
+    """Surrogate and FEM agree for a command that leaves one cable slack."""
     robot = make_robot("finger")
     data = measure(robot, {}, [[0.012, 0.0], [0.015, 0.001]])
     misfit = LearnedMisfit(robot, Parameters(robot, Box(robot.design_space, ["length"])), data)
@@ -146,7 +146,7 @@ def test_coordinates_are_those_of_equation_3_14(finger):
     assert row[:4].tolist() == [finger.design_space.baseline[name] for name in finger.design_space.names[:4]]
 
 
-def test_a_value_at_its_bound_is_told(positions):
+def test_a_value_at_its_bound_is_reported(positions):
     result = calibrate(configured("poisson_ratio", bounds={"poisson_ratio": [0.30, 0.46]}, level=None), data=positions)
     assert result.at_bound == ["poisson_ratio"] and result.design["poisson_ratio"] == pytest.approx(0.46)
     assert calibrate(configured("poisson_ratio", level=None), data=positions).at_bound == []
@@ -211,7 +211,7 @@ def test_malformed_json(finger, tmp_path, text, words):
     assert words in str(error.value)
 
 
-def test_files_come_back(finger, tmp_path, positions, pulled):
+def test_files_are_read_as_they_were_written(finger, tmp_path, positions, pulled):
     for data in (positions, pulled):
         write_measurements(tmp_path / "measured.csv", finger, data)
         back = read_measurements(tmp_path / "measured.csv", finger)

@@ -1,4 +1,4 @@
-"""Search and sensitivity: fronts, interruption, infeasible designs; indices against known functions."""
+"""Search and sensitivity: fronts, interruptions, infeasible designs; indices of known functions."""
 
 import json
 from pathlib import Path
@@ -36,15 +36,15 @@ def configured(**changes):
     return check_config(OptimiseConfig, {**data, **changes}, "test")
 
 
-class Some:
-    """An evaluator with infeasible designs, that stops after a number of evaluations."""
+class Stub:
+    """An evaluator with infeasible designs that stops after a number of evaluations."""
 
     stop = np.inf
     count = 0
 
     def __call__(self, design):
-        Some.count += 1
-        if Some.count > Some.stop:
+        Stub.count += 1
+        if Stub.count > Stub.stop:
             raise KeyboardInterrupt
         if design["joint_height"] > 0.0072:
             raise InfeasibleDesign("too thick")
@@ -52,25 +52,25 @@ class Some:
 
 
 @pytest.fixture
-def some(monkeypatch):
-    monkeypatch.setattr("codesign.tools.config.BodiesConfig.evaluator", lambda *arguments: Some())
-    monkeypatch.setattr(Some, "count", 0)
-    monkeypatch.setattr(Some, "stop", np.inf)
-    return Some
+def stub(monkeypatch):
+    monkeypatch.setattr("codesign.tools.config.BodiesConfig.evaluator", lambda *arguments: Stub())
+    monkeypatch.setattr(Stub, "count", 0)
+    monkeypatch.setattr(Stub, "stop", np.inf)
+    return Stub
 
 
-def test_a_stopped_search_ends_as_one_that_was_not(some, monkeypatch, tmp_path):
+def test_an_interrupted_search_has_the_same_result(stub, monkeypatch, tmp_path):
     whole = search(configured(), tmp_path / "whole", progress=False)
     assert whole.infeasible > 0 and whole.feasible + whole.infeasible == 20
-    some.count = 0
+    stub.count = 0
     for stop in (4, 11):
-        some.stop = stop
+        stub.stop = stop
         with pytest.raises(KeyboardInterrupt):
             search(configured(), tmp_path / "parts", progress=False)
-        some.count = stop
+        stub.count = stop
     with (tmp_path / "parts" / "journal.log").open("a") as stream:
-        stream.write('{"op_code": 5, "wor')  # what a crash leaves
-    some.stop = np.inf
+        stream.write('{"op_code": 5, "wor')  # as after a crash
+    stub.stop = np.inf
     parts = search(configured(), tmp_path / "parts", progress=False)
     assert parts.front == whole.front
     rows = [line.split(",") for line in (tmp_path / "whole" / "trials.csv").read_text().splitlines()[1:]]
@@ -80,14 +80,14 @@ def test_a_stopped_search_ends_as_one_that_was_not(some, monkeypatch, tmp_path):
     assert (tmp_path / "parts" / "trials.csv").read_text().count("\n") == 21
     assert (tmp_path / "parts" / "front.png").read_bytes().startswith(b"\x89PNG")
     more = configured(solver={"method": "search", "sampler": SAMPLER, "trials": 26, "batch": 6})
-    before = some.count
+    before = stub.count
     longer = search(more, tmp_path / "parts", progress=False)
-    assert longer.feasible + longer.infeasible == 26 and some.count - before <= 6
+    assert longer.feasible + longer.infeasible == 26 and stub.count - before <= 6
     with pytest.raises(ConfigError, match="holds a search with objectives = .*, or change only: name, workers"):
         search(configured(objectives=[{"metric": "travel"}]), tmp_path / "parts", progress=False)
 
 
-def test_starts_lie_within_the_bounds(some, tmp_path):
+def test_starts_lie_within_the_bounds(stub, tmp_path):
     def asked(**start):
         bodies = {**BODIES, "bounds": {"length": [0.041, 0.042]}}
         solver = {"method": "search", "sampler": {"name": "random"}, "trials": 3, "starts": [start]}
@@ -104,8 +104,8 @@ def test_starts_lie_within_the_bounds(some, tmp_path):
 
 
 @pytest.mark.parametrize("sampler", [SAMPLER, {"name": "tpe", "seed": 3}])
-@pytest.mark.parametrize("parameters", [1, 15, 26, 27])  # of which the first 18 are those of the first batch
-def test_a_search_that_was_stopped_while_it_proposed(sampler, parameters, some, monkeypatch, tmp_path):
+@pytest.mark.parametrize("parameters", [1, 15, 26, 27])  # the first batch has 18 parameters
+def test_a_search_that_was_interrupted_while_it_proposed(sampler, parameters, stub, monkeypatch, tmp_path):
     import optuna
 
     starts = [{"length": 0.039}, {"length": 0.0415}]
@@ -135,10 +135,10 @@ def test_a_search_that_was_stopped_while_it_proposed(sampler, parameters, some, 
     for name in ("feasible", "infeasible", "repeated"):
         assert getattr(parts, name) == getattr(whole, name)
     assert parts.front[0].design == whole.front[0].design
-    assert some.count == 2 * (14 - whole.repeated)  # nothing was evaluated again
+    assert stub.count == 2 * (14 - whole.repeated)  # nothing was evaluated again
 
 
-def test_folders_of_others_stay_as_they_are(some, tmp_path):
+def test_folders_of_other_runs_are_not_changed(stub, tmp_path):
     def contents():
         return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
@@ -156,18 +156,18 @@ def test_folders_of_others_stay_as_they_are(some, tmp_path):
         search(configured(), tmp_path, progress=False)
 
 
-def test_two_searches_in_one_folder(some, monkeypatch, tmp_path):
+def test_two_searches_in_one_folder(stub, monkeypatch, tmp_path):
     def other(self, design):
         with pytest.raises(ConfigError, match=f"folder '{tmp_path}' is in use by another process; wait, or use"):
             search(configured(), tmp_path, progress=False)
         return {"bending_angle": design["length"], "contact_force": -design["length"]}
 
-    monkeypatch.setattr(some, "__call__", other)
+    monkeypatch.setattr(stub, "__call__", other)
     assert search(configured(), tmp_path, progress=False).feasible == 20
     assert search(configured(), tmp_path, progress=False).feasible == 20
 
 
-def test_generations_of_nsga_are_full(some, tmp_path):
+def test_generations_of_nsga_are_full(stub, tmp_path):
     import optuna
 
     search(configured(), tmp_path, progress=False)
@@ -179,7 +179,7 @@ def test_generations_of_nsga_are_full(some, tmp_path):
     assert all(generations.count(k) == 6 for k in range(max(generations)))
 
 
-def test_nothing_feasible(some, tmp_path):
+def test_nothing_feasible(stub, tmp_path):
     bodies = {**BODIES, "bounds": {"joint_height": (0.0075, 0.008)}}
     with pytest.raises(
         ConvergenceError, match="none of 20 designs is feasible; the first: InfeasibleDesign: too thick"
@@ -197,7 +197,7 @@ def test_search_on_the_surrogate_by_tpe(tmp_path):
 
 
 def ishigami(unit):
-    """Ishigami's function on [-1, 1]^3 scaled to pi, whose indices are known."""
+    """Return Ishigami's function of points in [-1, 1]^3, scaled to pi; its indices are known."""
     x = np.pi * unit
     return np.sin(x[:, 0]) + 7.0 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
 
@@ -245,7 +245,7 @@ def test_one_at_a_time_is_equation_3_1():
     assert table["length"]["infeasible"] == 1 and table["length"]["low"] == pytest.approx(0.0)
 
 
-def test_sensitivity_goes_on(tmp_path):
+def test_an_interrupted_sensitivity_study_continues(tmp_path):
     config = study("oat", metrics=["bending_angle", "normal_force"])
     result = analyse_sensitivity(config, tmp_path, progress=False)
     records = (tmp_path / "evaluations.jsonl").read_bytes().splitlines(keepends=True)
