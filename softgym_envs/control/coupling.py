@@ -1,14 +1,14 @@
-"""Condensed models of robots that are turned, tied to each other, or hold a rigid object (thesis eq. 4.6-4.10).
+"""Condensed models of robots that are turned, tied to each other, or hold a rigid object (thesis, eq. 4.6-4.10).
 
-The parts keep their own models; only ties are added. With ``W`` the block-diagonal compliance of the parts, ``C`` the
+Each part keeps its own model; ties couple them. With ``W`` the block-diagonal compliance of the parts, ``C`` the
 tied rows, ``u`` the motion of the object, ``J`` the Jacobian of its tied points and ``f`` the load on it:
 
     delta = W (effort + C^T m) + free          every part, under actuator efforts and tie forces m
     C delta - J u = gap                        tied rows follow each other, or the object
     J^T m + K u = f                            the object is in equilibrium
 
-``K`` is how the present tie forces change their torque as the object turns; with it the coupled ``W`` is the exact
-derivative of the coupled equilibrium. Without ``m`` and ``u`` a model of actuators and object is left, symmetric again.
+``K`` is the change of the tie forces' torque as the object turns; with it, the coupled ``W`` is the exact derivative of
+the coupled equilibrium. Eliminating ``m`` and ``u`` leaves a symmetric model of actuators and object.
 """
 
 from __future__ import annotations
@@ -36,19 +36,20 @@ def rotate(
     *,
     points: str = "ec",
 ) -> CondensedModel:
-    """Return the model of a copy of a robot that is turned about the origin, then moved (thesis 4.3.1).
+    """Return the model of a copy of a robot that is turned about the origin, then moved (thesis, sec. 4.3.1).
 
     Args:
         condensed: model of the robot itself; leading batch shapes are kept.
         rotation: rotation matrix, shape (3, 3).
         shift: motion after the turn [m], shape (3,).
-        points: roles whose rows are coordinates of points; all other rows are scalars and stay.
+        points: roles whose rows are coordinates of points; all other rows are scalars and do not change.
 
     Raises:
-        ValueError: if ``rotation`` is none, ``shift`` is malformed, or a role of ``points`` is not made of threes.
+        ValueError: if ``rotation`` is not orthogonal, ``shift`` is malformed, or the number of rows of a role in
+            ``points`` is not a multiple of three.
     """
     R, shift = np.asarray(rotation, dtype=float), np.asarray(shift, dtype=float)
-    # A mirror image of a robot is another robot, but its condensed model follows the same rule.
+    # Reflections are allowed: the condensed model of a mirrored robot follows the same rule.
     if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), rtol=0.0, atol=1e-9):
         raise ValueError(f"rotation must be an orthogonal 3 x 3 matrix, got {R.tolist()}")
     if shift.shape != (3,) or not np.isfinite(shift).all():
@@ -58,7 +59,9 @@ def rotate(
     for role, size in condensed.roles:
         if role in points:
             if size % 3:
-                raise ValueError(f"role '{role}' has {size} rows, which are no points in space")
+                raise ValueError(
+                    f"role '{role}' has {size} rows, which is not a multiple of three: they are not points"
+                )
             rows = condensed.slices[role]
             turn[rows, rows] = np.kron(np.eye(size // 3), R)
             move[rows] = np.tile(shift, size // 3)
@@ -79,8 +82,8 @@ class HeldObject:
         position: its centre [m], shape (3,).
         points: where it is held, from its centre and in its own axes [m], shape (k, 3).
         rotation: its orientation, shape (3, 3).
-        load: force [N] and torque about its centre [N m] from outside (its weight, a button's spring), shape (6,).
-        free: which of x, y, z and the rotations about them can move, six flags; the others are guided.
+        load: external force [N] and torque about its centre [N m] (its weight, the spring of a button), shape (6,).
+        free: which translations along x, y, z and rotations about them are free, six flags; the others are guided.
     """
 
     position: np.ndarray
@@ -132,8 +135,8 @@ class HeldObject:
     def stiffness(self, forces: np.ndarray) -> np.ndarray:
         """``K = d (J^T m) / d u`` at fixed tie forces ``m`` [N] (3 k,), shape (6, 6).
 
-        A turned body turns the lever arms of its forces. It is symmetric when they have no torque about the centre;
-        a rest that is not (while an iteration is under way, or under a torque load) is left out.
+        The lever arms of the forces turn with the body. The matrix is symmetric when the forces have no torque about
+        the centre; its antisymmetric part, which occurs during iterations and under a torque load, is dropped.
         """
         result = np.zeros((6, 6))
         turn = (cross_matrix(np.reshape(forces, (-1, 3))) @ cross_matrix(self.arms)).sum(axis=0)
@@ -164,7 +167,7 @@ def tie_points(
 
 @dataclass(frozen=True)
 class Coupled:
-    """A coupled model, and the way back to its parts.
+    """A coupled model, and maps from its efforts back to the parts.
 
     Attributes:
         condensed: roles ``a`` (the actuators of all parts, in order) and ``e``: with an object, its centre [m] and, if
@@ -184,7 +187,7 @@ class Coupled:
     motion_map: np.ndarray
 
     def efforts(self, effort: np.ndarray) -> list[np.ndarray]:
-        """Return the efforts of all rows of every part under actuator efforts (n_a,): tie forces included."""
+        """Return the efforts of all rows of every part under actuator efforts (n_a,): including tie forces."""
         every = self.force_map @ np.append(1.0, effort)
         return np.split(every, np.cumsum(self.part_sizes)[:-1])
 
@@ -196,9 +199,9 @@ class Coupled:
 def _side_by_side(
     models: Sequence[CondensedModel],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
-    """Block-diagonal W, delta_free and present efforts of the parts, and the rows of each part's roles in them."""
+    """Return block-diagonal W, delta_free and present efforts of the parts, and the rows of each role of each part."""
     if not models or any(model.free.ndim != 1 for model in models):
-        raise ValueError("couple needs one or more models without batch")
+        raise ValueError("couple needs at least one model, and models without a batch dimension")
     starts = np.cumsum([0, *(len(model.free) for model in models)])
     W, free, present = np.zeros((starts[-1], starts[-1])), np.zeros(starts[-1]), np.zeros(starts[-1])
     rows = []
@@ -223,12 +226,12 @@ class _Saddle:
 def _solve_saddle(G: np.ndarray, J: np.ndarray, K: np.ndarray, tolerance: float) -> _Saddle:
     m = len(G)
     # Rows and columns of G are brought to a largest entry of one (Ruiz 2001) and columns of J to length one, which
-    # cancels units. G may be indefinite: a part that would not be stable alone can be so when it is tied.
+    # cancels units. G may be indefinite, as a part that is unstable alone can be stable when it is tied.
     ties = np.ones(m)
     for _ in range(10):
         largest = np.abs(ties[:, None] * G * ties).max(axis=1)
         if (largest == 0.0).any():
-            raise ValueError("a tied row has no compliance: no force can hold it")
+            raise ValueError("a tied row has no compliance, so no force can move it")
         ties /= np.sqrt(largest)
     lengths = np.linalg.norm(ties[:, None] * J, axis=0)
     scale = np.concatenate([ties, 1.0 / np.where(lengths > 0.0, lengths, 1.0)])
@@ -257,22 +260,22 @@ def couple(
 ) -> Coupled:
     """Tie robots to each other, or to a rigid object that their contact points hold.
 
-    Rows that are neither actuators nor tied keep the effort of their model, as a dead load. Ties pull as well as push,
-    and hold sideways, as the contacts of the thesis do.
+    Rows that are neither actuators nor tied keep the effort of their model as a dead load. Like the contacts of the
+    thesis, ties act in tension, in compression and sideways.
 
-    The result is as exact as the parts are, but no more than that: held parts are far stiffer than free ones, so the
-    compliance of a gripper is a small difference of theirs. Random relative errors in W of three fingers grow about a
-    thousandfold in W_ea of the cube they hold (1e-5 becomes 1.5 %).
+    Coupling amplifies errors of the parts: held parts are far stiffer than free ones, so the compliance of a gripper is
+    a small difference of theirs. Random relative errors in W of three fingers grow about a thousandfold in W_ea of the
+    cube that they hold (1e-5 becomes 1.5 %).
 
     Args:
         models: models of the parts at their present states (roles ``a`` and ``e``, ``c``, ...), unbatched.
         ties: rows ``C``, shape (m, n), over all rows of the parts, see `tie_points`.
         gap: ``C delta`` to hold, shape (m,); for two points, their distance as a vector [m].
-        body: object whose points are held by all rows of role ``c``, part by part.
-        orientation: give the rotation of the object too.
+        body: object whose points are tied to all rows of role ``c``, part by part.
+        orientation: include the rotation of the object.
         effectors: parts whose effector rows are kept; default the first, or none with an object.
-        tolerance: a direction of the ties in which the parts are this much stiffer than in others, relative, counts
-            as rigid and, unless the object needs it, redundant: it carries no force.
+        tolerance: directions of the ties whose relative compliance is below this count as rigid and, unless the object
+            needs them, as redundant: they carry no force.
 
     Raises:
         ValueError: for malformed or non-finite input, an object that its points do not hold, or redundant ties that
@@ -295,7 +298,7 @@ def couple(
         pose[:3] = body.position
         moving = np.flatnonzero(body.free)
     if len(C) == 0:
-        raise ValueError("there is nothing to couple: pass ties or a body")
+        raise ValueError("nothing to couple: pass ties or a body")
     tied = np.any(C != 0.0, axis=0)
     if tied[actuators].any():
         raise ValueError("actuator rows cannot be tied: tie effector or contact rows")
@@ -317,7 +320,7 @@ def couple(
     right = np.concatenate([-CW @ forces, -loads[moving]])
     right[: len(C), 0] += d - C @ free
     unmet = saddle.redundant.T @ right[: len(C), 0]
-    # In units of force and energy: compared with what moving the ties by a millionth of the parts' size would do.
+    # The gap that cannot be closed is compared with a motion of the ties by a millionth of the parts' size.
     if (np.abs(unmet) > 1e-6 * np.abs(C @ free).max() * np.abs(saddle.redundant).sum(axis=0)).any():
         raise ValueError("redundant ties contradict each other: no force closes their gap")
     solved = saddle.inverse @ right

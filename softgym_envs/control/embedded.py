@@ -1,4 +1,4 @@
-"""The embedded control loop: efforts out, at most an effector position in (thesis Algorithm 2)."""
+"""Embedded control loop: commands efforts, and needs at most the measured effector position (thesis, algorithm 2)."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from softgym_envs.mechanics.condensation import CondensedModel
 
 
 class PICorrection:
-    """Moves a goal by what the effector misses: ``goal + proportional * error + integral * sum of errors``.
+    """Shifts a goal by the measured error: ``goal + proportional * error + integral * sum of errors``.
 
-    The gains are per call, so that they do not depend on the rate of the loop (thesis 4.4.3: 0.01 and 0.002).
+    Gains are per call and thus independent of the rate of the loop (thesis, sec. 4.4.3: 0.01 and 0.002).
 
-    Anti-windup by conditional integration and clamping: the part of an error that points the way in which the model
-    itself falls short of the corrected goal (out of reach, or limited by a rate) is not summed up, and the sum never
+    Anti-windup by conditional integration and clamping: if the model itself cannot reach the corrected goal (out of
+    reach, or limited by a rate), the part of the error in that direction is not integrated, and the integral never
     moves the goal by more than ``limit``.
 
     Args:
         proportional: gain on the present error.
         integral: gain on the sum of errors.
-        limit: largest correction by the sum [m].
-        slip: distance below which the model counts as having reached the corrected goal [m]: above what one
-            linearisation leaves of a step (a hundredth of a millimetre for the Stiff-Flop on its circle).
+        limit: largest correction by the integral [m].
+        slip: distance below which the model counts as having reached the corrected goal [m]. It must exceed the error
+            of one linearised step (a hundredth of a millimetre for the Stiff-Flop on its circle).
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class PICorrection:
         """Return the corrected goal [m], shape (n_e,), for a measured effector (n_e,).
 
         Raises:
-            ValueError: if the measurement has another shape or is not finite: a lost sensor must not be summed up.
+            ValueError: if the measurement has another shape or is not finite, as with a lost sensor.
         """
         measured = np.asarray(measured, dtype=float).ravel()
         if measured.shape != goal.shape or not np.isfinite(measured).all():
@@ -60,7 +60,7 @@ class PICorrection:
         return goal + self.proportional * error + self.correction
 
     def hold(self, shortfall: np.ndarray) -> None:
-        """Take back what was just summed up towards where the model falls short, ``corrected goal - reached``."""
+        """Undo the last integration in the direction of the shortfall, ``corrected goal - reached``."""
         distance = float(np.linalg.norm(shortfall))
         if distance > self.slip:
             direction = shortfall / distance
@@ -75,15 +75,15 @@ class PICorrection:
 
 
 class EmbeddedLoop:
-    """Open- or closed-loop control in effort, on a model that is asked by actuator displacement.
+    """Open- or closed-loop control by effort, with a model that is evaluated at actuator displacements.
 
-    No sensor of the actuators is needed: their displacement is predicted from the last model,
-    ``delta_a = W_aa effort + delta_free_a``. Where they are measured, the measurement takes its place.
+    The actuators need no sensors: the last model predicts their displacement,
+    ``delta_a = W_aa effort + delta_free_a``. A measurement, if given, replaces the prediction.
 
     Args:
         model: function from actuator displacements (n_a,) to the condensed model there, or a backend.
         controller: inverse QP that commands every actuator in effort.
-        correction: correction of the goal from a measured effector, or None.
+        correction: corrects the goal by the measured effector; None for an open loop.
 
     Attributes:
         effort: last commanded efforts, shape (n_a,).
@@ -101,7 +101,7 @@ class EmbeddedLoop:
         correction: PICorrection | None = None,
     ) -> None:
         if not controller.by_effort.all():
-            raise ValueError("the embedded loop commands efforts: make its InverseQP with mode='effort'")
+            raise ValueError("the embedded loop commands efforts: its InverseQP needs mode='effort'")
         self.model = model
         self.controller = controller
         self.correction = correction
@@ -130,12 +130,12 @@ class EmbeddedLoop:
 
         Args:
             goal: desired effector coordinates [m], shape (n_e,).
-            measured: measured effector coordinates [m], shape (n_e,), where the loop is closed.
-            displacement: measured actuator displacements, shape (n_a,), where there are sensors.
+            measured: measured effector coordinates [m], shape (n_e,); None leaves the goal uncorrected.
+            displacement: measured actuator displacements, shape (n_a,), if there are sensors.
 
         Raises:
             ValueError: for malformed or non-finite input.
-            ConvergenceError: if model or QP find no answer; the last efforts stand.
+            ConvergenceError: if the model or the QP finds no solution; the last efforts are kept.
         """
         goal = np.asarray(goal, dtype=float).ravel()
         if displacement is not None:
@@ -154,7 +154,7 @@ class EmbeddedLoop:
             self.effort = self.controller.solve(condensed, aim, self.effort)
         except ConvergenceError:
             if closed is not None and summed is not None:
-                closed.correction = summed  # what is not acted upon must not wind up
+                closed.correction = summed  # do not integrate an error without acting on it
             raise
         change = self.effort - condensed.lambda_.a
         self.displacement = condensed.delta.a + condensed.W.aa @ change
@@ -167,14 +167,14 @@ class EmbeddedLoop:
 def follow(
     loop: EmbeddedLoop, plant: Backend, goals: Iterable[np.ndarray], *, feedback: bool = True, encoders: bool = False
 ) -> list[State]:
-    """Drive a plant in effort along goals [m] (n_e,), one call of the loop each.
+    """Drive a plant by efforts along goals [m] (n_e,), with one call of the loop for each.
 
     Args:
         loop: the control loop.
-        plant: the robot, or a backend in its place.
+        plant: backend of the robot.
         goals: one goal per call.
-        feedback: give the loop the measured effector.
-        encoders: give it the measured actuator displacements.
+        feedback: pass the measured effector to the loop.
+        encoders: pass the measured actuator displacements to the loop.
 
     Returns:
         The state of the plant after each call.

@@ -13,11 +13,11 @@ from softgym_envs.surrogate.model import Context, SurrogateModel
 
 
 class FingerModel(Protocol):
-    """Equal fingers, evaluated together.
+    """A model of equal fingers, which are evaluated together.
 
     Attributes:
         origin: origin of the pose at rest, in the finger's axes [m], shape (3,).
-        span: width of the range of each coordinate, shape (8,); steps are kept to a quarter of it.
+        span: width of the range of each coordinate, shape (8,); steps are limited to a quarter of it.
     """
 
     origin: np.ndarray
@@ -26,25 +26,25 @@ class FingerModel(Protocol):
     def evaluate(self, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return efforts (F, 8), compliance W (F, n, n) and tips [m] (F, 3) at coordinates (F, 8), cables first.
 
-        The first eight rows of W are those of the coordinates. Cables may push here.
+        The first eight rows of W belong to the coordinates. Cables can push.
 
         Raises:
-            ConvergenceError: where there is no such state.
+            ConvergenceError: if there is no such state.
         """
         ...
 
     def trust(self, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the uncertainty of the tips [m] (F,), and whether the model knows such states (F,)."""
+        """Return the uncertainty of the tips [m] (F,), and whether the states are in the model's domain (F,)."""
         ...
 
 
 class FEMFingers:
-    """Finite-element fingers; each follows a path of its own.
+    """Finite-element fingers; the solver of each follows its own path.
 
     Args:
         robot: the finger.
         design: its design; missing variables take their baseline.
-        tolerance: of its equilibria [m].
+        tolerance: accuracy of its equilibria [m].
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class SurrogateFingers:
     def __init__(self, model: SurrogateModel, design: Mapping[str, float] | None = None) -> None:
         robot = model.robot
         if not isinstance(robot, ContactFinger):
-            raise ValueError(f"a gripper is made of models of 'contact_finger', got one of '{robot.name}'")
+            raise ValueError(f"the model must be one of robot 'contact_finger', got one of '{robot.name}'")
         complete = robot.design_space.complete(design)
         self.model = model
         self.origin = robot.object_frame(complete)

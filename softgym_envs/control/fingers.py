@@ -1,15 +1,15 @@
-"""Grippers of turned and moved copies of one finger, from the finger's own model (thesis 4.3.1 and 4.3.2).
+"""Grippers of turned and moved copies of one finger, from the finger's own model (thesis, sec. 4.3.1 and 4.3.2).
 
-A `ContactFinger` is known by eight coordinates: its cables ``l`` and the pose ``z`` of the points it holds an object
-by, in its own axes. With ``U`` its energy, a rigid object at the pose ``p`` in the hold of fingers ``k`` has
+Eight coordinates describe a `ContactFinger`: its cables ``l`` and the pose ``z`` of its contact points in its own axes.
+With ``U`` the energy of a finger, a rigid object that fingers ``k`` hold at the pose ``p`` has the energy
 
     E(l, p) = sum_k U(l_k, z_k(p)) - work of the load on the object,
 
 so with ``J_k = dz_k / dp`` the tensions are ``dU / dl_k`` and the object is in equilibrium when the wrenches
-``J_k^T dU / dz_k`` add up to the load. These are six equations beside those of the cables. Their tangent, the second
-derivative of ``E`` (of ``z_k`` too: a turned object turns the lever arms of its forces), is inverted to the condensed
-model of the gripper: the exact derivative of its equilibrium, whatever gave the finger's. One learned finger thus
-serves any number of fingers in any place.
+``J_k^T dU / dz_k`` add up to the load. These are six equations beside those of the cables. Their tangent is the second
+derivative of ``E``, including that of ``z_k``, as an object that turns also turns the lever arms of its forces. Its
+inverse gives the condensed model of the gripper, the exact derivative of its equilibrium, whether the finger's model is
+exact or learned. One learned finger thus serves any number of fingers in any place.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from softgym_envs.mechanics.frames import frame_rows, rotation_vector_matrix
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.robots.grippers import FingerRobot
 
-#: Coordinates of a finger's pose, and arm [m] that turns a rotation into a displacement in norms.
+#: Number of coordinates of a pose, and lever arm [m] by which norms convert rotations to displacements.
 POSE, ARM = 6, 0.03
 
 
 @dataclass(frozen=True)
 class FingersState:
-    """An equilibrium of fingers and the object that they hold.
+    """Equilibrium of fingers and the object that they hold.
 
     Attributes:
         command: commanded displacements [m] or tensions [N] of the cables, shape (n_a,).
-        displacement: displacements of the cables [m], shape (n_a,); larger than commanded where slack.
+        displacement: displacements of the cables [m], shape (n_a,); larger than commanded if slack.
         effort: tensions [N], shape (n_a,).
-        slack: cables that hang slack, shape (n_a,).
+        slack: cables that are slack, shape (n_a,).
         position: centre of the object [m], shape (3,).
         rotation: its rotation from rest, shape (3, 3).
         coordinates: of each finger, in its own axes, shape (F, 8).
         wrenches: efforts on the pose of each finger in its own axes [N, N m], shape (F, 6).
         tips: of the fingers [m], shape (F, 3).
         condensed: model of all cables (role ``a``) and the object's centre (role ``e``).
-        iterations: of Newton's method, over all increments.
-        uncertainty: the largest of the tips' [m]; 0 on finite elements.
-        trusted: the model knows the states of all fingers.
+        iterations: of Newton's method, summed over all increments.
+        uncertainty: largest uncertainty of a tip [m]; 0 with finite elements.
+        trusted: the states of all fingers are in the domain of the model.
     """
 
     command: np.ndarray
@@ -75,23 +75,23 @@ class _Point:
     rotation: np.ndarray
 
     def moved(self, step: np.ndarray) -> _Point:
-        """The point after a step of cables, position and spin, shape (n_a + 6,)."""
+        """Return the point after a step of cables, position and spin, shape (n_a + 6,)."""
         cables, shift, spin = np.split(step, [-POSE, -3])
         rotation = rotation_vector_matrix(spin) @ self.rotation
-        # Round-off must not add up over a long motion.
+        # Orthonormalise, so that round-off does not accumulate over a long motion.
         rotation = 1.5 * rotation - 0.5 * rotation @ rotation.T @ rotation
         return _Point(self.cables + cables, self.position + shift, rotation)
 
 
 @dataclass(frozen=True)
 class _Linear:
-    """The system at a point.
+    """The system of equations, linearised at a point.
 
     Attributes:
-        point: where.
+        point: the point.
         coordinates, effort, tips: of the fingers, shapes (F, 8), (F, 8), (F, 3).
-        jacobian: of the fingers' poses by position and spin of the object, shape (F, 6, 6).
-        wrench: of the fingers together on position and spin [N, N m], shape (6,).
+        jacobian: derivative of the fingers' poses by position and spin of the object, shape (F, 6, 6).
+        wrench: sum of the fingers' wrenches on position and spin [N, N m], shape (6,).
         stiffness: of cables and object without the load, shape (n_a + 6, n_a + 6).
     """
 
@@ -109,7 +109,7 @@ class _Linear:
         return self.effort[:, :-POSE].ravel()
 
 
-class _NotFound(Exception):
+class _NewtonFailed(Exception):
     """Newton's method failed on one increment."""
 
 
@@ -125,22 +125,22 @@ def _sine_curvature(rotation: np.ndarray, effort: np.ndarray) -> np.ndarray:
 
 
 class CoupledFingers:
-    """Fingers that hold a free rigid object, followed under changing cables from one state to the next.
+    """Quasi-static model of fingers that hold a free rigid object; each state is found from the last one.
 
-    Contact is that of `FingerRobot`: the contact points stay on the object, in pull as in push.
+    Contact is that of `FingerRobot`: the contact points are tied to the object, in tension as in compression.
 
     Args:
         fingers: finite-element or learned model of one finger.
-        placements: rotation (3, 3) and shift [m] (3,) of each finger. Under gravity the rotations must keep its
-            direction, for the finger's model holds its weight.
-        centre: of the object at rest [m], shape (3,). Where the fingers hold it follows from their placements.
-        load: force on the centre [N] and torque [N m] on the object from outside, shape (6,). The torque is conjugate
-            to the sines of the object's turn, as the efforts of `Pose` are: one that keeps its direction in space has
-            no energy, and its condensed model would not be symmetric.
+        placements: rotation (3, 3) and shift [m] (3,) of each finger. Under gravity, rotations must preserve its
+            direction, because the model of the finger includes its weight.
+        centre: centre of the object at rest [m], shape (3,). The placements determine where the fingers hold it.
+        load: force on the centre [N] and torque [N m] on the object from outside, shape (6,). Like the efforts of
+            `Pose`, the torque is conjugate to the sines of the rotation. A torque of constant direction in space has no
+            energy, and its condensed model would not be symmetric.
         unilateral: cables cannot push.
-        tolerance: largest correction left at convergence [m].
-        max_iterations: of Newton's method per increment.
-        max_halvings: the smallest increment is ``0.5 ** max_halvings`` of the way.
+        tolerance: largest remaining correction at convergence [m].
+        max_iterations: limit on Newton iterations per increment.
+        max_halvings: the smallest increment is ``0.5 ** max_halvings`` of the whole step.
 
     Raises:
         ValueError: for malformed placements, centre or load.
@@ -159,9 +159,9 @@ class CoupledFingers:
         max_halvings: int = 8,
     ) -> None:
         if not placements:
-            raise ValueError("a gripper has at least one finger: placements are empty")
+            raise ValueError("placements are empty: a gripper needs at least one finger")
         for turn, shift in placements:
-            frame_rows(shift, turn)  # a mirrored finger would be another one
+            frame_rows(shift, turn)  # refuses reflections: a mirrored finger has another model
         self.fingers = fingers
         self.turns = np.array([turn for turn, _ in placements], dtype=float)
         self.shifts = np.array([shift for _, shift in placements], dtype=float)
@@ -186,24 +186,24 @@ class CoupledFingers:
     def for_robot(
         cls, robot: FingerRobot, fingers: FingerModel, design: Mapping[str, float] | None = None, **options
     ) -> CoupledFingers:
-        """Return the fingers of a gripper around its object; ``load`` and other ``options`` as for the class.
+        """Return the coupled fingers of a gripper; ``options`` are ``load`` and others of the class.
 
         Raises:
             ValueError: for a gripper without an object.
         """
         centre = robot.object_frame(robot.design_space.complete(design))
         if centre is None:
-            raise ValueError(f"the fingers of '{robot.name}' hold no rigid object")
+            raise ValueError(f"the fingers of robot '{robot.name}' do not hold a rigid object")
         return cls(fingers, robot.placements, centre, **{"unilateral": bool(robot.finger.unilateral.all()), **options})
 
     def reset(self) -> None:
-        """Go back to the undeformed shape with no load. The equilibrium under the load is found by `solve`."""
+        """Return to the undeformed shape without load; `solve` applies the load."""
         self._point = _Point(np.zeros(self.count), self.centre.copy(), np.eye(3))
         self._carried = np.zeros(POSE)
         self._present: _Linear | None = None
 
     def restore(self, state: FingersState) -> None:
-        """Start the next solve from an earlier state of these fingers."""
+        """Start the next call of `solve` from an earlier state of these fingers."""
         self._point = _Point(state.displacement, state.position, state.rotation)
         self._carried = self.load
         self._present = None
@@ -211,9 +211,9 @@ class CoupledFingers:
     # -- one linearisation ------------------------------------------------------------------------------------------
 
     def _linearise(self, point: _Point) -> _Linear | None:
-        """Evaluate the fingers at a point. None where they have no state, or the object has turned too far."""
+        """Linearise at a point; None if a finger has no state there or the object has turned too far."""
         R = point.rotation
-        # The sines of a turn stop to tell it at 90 degrees.
+        # Sines determine a rotation only up to 90 degrees.
         if not np.trace(R) > 1.0 + 2.0 * 0.05:
             return None
         arms = self.offsets @ R.T
@@ -251,10 +251,10 @@ class CoupledFingers:
         return _Linear(point, coordinates, effort, tips, J, wrench, 0.5 * (K + K.T))
 
     def _compliance(self, here: _Linear, load: np.ndarray) -> np.ndarray:
-        """Compliance of cables, position and spin, shape (n_a + 6, n_a + 6), under a load."""
+        """Return the compliance of cables, position and spin under a load, shape (n_a + 6, n_a + 6)."""
         K = here.stiffness.copy()
         K[-3:, -3:] -= _sine_curvature(here.point.rotation, load[3:])
-        # Cables and turns have other units: brought to ones on the diagonal, nothing is lost.
+        # Cables and rotations differ in units: scaling the diagonal to one preserves accuracy.
         scale = 1.0 / np.sqrt(np.abs(np.diag(K)))
         C = scale[:, None] * np.linalg.inv(scale[:, None] * K * scale) * scale
         return 0.5 * (C + C.T)
@@ -262,7 +262,7 @@ class CoupledFingers:
     def _correction(
         self, C: np.ndarray, here: _Linear, target: np.ndarray, load: np.ndarray, forced: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Newton step of cables, position and spin by a compliance ``C``, and the tensions it leads to."""
+        """Return the Newton step of cables, position and spin with compliance ``C``, and the tensions after it."""
         external = np.concatenate([load[:3], _sine_jacobian(here.point.rotation).T @ load[3:]])
         missing = np.append(np.zeros(self.count), external - here.wrench)
         tension, a = here.tension, slice(0, self.count)
@@ -285,9 +285,9 @@ class CoupledFingers:
     def _newton(
         self, start: _Linear, target: np.ndarray, load: np.ndarray, forced: bool
     ) -> tuple[_Linear, np.ndarray, np.ndarray, int]:
-        """Converge at one load level; returns the state, its compliance, the tensions and the iterations.
+        """Solve one load level; return the state, its compliance, the tensions and the number of iterations.
 
-        Steps are as long as the simplified correction after them is smaller (Deuflhard 2004), as in `Statics`.
+        A step is shortened until the simplified correction after it is smaller (Deuflhard 2004), as in `Statics`.
         """
         here = start
         C = self._compliance(here, load)
@@ -295,37 +295,37 @@ class CoupledFingers:
         for iteration in range(1, self.max_iterations + 1):
             norm = self._norm(step)
             if not np.isfinite(norm):
-                raise _NotFound
+                raise _NewtonFailed
             poses = np.einsum("fij,j->fi", here.jacobian, step[-POSE:])
             change = np.concatenate([step[:-POSE].reshape(-1, self.cables), poses], axis=1)
-            # The model is only asked where its neighbourhood of known states reaches.
+            # Stay within the range in which the model is known.
             length = float(min(1.0, 1.0 / max((np.abs(change) / self._limit).max(), 1e-12)))
             while True:
                 there = self._linearise(here.point.moved(length * step))
                 if there is not None:
                     remaining = self._norm(self._correction(C, there, target, load, forced)[0])
-                    # At the last digits round-off decides, not Newton.
+                    # Below the tolerance, round-off dominates.
                     if remaining <= (1.0 - 0.25 * length) * norm or remaining <= self.tolerance:
                         break
                 length *= 0.5
                 if length < 1e-3:
-                    raise _NotFound
+                    raise _NewtonFailed
             here = there
             C = self._compliance(here, load)
             step, tension = self._correction(C, here, target, load, forced)
             if self._norm(step) <= self.tolerance:
                 return here, C, tension, iteration
-        raise _NotFound
+        raise _NewtonFailed
 
     def solve(self, command: np.ndarray | Sequence[float], mode: str = "displacement") -> FingersState:
-        """Find the equilibrium under commanded cables, from the present one.
+        """Return the equilibrium under commanded cables, found from the present one.
 
         Args:
             command: displacements [m] or tensions [N] of all cables, finger by finger, shape (n_a,).
             mode: ``"displacement"`` or ``"effort"``.
 
         Raises:
-            ConvergenceError: if no equilibrium is found; the present state is kept.
+            ConvergenceError: if no equilibrium is found; the present state is then unchanged.
             ValueError: for a malformed command, an unknown mode, or a negative tension of cables that cannot push.
         """
         command = np.asarray(command, dtype=float)
@@ -335,10 +335,10 @@ class CoupledFingers:
             raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
         forced = mode == "effort"
         if forced and (command[self.unilateral] < 0.0).any():
-            raise ValueError(f"tensions {command.tolist()} must not be negative: the cables cannot push")
+            raise ValueError(f"tensions {command.tolist()} N must not be negative: the cables cannot push")
         here = self._linearise(self._point) if self._present is None else self._present
         if here is None:
-            raise ConvergenceError("the fingers have no state to start from")
+            raise ConvergenceError("the model of the fingers has no state at the starting point")
         start, start_load = (here.tension if forced else here.point.cables), self._carried
         done, size, iterations = 0.0, 1.0, 0
         while done < 1.0:
@@ -346,7 +346,7 @@ class CoupledFingers:
             target, load = start + level * (command - start), start_load + level * (self.load - start_load)
             try:
                 here, C, tension, spent = self._newton(here, target, load, forced)
-            except (_NotFound, np.linalg.LinAlgError):
+            except (_NewtonFailed, np.linalg.LinAlgError):
                 size = 0.5 * (level - done)
                 if size < 0.5**self.max_halvings:
                     raise ConvergenceError(

@@ -1,4 +1,4 @@
-"""Inverse control by quadratic programming on the condensed model (thesis eq. 2.14)."""
+"""Inverse control by quadratic programming on the condensed model (thesis, eq. 2.14)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from softgym_envs.mechanics.condensation import CondensedModel
 if TYPE_CHECKING:
     from softgym_envs.robots.base import Robot
 
-#: Stands for "no bound", in units of a problem scaled to order one.
-FAR = 1e6
+#: A bound that is never active in a problem scaled to order one.
+UNBOUNDED = 1e6
 
 
 class InverseQP:
-    """Actuator displacements or efforts that bring the effectors to a goal, one linearisation at a time.
+    """Controller that finds actuator displacements or efforts to bring the effectors to a goal, step by step.
 
     With ``d`` the change of the actuator displacements (so efforts change by ``W_aa^-1 d`` and effectors by
     ``W_ea W_aa^-1 d``), each call minimises
@@ -30,17 +30,17 @@ class InverseQP:
         effort >= 0 for unilateral actuators,  min_effort <= effort <= max_effort,  |change| <= effort_rate,
         lower <= delta_a <= upper,  |delta_a - command| <= rate.
 
-    Regularisation: three definitions of eps circulate in the group's codes; this one makes the weights pure numbers.
-    The defaults are far below the 0.01 that some use: with that the finger stops 0.58 mm short of a goal 54 mm away,
-    with 1e-5 it stops 0.6 um short.
-    ``effort_weight`` decides between redundant actuators and moves the result towards rest by about that fraction of
-    the way from it; ``step_weight`` only slows the last part of the approach and has no steady error.
-    ``goal_weights`` multiply the squared error of each effector coordinate: zero leaves a coordinate to itself,
-    and among coordinates that cannot all be met the larger weight wins.
+    Regularisation: published codes use three definitions of eps; this one makes the weights dimensionless. The defaults
+    are far below the 0.01 in some codes, with which the finger stops 0.58 mm short of a goal 54 mm away; with 1e-5 it
+    stops 0.6 um short.
+    ``effort_weight`` decides between redundant actuators and pulls the result towards rest by about that fraction of
+    its distance; ``step_weight`` only slows down the last part of the approach and causes no steady error.
+    ``goal_weights`` multiply the squared error of each effector coordinate: zero leaves a coordinate free, and of
+    coordinates that cannot all be reached, those with larger weights come closer.
 
     The problem is scaled to order one (displacements by the rate, efforts by the compliance) before ProxQP's dense
     backend solves it with box constraints and a warm start. The two norms in ``eps`` are taken in units of the rates,
-    so metres and cubic metres, newtons and pascals, or a mixture of them, give the same answer.
+    so the result does not depend on the units of displacements and efforts, also when they are mixed.
 
     Args:
         lower: smallest displacements [m, m3, ...], shape (n_a,).
@@ -116,7 +116,9 @@ class InverseQP:
             raise ValueError(f"mode must be 'displacement' or 'effort' (one, or {count} of them), got {mode!r}")
         self.by_effort = np.array([m == "effort" for m in modes], dtype=bool)
         if not np.isfinite(np.where(self.by_effort, np.minimum(self.rates, self.effort_rates), self.rates)).all():
-            raise ValueError("every actuator needs a finite rate: of its displacement or, in mode 'effort', its effort")
+            raise ValueError(
+                "every actuator needs a finite rate of its displacement or, in mode 'effort', of its effort"
+            )
         for low, high, word in (
             (self.lower, self.upper, "displacement"),
             (self.min_effort, self.max_effort, "effort"),
@@ -144,11 +146,11 @@ class InverseQP:
         return cls(**{**arguments, **options})
 
     def _make_qp(self) -> Any:
-        """A new solver; one that failed would warm-start from its bad result."""
+        """Return a new solver; a solver that failed would warm-start from its bad result."""
         n = len(self.rates)
         # One inequality per actuator (its effort) beside the box of displacements.
         qp = self._proxqp.dense.QP(n, 0, n, True)
-        qp.settings.eps_abs = 1e-11  # where many actuators serve one effector, 1e-9 leaves 5e-5 of their ranges open
+        qp.settings.eps_abs = 1e-11  # with many actuators for one effector, 1e-9 is inaccurate by 5e-5 of their ranges
         qp.settings.eps_rel = 0.0
         qp.settings.max_iter = 1000
         qp.settings.initial_guess = self._proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
@@ -163,7 +165,7 @@ class InverseQP:
             condensed: model at the present state.
             goal: desired effector coordinates [m], shape (n_e,) or (k, 3).
             command: present command, shape (n_a,).
-            slack: actuators that hang slack, shape (n_a,); default none.
+            slack: actuators that are slack, shape (n_a,); default none.
 
         Raises:
             ValueError: if goal, command or model have a wrong shape or are not finite.
@@ -189,7 +191,7 @@ class InverseQP:
         try:
             stiffness = np.linalg.inv(Waa)
         except np.linalg.LinAlgError:
-            raise ValueError("W_aa is singular: two actuators do the same") from None
+            raise ValueError("W_aa is singular: two actuators have the same effect") from None
 
         limited = np.isfinite(self.effort_rates)
         by_effort = np.abs(np.diag(Waa)) * np.where(limited, self.effort_rates, 0.0)
@@ -202,30 +204,30 @@ class InverseQP:
         pull = to_effort.T @ (Waa @ effort)
         energies, modes = np.linalg.eigh(0.5 * (quadratic + quadratic.T))
         if energies[0] < 0.0:
-            # A state that is stable only while its actuators are held: the energy of efforts is no norm; make it one.
+            # A state that is stable only while its actuators are held: make the energy of efforts positive.
             quadratic = (modes * np.abs(energies)) @ modes.T
             pull = quadratic @ np.linalg.solve(to_effort, effort) / epsilon
         hessian = jacobian.T @ jacobian + (self.effort_weight + self.step_weight) * quadratic
         gradient = jacobian.T @ (root * (delta.e - goal)) + self.effort_weight * epsilon * pull
-        # Order one: displacements are in units of the rate, the objective in units of its own curvature.
+        # Scale to order one: displacements by the rate, the objective by its curvature.
         norm = float(np.trace(hessian)) or float(scale.mean()) ** 2
 
         start = np.where(self.by_effort, delta.a, command)
         low, high = np.maximum(self.lower, start - self.rates), np.minimum(self.upper, start + self.rates)
-        # Standing still is allowed (unless it exceeds max_effort), so the problem is feasible, round-off or not.
-        box_low = np.maximum(np.minimum(low - delta.a, 0.0) / scale, -FAR)
-        # A slack cable's reached displacement is not held by its command.
-        box_high = np.where(slack, 1e3, np.minimum(np.maximum(high - delta.a, 0.0) / scale, FAR))
+        # Standing still is allowed (unless it exceeds max_effort), so round-off cannot make the problem infeasible.
+        box_low = np.maximum(np.minimum(low - delta.a, 0.0) / scale, -UNBOUNDED)
+        # The command does not bound the displacement of a slack cable.
+        box_high = np.where(slack, 1e3, np.minimum(np.maximum(high - delta.a, 0.0) / scale, UNBOUNDED))
         effort_scale = np.abs(to_effort).sum(axis=1)
         effort_low = np.maximum(-np.maximum(effort - self.min_effort, 0.0), -self.effort_rates)
         effort_high = np.minimum(self.max_effort - effort, self.effort_rates)
-        # A commanded effort moves from its last command, which need not be the effort of the model.
+        # Steps of commanded efforts start from the last command, which may differ from the effort of the model.
         least = np.clip(command - self.effort_rates, self.min_effort, self.max_effort)
         most = np.clip(command + self.effort_rates, self.min_effort, self.max_effort)
         effort_low = np.where(self.by_effort, least - effort, effort_low)
         effort_high = np.where(self.by_effort, most - effort, effort_high)
-        effort_low = np.maximum(effort_low / effort_scale, -FAR)
-        effort_high = np.clip(effort_high / effort_scale, effort_low, FAR)
+        effort_low = np.maximum(effort_low / effort_scale, -UNBOUNDED)
+        effort_high = np.clip(effort_high / effort_scale, effort_low, UNBOUNDED)
         arguments = (
             hessian / norm,
             gradient / norm,
@@ -237,7 +239,7 @@ class InverseQP:
             box_low,
             box_high,
         )
-        # A warm start from a distant solution may not converge where a cold one does.
+        # From a distant solution, a warm start may fail where a cold one converges.
         for warm in (True, False):
             if self._qp is None or not warm:
                 self._qp = self._make_qp()

@@ -1,4 +1,4 @@
-"""Manipulation of a rigid object by soft fingers whose condensed models are coupled (thesis Algorithm 1)."""
+"""Manipulation of a rigid object by soft fingers whose condensed models are coupled (thesis, algorithm 1)."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ class Plan:
 
 
 class Manipulation:
-    """Brings an object that is held at contact points to a goal.
+    """Controller that moves an object held at contact points to a goal.
 
     Each call ties the condensed models of the parts to the object, ``X = A effort + B`` (eq. 4.8-4.10), asks the
     inverse QP for actuator efforts, and evaluates contact forces and pose at them. The thesis takes the force on the
-    object from the last step; here the object is in equilibrium under its load at every step, so that force is
-    known: zero or the weight for a gripper, the spring for a button. The last contact forces enter through the models,
-    which are taken under them, and through the torque they exert on a turned object.
+    object from the last step. Here the object is in equilibrium under its load at every step, so this force is known:
+    zero or the weight for a gripper, the spring for a button. The last contact forces enter through the models, which
+    are evaluated under them, and through the torque that they exert on an object that turns.
 
-    Between calls the parts are brought to the plan: each in its commands and under its contact forces (or with its
-    contact points at ``body.contacts``). Where parts bend, tied points then part by the second order of the step; the
-    next call closes that gap, as Newton's method does.
+    Between calls, bring the parts to the plan: each to its commands and under its contact forces (or with its contact
+    points at ``body.contacts``). As parts bend, tied points then separate by a distance of second order in the step;
+    the next call closes this gap, as Newton's method does.
 
     Args:
         controller: inverse QP over the actuators of all parts; its ``goal_weights`` choose the degrees of freedom of
-            the object that matter. A radian counts as a metre where they do not say otherwise.
-        body: the object at its first pose; its flags ``free`` tell which way a guided one moves, e.g. a button.
+            the object that count. By default, a radian counts as much as a metre.
+        body: the object at its first pose; for a guided one, such as a button, its flags ``free`` name its directions.
         tolerance: see `couple`.
 
     Attributes:
-        body: the object at its present pose, as last predicted or measured.
+        body: the object at its present pose, predicted or measured.
         contact_forces: last forces of the object on the parts [N], shape (k, 3); zero at the start.
     """
 
@@ -61,7 +61,7 @@ class Manipulation:
         self.reset(body)
 
     def reset(self, body: HeldObject) -> None:
-        """Start again with an object that is not held yet."""
+        """Start again with an object on which no contact forces act yet."""
         self.body = body
         self.contact_forces = np.zeros_like(body.points)
 
@@ -82,15 +82,15 @@ class Manipulation:
             models: condensed models of the parts at their present states, roles ``a`` and ``c``.
             goal: position of the object's centre [m], shape (3,).
             command: present command of the actuators of all parts, shape (n_a,).
-            slack: actuators that hang slack, shape (n_a,).
-            rotation: desired orientation, shape (3, 3), or None to leave it to itself.
-            body: the measured object, where there is a sensor; default the predicted one.
-            load: new force and torque on the object [N, N m], shape (6,). Soft parts give way to it at once: bring a
-                large one on over several calls, as their actuators need time to answer.
+            slack: actuators that are slack, shape (n_a,).
+            rotation: desired orientation, shape (3, 3), or None to leave it free.
+            body: the measured object, if there is a sensor; by default the predicted one.
+            load: new force and torque on the object [N, N m], shape (6,). Soft parts yield to it at once, while
+                actuators need time to respond: apply a large load over several calls.
 
         Raises:
             ValueError: for malformed or non-finite input, or points that do not hold the object.
-            ConvergenceError: if the QP finds no step; the state is kept.
+            ConvergenceError: if the QP finds no step; the state is unchanged.
         """
         held = self.body if body is None else body
         if load is not None:

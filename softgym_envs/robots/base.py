@@ -93,11 +93,11 @@ class Robot(ABC):
         goal_tolerance: distance at which a goal counts as reached [m].
         workspace_scale: distance over which the effector typically moves [m], by default a quarter of the size; scales
             rewards and errors.
-        rest_mode: how actuators are held at rest: ``"effort"`` (without effort) or ``"displacement"`` (at zero).
+        rest_mode: state of the actuators at rest: ``"effort"`` (no effort) or ``"displacement"`` (held at zero).
         stiffness_variable: design variable that scales all efforts and nothing else (Young's modulus without dead
             loads), or None. Surrogates use it exactly instead of learning it.
-        convex: the elastic energy is convex in the displacements of the actuators: the body keeps its state also when
-            they are driven by efforts. Surrogates are built so; where it is False they learn unstable states too.
+        convex: the elastic energy is convex in the actuator displacements, so that the body is also stable when its
+            actuators are driven by efforts. Surrogates build on it; without it, they learn unstable states too.
         non_mechanical_options: options that leave the condensed model as it is.
     """
 
@@ -296,7 +296,7 @@ def _json_value(value: Any, label: str) -> Any:
 
 
 class MeshedRobot(Robot):
-    """A robot whose body is one solid from gmsh; its mesh is moved over the design space.
+    """A robot whose body is one solid, meshed by gmsh; the mesh is moved from design to design.
 
     Args:
         mesh_size: target edge length [m].
@@ -331,14 +331,14 @@ class MeshedRobot(Robot):
 
     @abstractmethod
     def mesh(self, design: Mapping[str, float]) -> BodyMesh:
-        """Mesh the body of a complete design, or the part of it that `unfold` completes, anew (or from the cache)."""
+        """Return a new or cached mesh of a complete design: the whole body, or the part that `unfold` completes."""
 
     @abstractmethod
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
-        """Geometric features that carry the boundary of what `mesh` returns, by name."""
+        """Return the planes, cylinders and cones on which the surface of a mesh from `mesh` lies, by name."""
 
     def unfold(self, part: BodyMesh) -> BodyMesh:
-        """Return the whole body; a symmetric robot meshes a part of it and mirrors that."""
+        """Return the whole body. A symmetric robot meshes a part of it and mirrors that part here."""
         return part
 
     @abstractmethod
@@ -351,7 +351,7 @@ class MeshedRobot(Robot):
         return self.design_space.baseline
 
     def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
-        """Rough displacement [m] (n, 3) of the reference nodes to a design; it only starts the mesh motion."""
+        """Return rough displacements [m] (n, 3) of the reference nodes, from which the mesh motion starts."""
         return np.zeros_like(nodes)
 
     # -- what follows from it ---------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """The cable trunk: a slender tapered silicone arm that eight cables bend in two independent halves.
 
-Dimensions are those of the public model of an elephant's trunk; its folds are left out. The trunk stands on its
+Dimensions are those of the public model of an elephant's trunk, without its folds. The trunk stands on its
 clamped base along +z. Four cables run to the tip and four to the middle, each pair in one of the planes xz and yz.
 """
 
@@ -23,19 +23,19 @@ LONG_GUIDES, SHORT_GUIDES = 20, 10
 def stretched(share: np.ndarray, short_fraction: float) -> np.ndarray:
     """Heights, as shares of the length, of equal steps along the trunk; the first half ends with the short cables.
 
-    Sections and guides move with that end. Were the mesh to stay, the force there would pass from one element to the
-    next as the design changes, and strains jump between elements: the derivative of the tip changed its sign within
-    2 % of the range.
+    Sections and guides move with that end. On a mesh that does not move, the force at the end passes from one element
+    to the next as the design changes. As strains jump between elements, even the sign of the tip's derivative changed
+    within 2 % of the range.
     """
     return np.interp(share, [0.0, 0.5, 1.0], [0.0, short_fraction, 1.0])
 
 
 def octagonal_bar(layers: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh a bar of octagonal section, half-width 1 and length 1, that stands on z = 0, in prisms cut in three.
+    """Mesh a bar of octagonal section on z = 0, of half-width 1 and length 1, by prisms of three tetrahedra each.
 
-    Sections are cut into triangles by rings about the axis. All cuts follow the numbers of the nodes, which go from
-    the axis outwards and on each ring from the middles of the sides to the corners: so the mesh is as symmetric as
-    the octagon.
+    Rings about the axis divide each section into triangles. Prisms are divided by the order of their node numbers,
+    which count from the axis outwards and, on each ring, from the middles of the sides to the corners. This makes the
+    mesh as symmetric as the octagon.
 
     Args:
         layers: number of prisms along the bar.
@@ -77,17 +77,17 @@ def octagonal_bar(layers: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
 class CableTrunk(Robot):
     """Tapered arm with four cables along its whole length and four to its middle.
 
-    The mesh is regular on either side of the short cables' end, so it follows the design exactly and is as symmetric
+    The mesh is regular on both sides of the end of the short cables. It follows the design exactly and is as symmetric
     as the body.
 
     Args:
         layers: number of elements along the trunk; the defaults give 825 nodes and 3456 tetrahedra.
         rings: number of rings of elements about the axis.
         material: name of a material of `softgym_envs.mechanics.materials`.
-        strokes: largest displacement of the long and of the short cables [m]. The default is half of what the public
-            model allows, (0.070, 0.040): from 37 mm on, opposite long cables crush the thin tip and no equilibrium is
-            found; a long cable alone gets to 57 mm.
-        unilateral: cables cannot push (default). False reproduces scenes whose cables can.
+        strokes: largest displacement of the long and of the short cables [m]. The default is half of the public model's
+            (0.070, 0.040): from 37 mm on, two opposite long cables crush the thin tip and no equilibrium is found; one
+            long cable alone can be pulled by 57 mm.
+        unilateral: cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the baseline body weighs 42 g.
     """
 

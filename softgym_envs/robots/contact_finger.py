@@ -1,14 +1,14 @@
-"""One finger and the pose of whatever its contact points are tied to: the part that grippers are made of.
+"""One finger whose contact points are tied to a frame that is driven: the building block of grippers.
 
-A finger that holds a rigid object (thesis 4.3.2) knows of it only where its three contact points are, and they keep
-their triangle. So eight numbers say all: the shortening of its two cables, and the pose of that triangle. Driven in
-all of them, the finger's energy is a function of eight coordinates whose derivatives are the tensions of the cables
-and the wrench that the object exerts. A gripper of any number of turned and moved copies is the sum of such functions
-(`softgym_envs.control.fingers`): one learned model serves every finger of every gripper, by symmetry.
+A finger that holds a rigid object (thesis, sec. 4.3.2) touches it at three points, which keep their triangle. Eight
+numbers therefore describe its state: the shortening of its two cables and the pose of the triangle. When all eight are
+driven, the finger's energy is a function of them, and its derivatives are the tensions of the cables and the wrench
+that the object exerts. The energy of a gripper of turned and moved copies is the sum of such functions
+(`softgym_envs.control.fingers`), so one learned model serves every finger of every gripper.
 
-That energy is not convex. A finger that is pulled and pushed would buckle if its cables and pose were free to give way,
-though held, or in a gripper, it is stable: of the fingers of the three-finger gripper under random commands two thirds
-have a ``W`` between actuators that is not positive definite.
+That energy is not convex. A finger that is pulled and pushed at once is stable while its cables and pose are held, or
+in a gripper, but would buckle under constant forces: under random commands, two thirds of the fingers of the
+three-finger gripper have a ``W`` between actuators that is not positive definite.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class ContactFinger(FingerRobot):
 
     The actuators are the two cables, then the displacement x, y, z [m] of the frame's origin from rest and its turn
     rx, ry, rz, the components of ``sin(angle) * axis`` [1]; see `softgym_envs.mechanics.constraints.Pose`. Their
-    ranges hold 99 % of what the block of the three-finger gripper does under random commands of its cables, over its
-    design space; the finger that presses a button turns further (up to 90 degrees). The effector is the tip.
+    ranges cover 99 % of the poses that occur in the three-finger gripper under random commands, over its design space;
+    the finger that presses a button turns further (up to 90 degrees). The effector is the tip.
 
     Args:
         **options: options of `FingerRobot`.
@@ -50,8 +50,8 @@ class ContactFinger(FingerRobot):
         ("ry", -0.36, 0.36, "1"),
         ("rz", -0.26, 0.26, "1"),
     )
-    #: The pose follows the cables: in the three-finger gripper its mean is about this at rest, plus these slopes
-    #: [1/m] times the sum and the difference of both shortenings, ...
+    #: The pose depends on the cables: in the three-finger gripper its mean is about the first number, plus these slopes
+    #: [1/m] times the sum and the difference of the two shortenings, ...
     pose_means = (
         ("x", 0.0, 0.0, -0.64),
         ("y", 0.001, 0.07, -0.14),
@@ -60,11 +60,11 @@ class ContactFinger(FingerRobot):
         ("ry", 0.0, 0.5, 13.5),
         ("rz", 0.0, 0.2, -13.3),
     )
-    #: ... and 99 % of its states lie within this on either side.
+    #: ... and 99 % of the poses are within this distance of the mean.
     pose_spread = (0.0045, 0.0065, 0.0035, 0.25, 0.28, 0.16)
-    #: Origin of the frame from the middle of the contact points [m]. A finger bends about a point far above them, so
-    #: that with an origin there they would move aside and turn as one; with this one y and rx, and x and ry, are
-    #: nearly uncorrelated in a gripper, and a box of independent coordinates holds few poses that never occur.
+    #: Origin of the frame from the middle of the contact points [m]. A finger bends about a point far above
+    #: them. With the origin at their middle, sideways motion and rotation are strongly correlated; with this origin, y
+    #: and rx, and x and ry, are nearly independent in a gripper, so a box contains few poses that never occur.
     origin = (0.0, 0.0, 0.030)
 
     def __init__(self, **options: Any) -> None:
@@ -81,11 +81,11 @@ class ContactFinger(FingerRobot):
         return self.finger.tip(design)
 
     def object_frame(self, design: Mapping[str, float]) -> np.ndarray:
-        """Origin of the frame that the contact points are tied to [m], shape (3,)."""
+        """Return the origin of the frame to which the contact points are tied [m], shape (3,)."""
         return self.finger.contact_points(design).mean(axis=0) + self.origin
 
     def displacements(self, fractions: np.ndarray) -> np.ndarray:
-        """Cables anywhere, and poses about those that go with them: others do not occur."""
+        """Return cables anywhere in their ranges with poses near the mean for these cables; others do not occur."""
         found = super().displacements(fractions)
         one, other = found[:, 0], found[:, 1]
         rest, mean, skew = np.array([row[1:] for row in self.pose_means]).T

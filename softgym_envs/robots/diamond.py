@@ -1,6 +1,6 @@
 """The Diamond: a soft parallel robot, four legs with an elbow each between a clamped base and a free top.
 
-Dimensions are those of the thesis (section 4.3.1) and its public model. The legs lie in the planes xz and yz; a
+Dimensions are those of its public model (thesis, sec. 4.3.1). The legs lie in the planes xz and yz; a
 cable pulls each elbow inwards, which lifts the top and tilts it away.
 """
 
@@ -17,7 +17,7 @@ from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature, Plane
 from softgym_envs.robots.geometry.symmetry import mirrored
 
-# Contours of one leg (r, z) from the base to the top [mm], inset by a few tenths towards the published volume.
+# Contours of one leg (r, z) from the base to the top [mm], inset by a few tenths to match the published volume.
 OUTER = (
     *((0, -37), (35, -37), (50, -29.6), (62, -23.6), (70, -17.6), (76, -11.6), (81.6, 0), (86.6, 12), (94.7, 36)),
     *((97, 45), (93.7, 54), (87, 59.6), (73, 71.6), (43, 95.6), (29, 107.6), (14, 119.6), (0, 126)),
@@ -75,7 +75,7 @@ class Diamond(MeshedRobot):
             shorter than that, so elements are smaller.
         meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` meshes every design anew.
         material: name of a material of `softgym_envs.mechanics.materials`.
-        unilateral: cables cannot push (default). False reproduces scenes whose cables can.
+        unilateral: cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the condensed-model work of the thesis has none. Its reinforcement-learning scene
             is ``gravity=(0, 0, -9.81)`` with the design ``{"young_modulus": 1.8e5}``; the baseline body weighs 0.5 kg.
     """
@@ -108,8 +108,8 @@ class Diamond(MeshedRobot):
         self.effector_rest = self._top(self.design_space.baseline)
         self.effort_scale = np.full(4, 40.0)
         self.actuators = tuple(
-            # Published are 0 to 30 mm. Paying out lets the antagonists go, without which the published circle is out of
-            # reach: the top stays 6 mm above it.
+            # The published range is 0 to 30 mm. Without paying out the antagonists the top stays 6 mm above the
+            # published circle.
             Actuator(name, -0.010, 0.030, 0.0015, unilateral=unilateral)
             for name in ("north", "west", "south", "east")
         )
@@ -124,8 +124,8 @@ class Diamond(MeshedRobot):
     def side_view(design: Mapping[str, float]) -> np.ndarray:
         """Closed contour (r, z) of a leg [m], shape (k, 2): the published one, stretched piece by piece.
 
-        Between the hub and the elbow radii stretch; heights do between base and elbow, and between elbow and top.
-        It reaches a little beyond the axis, where the legs cut each other.
+        Radii are stretched between the hub and the elbow, heights between base and elbow and between elbow and top.
+        The contour ends a little beyond the axis, where the legs intersect.
         """
         contour = []
         for points in (OUTER, INNER[::-1]):
@@ -164,7 +164,7 @@ class Diamond(MeshedRobot):
         return mesh_geometry(draw_eighth, corners, mesh_size=self.mesh_size)
 
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
-        """One plane for each edge of the side view and of the plan view."""
+        """Planes: one for each edge of the side view and of the plan view."""
         features: dict[str, Feature] = {}
         contour = self.side_view(design)
         for k, ((r, z), (dr, dz)) in enumerate(zip(contour, np.diff(contour, axis=0), strict=False)):
@@ -202,7 +202,7 @@ class Diamond(MeshedRobot):
 
     def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Clamp the middle of the base, tie a cable to each elbow, put the effector just below the top."""
-        # Chosen on the reference mesh, so that no node joins or leaves the clamp as the mesh moves.
+        # Chosen by the reference positions: the same nodes are clamped however far the mesh has moved.
         nodes = self.reference_nodes(mesh)
         fixed = (np.abs(nodes[:, :2]) <= 15.0e-3).all(axis=1) & (nodes[:, 2] <= 10.0e-3)
         model = self.solid(mesh, design, fixed=fixed, density=MASS / VOLUME)
@@ -218,7 +218,8 @@ class Diamond(MeshedRobot):
     def reference_path(self, count: int = 30) -> np.ndarray:
         """Circle of radius 20 mm in the plane z = 133 mm, as published; the same for every body.
 
-        Cables that cannot push bring the top of the baseline body within 1.2 mm of it, others exactly onto it.
+        With cables that cannot push the top of the baseline body comes within 1.2 mm of it, with others it follows
+        exactly.
         """
         angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
         return np.column_stack([0.020 * np.cos(angle), 0.020 * np.sin(angle), np.full(count, 0.133)])

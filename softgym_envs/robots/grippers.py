@@ -1,7 +1,7 @@
-"""Grippers made from copies of the Soft Finger: each is the finger turned and moved (thesis 4.3.1 and 4.3.2).
+"""Grippers made from turned and moved copies of the Soft Finger (thesis, sec. 4.3.1 and 4.3.2).
 
-All bodies of a gripper and the object in its hold are one finite-element model. Contact is that of the thesis: the
-fingers' contact points stay on the object, without friction moments (ball joints), in pull as in push.
+The fingers and the object that they hold are one finite-element model. Contact is that of the thesis: contact points
+are tied to the object by ball joints, which pull as well as push and transmit no moments.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class FingerRobot(Robot):
     #: Range of the cables and their largest change in a control step [m].
     cable_range = (0.0, 0.020)
     cable_rate = 0.001
-    #: Without gravity, all efforts scale with Young's modulus.
-    scales = True
+    #: Without gravity, all efforts are proportional to Young's modulus.
+    proportional_to_modulus = True
 
     def __init__(
         self,
@@ -69,26 +69,26 @@ class FingerRobot(Robot):
         )
         self.effort_scale = np.full(len(self.actuators), 20.0)
         self.effector_rest = self.object_rest(self.design_space.baseline)
-        self.stiffness_variable = "young_modulus" if self.scales and not any(gravity) else None
+        self.stiffness_variable = "young_modulus" if self.proportional_to_modulus and not any(gravity) else None
 
     def variables(self) -> tuple[DesignVariable, ...]:
-        """Design variables: those of the finger, and more if there are any."""
+        """Return the design variables: those of the finger, then those of the gripper."""
         return tuple(self.finger.design_space)
 
     @abstractmethod
     def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
-        """Where the effector is at rest [m], shape (3,)."""
+        """Return the effector at rest [m], shape (3,)."""
 
     @abstractmethod
     def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
-        """Add what ties the fingers to each other or to the object, whose frame is given, and the effector."""
+        """Tie the fingers to each other, or to the object whose frame is given, and add the effector."""
 
     def object_frame(self, design: Mapping[str, float]) -> np.ndarray | None:
-        """Position of the rigid object [m], shape (3,), or None without one."""
+        """Return the position of the rigid object [m], shape (3,), or None if there is none."""
         return None
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
-        """Place the fingers, route their cables, and let them hold the object."""
+        """Place the fingers, route their cables, and tie them to the object."""
         names = self.finger.design_space.names
         self._shape = {name: design[name] for name in names}
         mesh = self.finger.body(self._shape)
@@ -124,13 +124,13 @@ class FingerRobot(Robot):
     def material_point(
         self, model: MechanicalModel, finger: int, point: np.ndarray, reference: np.ndarray
     ) -> EmbeddedPoints:
-        """Embed a point of the finger [m] (3,), given where it is in the finger's own axes, in one of its copies.
+        """Embed a point of the finger [m] (3,), given in the finger's own axes, in one of its copies.
 
         Args:
             model: the gripper.
             finger: number of the copy.
             point: the point [m], shape (3,).
-            reference: the same point of the reference body, which settles the element of points outside the mesh.
+            reference: the same point of the reference body, which selects the element for points outside the mesh.
         """
         turn, shift = self.placements[finger]
         hint = self.finger.reference_element(self._mesh, reference)
@@ -151,8 +151,8 @@ class PressFinger(FingerRobot):
     """A finger that presses a cube-shaped button, which resists with a constant force along -y.
 
     Args:
-        button_force: force of the button [N]. The published "10 N" pushes this finger back by 66 mm with cables held
-            at zero and leaves it no stable way forward; 2 N is a fifth of it, and well inside its strength.
+        button_force: force of the button [N]. The published "10 N" pushes this finger back by 66 mm with its cables
+            held at zero, from where it cannot press the button in a stable way; 2 N is well within its strength.
         **options: options of `FingerRobot`.
     """
 
@@ -162,7 +162,7 @@ class PressFinger(FingerRobot):
     half_extents = (13.75e-3, 13.75e-3, 13.75e-3)
     goal_axes = np.array([0.0, 1.0, 0.0])
     goal_tolerance = 5e-4
-    scales = False  # the button's force stays what it is
+    proportional_to_modulus = False  # the force of the button does not depend on it
 
     def __init__(self, *, button_force: float = 2.0, **options: Any) -> None:
         if not (np.isfinite(button_force) and button_force >= 0.0):
@@ -171,7 +171,7 @@ class PressFinger(FingerRobot):
         super().__init__(**options)
 
     def variables(self) -> tuple[DesignVariable, ...]:
-        """Those of the finger, without bodies so soft that the button folds them."""
+        """Return those of the finger, without moduli so low that the button folds the finger."""
         return tuple(
             replace(variable, low=2.0e6) if variable.name == "young_modulus" else variable
             for variable in super().variables()
@@ -184,7 +184,7 @@ class PressFinger(FingerRobot):
     object_frame = object_rest
 
     def reference_path(self, count: int = 9) -> np.ndarray:
-        """Goals along y, from where the button's force has pushed the finger, shape (count, 3); x and z are free."""
+        """Goals along y from where the button has pushed the finger, shape (count, 3); x and z do not count."""
         path = np.tile(self.effector_rest, (count, 1))
         path[:, 1] = np.linspace(0.020, 0.044, count)
         return path
@@ -199,9 +199,9 @@ class PressFinger(FingerRobot):
 
 
 class TwoFingerGripper(FingerRobot):
-    """Two fingers that face each other and hold a bar between their tips (thesis eq. 4.6).
+    """Two fingers that face each other and hold a bar between their tips (thesis, eq. 4.6).
 
-    The bar ties the tips at a constant offset along y; it is shorter than their distance at rest, so the fingers bend
+    The bar keeps the tips at a constant offset along y. It is shorter than their distance at rest, so the fingers bend
     towards each other. The effector is the middle of the bar.
 
     Args: as for `FingerRobot`.
@@ -214,7 +214,7 @@ class TwoFingerGripper(FingerRobot):
     goal_tolerance = 5e-4
 
     def variables(self) -> tuple[DesignVariable, ...]:
-        """Those of the finger and the length of the bar."""
+        """Return those of the finger and the length of the bar."""
         bar = DesignVariable("bar_length", 0.030, 0.055, 0.040, "m", "offset of the two tips along y")
         return (*super().variables(), bar)
 
@@ -223,7 +223,7 @@ class TwoFingerGripper(FingerRobot):
         return np.array([0.0, 0.040, self.finger.tip(design)[2]])
 
     def reference_path(self, count: int = 25) -> np.ndarray:
-        """Goals along x: from 0 to 30 mm, to -30 mm and back to 0, shape (count, 3); z is free."""
+        """Goals along x: from 0 to 30 mm, to -30 mm and back to 0, shape (count, 3); z does not count."""
         path = np.tile(self.effector_rest, (count, 1))
         path[:, 0] = np.interp(np.linspace(0.0, 4.0, count), [0.0, 1.0, 3.0, 4.0], [0.0, 0.030, -0.030, 0.0])
         return path
@@ -242,7 +242,7 @@ class TwoFingerGripper(FingerRobot):
 
 
 class ThreeFingerGripper(FingerRobot):
-    """Three fingers that hold a cube (thesis 4.3.2): one pushes along +y, two along -y.
+    """Three fingers that hold a cube (thesis, sec. 4.3.2): one pushes along +y, two along -y.
 
     Args: as for `FingerRobot`.
     """
@@ -275,8 +275,8 @@ class ThreeFingerGripper(FingerRobot):
     def reference_path(self, count: int = 20) -> np.ndarray:
         """Horizontal circle of the cube's centre, shape (count, 3).
 
-        With cables that may push it is the published one: radius 1.5 mm about the rest position. Cables that cannot
-        push only lift the cube: then its radius is 1 mm, about a centre 4 mm higher.
+        With cables that can push it is the published one, of radius 1.5 mm about the rest position. Cables that cannot
+        push can only lift the cube: then the radius is 1 mm, and the centre 4 mm higher.
         """
         angle = 2.0 * np.pi * np.arange(count) / count
         circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])

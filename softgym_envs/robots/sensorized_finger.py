@@ -1,8 +1,9 @@
-"""The sensorized Soft Finger: one cable, and the volumes of its bellows' cavities as sensors (thesis, section 3.3).
+"""The sensorized Soft Finger: one cable, and the volumes of its bellows' cavities as sensors (thesis, sec. 3.3).
 
 The finger hangs along -z, is clamped by a flange at z = 0, and bends towards +y when its cable is pulled, which
 squeezes the cavities. Seven lengths and angles shape its notches, bellows and cavities. With four cavities (thesis
-3.3.6) a wall in the plane x = 0 splits each cavity in two, so that the sensors tell a lateral force from a pull.
+3.3.6) a wall in the plane x = 0 splits each cavity in two, so that the sensors can distinguish a lateral force from a
+pull.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _LATERAL_POINT = (-THICKNESS / 2, HEIGHT / 2, -1.5 * LENGTH)
 
 @dataclass(frozen=True)
 class SensorReadings:
-    """What the sensors and the tip of one design do (thesis eq. 3.3 and 3.4, and section 3.3.6).
+    """Sensor readings and tip under a pull and a lateral force (thesis, eq. 3.3 and 3.4, sec. 3.3.6).
 
     Attributes:
         volume_change: ``f1 = |V(pull) - V(0)|`` of the first cavity [m3].
@@ -75,7 +76,7 @@ class SensorizedFinger(MeshedRobot):
         cavities: 2 (one in each bellow) or 4 (two in each, with a wall between; its thickness is then a variable).
         mesh_size: target edge length [m].
         meshing: ``"remesh"`` (default) meshes every design anew, as the published study does. ``"morph"`` moves the
-            baseline mesh where its elements stay good: in about a quarter of this large box.
+            baseline mesh if its elements stay good, which holds in about a quarter of this large box.
         material: name of a material of `softgym_envs.mechanics.materials`.
         unilateral: the cable cannot push (default).
         gravity: acceleration [m/s2].
@@ -182,7 +183,7 @@ class SensorizedFinger(MeshedRobot):
         return mesh
 
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
-        """Surfaces of the shape of a complete design."""
+        """Return the surfaces of the shape of a complete design."""
         return finger_features(self.lengths(design))
 
     def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
@@ -195,7 +196,7 @@ class SensorizedFinger(MeshedRobot):
         points = np.array([[0.0, height, s] for s in stations])
         (cable,) = self.actuators
         model.add_cable(cable.name, points, np.array([0.0, height, 0.0]), unilateral=cable.unilateral)
-        # Above the joint's height the effector floats in front of the slanted end.
+        # Above the height of the joints the effector lies in front of the slanted end, outside the body.
         hint = self.reference_element(mesh, self.effector_rest)
         model.add_effector("tip", self.effector_rest, hint=hint)
         for number, triangles in enumerate(mesh.cavities(), start=1):
@@ -205,7 +206,7 @@ class SensorizedFinger(MeshedRobot):
     def readings(
         self, design: Mapping[str, float] | None = None, *, pull: float = 0.010, lateral_force: float = 5.0
     ) -> SensorReadings:
-        """Solve the equilibria that the published objectives are made of.
+        """Return the quantities in the published objectives, from their equilibria.
 
         Args:
             design: the body; missing variables take their baseline.

@@ -36,15 +36,15 @@ class SoftFinger(MeshedRobot):
     """Cable-driven soft finger.
 
     Args:
-        cables: 2 (thesis 4.3: x = -5 and 5 mm, y = 15.33 mm, notch slope 45 degrees, nu 0.3) or
-            1 (thesis 4.5: x = 0, y = 17.75 mm, notch slope 30 degrees, nu 0.47).
+        cables: 2 (thesis, sec. 4.3: x = -5 and 5 mm, y = 15.33 mm, notch slope 45 degrees, nu 0.3) or
+            1 (thesis, sec. 4.5: x = 0, y = 17.75 mm, notch slope 30 degrees, nu 0.47).
         mesh_size: target edge length [m]; default 8 mm (485 nodes, 1572 tetrahedra) with two cables, 7.9 mm (520
-            nodes, 1721 tetrahedra) with one: sizes whose mesh moves to every body of the box without remeshing.
+            nodes, 1721 tetrahedra) with one. Meshes of these sizes can be moved to every design without remeshing.
         meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` meshes every design anew.
         material: name of a material of `softgym_envs.mechanics.materials`.
-        unilateral: cables cannot push (default). False reproduces scenes whose cables can.
+        unilateral: cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the condensed-model work of the thesis has none.
-        contacts: add three contact points (role ``c``) on the front of the last segment (thesis 4.3.2).
+        contacts: add three contact points (role ``c``) on the front of the last segment (thesis, sec. 4.3.2).
     """
 
     name = "finger"
@@ -114,7 +114,7 @@ class SoftFinger(MeshedRobot):
         return mesh_geometry(draw, lengths, mesh_size=self.mesh_size)
 
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
-        """Surfaces of the shape of a complete design."""
+        """Return the surfaces of the shape of a complete design."""
         return finger_features(self.lengths(design))
 
     @staticmethod
@@ -123,7 +123,7 @@ class SoftFinger(MeshedRobot):
         return np.array([0.0, design["height"] / 2, -3.0 * design["length"]])
 
     def routes(self, design: Mapping[str, float]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Pull point (3,) and guides (6, 3) [m] of each cable: past the two notches, at both of their edges."""
+        """Pull point (3,) and guides (6, 3) [m] of each cable. Guides are where it leaves and enters a segment."""
         length = design["length"]
         offset = (self.cable_height - design["joint_height"]) * math.tan(self.slope)
         stations = [s for k in range(3) for s in (-k * length - offset, -(k + 1) * length + offset)]
@@ -134,7 +134,7 @@ class SoftFinger(MeshedRobot):
 
     @staticmethod
     def contact_points(design: Mapping[str, float]) -> np.ndarray:
-        """Three points on a circle in the middle of the last segment's front [m], shape (3, 3)."""
+        """Return three points on a circle in the middle of the front of the last segment [m], shape (3, 3)."""
         angles = math.pi / 2 + 2.0 * math.pi / 3 * np.arange(3)
         circle = CONTACT_RADIUS * np.column_stack([np.cos(angles), np.zeros(3), np.sin(angles)])
         return np.array([0.0, design["height"], -2.5 * design["length"]]) + circle
@@ -150,7 +150,7 @@ class SoftFinger(MeshedRobot):
         model = self.solid(mesh, design, fixed=in_flange(mesh.nodes))
         for actuator, (pull_point, points) in zip(self.actuators, self.routes(design), strict=True):
             model.add_cable(actuator.name, points, pull_point, unilateral=actuator.unilateral)
-        # The effector floats in front of the slanted tip, outside the body.
+        # The effector lies in front of the slanted tip, outside the body.
         hint = self.reference_element(mesh, self.tip(self.reference_design))
         model.add_effector("tip", self.tip(design), hint=hint)
         if self.contacts:
@@ -161,11 +161,11 @@ class SoftFinger(MeshedRobot):
         return model
 
     def reference_path(self, count: int = 25) -> np.ndarray:
-        """Closing motion of the thesis (Fig. 4.3): the tip bends about the base by up to 60 degrees, shape (count, 3).
+        """Closing motion (thesis, fig. 4.3): the tip bends about the base by up to 60 degrees, shape (count, 3).
 
-        The radius shrinks as that of the bending finger does, ``1 - 0.7 (theta / 90 deg)^2`` of the rest length (within
-        2 mm of the baseline's workspace up to 45 degrees); the end of the path is outside the workspace, as in the
-        thesis.
+        The distance from the base shrinks like that of the bending finger, to ``1 - 0.7 (theta / 90 deg)^2`` of the
+        rest length. Up to 45 degrees the path stays within 2 mm of the baseline's workspace; its end is out of reach,
+        as in the thesis.
         """
         theta = np.linspace(0.0, np.pi / 3, count)
         radius = self.size * (1.0 - 0.7 * (theta / (0.5 * np.pi)) ** 2)

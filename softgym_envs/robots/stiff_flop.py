@@ -1,4 +1,4 @@
-"""Stiff-Flop: a pneumatic trunk of two modules with fibre-reinforced chambers (Abidi et al. 2018; thesis 4.4).
+"""Stiff-Flop: a pneumatic trunk of two modules with fibre-reinforced chambers (Abidi et al. 2018; thesis, sec. 4.4).
 
 Each module bends and stretches when its three pairs of chambers, 120 degrees apart, are filled. The model is that of
 the thesis: beams along the axis with chambers that act along off-axis lines (Chaillou et al. 2023), here geometrically
@@ -25,9 +25,9 @@ STIFF_MODULUS = 1.875e6
 STIFF_LENGTH = 5e-3
 """Length of the stiff end piece of each module [m]; the chambers fill the rest."""
 
-# The published dimensions do not fix the chambers' lever arm nor the section that carries load. These four values are
-# inferred from the published rest compliance, the same for both modules (see the page of this robot): equal errors of
-# all its entries, none above 6 %.
+# The published dimensions determine neither the lever arm of the chambers nor the section that carries load. These four
+# values, the same for both modules, are inferred from the published compliance at rest: they make the errors of all its
+# entries equal, none above 6 % (see the page of this robot).
 CHAMBER_RADIUS = 0.719e-3
 """Inner radius of one tube [m]: two of them have 3.25 mm2 (nominal 0.75 mm, 3.53 mm2)."""
 CHAMBER_OFFSET = 3.45e-3
@@ -47,8 +47,8 @@ class StiffFlop(Robot):
     Args:
         elements: quadratic beam elements along the chambers of each module.
         gravity: acceleration [m/s2]; the published work has none.
-        unilateral: chambers are not sucked empty: a volume below what the other chambers stretch it to leaves a chamber
-            open, at no pressure (default). False lets the pressure be negative.
+        unilateral: pressures are not negative (default): a chamber whose commanded volume is below the one to which the
+            others stretch it is open, without pressure.
     """
 
     name = "trunk"
@@ -68,7 +68,9 @@ class StiffFlop(Robot):
         self.elements = elements
         self.design_space = DesignSpace(
             DesignVariable("module_length", 0.045, 0.065, 0.055, "m", "length of one of the two modules"),
-            DesignVariable("outer_radius", 0.0052, 0.0065, 0.00575, "m", "radius of the body; its wall scales along"),
+            DesignVariable(
+                "outer_radius", 0.0052, 0.0065, 0.00575, "m", "radius of the body, in proportion to its wall"
+            ),
             DesignVariable(
                 "chamber_offset", 0.0030, 0.0040, CHAMBER_OFFSET, "m", "distance of the chambers to the axis"
             ),
@@ -129,6 +131,6 @@ class StiffFlop(Robot):
         return model
 
     def reference_path(self, count: int = 50) -> np.ndarray:
-        """Circle of radius 40 mm about the axis (thesis 4.4.3), in a plane the baseline reaches, shape (count, 3)."""
+        """Circle of radius 40 mm about the axis (thesis, sec. 4.4.3) that the baseline reaches, shape (count, 3)."""
         angle = 2.0 * np.pi * np.arange(count) / count
         return np.column_stack([np.full(count, CIRCLE_DISTANCE), 0.040 * np.cos(angle), 0.040 * np.sin(angle)])

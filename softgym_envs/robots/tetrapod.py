@@ -1,6 +1,6 @@
-"""The Tetrapod: four servos bend elastic legs that meet in a small rigid centre (thesis 5.3).
+"""The Tetrapod: four servos bend elastic legs that meet in a small rigid centre (thesis, sec. 5.3).
 
-The published frame has y up; here z is up, so its (x, y, z) is our (x, z, -y). The robot hangs from its servos.
+The published frame has y up. Here z is up: (x, y, z) there is (x, z, -y) here. The robot hangs from its servos.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ CENTRE_RADIUS = 13e-3
 CENTRE_MASS = 0.020
 """Mass of the centre part [kg]; not published."""
 HANGING = -0.150
-"""Published height of the centre at rest [m]; where the search for the true one starts."""
+"""Published height of the centre at rest [m], from which the search for the equilibrium starts."""
 UP = np.array([0.0, 0.0, 1.0])
 
 
 class Tetrapod(Robot):
     """Four servo-driven legs and a rigid centre.
 
-    A leg leaves the horn of its servo straight downwards and reaches the centre horizontally; printed straight, it is
-    bent in between. With the published lengths that gives the published rest height and workspace (see the page of
-    this robot).
+    A leg leaves the horn of its servo downwards and reaches the centre horizontally. It is printed straight and bent by
+    this assembly. With the published lengths, this gives the published rest height and workspace (see the page of this
+    robot).
 
     Args:
         payload: mass at the centre [kg].
@@ -92,7 +92,7 @@ class Tetrapod(Robot):
         )
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
-        """Lay out servos, legs and centre, bent as a first guess; the equilibrium is found by the solver."""
+        """Lay out servos, legs and centre in a bent first guess; the solver finds the equilibrium."""
         radius, length = design["servo_radius"], design["leg_length"]
         assembly = ModelBuilder(gravity=self.gravity)
         middle = HANGING * UP
@@ -133,7 +133,7 @@ class Tetrapod(Robot):
     def _printed(
         self, root: np.ndarray, outwards: np.ndarray, along: np.ndarray, design: Mapping[str, float]
     ) -> np.ndarray:
-        """Rows of the frames of a leg as printed: from the root downwards, with a curvature quadratic in the length."""
+        """Frames of a leg as printed: from the root downwards, with a curvature that is quadratic in the length."""
         count, length = 2 * self.elements + 1, design["leg_length"]
         knots = [design[f"curvature_{k}"] for k in (1, 2, 3)]
         curvature = np.polynomial.Polynomial.fit([0.0, 0.5 * length, length], knots, 2)
@@ -165,7 +165,7 @@ def _bent(
     across: np.ndarray,
     count: int,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Frames, evenly spaced, along a cubic of a length [m] between two points with given directions."""
+    """Return evenly spaced frames on a cubic curve of a length [m] between two points with given directions."""
     t = np.linspace(0.0, 1.0, 20 * count)[:, None]
 
     def curve(reach: float) -> np.ndarray:
@@ -179,7 +179,7 @@ def _bent(
     def excess(reach: float) -> float:
         return float(np.linalg.norm(np.diff(curve(reach), axis=0), axis=1).sum()) - length
 
-    # A leg too short for its gap starts stretched along the shortest of these curves.
+    # A leg that is too short for the gap starts stretched, on the shortest of these curves.
     reaches = np.linspace(0.5, 4.0, 36) * length
     lengths = [excess(reach) for reach in reaches]
     shortest = int(np.argmin(lengths))
@@ -189,7 +189,7 @@ def _bent(
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     even = np.linspace(0.0, arc[-1], count)
     slopes = np.gradient(points, arc, axis=0)
-    slopes[0], slopes[-1] = first, last  # the ends are clamped: exactly so
+    slopes[0], slopes[-1] = first, last  # exactly: the ends are clamped
     frames = []
     for s in even:
         point, direction = (np.array([np.interp(s, arc, field[:, d]) for d in range(3)]) for field in (points, slopes))

@@ -193,7 +193,7 @@ def test_malformed_couplings_are_refused(rng):
     contacts = rng.standard_normal((2, 3))
     for expected, arguments, options in [
         ("nothing to couple", [models], {}),
-        ("one or more models", [[]], {}),
+        ("at least one model", [[]], {}),
         ("must be finite, of shapes", [models, C, np.zeros(2)], {}),
         ("must be finite, of shapes", [models, C, np.full(3, np.nan)], {}),
         ("actuator rows cannot be tied", [models, np.eye(16)[:1]], {}),
@@ -305,7 +305,7 @@ def test_rotate_keeps_batches_and_refuses_nonsense(rng):
             rotate(model, R_bad, shift)
     with pytest.raises(ValueError, match="three finite numbers"):
         rotate(model, R, [0.0, np.nan, 0.0])
-    with pytest.raises(ValueError, match="no points in space"):
+    with pytest.raises(ValueError, match="not a multiple of three"):
         rotate(model, R, points="a")
 
 
@@ -407,7 +407,7 @@ class Grip:
 
 
 def gripper(model, **options):
-    """Three fingers of the thesis (4.3.2) and its cube, at rest."""
+    """Three fingers of the thesis (sec. 4.3.2) and its cube, at rest."""
     rest = np.array([point.value(model.nodes) for point in model.constraints["c"]])
     contacts = np.concatenate([rest @ R.T + shift for R, shift in Grip.places])
     return HeldObject.around(np.array([0.0, 0.035, -0.095]), contacts, **options)

@@ -165,10 +165,10 @@ def test_a_finger_out_of_its_domain_is_told():
     assert not fingers.solve(command).trusted
 
 
-def test_a_contact_finger_alone_is_no_environment():
+def test_a_contact_finger_alone_is_not_an_environment():
     with pytest.raises(ValueError, match="'contact_finger' alone has no state that a search finds"):
         SurrogateBackend(make_robot("contact_finger"))
-    with pytest.raises(ValueError, match="energy of robot 'contact_finger' is not convex"):
+    with pytest.raises(ValueError, match="'contact_finger' cannot be exported: its energy is not convex"):
         export_c(pretrained_model(make_robot("contact_finger")), {}, "finger.h")
 
 
@@ -297,7 +297,7 @@ def test_learned_fingers_are_evaluated_together(parts):
 
 
 def test_only_models_of_the_contact_finger_make_a_gripper():
-    with pytest.raises(ValueError, match="made of models of 'contact_finger', got one of 'finger'"):
+    with pytest.raises(ValueError, match="must be one of robot 'contact_finger', got one of 'finger'"):
         SurrogateFingers(Learned(make_robot("finger")))
 
 
@@ -324,7 +324,7 @@ def test_an_object_turned_over_is_told():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"placements": []}, "at least one finger"),
+        ({"placements": []}, "needs at least one finger"),
         ({"placements": [(np.diag([1.0, 1.0, -1.0]), np.zeros(3))]}, "right-handed"),
         ({"placements": [(2.0 * np.eye(3), np.zeros(3))]}, "orthonormal"),
         ({"placements": [(np.eye(3), [0.0, np.nan, 0.0])]}, "shifts must be finite"),
@@ -348,5 +348,5 @@ def test_malformed_commands_are_refused(parts):
     ]:
         with pytest.raises(ValueError, match=message):
             coupled.solve(command, mode)
-    with pytest.raises(ValueError, match="'two_finger_gripper' hold no rigid object"):
+    with pytest.raises(ValueError, match="'two_finger_gripper' do not hold a rigid object"):
         CoupledFingers.for_robot(make_robot("two_finger_gripper", mesh_size=MESH_SIZE), Energy())

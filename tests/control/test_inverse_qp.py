@@ -335,7 +335,7 @@ def test_other_malformed_input_is_refused(linear):
     W[:2] = W[0]
     W[:, :2] = W[:, :1]
     same = CondensedModel(W, linear.model.free, linear.model.effort, linear.model.roles)
-    with pytest.raises(ValueError, match="two actuators do the same"):
+    with pytest.raises(ValueError, match="two actuators have the same effect"):
         linear.controller().solve(same, linear.rest, linear.command)
 
 

@@ -23,7 +23,7 @@ def bilateral(count, *, rate=1e-3, **options):
 
 
 class Gripper:
-    """One to three fingers of the thesis (4.3.2) whose contact points are driven to where the plan has them."""
+    """One to three fingers of the thesis (sec. 4.3.2) whose contact points are driven to where the plan has them."""
 
     def __init__(self, count, **body):
         robot = make_robot("finger", contacts=True, unilateral=False)
@@ -50,7 +50,7 @@ class Gripper:
 
 
 def test_three_fingers_carry_a_cube_along_a_circle():
-    """Goals on a circle of radius 1.5 mm (thesis 4.3.2), some calls each; the cube weighs 50 g."""
+    """Goals on a circle of radius 1.5 mm (thesis, sec. 4.3.2), some calls each; the cube weighs 50 g."""
     gripper = Gripper(3, load=np.array([0.0, 0.0, -0.5, 0.0, 0.0, 0.0]))
     control = Manipulation(bilateral(6), gripper.body)
     assert not control.contact_forces.any()

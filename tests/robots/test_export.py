@@ -189,7 +189,7 @@ def test_mould_files_are_closed(tmp_path, occ):
 
 
 def test_moulds_are_for_fingers_that_can_exist(tmp_path):
-    with pytest.raises(ValueError, match="there are no moulds for robot 'trunk'; allowed: finger, sensorized_finger"):
+    with pytest.raises(ValueError, match="robot 'trunk' has no moulds; allowed: finger, sensorized_finger"):
         mould_parts(make_robot("trunk"))
     with pytest.raises(InfeasibleDesign, match="the notches meet"):
         export_moulds(make_robot("sensorized_finger"), tmp_path / "moulds", {"slope": 1.04})
@@ -227,7 +227,7 @@ def test_command_line(monkeypatch, capsys, tmp_path):
         (["octopus", "body.stl"], ["octopus", "finger"]),
         (["finger", "body.stl", "--design", "length=1"], ["length", "0.038"]),
         (["sensorized_finger", "body.step", "--design", "slope=1.04"], ["the notches meet"]),
-        (["trunk", "--moulds", "moulds"], ["no moulds for robot 'trunk'"]),
+        (["trunk", "--moulds", "moulds"], ["robot 'trunk' has no moulds"]),
     ],
 )
 def test_bad_input_is_one_line_and_status_two(monkeypatch, capsys, tmp_path, arguments, words):

@@ -1,6 +1,6 @@
 """Bodies as files for CAD programs, slicers and other simulators: STEP (exact shapes) and STL (triangles).
 
-Lengths in the files are **millimetres**; the suite itself counts in metres.
+Lengths in the files are in **millimetres**, unlike everywhere else in the suite.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from softgym_envs.robots.geometry.meshing import BodyMesh, run_gmsh
 from softgym_envs.storage import atomic_write
 
 FORMATS = (".step", ".stl")
-"""Endings of the files that can be written."""
+"""Allowed endings of files."""
 
 
 def export_body(
@@ -36,7 +36,7 @@ def export_body(
     Raises:
         DesignError: for a malformed design.
         InfeasibleDesign: if the geometry cannot exist.
-        ValueError: for another ending, or a robot that has no such shape.
+        ValueError: for another ending, or a robot without an exact or a solid shape.
     """
     path = _check_path(path)
     if path.suffix == ".step":
@@ -61,7 +61,7 @@ def write_drawing(drawing: Drawing, path: str | Path, *, mesh_size: float = 0.00
     Args:
         drawing: the function and its parameters.
         path: ends with ``.step`` or ``.stl``.
-        mesh_size: largest edge of the triangles of an STL [m]; round parts get finer ones.
+        mesh_size: largest edge of the triangles of an STL [m]; round parts have shorter edges.
         time_limit: wall-clock limit [s].
 
     Raises:
@@ -89,7 +89,7 @@ def write_stl(path: str | Path, nodes: np.ndarray, triangles: np.ndarray) -> Pat
     """Write triangles as a binary STL in millimetres, atomically.
 
     Args:
-        path: where to.
+        path: the file.
         nodes: positions [m], shape (n, 3).
         triangles: corner indices, shape (k, 3), seen counter-clockwise from outside.
     """

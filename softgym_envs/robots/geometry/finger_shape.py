@@ -1,4 +1,4 @@
-"""The shape that the soft fingers share: three segments, two notches with bellows, and cavities inside (thesis 3.3)."""
+"""The shape of the soft fingers: three segments, two notches with bellows, and cavities inside (thesis, sec. 3.3)."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def draw_finger(
 
 
 def check_finger(lengths: Mapping[str, float]) -> None:
-    """Check that the shape of `draw_finger` exists.
+    """Check that the shape that `draw_finger` draws can exist.
 
     Args:
         lengths: its parameters [mm, rad].
@@ -145,12 +145,12 @@ def check_finger(lengths: Mapping[str, float]) -> None:
 
 
 def in_flange(nodes: np.ndarray) -> np.ndarray:
-    """Nodes [m] (n, 3) of the flange, which is clamped, shape (n,)."""
+    """Return which nodes [m] (n, 3) belong to the flange, which is clamped, shape (n,)."""
     return nodes[:, 2] >= -(FLANGE + 1e-3) * 1e-3
 
 
 def finger_features(lengths: Mapping[str, float]) -> dict[str, Feature]:
-    """Planes of the bar, the flange and the notches; cones and cylinders of bellows and cavities [m].
+    """Return the planes of bar, flange and notches, and the cones and cylinders of bellows and cavities [m].
 
     Args:
         lengths: parameters of `draw_finger` [mm, rad].

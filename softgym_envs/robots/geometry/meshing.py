@@ -1,8 +1,8 @@
-"""Meshes from gmsh, behind a content-keyed cache and a time limit.
+"""Meshes from gmsh, with a cache and a time limit.
 
-A geometry is a function ``build(**parameters)`` that draws one volume in the current gmsh model **in millimetres**;
-it runs in a process of its own, because OpenCASCADE may hang on an infeasible shape. Nodes come back in metres. SciPy
-and the mechanics are imported where they are used: loading them would take that process longer than a coarse mesh.
+A geometry is a function ``build(**parameters)`` that draws one volume in the current gmsh model **in millimetres**. It
+runs in a separate process, because OpenCASCADE may hang on an infeasible shape. Nodes are returned in metres. SciPy and
+the mechanics are imported only where they are used, as loading them takes longer than a coarse mesh in that process.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class BodyMesh:
         tetrahedra: corner indices, shape (m, 4).
         triangles: boundary triangles, shape (k, 3).
         surfaces: geometric surface of each boundary triangle, shape (k,).
-        origin: ``"meshed"``, ``"morphed"`` or ``"remeshed"``: how this mesh came to be.
+        origin: how the mesh was made: ``"meshed"``, ``"morphed"`` from another one or ``"remeshed"`` in its place.
     """
 
     nodes: np.ndarray
@@ -61,11 +61,11 @@ class BodyMesh:
     def cavities(
         self, along: Sequence[float] = (0.0, 0.0, -1.0), across: Sequence[float] = (1.0, 0.0, 0.0)
     ) -> list[np.ndarray]:
-        """Find the closed cavities: the connected pieces of the boundary but the outer hull.
+        """Return the closed cavities: the connected pieces of the boundary except the outer hull.
 
         Args:
-            along: cavities are ordered by the position of their middle in this direction, shape (3,),
-            across: and, where these agree within a hundredth of the body's size, in this one, shape (3,).
+            along: direction in which the cavities are ordered by their middle, shape (3,).
+            across: second direction, for middles that agree within a hundredth of the body's size, shape (3,).
 
         Returns:
             Triangles (k, 3) of each cavity, seen counter-clockwise from inside it.
@@ -112,7 +112,7 @@ class BodyMesh:
 def mesh_geometry(
     build: Callable[..., None], parameters: dict[str, float], *, mesh_size: float, time_limit: float = 60.0
 ) -> BodyMesh:
-    """Mesh a geometry, or return it from the cache.
+    """Return the mesh of a geometry, from the cache if it is there.
 
     Args:
         build: module-level function that draws one volume with ``gmsh.model.occ`` in millimetres.
@@ -136,7 +136,7 @@ def mesh_geometry(
             except DataError:
                 if folder == _SHIPPED:
                     raise
-                path.unlink(missing_ok=True)  # a damaged cache entry is made again
+                path.unlink(missing_ok=True)  # make a damaged cache entry again
     with tempfile.TemporaryDirectory() as scratch:
         output = Path(scratch) / "mesh.npz"
         run_gmsh({**request, "output": str(output)}, time_limit=time_limit)
@@ -144,14 +144,15 @@ def mesh_geometry(
     try:
         mesh.save(path)
     except OSError as error:
-        warnings.warn(f"the mesh is not kept, its cache '{path.parent}' cannot be written: {error}", stacklevel=2)
+        warnings.warn(f"the mesh is not cached, as '{path.parent}' cannot be written: {error}", stacklevel=2)
     return mesh
 
 
 def _cache_key(build: Callable[..., None], parameters: dict[str, float], mesh_size: float) -> str:
-    """Key of a mesh: code and constants of the drawing are part of it, so an edited shape never meets an old mesh.
+    """Return the cache key of a mesh: a hash of the drawing's code, constants and parameters.
 
-    Comments, docstrings, white space and the place of the file are not: they do not change the shape.
+    A new mesh is made when the drawing function is edited. Comments, its docstring, white space and the path of the
+    file do not count, as they do not change the shape.
     """
     code = ast.parse(textwrap.dedent(inspect.getsource(build)))
     function = code.body[0]
@@ -172,7 +173,7 @@ def _cache_key(build: Callable[..., None], parameters: dict[str, float], mesh_si
 
 
 def run_gmsh(request: dict, *, time_limit: float) -> None:
-    """Draw a geometry in a process of its own and write it to a file.
+    """Draw a geometry in a separate process and write it to a file.
 
     Args:
         request: ``build`` (``module:function``), its ``parameters``, ``mesh_size`` [m] and ``output``: a path that
@@ -204,7 +205,7 @@ def run_gmsh(request: dict, *, time_limit: float) -> None:
 
 
 def _draw_here(request: dict) -> None:
-    """Draw in this process, mesh where the output asks for it, and write the output."""
+    """Draw in this process, mesh if the output is a mesh, and write the output."""
     import gmsh
 
     module, _, function = request["build"].partition(":")
@@ -232,7 +233,7 @@ def _draw_here(request: dict) -> None:
         if output.suffix != ".npz":
             if output.suffix == ".stl":
                 gmsh.option.setNumber("Mesh.MeshSizeMin", 0.0)
-                gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", 24)  # edges per turn: round parts look round
+                gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", 24)  # edges per turn
                 gmsh.option.setNumber("Mesh.Binary", 1)
                 gmsh.model.mesh.generate(2)
                 gmsh.model.mesh.setOutwardOrientation(volumes[0][1])

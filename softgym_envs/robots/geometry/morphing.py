@@ -1,9 +1,8 @@
 """Moving a mesh of fixed topology from one design to another.
 
-Remeshing makes node counts jump between neighbouring designs, and with them the compliance. Here the baseline mesh
-is moved instead: its boundary nodes stay on the geometric features (planes, cylinders, cones) they were born on, as
-these move with the design; corners are placed first, then curves, then surfaces, then the interior follows a
-harmonic extension.
+With remeshing, the number of nodes jumps between neighbouring designs, and so does the compliance. Here the baseline
+mesh is moved instead. Its boundary nodes stay on their geometric features (planes, cylinders, cones), which move with
+the design: first corners are placed, then curves, then surfaces. The interior follows by harmonic extension.
 """
 
 from __future__ import annotations
@@ -44,20 +43,20 @@ class Cone(Feature):
     slope: float
 
     def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-12)  # the gradient is arbitrary on the axis
+        rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-12)  # on the axis any gradient will do
         scale = 1.0 / np.hypot(1.0, self.slope)
         distance = (rho - self.radius - self.slope * (x[:, 2] - self.height)) * scale
         gradient = np.column_stack([x[:, 0] / rho, x[:, 1] / rho, np.full(len(x), -self.slope)]) * scale
         return distance, gradient
 
 
-def Cylinder(radius: float) -> Cone:  # noqa: N802 - reads as the feature it makes
-    """The cylinder of a radius [m] about the z axis."""
+def Cylinder(radius: float) -> Cone:  # noqa: N802 - named like the features
+    """Return the cylinder of a radius [m] about the z axis."""
     return Cone(radius, 0.0, 0.0)
 
 
 def mean_ratio(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Quality of each tetrahedron in (-inf, 1]: 1 is regular, 0 flat, negative inverted. Shape (m,)."""
+    """Return the quality of tetrahedra, shape (m,): 1 if regular, 0 if flat, negative if inverted."""
     corners = nodes[tetrahedra]
     volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
     pairs = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
@@ -78,7 +77,7 @@ def _extension(count: int, edges: np.ndarray, weights: np.ndarray, known: np.nda
     touched[edges.ravel()] = True
     unknown = touched & ~known
     size = int(unknown.sum())
-    # The anchor keeps pieces without a known node where the guess puts them.
+    # The anchor keeps pieces without a known node at their guess.
     factor = splu(csc_matrix(laplacian[unknown][:, unknown] + anchor * identity(size))) if size else None
     coupling = laplacian[unknown][:, known]
 
@@ -95,7 +94,7 @@ class Morpher:
 
     Args:
         mesh: the baseline mesh.
-        features: features of the baseline design by name. Every geometric surface must lie on one.
+        features: features of the baseline design by name. Every surface of the mesh must lie on one.
 
     Raises:
         ValueError: if a surface of the mesh lies on no feature.
@@ -148,7 +147,7 @@ class Morpher:
 
         Args:
             features: features of the new design, of the same names.
-            guess: a rough displacement field of the nodes [m], shape (n, 3), zero for none.
+            guess: rough displacements of the nodes [m], shape (n, 3); may be zero.
         """
         rest = self.mesh.nodes
         displacement = guess.copy()
@@ -170,7 +169,7 @@ class Morpher:
         for _ in range(20):
             parts = [features[name].evaluate(x) for name in chosen]
             distance = np.stack([part[0] for part in parts], axis=1)
-            if flat:  # one matrix for all points, and one step
+            if flat:  # planes: one matrix for all points, and one step is exact
                 return x - distance @ np.linalg.pinv(np.stack([part[1][0] for part in parts]), rcond=1e-6).T
             gradient = np.stack([part[1] for part in parts], axis=1)
             step = np.einsum("kij,kj->ki", np.linalg.pinv(gradient, rcond=1e-6), distance)

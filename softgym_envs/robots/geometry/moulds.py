@@ -1,16 +1,14 @@
-"""Casting moulds of the fingers, derived from the design (thesis, sections 3.2.3 and 3.3.2).
+"""Casting moulds of the fingers, derived from the design (thesis, sec. 3.2.3 and 3.3.2).
 
 A finger is cast upside down: its flat bottom (y = 0) is the open face of the mould.
 
-* ``box``: a block with the outer shape of the finger cut out of it, and bores for the wires that keep the channels of
-  the cables free.
-* ``lid``: closes the bottom. It carries the cores of the cavities, stands over the rim of the box, and has a window
-  over each segment to pour silicone into and to let air out.
-* ``cork``: a tray for casting the plugs that close the cavities where their cores went out; they are glued in.
+* ``box``: a block with the outer shape of the finger cut out, and bores for wires that keep the cable channels free.
+* ``lid``: closes the bottom. It carries the cores of the cavities, overlaps the rim of the box, and has a window over
+  each segment through which silicone is poured and air escapes.
+* ``cork``: a tray for casting the plugs that are glued into the openings left by the cores.
 * ``clamp``: a yoke with two screw holes that holds the flange of the finished finger against a wall.
 
-The silicone of box and lid plus that of the tray is the body that is simulated, but for the channels of the cables.
-Lengths are millimetres.
+Together, the silicone parts are the simulated body except for the cable channels. Lengths are in millimetres.
 """
 
 from __future__ import annotations
@@ -28,15 +26,15 @@ MOULD_PARTS = ("box", "lid", "cork", "clamp")
 """Parts of a mould."""
 
 WALL = 3.0  # thickness of the moulds
-WIRE_RADIUS = 0.6  # thinner than the space between bellow and cable, which it would else cut open
+WIRE_RADIUS = 0.6  # thinner than the gap between cable and bellow, so that the bore does not open the bellow
 TOLERANCE = 0.1  # gap between parts that slide over each other
-RIM = 4.0  # how far the lid reaches down the sides of the box
-WINDOW = 0.4  # length of the lid's windows as a part of the segment's
+RIM = 4.0  # overlap of the lid on the sides of the box
+WINDOW = 0.4  # length of a window of the lid as a share of that of the segment
 SCREW_RADIUS = 1.7  # M3
 
 
 def mould_parts(robot: Robot, design: Mapping[str, float] | None = None) -> dict[str, Drawing]:
-    """Return what draws the parts of a finger's mould.
+    """Return the drawings of the parts of a finger's mould.
 
     Args:
         robot: a `SoftFinger` or a `SensorizedFinger`.
@@ -56,7 +54,7 @@ def mould_parts(robot: Robot, design: Mapping[str, float] | None = None) -> dict
     elif isinstance(robot, SoftFinger):
         wires = [[1e3 * x, 1e3 * robot.cable_height] for x in robot.cable_offsets]
     else:
-        raise ValueError(f"there are no moulds for robot '{robot.name}'; allowed: finger, sensorized_finger")
+        raise ValueError(f"robot '{robot.name}' has no moulds; allowed: finger, sensorized_finger")
     lengths = {"split": 0.0, **robot.drawing(complete)[1]}
     return {
         "box": (draw_box, {"lengths": lengths, "wires": wires}),
@@ -78,7 +76,7 @@ def export_moulds(
 
     Args:
         robot: a `SoftFinger` or a `SensorizedFinger`.
-        folder: where to; made if missing.
+        folder: output folder, which is created if necessary.
         design: the body; missing variables take their baseline.
         formats: endings, of ``.step`` and ``.stl``.
         time_limit: wall-clock limit of one file [s].
@@ -167,7 +165,7 @@ def draw_lid(lengths: Mapping[str, float]) -> None:
     x, _, z, dx, _, dz = _outside(lengths)
     gap = WALL + TOLERANCE
     plate = (3, occ.addBox(x - gap, -WALL, z - gap, dx + 2 * gap, WALL + RIM, dz + 2 * gap))
-    # The cores reach into the plate: two solids that only touch may stay two.
+    # The cores reach into the plate, because solids that only touch might not be fused.
     inside = (3, occ.addBox(x - TOLERANCE, 0, z - TOLERANCE, dx + 2 * TOLERANCE, RIM, dz + 2 * TOLERANCE))
     window, length = WINDOW * lengths["length"], lengths["length"]
     windows = [
@@ -186,7 +184,7 @@ def draw_cork(lengths: Mapping[str, float]) -> None:
     occ = gmsh.model.occ
     cavities, plugs = _draw_plugs(lengths, 0.0)
     occ.remove(cavities, recursive=True)
-    # Plugs of the second joint come close to those of the first.
+    # Move the plugs of the second joint close to those of the first.
     step = lengths["bellow_height"] + WALL
     for plug in plugs:
         _, _, low, _, _, high = occ.getBoundingBox(*plug)

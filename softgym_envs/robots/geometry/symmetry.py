@@ -1,7 +1,7 @@
-"""Whole bodies from the part of them that is meshed.
+"""Symmetric bodies from a mesh of one part.
 
-A mesh generator knows nothing of symmetry: of two legs that are drawn alike one comes out stiffer. Meshing one part
-and mirroring it makes the response of the body as symmetric as its shape, to round-off.
+Mesh generators do not preserve symmetry: of two equal legs, one comes out stiffer. A body that is mirrored from one
+part responds as symmetrically as its shape, up to round-off.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from softgym_envs.robots.geometry.meshing import BodyMesh
 
 
 def mirrored(part: BodyMesh, normal: tuple[float, float, float]) -> BodyMesh:
-    """Return a part and its mirror image, joined at the plane through the origin with a ``normal`` of any length.
+    """Return a part joined to its mirror image at the plane through the origin with a ``normal`` of any length.
 
-    Nodes on the plane are shared, and boundary triangles in it vanish: they are inside the whole.
+    Nodes on the plane are shared. Boundary triangles in the plane are removed, as they lie inside the whole body.
 
     Args:
         part: a mesh on one side of the plane.
@@ -29,14 +29,14 @@ def mirrored(part: BodyMesh, normal: tuple[float, float, float]) -> BodyMesh:
     shared = np.abs(distance) < 1e-9
     if (distance[~shared] > 0.0).any() and (distance[~shared] < 0.0).any():
         raise ValueError(f"the mesh lies on both sides of the plane with normal {normal}")
-    nodes[shared] -= distance[shared, None] * unit  # onto the plane to the last digit
+    nodes[shared] -= distance[shared, None] * unit  # exactly onto the plane
     count = len(nodes)
     image = np.arange(count)
     image[~shared] = count + np.arange(np.count_nonzero(~shared))
     reflected = nodes[~shared] - 2.0 * distance[~shared, None] * unit
     outside = ~shared[part.triangles].all(axis=1)
     triangles, surfaces = part.triangles[outside], part.surfaces[outside]
-    # A reflection turns elements inside out; two corners exchanged turn them back.
+    # A reflection inverts elements; exchanging two corners restores their orientation.
     return BodyMesh(
         nodes=np.concatenate([nodes, reflected]),
         tetrahedra=np.concatenate([part.tetrahedra, image[part.tetrahedra][:, [0, 2, 1, 3]]]),
