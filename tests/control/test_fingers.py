@@ -166,7 +166,9 @@ def test_a_finger_out_of_its_domain_is_told():
 
 
 def test_a_contact_finger_alone_is_not_an_environment():
-    with pytest.raises(ValueError, match="'contact_finger' alone has no state that a search finds"):
+    with pytest.raises(
+        ValueError, match="'contact_finger' has a non-convex energy and cannot run on the surrogate alone"
+    ):
         SurrogateBackend(make_robot("contact_finger"))
     with pytest.raises(ValueError, match="'contact_finger' cannot be exported: its energy is not convex"):
         export_c(pretrained_model(make_robot("contact_finger")), {}, "finger.h")
