@@ -53,7 +53,7 @@ def symmetric(stencils, values, size):
 
 
 def places_of(stencils):
-    """Scatter maps that give each entry of the stencils a place of its own, and the number of places."""
+    """Scatter maps that give each entry of the stencils its own place, and the number of places."""
     sizes = [rows.size for rows, _ in stencils]
     places = np.split(np.arange(sum(sizes), dtype=np.int32), np.cumsum(sizes)[:-1])
     return [place.reshape(rows.shape) for place, (rows, _) in zip(places, stencils, strict=True)], sum(sizes)
@@ -86,7 +86,7 @@ def test_every_block_is_tested():
 
 
 def test_residual_and_tangent_are_derivatives(body, derivatives, rng):
-    """Through fixed nodes, frames and warped steps: what a solver sees (measured: 2e-8 and 3e-10)."""
+    """Through fixed nodes, frames and warped steps: as a solver uses them (measured: 2e-8 and 3e-10)."""
     body.set_gravity((1.0, -2.0, -9.81))
     errors = derivatives(body, moved(body, rng), np.empty(0))
     print(f"gradient {errors.gradient:.1e}, tangent {errors.tangent:.1e}")
@@ -95,7 +95,7 @@ def test_residual_and_tangent_are_derivatives(body, derivatives, rng):
 
 
 def test_derivatives_by_all_rows(body, rng):
-    """The same by every row of x, also where directors are no longer orthonormal."""
+    """Derivatives by every row of x, also with directors that are not orthonormal."""
     x = moved(body, rng) + 1e-4 * rng.standard_normal(body.nodes.shape)
     for block in body.blocks:
         _, gradient, matrix = element_matrix(block, x)
@@ -124,7 +124,7 @@ def test_tangent_at_rest_has_no_negative_eigenvalue_and_six_rigid_motions(body):
 
 
 def test_viscosity_is_the_stiffness_without_stress(body, rng):
-    """At rest it is the tangent; elsewhere it has no negative eigenvalue, and rigid motions do not feel it."""
+    """At rest it is the tangent; elsewhere it has no negative eigenvalue and does not resist rigid motions."""
     x = moved(body, rng)
     turning, shift = np.cross([0.3, -0.5, 0.8], x), np.array([0.1, 0.2, -0.3])
     frames = body.frames.rows[:, None] + np.arange(1, 4)
@@ -142,7 +142,7 @@ def test_viscosity_is_the_stiffness_without_stress(body, rng):
         assert np.abs(matrix - element_matrix(block, x)[2]).max() > 1e-5 * scale
 
 
-def test_a_rigid_motion_strains_nothing(body, rng):
+def test_a_rigid_motion_causes_no_strain(body, rng):
     x = moved(body, rng)
     turn, shift = Rotation.random(random_state=3).as_matrix(), np.array([0.5, -0.2, 0.3])
     frames = body.frames.rows[:, None] + np.arange(1, 4)
@@ -160,7 +160,7 @@ def test_a_rigid_motion_strains_nothing(body, rng):
 
 
 def test_forces_and_moments_balance(body, rng):
-    """No block can push its body as a whole, nor turn it: the moment includes that on the directors."""
+    """A block exerts no net force and no net moment on its body; the moment includes that on the directors."""
     x = moved(body, rng)
     gradient = np.zeros_like(x)
     body.blocks[0].add(x, gradient, None, None)
@@ -200,7 +200,7 @@ def test_weight_of_a_beam(make_beam, order):
     assert not np.delete(masses, np.arange(0, len(masses), 4)).any()  # no weight on directors
 
 
-def test_warping_equals_a_small_step_and_keeps_rigid_turns(body, rng):
+def test_warping_equals_a_small_step_and_preserves_rigid_rotations(body, rng):
     x = moved(body, rng)
     step = rng.standard_normal(body.equations) / body.kinematics.dof_scale
     ratios = []
@@ -243,7 +243,7 @@ def test_patch_of_irregular_elements_reproduces_a_linear_field(box, rng, element
 @pytest.mark.parametrize("material", MATERIALS)
 @pytest.mark.parametrize("element", SOLIDS)
 def test_patch_under_tension_on_its_faces(box, element, material):
-    """Uniaxial tension by forces: held by three planes of symmetry (nodes free along two axes), nothing else."""
+    """Uniaxial tension by forces: held only by three planes of symmetry (nodes free along two axes)."""
     size = np.array([0.04, 0.03, 0.02])
     nodes, tetrahedra = box(size, (3, 2, 2), jitter=0.3)
     body = ModelBuilder()
@@ -279,7 +279,7 @@ def test_patch_under_tension_on_its_faces(box, element, material):
 
 
 def test_a_rotated_patch_of_a_beam_has_constant_strain(make_beam):
-    """An arc with a constant stretch, bend and twist: order 2 converges to it, and its strains are what they should."""
+    """An arc with a constant stretch, bend and twist: order 2 converges to it, with the exact strains."""
     kappa, stretch, twist = 2.0, 1.05, 1.5
     errors = []
     for elements in (2, 4, 8):
@@ -342,7 +342,7 @@ def test_an_impossible_section_is_refused(values):
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize(("force", "axis"), [((1.0, 0, 0), 0), ((0, 1.0, 0), 1), ((0, 0, 1.0), 2)])
 def test_small_deflections_of_a_beam(make_beam, order, force, axis):
-    """Tip of a cantilever of three unequal elements: order 2 has Timoshenko's deflection but for (1/6)^4."""
+    """Tip of a cantilever of three unequal elements: order 2 has Timoshenko's deflection up to (1/6)^4."""
     model = make_beam(order, "straight")
     model.add("e", Point("tip", model.blocks[0].point(-1, np.zeros(3), model.nodes)))
     W = Statics(model).solve([]).condensed.W.ee
@@ -365,7 +365,7 @@ def test_a_curved_rest_shape_is_free_of_strain(make_beam):
         np.testing.assert_allclose(Statics(model).solve([]).x, model.nodes, atol=1e-14)
 
 
-def test_beams_of_other_shapes_are_refused():
+def test_malformed_beams_are_refused():
     nodes = np.vstack([frame_rows([s, 0, 0]) for s in (0.0, 0.1, 0.2, 0.3)])
     options = {"section": Section.circle(0.01), "young_modulus": 1e6}
     for change, message in [
@@ -449,7 +449,7 @@ def test_quadratic_elements_hold_a_quadratic_field(box, rng):
     np.testing.assert_allclose(block._F.reshape(-1, 3, 3), expected, atol=1e-12)
 
 
-def test_model_embeds_in_the_block_asked_for(make_solid):
+def test_model_embeds_in_the_chosen_block(make_solid):
     model = make_solid("quadratic", "corotational")
     assert model.embed(np.array([0.01, 0.01, 0.02])).node_ids.shape == (1, 10)
     effector = model.add_effector("tip", np.array([0.01, 0.012, 0.03]))
@@ -471,7 +471,7 @@ def test_negatively_oriented_quadratic_elements_are_turned(box, rng):
 
 
 def test_curved_edges_change_the_volume(box):
-    """A quarter of a sphere's octant: with midside nodes on the sphere, the volume is closer by far."""
+    """A quarter of a sphere's octant: with midside nodes on the sphere, the volume is far more accurate."""
     nodes = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     finer, ten = add_midside_nodes(nodes, np.array([[0, 1, 2, 3]]))
     straight = QuadraticTetrahedra(finer, ten).volume
@@ -498,7 +498,7 @@ def test_malformed_quadratic_elements_are_refused(box):
 # -- averaged -------------------------------------------------------------------------------------------------------
 
 
-def test_averaging_changes_nothing_without_lame_or_in_uniform_strain(box, rng):
+def test_averaging_has_no_effect_without_lame_or_in_uniform_strain(box, rng):
     nodes, tetrahedra = box((1, 1, 1), (2, 2, 2), 0.2)
     x = nodes + 0.1 * np.sin(3.0 * nodes[:, ::-1])
     for material in MATERIALS:

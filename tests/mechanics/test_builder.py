@@ -1,4 +1,4 @@
-"""ModelBuilder: parts become one model, with the rows and boundary conditions that were asked for."""
+"""ModelBuilder: parts become one model, with the specified rows and boundary conditions."""
 
 from __future__ import annotations
 

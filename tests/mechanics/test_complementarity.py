@@ -77,15 +77,15 @@ def test_small_cases_by_hand():
     assert pushing[0, 1] < 0.0
 
 
-def test_on_the_edge_of_slackness():
-    """A gap that just closes: round-off must not leave it without an answer."""
+def test_at_the_limit_of_slackness():
+    """A gap that just closes: round-off must not leave it without a solution."""
     W = np.array([[[3.0, 1.0, 0.2], [1.0, 2.0, 0.3], [0.2, 0.3, 1.5]]]) * 1e-4
     for y in itertools.product([0.0, 1.0 / 3.0, 7.7], repeat=3):
         found = solve_complementarity(W, -(W @ np.array(y)), np.ones(3, dtype=bool))
         np.testing.assert_allclose(found[0], y, atol=1e-10)
 
 
-def test_an_indefinite_matrix_without_an_answer_is_an_error():
+def test_an_indefinite_matrix_without_a_solution_is_an_error():
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
         solve_complementarity(np.array([[[-1.0]]]), np.array([[-1.0]]), np.array([True]))
 

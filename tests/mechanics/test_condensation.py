@@ -71,7 +71,7 @@ def test_actuator_blocks_by_displacement(pulled):
 
 
 def test_effector_columns_by_a_force_on_the_effector(pulled):
-    """The force enters through the nodes, by the weights of the effector's embedding: the constraint has no part."""
+    """The force enters through the nodes, by the weights of the effector's embedding, without the constraint."""
     W, n, model = pulled.state.condensed.W, pulled.count, pulled.model
     embedding = model.constraints["e"][0].embedding
     columns = np.empty((n + 3, 3))
@@ -163,7 +163,7 @@ def test_blocks_by_role_of_a_batch(batch):
         np.testing.assert_allclose(batch.delta.array[k], expected, atol=1e-13)
 
 
-def test_unknown_roles_are_told(batch):
+def test_unknown_roles_are_refused(batch):
     with pytest.raises(AttributeError, match="no block 'ec'; roles: a, e"):
         batch.W.ec  # noqa: B018
     with pytest.raises(AttributeError, match="no role 'c'"):

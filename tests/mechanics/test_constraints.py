@@ -69,7 +69,7 @@ def make_cavity(nodes, tetrahedra):
 
 
 def make_quadratic_cavity(nodes, tetrahedra):
-    """Four curved triangles between nodes of the mesh: corners 0-3, midside nodes 4-9, in no special position."""
+    """Four curved triangles between nodes of the mesh: corners 0-3, midside nodes 4-9, in general position."""
     middle = {(0, 1): 4, (1, 2): 5, (0, 2): 6, (0, 3): 7, (1, 3): 8, (2, 3): 9}
     faces = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
     rows = [[*f, *(middle[min(p), max(p)] for p in (f[:2], f[1:], (f[2], f[0])))] for f in faces]
@@ -173,7 +173,7 @@ def test_jacobian_is_the_derivative_of_the_value(constraint, moved):
     )
 
 
-def test_value_depends_on_no_other_dof(constraint, moved, rng):
+def test_value_depends_only_on_its_dofs(constraint, moved, rng):
     other = moved + rng.standard_normal(moved.shape)
     other.ravel()[constraint.dofs] = moved.ravel()[constraint.dofs]
     np.testing.assert_array_equal(constraint.value(other), constraint.value(moved))
@@ -229,7 +229,7 @@ def test_shortening_is_positive_and_tension_pulls_the_anchor_towards_the_pull_po
     np.testing.assert_allclose(force, [-1.0, 0.0, 0.0], atol=1e-13)
 
 
-def test_cable_forces_balance_but_for_the_pull_point(mesh, moved):
+def test_cable_forces_balance_except_at_the_pull_point(mesh, moved):
     """Inner segments exert no net force; the first one pulls with unit tension."""
     cable = make_cable(*mesh)
     first = cable.path(moved)[:2]
@@ -330,7 +330,7 @@ def test_quadratic_triangles_hold_a_curved_volume():
 
 
 def test_flat_quadratic_triangles_are_linear_ones(mesh):
-    """With midside nodes in the middle, volume and pressure forces are the known ones: a third at each midside node."""
+    """With midside nodes in the middle, the volume is the same; each midside node carries a third of the pressure."""
     nodes, tetrahedra = mesh
     finer, ten = add_midside_nodes(nodes, oriented(nodes, tetrahedra))
     outer = surface(oriented(nodes, tetrahedra))
@@ -348,7 +348,7 @@ def test_flat_quadratic_triangles_are_linear_ones(mesh):
     np.testing.assert_allclose(forces, expected, atol=1e-14)
 
 
-def test_an_inward_surface_is_turned(mesh):
+def test_an_inward_surface_is_reversed(mesh):
     nodes, tetrahedra = mesh
     outward = make_cavity(nodes, tetrahedra)
     inward = Cavity("cavity", outward.triangles[:, ::-1], nodes)
@@ -357,7 +357,7 @@ def test_an_inward_surface_is_turned(mesh):
     assert enclosed_volume(nodes, outward.triangles[:, ::-1]) == pytest.approx(-1.0, rel=1e-12)
 
 
-def test_a_surface_that_encloses_nothing_is_refused(mesh):
+def test_a_surface_without_volume_is_refused(mesh):
     nodes, tetrahedra = mesh
     triangles = make_cavity(nodes, tetrahedra).triangles
     with pytest.raises(ValueError, match="cavity 'c' is not closed"):
@@ -470,7 +470,7 @@ def test_bond_of_a_point_with_itself_has_no_derivative(mesh):
     np.testing.assert_allclose(Bond("b", point, point).jacobian(mesh[0]), 0.0, atol=1e-15)
 
 
-def test_bond_ties_one_point_to_one_point(mesh):
+def test_bond_needs_one_point_on_each_side(mesh):
     nodes, tetrahedra = mesh
     two = EmbeddedPoints(np.full((2, 3), 0.5), nodes, tetrahedra)
     for pair in ((two, two), (two, np.zeros(3))):

@@ -22,7 +22,7 @@ def relative(found, expected):
 
 
 def compliance_by_differences(statics, state, solve, steps):
-    """Columns of W for one step of each row's effort; ``solve(efforts)`` finds an equilibrium, from the same start."""
+    """Columns of W from one step of each effort; ``solve(efforts)`` finds an equilibrium from the same start."""
     columns = []
     for row, step in enumerate(steps):
         ends = []
@@ -114,7 +114,7 @@ def test_bonds_are_eliminated_from_the_condensed_model(bonded):
     assert np.linalg.eigvalsh(W)[0] > 0.0
 
 
-def test_the_stiffness_of_bonds_changes_nothing(bonded):
+def test_the_stiffness_of_bonds_has_no_effect(bonded):
     model, _ = bonded
     states = []
     stiffness = model.assembly.bond_stiffness
@@ -129,7 +129,7 @@ def test_the_stiffness_of_bonds_changes_nothing(bonded):
 
 
 def test_a_bond_to_a_point_in_space_and_a_gap(box):
-    """The free end of a bar is pulled to where its bond's anchor and gap say, by Hooke's force."""
+    """The free end of a bar is pulled to the anchor and gap of its bond, by Hooke's force."""
     nodes, tetrahedra = box((0.1, 0.01, 0.01), (8, 1, 1))
     model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=1e6, poisson_ratio=0.0)
     tip = model.embed(np.array([0.1, 0.005, 0.005]))
@@ -147,7 +147,7 @@ def test_a_bond_to_a_point_in_space_and_a_gap(box):
 
 
 def test_a_body_held_by_bonds_alone(box):
-    """Four bonds at corners instead of a clamp: statically determined in no way, yet stable; it hangs by its weight."""
+    """Four bonds at corners instead of a clamp: statically indeterminate, yet stable; it hangs under its weight."""
     nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 3))
     body = ModelBuilder(gravity=(0.0, 0.0, -9.81))
     wall = body.add_frame([0.0, 0.0, 0.0], fixed=True, fixed_spin=True)
@@ -163,7 +163,7 @@ def test_a_body_held_by_bonds_alone(box):
 
 
 def test_a_rigid_pendulum_hangs_in_line_with_its_load(box):
-    """Only the geometric stiffness of load and bond holds it: no element has a part in it."""
+    """Only the geometric stiffness of load and bond holds it, not an element."""
     body = ModelBuilder()
     body.add_solid(*box(), fixed=[0])
     base = body.add_frame([0.0, 0.0, 0.5], fixed=True, fixed_spin=True)
@@ -188,7 +188,7 @@ def test_a_rigid_pendulum_hangs_in_line_with_its_load(box):
 
 
 def test_redundant_bonds_are_refused_or_right(bonded):
-    """The force of a bond given twice is shared in some way; everything else is as with one."""
+    """The force of a bond given twice is shared somehow; everything else is as with one bond."""
     model, _ = bonded
     one = Statics(model, tolerance=1e-13).solve([0.004], effector_force=FORCE)
     model.add("b", model.constraints["b"][0])
@@ -201,7 +201,7 @@ def test_redundant_bonds_are_refused_or_right(bonded):
     assert relative(two.condensed.compliance, one.condensed.compliance) < 1e-8
 
 
-def test_a_part_that_nothing_holds_is_an_error(box):
+def test_a_part_that_is_not_held_is_an_error(box):
     nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 3))
     body = ModelBuilder()
     body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] == 0.0)
@@ -286,7 +286,7 @@ def test_malformed_loads_are_refused(touched, arguments, message):
     np.testing.assert_array_equal(statics.x, touched.nodes)
 
 
-def test_an_unreachable_contact_says_how_far_it_got(touched):
+def test_an_unreachable_contact_reports_the_reached_fraction(touched):
     statics = Statics(touched)
     with pytest.raises(ConvergenceError, match="% of the increment") as caught:
         statics.solve([0.0], contact=np.full(6, -3.0), contact_mode="displacement")
@@ -317,7 +317,7 @@ def test_nodes_may_be_held_along_some_axes(box):
 
 
 def test_no_node_needs_to_be_held_along_all_axes(box):
-    """Three planes of symmetry without the node they share: as with it, only that this node now finds its place."""
+    """Three planes of symmetry without the node they share: the result is the same, and this node finds its place."""
     nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 4), jitter=0.2)
     held = np.isclose(nodes, 0.0, atol=1e-12)
     held[held.all(axis=1)] = False

@@ -1,4 +1,4 @@
-"""Motion: what it conserves, how it converges, its frequencies, energies, commands, cuts and refusals."""
+"""Dynamics: conservation, convergence, frequencies, energies, commands, divided steps and refusals."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_orders_of_the_schemes():
 
 
 def test_the_spectral_radius_damps_what_the_step_does_not_resolve():
-    """With 1 the energy stays, with less it falls: of the fast motions first, and the slow one remains."""
+    """With 1 the energy is constant; with less it falls, first that of fast motions, while the slow one remains."""
     kept = {}
     model = cases.rod(clamped=True, elements=3)
     (first, last), modes = (a[..., [0, -1]] for a in cases.eigenmodes(model, lumped=False, count=model.equations))
@@ -123,8 +123,8 @@ def test_stiffness_damping_of_the_first_mode():
     assert motion.dissipated + motion.energy == pytest.approx(start, rel=2e-2)
 
 
-def test_damping_takes_energy_whatever_the_load():
-    """A bar bent by a strong cable, plucked: in no step does stiffness damping give energy."""
+def test_damping_dissipates_energy_under_any_load():
+    """A bar bent by a strong cable, plucked: stiffness damping dissipates energy in every step."""
     solver = cases.pulled_bar_at_rest(step=0.01, stiffness_damping=0.05)
     for k in range(20):
         solver.advance([0.002 * (k + 1)])
@@ -183,7 +183,7 @@ def test_masses(lumped):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_compliance_is_the_derivative_of_a_step(scheme):
-    """The second order scheme leaves out gyroscopic terms of frames (measured: 5e-5, with damping 5e-3)."""
+    """The second order scheme omits gyroscopic terms of frames (measured: 5e-5, with damping 5e-3)."""
     for row in cases.compliance(scheme):
         print(row.case, row.setting, row.error)
         frames = scheme == "generalised_alpha" and "Tetrapod" in row.case
@@ -191,7 +191,7 @@ def test_compliance_is_the_derivative_of_a_step(scheme):
 
 
 def test_energies_add_up():
-    """Euler loses energy, never wins it; without damping the second order scheme misses 1e-5 of the work."""
+    """Euler only loses energy; without damping the second order scheme misses 1e-5 of the work."""
     for case, group in by_case(cases.book_keeping(levels=(25, 50))).items():
         if "generalised_alpha, no damping" in case:
             assert abs(group[-1].error) < 1e-4
@@ -202,7 +202,7 @@ def test_energies_add_up():
 
 
 def test_a_cable_that_hangs_slack_in_motion():
-    """Paid out at once, the cable goes slack while the bar swings back, and is taut again at rest."""
+    """Released suddenly, the cable goes slack while the bar swings back, and is taut again at rest."""
     solver = cases.pulled_bar_at_rest(step=0.01, mass_damping=3.0)
     for k in range(30):
         taut = solver.advance([0.02 * (k + 1) / 30.0])
@@ -227,11 +227,11 @@ def test_slow_motion_follows_statics():
 
 
 JUMP = np.array([3.0, -3.0, 1.5, 0.0])
-"""Servo angles no solver goes to at once."""
+"""Servo angles that no solver reaches in one step."""
 
 
 def test_a_step_that_cannot_be_solved_is_cut():
-    """Its command is ramped over the parts, of which the last takes the command itself."""
+    """Its command is ramped over the parts; the last part takes the command itself."""
     solver = cases.tetrapod_at_rest(step=0.01)
     motion = solver.advance(JUMP)
     assert motion.substeps > 4 and (motion.substeps & (motion.substeps - 1)) == 0
@@ -261,7 +261,7 @@ def test_a_step_that_cannot_be_cut_further_leaves_the_state():
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_steps_taken_back_are_the_same_again(scheme):
+def test_undone_steps_can_be_repeated_exactly(scheme):
     solver = cases.tetrapod_at_rest(step=0.01, scheme=scheme, stiffness_damping=0.01)
     path = [0.02 * k * np.array([1.0, -0.5, 0.3, 0.0]) for k in range(1, 9)]
     for command in path[:4]:
@@ -276,8 +276,8 @@ def test_steps_taken_back_are_the_same_again(scheme):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_motion_goes_on_from_positions_efforts_and_velocities(scheme):
-    """What a state holds is enough: exactly for Euler, to the second order for the other scheme."""
+def test_a_motion_continues_from_positions_efforts_and_velocities(scheme):
+    """A state is enough to continue: exactly for Euler, to second order for the other scheme."""
     solver = cases.swinging(cases.rod(clamped=True, elements=3), 0.5, step=0.01, scheme=scheme)
     for _ in range(20):
         solver.advance([])
@@ -305,7 +305,7 @@ def test_rest_and_reset():
 
 
 def test_statics_of_the_same_model_are_not_disturbed():
-    """Both share model and factorisation; inertia is gone after each step."""
+    """Both share the model; each has its own linearisation."""
     from softgym_envs.mechanics.solvers.statics import Statics
 
     model = cases.pulled_bar()
@@ -388,7 +388,7 @@ def test_bad_commands_and_launches():
         solver.launch(np.zeros(3))
 
 
-def test_an_impossible_start_is_said():
+def test_an_impossible_start_is_reported():
     solver = cases.pulled_bar_at_rest(step=0.01, scheme="generalised_alpha", max_cuts=0)
     x = solver.x.copy()
     x[:, 2] *= -1.0

@@ -1,4 +1,4 @@
-"""Frames: rigid parts and what they carry move as rigid bodies, and their derivatives are exact."""
+"""Frames: rigid parts and the rows they carry move as rigid bodies, with exact derivatives."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def capped(box):
 
 
 def constrain(model, plate, part):
-    """Add every kind of constraint, each one on carried rows, frames and free nodes."""
+    """Add every kind of constraint, each on carried rows, frames and free nodes."""
     model.add_cable("cable", np.array([[0.005, 0.005, 0.01], [0.006, 0.005, 0.025]]), np.array([0.005, 0.005, -0.01]))
     hub = EmbeddedPoints.in_frame(plate, [[0.0, 0.0, 0.0], [0.01, 0.002, 0.003]], model.nodes)
     model.add("a", Cable("rigid cable", hub, np.array([0.04, 0.0, 0.0])))
@@ -100,7 +100,7 @@ def test_derivatives_through_carried_nodes_frames_and_bonds(capped, derivatives,
 
 
 def test_each_constraint_contributes_its_curvature_through_frames(capped, full_tangent, derivatives, rng):
-    """One effort at a time, so large that a missing term could not hide."""
+    """One effort at a time, so large that a missing term would show."""
     model, plate, part = capped()
     constrain(model, plate, part)
     x = moved(model, rng)
@@ -185,7 +185,7 @@ def test_rotation_vectors(rng):
     assert rotation_vector_matrix(vectors.reshape(2, -1, 3)).shape == (2, 13, 3, 3)
 
 
-def test_what_a_frame_carries_stays_rigid_in_equilibrium(capped):
+def test_carried_nodes_stay_rigid_in_equilibrium(capped):
     model, plate, part = capped()
     constrain(model, plate, part)
     statics = Statics(model)

@@ -1,4 +1,4 @@
-"""Meshes of the user: files of tetrahedra and of surfaces, units, elasticity by region, cavities, and their faults."""
+"""Own meshes: files of tetrahedra and of surfaces, units, elasticity by region, cavities, and malformed input."""
 
 from __future__ import annotations
 
@@ -84,12 +84,12 @@ def test_missing_file(tmp_path):
 
 
 class EndlessReading(BaseException):
-    """Not an Exception, which `read_mesh` would take for a fault of the file."""
+    """Not an Exception, which `read_mesh` would report as a malformed file."""
 
 
 @pytest.fixture
 def no_endless_reading():
-    """Break off a reader that never ends (it would need milliseconds)."""
+    """Interrupt a reader that never ends (a good one needs milliseconds)."""
 
     def stop(*_):
         raise EndlessReading
@@ -124,7 +124,7 @@ def test_truncated_ansys_file(tmp_path, no_endless_reading, mesh_in_millimetres,
 
 
 @pytest.mark.parametrize("name", ["noise.msh", "noise.vtk", "noise.unknown"])
-def test_file_that_is_no_mesh(tmp_path, name, rng):
+def test_file_that_is_not_a_mesh(tmp_path, name, rng):
     (tmp_path / name).write_bytes(rng.bytes(2000))
     with pytest.raises(DataError, match=name):
         read_mesh(tmp_path / name)
@@ -141,7 +141,7 @@ def test_file_without_tetrahedra(tmp_path, box):
 
 
 @pytest.mark.parametrize("wrong", [99, -1], ids=["beyond the nodes", "negative"])
-def test_file_whose_tetrahedra_refer_to_no_node(tmp_path, wrong):
+def test_file_whose_tetrahedra_refer_to_missing_nodes(tmp_path, wrong):
     meshio.Mesh(ONE_TETRAHEDRON, [("tetra", [[0, 1, 2, wrong]])]).write(tmp_path / "broken.vtk", binary=False)
     with pytest.raises(DataError, match=r"broken\.vtk"):
         read_mesh(tmp_path / "broken.vtk")
@@ -150,7 +150,7 @@ def test_file_whose_tetrahedra_refer_to_no_node(tmp_path, wrong):
 # -- units and sizes ------------------------------------------------------------------------------------------------
 
 
-def test_unit_and_scale_say_the_same(tmp_path, mesh_in_millimetres):
+def test_unit_and_scale_are_equivalent(tmp_path, mesh_in_millimetres):
     path = tmp_path / "beam.vtk"
     mesh_in_millimetres.write(path)
     for unit, scale in UNITS.items():
@@ -438,7 +438,7 @@ def test_meshing_has_a_time_limit(tmp_path):
         read_mesh(write_stl(tmp_path, BAR), unit="mm", time_limit=0.01)
 
 
-def test_a_missing_gmsh_is_said(tmp_path, monkeypatch):
+def test_a_missing_gmsh_is_reported(tmp_path, monkeypatch):
     (tmp_path / "gmsh.py").write_text("raise ImportError('libGLU.so.1: cannot open shared object file')")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(MeshingError, match="gmsh cannot be used: libGLU"):

@@ -1,4 +1,4 @@
-"""Linear solvers: agreement on definite matrices, honesty on others."""
+"""Linear solvers: agreement on definite matrices, refusal of all others."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def test_tangent_is_the_symmetric_derivative_of_the_stress(material, gradients, 
 
 
 @pytest.mark.parametrize(("mu", "lame"), ELASTICITIES)
-def test_rotations_cost_nothing(material, mu, lame):
+def test_rotations_need_no_energy(material, mu, lame):
     turned = np.concatenate([np.eye(3)[None], Rotation.random(50, random_state=3).as_matrix()])
     # Half turns, where the iteration for the polar rotation is far from the identity.
     turned = np.concatenate([turned, [np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, -1.0, 1.0])]])
@@ -137,7 +137,7 @@ def test_dilation_has_exact_derivatives(material, gradients):
 
 @pytest.mark.parametrize(("mu", "lame"), ELASTICITIES)
 def test_lames_first_parameter_acts_on_the_dilation_alone(material, gradients, mu, lame):
-    """psi(mu, lambda) = psi(mu, 0) + lambda / 2 theta^2, with its derivatives: what averaged elements rest on."""
+    """psi(mu, lambda) = psi(mu, 0) + lambda / 2 theta^2, with its derivatives: averaged elements depend on this."""
     theta, slope, curvature = dilation(material, gradients)
     whole, shear = evaluate(material, gradients, mu, lame), evaluate(material, gradients, mu, 0.0)
     size = max(1.0, abs(lame))

@@ -47,7 +47,7 @@ def test_inertia_of_simple_bodies(rng):
 
 
 def test_kinetic_energy_is_that_of_mass_and_inertia(rng):
-    """For any inertia, rotation, velocity and spin: m v^2 / 2 + w . R I R^T w / 2; lumping changes nothing."""
+    """For any inertia, rotation, velocity and spin: m v^2 / 2 + w . R I R^T w / 2; lumping does not change it."""
     squares = np.diag([0.3, 0.1, 0.05])
     turn = Rotation.random(random_state=1).as_matrix()
     inertia = turn @ (np.trace(squares) * np.eye(3) - squares) @ turn.T
@@ -94,8 +94,8 @@ def test_a_spin_about_a_principal_axis_stays(scheme):
     np.testing.assert_allclose(solver.x[0], [0.5, 0.0, 0.0], atol=1e-10)
 
 
-def test_a_tumbling_box_turns_over_and_pendulums_swing_as_they_should():
-    """Second order in momentum, energy and place; against Euler's equations and joints by another way."""
+def test_a_tumbling_box_and_pendulums_against_exact_equations():
+    """Second order in momentum, energy and place; against Euler's equations and independent solutions of joints."""
     for case, group in by_case(cases.rigid(levels=(50, 100))).items():
         if "euler" in case:
             assert 0.6 < group[-1].order < 1.1, case
@@ -105,7 +105,7 @@ def test_a_tumbling_box_turns_over_and_pendulums_swing_as_they_should():
 
 
 def test_the_box_turns_over():
-    """Dzhanibekov: a spin near the middle axis changes sign, again and again, at the times of Euler's equations."""
+    """Dzhanibekov: a spin near the middle axis changes sign repeatedly, at the times of Euler's equations."""
     inertia = box_inertia(1.0, np.array([0.1, 0.2, 0.4]))
     solver = free(inertia, step=0.01, scheme="generalised_alpha", spectral_radius=1.0)
     solver.launch(np.concatenate([np.zeros(3), cases.SPIN]))
@@ -151,7 +151,7 @@ def test_a_small_swing_of_a_bar_has_its_period():
 
 
 @pytest.mark.parametrize("mass", [0.0, -1.0, np.nan, np.inf])
-def test_a_mass_no_body_has(mass):
+def test_an_impossible_mass_is_refused(mass):
     with pytest.raises(ValueError, match=f"mass = {mass} kg of a rigid body must be positive and finite"):
         RigidBody(np.zeros((4, 3)), 0, mass=mass, inertia=np.eye(3))
 
@@ -166,7 +166,7 @@ def test_a_mass_no_body_has(mass):
         (np.diag([1.0, 1.0, -1.0]), "violates the triangle inequality"),
     ],
 )
-def test_an_inertia_no_body_has(inertia, message):
+def test_an_impossible_inertia_is_refused(inertia, message):
     with pytest.raises(ValueError, match=message):
         RigidBody(np.zeros((4, 3)), 0, mass=1.0, inertia=inertia)
 

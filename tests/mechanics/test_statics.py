@@ -232,7 +232,7 @@ def test_bilateral_and_unilateral_cables_together(fingers):
 
 
 @pytest.mark.parametrize("mode", ["effort", "displacement"])
-def test_an_impossible_command_says_how_far_it_got_and_keeps_the_last_state(finger, mode):
+def test_an_impossible_command_reports_the_reached_fraction_and_keeps_the_last_state(finger, mode):
     statics, count = finger.statics, len(finger.robot.actuators)
     command = np.full(count, 1000.0 if mode == "effort" else 0.5)
     with pytest.raises(ConvergenceError, match=r"no equilibrium .*% of the increment") as caught:
@@ -252,7 +252,7 @@ def test_an_impossible_command_says_how_far_it_got_and_keeps_the_last_state(fing
     np.testing.assert_allclose(after.x, fresh.x, rtol=0, atol=1e-9)
 
 
-def test_an_absurd_effort_ends_too(fingers):
+def test_an_absurd_effort_terminates(fingers):
     _, model = fingers(2, "corotational")
     statics = Statics(model)
     with pytest.raises(ConvergenceError) as caught:
@@ -261,8 +261,8 @@ def test_an_absurd_effort_ends_too(fingers):
     assert np.isfinite(statics.x).all()
 
 
-def test_continuation_towards_a_limit_ends(fingers, monkeypatch):
-    """Where Newton manages ever smaller steps towards a limit, the increments must not go on for ever."""
+def test_continuation_towards_a_limit_terminates(fingers, monkeypatch):
+    """Even if Newton's method succeeds with ever smaller steps towards a limit, the increments must end."""
     _, model = fingers(2, "corotational")
     statics = Statics(model)
     limit, position, calls = 7.0, [0.0], []
@@ -336,7 +336,7 @@ def test_cholmod_is_the_default_where_it_is_installed(notched):
     assert isinstance(make_solver("auto", assembly.indptr, assembly.indices), CholmodSolver)
 
 
-def test_loads_that_change_after_a_solve_are_brought_on_in_steps(fingers):
+def test_loads_that_change_after_a_solve_are_applied_in_steps(fingers):
     robot, _ = fingers(2, "corotational")
     model = robot.build({"young_modulus": 1.0e6, "poisson_ratio": 0.499})
     statics = Statics(model)
@@ -366,7 +366,7 @@ def test_a_copied_model_is_whole(fingers):
     assert found.increments == expected.increments
 
 
-def test_a_cable_cannot_be_told_to_push(fingers):
+def test_a_cable_cannot_be_commanded_to_push(fingers):
     _, model = fingers(2, "corotational")
     with pytest.raises(ValueError, match=r"effort -3 on actuator row 1.*cannot push"):
         Statics(model).solve([1.0, -3.0], "effort")

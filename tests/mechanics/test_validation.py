@@ -49,7 +49,7 @@ def test_cantilever():
 
 
 @pytest.mark.parametrize("load", [1.0, 5.0, 10.0])
-def test_the_elastica_by_another_way(load):
+def test_the_elastica_by_its_differential_equation(load):
     """The elliptic integrals against the differential equation theta'' = -load cos(theta)."""
     s = np.linspace(0.0, 1.0, 200)
     solved = solve_bvp(
@@ -81,7 +81,7 @@ def test_bending_to_a_circle():
 
 
 def test_45_degree_bend():
-    """Published positions were computed with few elements: 0.4 % is what separates them from converged ones."""
+    """Published positions were computed with few elements: they differ by 0.4 % from converged ones."""
     groups = by_element(validation.bend((4, 8), (16, 32), (300.0,)))
     case = "45 degree bend, P = 300: height"
     assert errors(groups[case, "beam of order 2, published torsion"])[-1] < 0.005
