@@ -35,7 +35,7 @@ def state(finger):
 
 @pytest.mark.parametrize("rest", [np.eye(3), Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()], ids=["", "turned"])
 def test_a_pose_counts_from_rest(rest):
-    """Displacement of the origin, and sin(angle) times axis of the turn, whatever the directors at rest."""
+    """Displacement of the origin, and sin(angle) times axis of the rotation, for any directors at rest."""
     nodes = np.vstack([np.zeros((1, 3)), frame_rows([0.1, 0.2, 0.3], rest)])
     rows = [Pose("pose", 1, component, nodes) for component in range(6)]
     assert [row.unit for row in rows] == [("m", "N")] * 3 + [("1", "N m")] * 3
@@ -91,7 +91,7 @@ def test_rest_is_zero_without_effort(finger):
 
 
 def test_the_tip_keeps_some_freedom_when_all_is_held(state):
-    """What is left of W_ee with cables and pose held is what a model has to learn beside the energy."""
+    """W_ee with cables and pose held is what a model has to learn besides the energy."""
     W = state.condensed.W
     held = W.ee - W.ea @ np.linalg.solve(W.aa, W.ea.T)
     assert np.linalg.eigvalsh(held)[0] > 1e-4 * np.trace(W.ee)

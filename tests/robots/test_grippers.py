@@ -311,7 +311,7 @@ def test_the_bar_may_be_longer_or_shorter():
 
 
 @pytest.mark.parametrize("name", GRIPPERS)
-def test_signatures_tell_options_apart(name):
+def test_mechanics_keys_distinguish_options(name):
     base = make_robot(name).mechanics_key
     assert make_robot(name).mechanics_key == base
     for options in ({"mesh_size": MESH_SIZE}, {"gravity": (0.0, 0.0, -9.81)}, {"material": "stable_neo_hookean"}):

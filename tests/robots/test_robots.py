@@ -75,7 +75,7 @@ def test_describes_itself(robot):
     assert robot.stiffness_variable is None or robot.stiffness_variable in robot.design_space.names
 
 
-def test_variants_have_their_own_names_and_signatures():
+def test_variants_have_their_own_weights_names_and_mechanics_keys():
     robots = [make_robot(name, **options) for name, options in VARIANTS]
     assert len({r.weights_name for r in robots}) == len(robots)
     assert len({json.dumps(r.mechanics_key, sort_keys=True) for r in robots}) == len(robots)
@@ -105,7 +105,7 @@ def test_finger_has_its_published_size():
 
 
 def test_baseline_meshes_are_shipped(robot, monkeypatch, tmp_path):
-    """The first use of a robot needs neither gmsh nor a cache."""
+    """The first use of a robot requires neither gmsh nor a cache."""
     monkeypatch.setenv("SOFTGYM_CACHE", str(tmp_path))
 
     def refuse(*_, **__):
@@ -137,7 +137,7 @@ def test_bodies_at_the_corners_and_inside_of_the_design_box(robot, rng):
 
 
 def test_effectors_outside_the_body_hang_on_one_element(robot, rng):
-    """The nearest element changes from design to design; an effector that changed with it would jump."""
+    """The nearest element changes from design to design; an effector tied to the nearest one would jump."""
     (base,) = robot.build().constraints["e"]
     if base.embedding.weights.min() > -1e-9:
         pytest.skip("the effector is inside the body")
@@ -160,7 +160,7 @@ def test_the_same_design_gives_the_same_body_to_the_bit(robot):
     options = next(o for n, o in VARIANTS if make_robot(n, **o).weights_name == robot.weights_name)
     design = robot.design_space.from_unit(np.linspace(-0.3, 0.4, len(robot.design_space)))
     first = robot.body(design)
-    robot.body(robot.design_space.from_unit(np.linspace(0.5, -0.2, len(robot.design_space))))  # no memory of others
+    robot.body(robot.design_space.from_unit(np.linspace(0.5, -0.2, len(robot.design_space))))  # must leave no trace
     for other in (robot.body(design), make_robot(robot.name, **options).body(design)):
         np.testing.assert_array_equal(first.nodes, other.nodes)
         np.testing.assert_array_equal(first.tetrahedra, other.tetrahedra)
@@ -233,7 +233,7 @@ def test_with_gravity_nothing_scales():
     assert model.loads.sum(axis=0)[2] == pytest.approx(-9.81 * 1100.0 * model.volume, rel=1e-9)
 
 
-def test_cables_may_push_where_asked():
+def test_cables_can_push_by_option():
     model = make_robot("finger", unilateral=False).build()
     assert [c.unilateral for c in model.constraints["a"]] == [False, False]
 
@@ -269,7 +269,7 @@ def test_wrong_options(options, message):
     ids=str,
 )
 def test_wrong_physics_is_an_error_of_the_caller_not_of_the_design(options, message):
-    """An optimiser takes `InfeasibleDesign` for a bad body and goes on: a typing error must not look like one."""
+    """An optimiser continues after `InfeasibleDesign`, so a typing error must not raise it."""
     with pytest.raises(ValueError, match=message):
         make_robot("finger", **options).build()
 
@@ -292,7 +292,7 @@ def test_malformed_designs(design, message):
 
 
 def test_a_geometry_that_cannot_exist_is_infeasible(monkeypatch):
-    """Through `build`: the design space lets it through, the mesher does not."""
+    """`build` passes on what the mesher refuses although the design space allows it."""
     robot = make_robot("finger", meshing="remesh", mesh_size=0.02)
 
     def impossible(design):

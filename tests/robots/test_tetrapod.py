@@ -23,7 +23,7 @@ def robot():
 
 
 def rest_of(design=None, **options):
-    """Model and equilibrium of a body at rest, whatever it takes to get there."""
+    """Model and equilibrium of a body at rest."""
     backend = FEMBackend(make_robot("tetrapod", **options), design)
     return backend.model, backend.state
 
@@ -70,7 +70,7 @@ def test_rest_and_workspace():
 
 
 def test_a_quarter_turn_of_the_commands_turns_the_motion(robot):
-    """Servo k + 1 stands 90 degrees after servo k; a reflection swaps the two beside the plane."""
+    """Servo k + 1 stands 90 degrees after servo k; a reflection swaps the two on either side of its plane."""
     command = np.array([0.5, -0.3, 0.2, 0.4])
     statics = Statics(robot.build(), tolerance=1e-12)
     rest = statics.solve(np.zeros(4))
@@ -150,7 +150,7 @@ def test_the_torque_limit_is_out_of_reach_of_the_baseline(robot):
 
 @pytest.mark.parametrize("curvature", [-8.0, 4.0, 8.0])
 def test_evenly_curved_legs_hang_as_straight_ones_do(curvature):
-    """A clamped inextensible leg takes up an even curvature as a moment E I k, whatever its shape.
+    """A clamped inextensible leg takes up an even curvature as a moment E I k, for any shape.
 
     The servo feels that moment.
     """
