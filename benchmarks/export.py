@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.speed import _median_seconds
+from benchmarks.speed import median_seconds
 from softgym_envs.mechanics.condensation import CondensedModel
 
 FLAGS = {
@@ -270,7 +270,7 @@ def _onnx_speed(model: Any, displacement: np.ndarray, folder: Path) -> dict[str,
     for count in (1, 256):
         feed = {"design": np.repeat(design, count, axis=0), "displacement": displacement[:count]}
         session.run(None, feed)
-        seconds = _median_seconds(partial(session.run, None, feed), 400 // count + 100)
+        seconds = median_seconds(partial(session.run, None, feed), 400 // count + 100)
         result[f"ONNX, W included, batch {count} [us per state]"] = 1e6 * seconds / count
     return result
 
@@ -324,7 +324,7 @@ def _control_speed(model: Any, context: Any, library: ctypes.CDLL, efforts: np.n
         "Algorithm 2 on the Python model [Hz]": 1.0 / reference,
         "mean distance of its predictions to the goals [mm]": 1e3 * distance,
         "Algorithm 2 on the C model, controller in Python [Hz]": 1.0 / mixed,
-        "of it the model, called from Python [us]": 1e6 * _median_seconds(partial(asked, here), 300),
+        "of it the model, called from Python [us]": 1e6 * median_seconds(partial(asked, here), 300),
         "largest difference of efforts to the Python model [%]": 100.0
         * float(np.abs(answers - expected).max() / most[0]),
         "Algorithm 2 in C as a whole [Hz]": 1.0 / seconds if seconds > 0.0 else float("nan"),
@@ -353,7 +353,7 @@ def _measure(model: Any) -> dict[str, object]:
         one = displacement[:1].astype(float)
         for name, work in (("state", model.state), ("condensed", model.condensed)):
             work(context, one)  # the first call compiles
-            result[f"Python {name}, batch 1 [us]"] = 1e6 * _median_seconds(partial(work, context, one), 500)
+            result[f"Python {name}, batch 1 [us]"] = 1e6 * median_seconds(partial(work, context, one), 500)
         result |= _onnx_speed(model, displacement, folder)
         efforts = model.state(context.shared(context, calls), displacement.astype(float))[0]
         result |= _control_speed(model, context, library, efforts)

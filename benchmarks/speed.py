@@ -17,7 +17,7 @@ import numpy as np
 _BEAM = Path(__file__).resolve().parent.parent / "tests" / "data"
 
 
-def _median_seconds(work: Callable[[], object], repeats: int) -> float:
+def median_seconds(work: Callable[[], object], repeats: int) -> float:
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -54,7 +54,7 @@ def fem_step() -> dict[str, object]:
             env.reset(seed=repeat)
             for _ in range(12):
                 env.step(np.ones(cables, dtype=np.float32))
-            repeats.append(_median_seconds(_random_walk(env, 30, repeat), 1) / 30)
+            repeats.append(median_seconds(_random_walk(env, 30, repeat), 1) / 30)
         seconds = statistics.median(repeats)
         unwrapped: Any = env.unwrapped
         model = unwrapped.backend.model
@@ -225,7 +225,7 @@ def notched_beam() -> dict[str, object]:
 
     pull()
     return {
-        "milliseconds": 1e3 * _median_seconds(pull, 21),
+        "milliseconds": 1e3 * median_seconds(pull, 21),
         "milliseconds with SOFA v25.06 (published reference)": 440.0,
     }
 
@@ -270,7 +270,7 @@ def surrogate_step() -> dict[str, object]:
         env.reset(seed=0)
         walk = _random_walk(env, 1000, 0)
         walk()
-        result[f"{name}, single: steps per second"] = 1000 / _median_seconds(walk, 5)
+        result[f"{name}, single: steps per second"] = 1000 / median_seconds(walk, 5)
         for processes in (1, 2):
             running = [
                 subprocess.Popen([sys.executable, "-c", _BATCHED, identifier, "1024"], stdout=subprocess.PIPE)
@@ -310,7 +310,7 @@ def inference() -> dict[str, object]:
         }
         for name, (work, count) in candidates.items():
             work()
-            result[f"{variant}: {name} [us]"] = 1e6 * _median_seconds(work, 2000 // count + 10) / count
+            result[f"{variant}: {name} [us]"] = 1e6 * median_seconds(work, 2000 // count + 10) / count
     return result
 
 

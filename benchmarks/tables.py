@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from benchmarks.page import figure, number, records, results
+from benchmarks.recorded import figure, number, records, results
 
 WEIGHTS = {
     "finger_1cable": "finger, 1 cable",

@@ -69,7 +69,7 @@ def imports_of(path):
         else:
             continue
         for name in names:
-            if name.split(".")[0] in PACKAGES:
+            if name.split(".")[0] in (*PACKAGES, "benchmarks"):
                 yield name, id(node) in lazy, node.lineno
 
 
@@ -123,7 +123,7 @@ def test_the_light_import_registers_the_environments():
 
 # -- structure ----------------------------------------------------------------------------------------------------
 
-STRUCTURED = ("softgym_envs", "agents")  # packages without circles, private imports and long files
+STRUCTURED = ("softgym_envs", "agents", "benchmarks")  # packages without circles, private imports and long files
 MODULES = {module_name(path): path for package in STRUCTURED for path in (ROOT / package).rglob("*.py")}
 MAX_LINES = 600
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import page as bench
+from benchmarks import recorded as results
 from softgym_envs.errors import DataError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -48,10 +49,10 @@ def test_numbers_are_those_of_the_results(page):
 @pytest.fixture
 def recorded(monkeypatch):
     entry = {"results": {"a: error [mm]": 0.00018, "b: error [mm]": 2.5, "pair": [1.0, 2.0], "text": "3 of 4"}}
-    monkeypatch.setattr(bench, "records", lambda: {"speed": entry})
-    bench.results.cache_clear()
+    monkeypatch.setattr(results, "records", lambda: {"speed": entry})
+    results.results.cache_clear()
     yield
-    bench.results.cache_clear()
+    results.results.cache_clear()
 
 
 @pytest.mark.parametrize(
