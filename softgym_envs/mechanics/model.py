@@ -214,9 +214,15 @@ class MechanicalModel:
         Raises:
             ValueError: if a point lies more than the size of the body away from it.
         """
-        solid = self.solids[block]
+        solid = self._solid(block)
         check_distance(points, self._solid_nodes, name, 1.0)
         return solid.embed(points, self.nodes, hint)
+
+    def _solid(self, block: int) -> SolidBlock:
+        solids = self.solids
+        if not 0 <= block < len(solids):
+            raise ValueError(f"block = {block} is out of range: the model has {len(solids)} solids")
+        return solids[block]
 
     @property
     def _solid_nodes(self) -> np.ndarray:
@@ -281,7 +287,7 @@ class MechanicalModel:
         """
         if (surface is None) == (inside is None):
             raise ValueError(f"cavity '{name}' needs either its 'surface' or a point 'inside' it")
-        solid = self.solids[block]
+        solid = self._solid(block)
         if surface is None:
             check_distance(np.asarray(inside), self._solid_nodes, f"the point inside cavity '{name}'", 1.0)
             triangles = cavity_around(self.nodes, solid.corners, np.asarray(inside), name)

@@ -199,6 +199,8 @@ def test_points_in_millimetres_are_refused(box, add, message):
     with pytest.raises(ValueError, match=message):
         add(model)
     assert not model.rows
+    with pytest.raises(ValueError, match="block = 1 is out of range: the model has 1 solids"):
+        model.add_effector("tip", [0.09, 0.01, 0.01], block=1)
     model.add_effector("tip", [0.15, 0.01, 0.01])  # beside the body, as a probe may be
 
 
