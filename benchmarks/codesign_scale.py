@@ -25,7 +25,8 @@ import yaml
 from benchmarks.postgres_server import PostgresServer, temporary_server
 from codesign.config import JOURNAL, StudyConfig
 from codesign.folder import StudyFolder
-from codesign.scheduling.queue import open_study
+from codesign.records import TrialResult
+from codesign.scheduling.optuna_study import open_study
 from codesign.scheduling.storage import StudyStorage
 
 TRIALS = 200
@@ -51,7 +52,10 @@ def finished(folder: StudyFolder, storage: StudyStorage) -> dict[int, Any]:
     trials = storage.patiently(lambda: open_study(folder, storage).get_trials(deepcopy=False))
     ended = [trial for trial in trials if trial.state.name in ("COMPLETE", "PRUNED")]
     return {
-        trial.number: trial.user_attrs["result"] if storage.shared else folder.result(trial.number) for trial in ended
+        trial.number: TrialResult.from_json(trial.user_attrs["result"])
+        if storage.shared
+        else folder.result(trial.number)
+        for trial in ended
     }
 
 
@@ -64,7 +68,7 @@ def faults(folder: StudyFolder, seen: dict[int, Any]) -> list[str]:
     """
     trials = open_study(folder).get_trials(deepcopy=False)
     counted = [trial for trial in trials if trial.state.name != "FAIL"]
-    records = {record["number"]: record for record in folder.results()}
+    records = {record.number: record for record in folder.results()}
     found = []
     if len(counted) != folder.config.trials:
         found.append(f"{len(counted)} trials instead of {folder.config.trials}")
@@ -74,7 +78,7 @@ def faults(folder: StudyFolder, seen: dict[int, Any]) -> list[str]:
     found += [f"trial {number} has no result, or its result has no trial" for number in unpaired]
     for trial in counted:
         record = records.get(trial.number)
-        if record is not None and (record["number"], record["scores"]) != (trial.number, trial.values):
+        if record is not None and (record.number, record.scores) != (trial.number, trial.values):
             found.append(f"trial {trial.number} has the result of another trial")
     for what, keys in (
         ("origin", [trial.user_attrs["origin"] for trial in counted]),
@@ -212,7 +216,6 @@ def kills() -> dict[str, object]:
 
 def _timed_worker(path: str, output: str, started: str) -> None:
     """Run a worker and write how long it was inside training, evaluation and the queue [s]."""
-    import agents.training
     import codesign.phases.trial
     import codesign.scheduling.worker
 
@@ -230,10 +233,10 @@ def _timed_worker(path: str, output: str, started: str) -> None:
 
         setattr(module, name, wrapper)
 
-    timed(agents.training, "train")
+    timed(codesign.phases.trial, "train")
     timed(codesign.phases.trial, "assess")
     for name in ("claim", "finish"):
-        timed(codesign.scheduling.worker.Ledger, name)
+        timed(codesign.scheduling.worker.TrialQueue, name)
     spent["start"] = time.time() - float(started)
     codesign.scheduling.worker.run_trials(StudyFolder(path))
     Path(output).write_text(json.dumps(spent))

@@ -135,15 +135,16 @@ def _truth(path: Path, values: tuple[float, ...], folder: Path) -> Path:
     """Score of one body of the grid: train from the design-conditioned policy, and evaluate."""
     import torch
 
+    from agents.evaluation import evaluate
     from agents.training import train
     from codesign.folder import StudyFolder
-    from codesign.phases.trial import assess, training_config
+    from codesign.phases.trial import training_config
 
     torch.set_num_threads(1)
     study = StudyFolder.create(folder / "question", _question(**PLAIN, strategy="qp", trials=1))
     config, space = study.config, study.config.space
     design = config.baseline | {n: float(space[n].from_unit(v)) for n, v in zip(VARIABLES, values, strict=True)}
-    training = training_config(study, design).model_copy(
+    training = training_config(study, design, {}).model_copy(
         update={"steps": TRUTH_STEPS, "report_every": 1_000, "evaluation_episodes": 40}
     )
     run = path.with_suffix("")
@@ -155,8 +156,8 @@ def _truth(path: Path, values: tuple[float, ...], folder: Path) -> Path:
         {
             "unit": list(values),
             "design": design,
-            "sac": assess(policy, config.environment, goals, design),
-            "qp": assess("qp", config.environment, goals, design),
+            "sac": evaluate(policy, config.environment, goals, design=design).to_json(),
+            "qp": evaluate("qp", config.environment, goals, design=design).to_json(),
             "curve": [[row["step"], row["mean_distance"]] for row in curve],
         },
     )
@@ -167,23 +168,22 @@ def _run_study(path: Path, name: str, repeat: int) -> Path:
     from codesign.folder import StudyFolder
     from codesign.study import run_study
 
-    run_study(_study(name, repeat), path.parent, progress=False)
+    cost = run_study(_study(name, repeat), path.parent, progress=False).cost
     folder = StudyFolder(path.parent)
-    results = json.loads((path.parent / "results.json").read_text())
-    cost = results["cost"]
-    before = cost["joint_steps"] + cost["joint_report_steps"] + cost["screen_steps"]
-    cpu = cost["cpu_seconds"]["judge"] + cost["cpu_seconds"]["screen"]
+    before = cost.joint_steps + cost.joint_report_steps + cost.screen_steps
+    cpu = cost.cpu_seconds["shared_policy"] + cost.cpu_seconds["screen"]
     rows = []
-    for trial in sorted(folder.results(), key=lambda trial: trial["finished_at"]):
-        evaluation = trial["evaluation"] or {}
-        reports = len(trial["curve"]) * folder.config.training.evaluation_episodes * 50
+    for trial in sorted(folder.results(), key=lambda trial: trial.finished_at):
+        scored = trial.evaluation.steps if trial.evaluation is not None else 0
+        qp_seconds = trial.qp.cpu_seconds if trial.qp is not None and trial.controller != "qp" else 0.0
+        reports = len(trial.curve) * folder.config.training.evaluation_episodes * 50
         rows.append(
             {
-                "design": trial["design"],
-                "score": trial["score"],
+                "design": trial.design,
+                "score": trial.score,
                 # Every trial is also scored by the inverse QP; strategies do not need that score, so it does not count.
-                "steps": trial["training_steps"] + reports + evaluation.get("steps", 0),
-                "cpu_seconds": trial["cpu_seconds"] - (0.0 if trial["agent"] == "qp" else trial["qp"]["cpu_seconds"]),
+                "steps": trial.training_steps + reports + scored,
+                "cpu_seconds": trial.cpu_seconds - qp_seconds,
             }
         )
     pretraining = PRETRAINING if folder.config.policy else 0
@@ -250,7 +250,8 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
     from scipy.interpolate import RBFInterpolator
     from scipy.optimize import minimize
 
-    from codesign.phases.trial import assess
+    from agents.evaluation import evaluate
+    from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
     config = _question()
     space = config.space
@@ -266,8 +267,11 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
 
     def score(unit: np.ndarray) -> float:
         design = config.baseline | {n: float(space[n].from_unit(v)) for n, v in zip(VARIABLES, unit, strict=True)}
-        qp = assess("qp", config.environment, goals, design)
-        return qp["mean_distance"] + float(residual(unit[None])[0]) if "error" not in qp else float("inf")
+        try:
+            qp = evaluate("qp", config.environment, goals, design=design)
+        except (InfeasibleDesign, ConvergenceError):
+            return float("inf")
+        return qp.mean_distance + float(residual(unit[None])[0])
 
     def unit_of(design: dict[str, float]) -> np.ndarray:
         return np.array([float(space[name].to_unit(design[name])) for name in VARIABLES])

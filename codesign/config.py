@@ -1,38 +1,28 @@
-"""Configuration of a co-design study. Lengths and all other quantities are SI."""
+"""Configuration of a co-design study; all quantities are in SI units."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from agents.config import EnvironmentConfig, SACConfig, check_hindsight, check_start
 from agents.joint import PROPOSERS
-from codesign.objectives import OBJECTIVES
+from codesign.objectives import OBJECTIVES, Objective, find_objective, objective_name
 from codesign.sampling import SamplerConfig, check_options
+from codesign.variables import OptionRange, is_option, make_variables, split_values, with_options
 from softgym_envs.config import Config
-from softgym_envs.designs import DesignSpace
+from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.envs.tasks.reach import Reach
+from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.robots.base import Robot
 
-__all__ = [
-    "JOURNAL",
-    "PRUNERS",
-    "STRATEGIES",
-    "FinalistsConfig",
-    "GoalsConfig",
-    "JointConfig",
-    "PrunerConfig",
-    "ScreenConfig",
-    "Strategy",
-    "StudyConfig",
-    "TrainingConfig",
-    "ZoneConfig",
-]
-
 JOURNAL = "journal"
-"""``storage`` of a study whose trials are kept in its folder."""
+"""``storage`` of a study whose folder keeps the trials."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +30,9 @@ class Strategy:
     """How a body gets its score.
 
     Args:
-        trains: each trial trains a policy of its own.
-        policy: it needs a design-conditioned policy: to start from where it trains, else as the judge of all bodies.
-        proposer: name in `agents.joint.PROPOSERS`: bodies and their judge are first trained together.
+        trains: whether each trial trains a policy of its own.
+        policy: whether the study needs a design-conditioned policy: as the start of trainings, else as shared policy.
+        proposer: name in `agents.joint.PROPOSERS` if bodies and a shared policy are trained together first.
     """
 
     trains: bool = False
@@ -50,8 +40,8 @@ class Strategy:
     proposer: str | None = None
 
     @property
-    def judges(self) -> bool:
-        """One policy scores all bodies: the given one, or that of the joint training."""
+    def shares_policy(self) -> bool:
+        """Whether one policy scores all bodies: the given one, or that of the joint training."""
         return not self.trains and (self.policy or bool(self.proposer))
 
 
@@ -74,13 +64,18 @@ PRUNERS: dict[str, str] = {
     "threshold": "ThresholdPruner",
     "wilcoxon": "WilcoxonPruner",
 }
-"""Registry: name to class of `optuna.pruners`. Their steps are environment steps of training; those of ``"wilcoxon"``,
-for strategies that train nothing in a trial, are goals, each of which is compared with the same goal of the best body.
+"""Registry: name to class of `optuna.pruners`. They count environment steps of training; ``"wilcoxon"``, for strategies
+without training in a trial, counts goals and compares each with the same goal of the best body.
 """
 
 
 class PrunerConfig(Config):
-    """Who stops hopeless trials: ``name`` of `PRUNERS`, and further arguments of its class."""
+    """Algorithm that stops hopeless trials.
+
+    Attributes:
+        name: key of `PRUNERS`.
+        options: further arguments of its class.
+    """
 
     name: Literal["none", "median", "percentile", "hyperband", "successive_halving", "threshold", "wilcoxon"] = "none"
     options: dict[str, Any] = Field(default_factory=dict)
@@ -94,7 +89,7 @@ class PrunerConfig(Config):
 
 
 class ZoneConfig(Config):
-    """A box of space [m] in which goals are spread evenly."""
+    """A box [m] over which goals are spread evenly."""
 
     center: tuple[float, float, float]
     half_size: tuple[float, float, float]
@@ -103,24 +98,24 @@ class ZoneConfig(Config):
     @classmethod
     def _positive(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
         if not all(size >= 0.0 for size in value):
-            raise ValueError("must be three lengths of at least 0 m")
+            raise ValueError("must be three lengths of 0 m or more")
         return value
 
 
 class GoalsConfig(Config):
-    """Three disjoint sets of goals: to train on, to choose bodies by, and unseen ones to test the choice.
+    """Three disjoint sets of goals: for training, for scoring bodies, and unseen ones for the final test.
 
     Attributes:
-        source: ``"family"``: effector positions that random bodies reach under random commands, the same for every
-            body; ``"zone"``: points of a box in space, the work zone a designer has in mind, whether any body reaches
-            them or not; ``"task"``: as the task draws them for the baseline body (for tasks whose goals are paths).
+        source: where goals come from. ``"family"``: effector positions that random bodies reach under random commands,
+            the same for every body. ``"zone"``: points in a box, the work zone of the designer, reachable or not.
+            ``"task"``: as the task draws them for the baseline body; for tasks whose goals are paths.
         zone: the box, for ``"zone"``.
-        vary: design variables in which those random bodies differ; default: those that are optimised.
-        count: goals every trial is scored on.
-        unseen_count: goals only the finalists are tested on.
-        training_count: goals that training episodes draw from (not for ``"task"``).
-        seed: seed of all three.
-        command_low: smallest random command, as a part of the range of its actuator, in [0, 1) (``"family"`` only).
+        vary: design variables in which the random bodies differ; default: the optimised ones.
+        count: number of goals that every trial is scored on.
+        unseen_count: number of goals that only finalists are tested on.
+        training_count: number of goals that training episodes draw from (not for ``"task"``).
+        seed: seed of all three sets.
+        command_low: smallest random command as a fraction of its actuator's range, in [0, 1) (``"family"`` only).
     """
 
     source: Literal["family", "zone", "task"] = "family"
@@ -135,7 +130,7 @@ class GoalsConfig(Config):
     @model_validator(mode="after")
     def _zone_where_needed(self) -> GoalsConfig:
         if (self.source == "zone") != (self.zone is not None):
-            raise ValueError("'zone' (center, half_size) belongs to source 'zone', and to it alone")
+            raise ValueError("'zone' (center, half_size) must be given with source 'zone', and only with it")
         return self
 
 
@@ -145,9 +140,9 @@ class TrainingConfig(Config):
     Attributes:
         steps: environment steps of one trial.
         report_every: environment steps between two reports to the pruner.
-        evaluation_episodes: episodes behind each report.
-        num_envs: environments in parallel in one trial.
-        seed: the same in all trials, so that they differ by their bodies.
+        evaluation_episodes: number of episodes for each report.
+        num_envs: number of parallel environments in one trial.
+        seed: seed, the same in all trials so that they differ by their bodies only.
         sac: hyper-parameters.
     """
 
@@ -164,8 +159,8 @@ class JointConfig(TrainingConfig):
 
     Attributes:
         steps: environment steps.
-        report_every: environment steps between two checkpoints, and two questions to the critic.
-        keep: number of its most promising bodies that become trials.
+        report_every: environment steps between two checkpoints; the critic proposes bodies at each.
+        keep: number of the most promising bodies that become trials.
         options: arguments of the proposer, see `agents.joint`.
     """
 
@@ -176,13 +171,13 @@ class JointConfig(TrainingConfig):
 
 
 class ScreenConfig(Config):
-    """A cheap first look: many bodies scored by the inverse QP, the best of them become trials.
+    """Screen before the trials: the inverse QP scores many bodies, and the best become trials.
 
     Attributes:
-        enabled: whether there is one.
-        candidates: bodies to score, spread evenly over the box.
+        enabled: whether there is a screen.
+        candidates: number of bodies to score, spread evenly over the design box.
         keep: fraction of the candidates that becomes trials.
-        goals: goals per candidate, the first ones of those that bodies are chosen by.
+        goals: number of goals per candidate: the first of the selection goals.
     """
 
     enabled: bool = False
@@ -200,13 +195,13 @@ class FinalistsConfig(Config):
     """The check on FEM.
 
     Attributes:
-        count: best bodies to test beside the baseline; 0 for no check.
-        choose: who names the winner: the ``"surrogate"`` score of the trials, or the ``"fem"`` score of the finalists
-            on the same goals. Never the unseen goals.
+        count: number of best bodies to test besides the baseline; 0 for no check.
+        choose: what decides who wins: the ``"surrogate"`` score of the trials, or the ``"fem"`` score of the finalists
+            on the same goals. The unseen goals never do.
         fem_options: options of the FEM backend.
-        seeds: policies trained anew for each finalist, with seeds 1, 2, ... beside that of the trial; 0: the policy of
-            the trial itself is tested.
-        steps: environment steps of each of them; default: those of a trial.
+        seeds: number of policies to train anew for each finalist, with seeds 1, 2, ... added to that of the trial; 0 to
+            test the policy of the trial.
+        steps: environment steps of each of these trainings; default: those of a trial.
     """
 
     count: int = Field(default=3, ge=0)
@@ -220,35 +215,39 @@ class StudyConfig(Config):
     """A co-design study.
 
     Attributes:
-        name: of the study, and of its folder.
-        title: of the report; default: the name.
+        name: name of the study and of its folder.
+        title: title of the report; default: the name.
         environment: robot, task and backend of the trials. Its ``design`` (default: the robot's baseline) is the
-            baseline body of the study and gives the variables that are not optimised.
-        variables: names of the design variables to optimise.
-        objective: what is optimised, a name in `codesign.objectives.OBJECTIVES`; the winner is the best in it.
-        also: further objectives: the study then looks for the Pareto front of all of them.
-        limits: largest allowed values of objectives that are better when smaller, smallest of the others [SI]; a body
-            that breaks one cannot win.
-        strategy: ``"policy"`` lets one design-conditioned policy judge all bodies as it is, ``"warm_start"`` fine-tunes
-            it in each trial, ``"scratch"`` trains a policy in each trial (plain nesting), ``"critic"`` and
-            ``"distribution"`` train bodies and a policy together and then let it judge, ``"qp"`` trains none and asks
-            the inverse QP.
-        policy: design-conditioned policy, for ``"warm_start"`` and ``"policy"``: a file or the name of a shipped one.
+            baseline body of the study and gives the design variables that are not optimised.
+        variables: names of what is optimised: design variables, and options of robot or task as ``robot.<option>`` and
+            ``task.<option>``; see `codesign.variables`.
+        ranges: bounds of those options.
+        objective: what is optimised: a name in `codesign.objectives.OBJECTIVES`, or one of your own as
+            ``module:attribute``; in Python also the function or `Objective` itself.
+        secondary_objectives: further objectives; the study then looks for the Pareto front of all of them.
+        constraints: largest allowed values of objectives that are minimised, smallest of those that are maximised [SI];
+            a body that violates one cannot win.
+        strategy: how bodies are scored. ``"policy"``: by one design-conditioned policy. ``"warm_start"``: each trial
+            fine-tunes that policy. ``"scratch"``: each trial trains a policy (plain nesting). ``"critic"`` and
+            ``"distribution"``: bodies and a policy are trained together, then that policy scores every body. ``"qp"``:
+            by the inverse QP, without training.
+        policy: design-conditioned policy, for ``"policy"`` and ``"warm_start"``: a file or the name of a shipped one.
         joint: training of bodies and policy together, for ``"critic"`` and ``"distribution"``.
         trials: number of bodies, the baseline and those of the screen included.
-        workers: processes, one thread each.
-        executor: what they are: ``"processes"`` of this machine, or tasks of a ``"ray"`` cluster.
-        storage: where trials are kept: the ``"journal"`` of the folder, for one machine, or a PostgreSQL database that
-            many machines share, ``postgresql://user@host:port/database``.
-        heartbeat: a worker of a database that gave no sign of life for so long counts as dead, and its trial runs
-            again [s].
-        patience: how long a database that does not answer is waited for [s].
-        attempts: workers that a body may cost without any progress of its training, before it counts as infeasible.
-        sampler: who proposes bodies; Gaussian processes need the fewest, but learn nothing from pruned trials.
-        pruner: who stops hopeless trials.
-        goals: what the body has to reach.
+        workers: number of workers with one thread each.
+        executor: what workers are: ``"processes"`` of this machine, or tasks of a ``"ray"`` cluster.
+        storage: where trials are kept: the ``"journal"`` of the folder, for one machine, or a PostgreSQL database for
+            many machines, ``postgresql://user@host:port/database``.
+        heartbeat: time without a heartbeat after which a worker of a database counts as dead; another worker then runs
+            its trial again [s].
+        patience: how long to wait for a database that does not answer [s].
+        attempts: number of workers that a body may crash without any progress of its training; the next one gives the
+            body up as infeasible.
+        sampler: algorithm that proposes bodies. Gaussian processes need the fewest, but ignore pruned trials.
+        pruner: algorithm that stops hopeless trials.
+        goals: what the effector has to reach.
         training: training inside one trial.
-        screen: cheap first look by the inverse QP.
+        screen: screen by the inverse QP before the trials.
         finalists: check on FEM.
     """
 
@@ -256,9 +255,10 @@ class StudyConfig(Config):
     title: str = ""
     environment: EnvironmentConfig
     variables: tuple[str, ...] = Field(min_length=1)
+    ranges: dict[str, OptionRange] = Field(default_factory=dict)
     objective: str = "mean_distance"
-    also: tuple[str, ...] = ()
-    limits: dict[str, float] = Field(default_factory=dict)
+    secondary_objectives: tuple[str, ...] = ()
+    constraints: dict[str, float] = Field(default_factory=dict)
     strategy: Literal["policy", "warm_start", "scratch", "critic", "distribution", "qp"] = "policy"
     policy: str | None = None
     joint: JointConfig = Field(default_factory=JointConfig)
@@ -289,7 +289,7 @@ class StudyConfig(Config):
         except ArgumentError:
             raise ValueError(f"allowed: {JOURNAL}, postgresql://user@host:port/database") from None
         if url.password is not None or "password" in url.query:
-            raise ValueError("the address must hold no password, it is written to files; use ~/.pgpass or PGPASSWORD")
+            raise ValueError("remove the password: the address is written to files; use ~/.pgpass or PGPASSWORD")
         if url.get_backend_name() != "postgresql" or not url.database:
             raise ValueError(f"allowed: {JOURNAL}, postgresql://user@host:port/database")
         return storage
@@ -298,20 +298,30 @@ class StudyConfig(Config):
     @classmethod
     def _comparable(cls, environment: EnvironmentConfig) -> EnvironmentConfig:
         if environment.sample_design:
-            raise ValueError("sample_design must be false: a trial has one body; 'variables' names what is optimised")
+            raise ValueError("sample_design must be false: a trial has one body, and 'variables' names what varies")
         environment.make_robot().design_space.complete(environment.design)
         return environment
 
+    @field_validator("objective", mode="before")
+    @classmethod
+    def _importable(cls, objective: Any) -> str:
+        return objective_name(objective)
+
+    @field_validator("secondary_objectives", mode="before")
+    @classmethod
+    def _all_importable(cls, objectives: Any) -> Any:
+        return [objective_name(o) for o in objectives] if isinstance(objectives, list | tuple) else objectives
+
     @model_validator(mode="after")
     def _consistent(self) -> StudyConfig:
-        space = self.space
-        repeated = [name for name in self.variables if self.variables.count(name) > 1]
-        if repeated:
-            raise ValueError(f"variables: '{repeated[0]}' is named twice")
-        for name in (*self.variables, *(self.goals.vary or ())):
-            space[name]
+        make_variables(self.variables, self.ranges, self.space)
+        for name in self.goals.vary or ():
+            self.space[name]
         self._check_objectives()
         self._check_strategy()
+        self._check_options()
+        if self.goals.zone is not None:
+            self._check_zone(self.goals.zone)
         if self.screen.enabled and self.screen.goals > self.goals.count:
             raise ValueError(f"screen.goals = {self.screen.goals} exceeds goals.count = {self.goals.count}")
         first = self.screen.kept + (self.joint.keep if self.plan.proposer else 0)
@@ -324,54 +334,69 @@ class StudyConfig(Config):
         return self
 
     def _check_objectives(self) -> None:
-        named = (self.objective, *self.also, *self.limits)
-        for name in named:
-            if name not in OBJECTIVES:
-                raise ValueError(f"unknown objective '{name}'; allowed: {', '.join(OBJECTIVES)}")
-        if OBJECTIVES[self.objective].of_body:
-            allowed = ", ".join(name for name, objective in OBJECTIVES.items() if not objective.of_body)
-            raise ValueError(
-                f"objective '{self.objective}' asks nothing of the controller: name it in 'also' or 'limits'; allowed: "
-                f"{allowed}"
-            )
-        objectives = (self.objective, *self.also)
+        objectives = (self.objective, *self.secondary_objectives)
         repeated = [name for name in objectives if objectives.count(name) > 1]
         if repeated:
             raise ValueError(f"objective '{repeated[0]}' is named twice")
-        if self.also and self.pruner.name != "none":
-            raise ValueError(f"pruner '{self.pruner.name}' compares one number, and there are several; allowed: none")
-        if (self.also or self.limits) and self.sampler.name == "cmaes":
-            raise ValueError("sampler 'cmaes' knows neither several objectives nor limits; allowed: tpe, gp, nsgaii")
+        if self.primary.of_body:  # looking it up also refuses unknown names
+            allowed = ", ".join(name for name, objective in OBJECTIVES.items() if not objective.of_body)
+            raise ValueError(
+                f"objective '{self.objective}' does not depend on the controller; use it in 'secondary_objectives' or "
+                f"'constraints', or run a design search; allowed: {allowed}"
+            )
+        if self.secondary_objectives and self.pruner.name != "none":
+            raise ValueError(f"pruner '{self.pruner.name}' supports one objective only; allowed: none")
+        if (self.secondary_objectives or self.constraints) and self.sampler.name == "cmaes":
+            raise ValueError(
+                "sampler 'cmaes' supports neither secondary objectives nor constraints; allowed: tpe, gp, nsgaii"
+            )
+
+    def _check_options(self) -> None:
+        options = [name for name in self.variables if is_option(name)]
+        if options and (self.plan.policy or self.plan.proposer):
+            raise ValueError(
+                f"strategy '{self.strategy}' uses a policy that was trained with fixed options, so '{options[0]}' "
+                "cannot vary; allowed: qp, scratch"
+            )
+        if options and self.goals.source == "task":
+            task = [name for name in options if name.startswith("task.")]
+            if task:
+                raise ValueError(f"goals.source = 'task' depends on '{task[0]}', so bodies would have different goals")
+
+    def _check_zone(self, zone: ZoneConfig) -> None:
+        corners = np.asarray(zone.center) + np.array(list(product((-1.0, 1.0), repeat=3))) * zone.half_size
+        self.robot.check_point("goals.zone.center", zone.center)
+        self.robot.check_point("a corner of goals.zone", corners)
 
     def _check_strategy(self) -> None:
         plan = self.plan
         if plan.policy and not self.policy:
-            raise ValueError(f"strategy '{self.strategy}' needs 'policy', a trained design-conditioned policy")
+            raise ValueError(f"strategy '{self.strategy}' needs 'policy': a trained design-conditioned policy")
         if not plan.policy and self.policy:
-            raise ValueError(f"policy = '{self.policy}' is of no use to strategy '{self.strategy}'; remove it")
+            raise ValueError(f"strategy '{self.strategy}' does not use policy = '{self.policy}'; remove it")
         if self.strategy != "qp" and self.environment.backend != "surrogate" and plan.proposer:
             raise ValueError(
-                f"environment.backend = '{self.environment.backend}' has no joint training; allowed: surrogate"
+                f"joint training does not run on environment.backend = '{self.environment.backend}'; allowed: surrogate"
             )
         row = self.environment.row
         if self.goals.source == "family" and not self.environment.has_surrogate:
             raise ValueError(
-                f"goals.source = 'family' needs a surrogate, which robot '{row.robot}' has not; allowed: task, zone"
+                f"goals.source = 'family' needs a surrogate, and robot '{row.robot}' has none; allowed: task, zone"
             )
         trains = plan.trains or plan.proposer or self.finalists.seeds
         if self.goals.source != "task" and trains and not issubclass(self.environment.task_class, Reach):
             raise ValueError(
-                f"goals.source = '{self.goals.source}' gives points to train on, task '{row.task}' takes paths; "
+                f"goals.source = '{self.goals.source}' makes points, but task '{row.task}' trains on paths; "
                 "allowed: task"
             )
         if self.finalists.seeds and self.strategy == "qp":
             raise ValueError(
-                f"finalists.seeds = {self.finalists.seeds} trains policies, strategy 'qp' has none; allowed: 0"
+                f"finalists.seeds = {self.finalists.seeds} trains policies, but strategy 'qp' has none; allowed: 0"
             )
         shown = self.environment.design_in_observation
-        if plan.judges and shown is not True and not set(self.variables) <= set(shown or ()):
+        if plan.shares_policy and shown is not True and not set(self.variables) <= set(shown or ()):
             raise ValueError(
-                f"strategy '{self.strategy}' needs a policy that sees the body: name {', '.join(self.variables)} in "
+                f"strategy '{self.strategy}' needs a policy that observes the body: add {', '.join(self.variables)} to "
                 "environment.design_in_observation"
             )
         if plan.proposer:
@@ -386,11 +411,12 @@ class StudyConfig(Config):
         pruner = self.pruner.name
         if not plan.trains and pruner not in ("none", "wilcoxon"):
             raise ValueError(
-                f"pruner '{pruner}' has no training to stop in strategy '{self.strategy}'; allowed: none, wilcoxon"
+                f"pruner '{pruner}' stops trainings, but trials of strategy '{self.strategy}' do not train; "
+                "allowed: none, wilcoxon"
             )
         if plan.trains and pruner == "wilcoxon":
             raise ValueError(
-                f"pruner 'wilcoxon' compares goals, strategy '{self.strategy}' reports its training; "
+                f"pruner 'wilcoxon' compares goals, but strategy '{self.strategy}' reports its training; "
                 f"allowed: {', '.join(name for name in PRUNERS if name != 'wilcoxon')}"
             )
         self._check_trainings()
@@ -427,6 +453,50 @@ class StudyConfig(Config):
         return self.robot.design_space
 
     @property
+    def optimised(self) -> dict[str, DesignVariable]:
+        """What is optimised, by name: design variables, and options of robot or task."""
+        return make_variables(self.variables, self.ranges, self.space)
+
+    @property
+    def objectives(self) -> dict[str, Objective]:
+        """All objectives that the study names, by name: objective, secondary objectives and constraints."""
+        names = (self.objective, *self.secondary_objectives, *self.constraints)
+        return {name: find_objective(name, self.robot) for name in names}
+
+    @property
+    def primary(self) -> Objective:
+        """The objective that decides who wins."""
+        return self.objectives[self.objective]
+
+    @property
+    def controller_constraints(self) -> dict[str, float]:
+        """Constraints that depend on the controller, and therefore on the backend [SI]."""
+        return {name: limit for name, limit in self.constraints.items() if not self.objectives[name].of_body}
+
+    def violations_text(self, values: Mapping[str, float], constraints: Mapping[str, float]) -> str:
+        """Return the constraints [SI] that values [SI] violate, in words; empty if there are none."""
+        broken = (
+            self.objectives[name].violation_text(values[name], limit)
+            for name, limit in constraints.items()
+            if name in values and self.objectives[name].excess(values[name], limit) > 0.0
+        )
+        return "; ".join(broken)
+
+    @property
+    def success_distance(self) -> float:
+        """Distance within which a goal counts as reached [m]."""
+        row = self.environment.row
+        options = {**row.task_options, **self.environment.task_options}
+        return make_task(row.task, self.robot, **options).success_distance
+
+    @property
+    def test_backends(self) -> tuple[str, ...]:
+        """Backends that finalists are tested on, the slow one first."""
+        # Surrogate weights are for fixed options of the robot.
+        varies = any(name.startswith("robot.") for name in self.variables)
+        return ("fem", "surrogate") if self.environment.has_surrogate and not varies else ("fem",)
+
+    @property
     def episode_steps(self) -> int:
         """Environment steps of an episode."""
         return self.environment.row.max_episode_steps
@@ -435,3 +505,17 @@ class StudyConfig(Config):
     def baseline(self) -> dict[str, float]:
         """The complete baseline design [SI]."""
         return dict(self.space.complete(self.environment.design))
+
+    @property
+    def baseline_values(self) -> dict[str, float]:
+        """Value of each optimised variable in the baseline [SI]."""
+        return {n: self.baseline.get(n, variable.baseline) for n, variable in self.optimised.items()}
+
+    def body(self, values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
+        """Return the complete design [SI] and the options [SI] of values of the optimised variables."""
+        design, options = split_values(values)
+        return dict(self.space.complete(design, self.baseline)), options
+
+    def environment_of(self, options: Mapping[str, float]) -> EnvironmentConfig:
+        """Return the environment with other values of options [SI]."""
+        return with_options(self.environment, options)

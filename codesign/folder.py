@@ -1,4 +1,4 @@
-"""A study on disk: where everything lies, and what its processes share."""
+"""The folder of a study: which file is where, and who may continue it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import numpy as np
 
 from codesign.config import JOURNAL, StudyConfig
 from codesign.goals import draw_goals
-from codesign.scheduling.storage import StudyStorage, file_lock, open_storage
+from codesign.records import Account, TrialResult
+from codesign.scheduling.connect import open_storage
+from codesign.scheduling.storage import SharedStorage, StudyStorage, file_lock
 from softgym_envs.config import check_compatible, check_config, load_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.storage import atomic_write, read_json, write_json
@@ -18,37 +20,39 @@ from softgym_envs.storage import atomic_write, read_json, write_json
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
-__all__ = ["StudyFolder"]
-
-# What may change between two runs of one study.
 EXTENSIBLE = (
     *("name", "title", "trials", "workers", "executor", "heartbeat", "patience", "attempts"),
     *("finalists.count", "finalists.choose", "finalists.seeds", "finalists.steps", "finalists.fem_options"),
 )
-MADE_BY = ("finalists.steps", "finalists.fem_options")  # how tests of finalists were made
-TESTED = """
-SELECT EXISTS (SELECT FROM codesign_files JOIN studies USING (study_id)
-               WHERE study_name = :study AND path LIKE 'finalists/%')
-"""
-"""Whether a database has tests of finalists of a study."""
+"""Keys that may change between two runs of one study."""
+
+TEST_SETTINGS = ("finalists.steps", "finalists.fem_options")
+"""Keys of `EXTENSIBLE` that must not change once finalists were tested with them."""
+
+
+SHARED_POLICY = "shared_policy/policy.safetensors"
+"""File of the shared policy, relative to the folder of a study."""
+SHARED_POLICY_RECORD = "shared_policy/shared_policy.json"
+"""File of its `codesign.records.SharedPolicy`, relative to the folder of a study."""
 
 
 class StudyFolder:
     """The folder of a study.
 
-    It holds::
+    It contains::
 
         config.yaml  provenance.json  goals.json
-        journal.log                    Optuna's journal; or study.json, which study of the database this is
-        screen/000.json ...            QP score of each candidate of the screen
+        journal.log                    Optuna's journal; or study.json, which identifies the study in the database
+        screen/000.json ...            score of each candidate of the screen
+        shared_policy/                 policy that scores every body, for strategies that have one
         trials/0000/ ...               training of each trial, and its result.json once it is finished
-        finalists/*.json               one evaluation each
+        finalists/*.json               one test each
         account.json                   time spent, and the command
-        locks/                         locks of the operating system: they die with their holder
+        locks/                         locks of the operating system, which end with their holder
         results.json  trials.csv  finalists.csv  report.html
 
-    Every file is either whole or absent. With a database, every machine may have such a folder: it then holds copies of
-    all results, and the policies and training files of the trials that ran there.
+    Every file is either whole or absent. With a database, each machine may have a folder of its own: it contains copies
+    of all results, and the policies and training files of the trials that ran there.
 
     Args:
         path: the folder; see `create` for a new one.
@@ -64,14 +68,11 @@ class StudyFolder:
         Args:
             path: the folder.
             config: the study.
-            wait: whether to wait for a database that does not answer; by default a wrong address is told at once.
+            wait: whether to wait for a database that does not answer; by default a wrong address is an error at once.
 
         Raises:
-            ConfigError: if the folder, or the study of this name in the database, is of another study, or FEM does not
-                take ``finalists.fem_options``.
+            ConfigError: if the folder, or the study of this name in the database, belongs to another study.
         """
-        from codesign.phases.finalists import check_tests  # whose module needs this one
-
         folder = cls(path)
         folder.path.mkdir(parents=True, exist_ok=True)
         with folder.lock("study"):
@@ -79,10 +80,8 @@ class StudyFolder:
             if new and (folder.path / "journal.log").exists():
                 raise ConfigError(f"folder '{path}' holds a journal but no config.yaml; use another folder")
             if not new:
-                _accept(folder.config, config, f"folder '{path}'", "folder", folder._made())
-            if new or folder.config.finalists != config.finalists:
-                check_tests(config)  # now, and not after hours of trials
-            goals = folder._agree(config, str(path), wait) if config.storage != JOURNAL else None
+                _accept(folder.config, config, f"folder '{path}'", "folder", folder._tested_with())
+            goals = None if config.storage == JOURNAL else folder._agree(config, str(path), wait)
             if new or folder.config != config:
                 save_resolved(folder.path, config)
                 folder.__dict__.pop("config", None)
@@ -91,12 +90,9 @@ class StudyFolder:
         return folder
 
     def _agree(self, config: StudyConfig, shown: str, wait: bool) -> dict[str, Any]:
-        """Agree with the other machines on configuration and goals of a study; return the goals."""
-        from codesign.scheduling.postgres import PostgresStorage
-
-        storage = PostgresStorage(
-            config.storage, config.name, grace=config.heartbeat, patience=config.patience, wait=wait
-        )
+        """Agree with the other machines on the configuration and the goals of a study; return the goals."""
+        storage = open_storage(self.path, config, wait=wait)
+        assert isinstance(storage, SharedStorage)
         known = self.path / "study.json"
         mine = read_json(known)["id"] if known.exists() else None
 
@@ -105,29 +101,33 @@ class StudyFolder:
                 if mine is not None:
                     raise ConfigError(
                         f"the study '{config.name}' of folder '{shown}' is not in storage '{config.storage}'; use "
-                        "another folder to begin anew"
+                        "another folder to start again"
                     )
                 return {"config": config.model_dump(mode="json"), "goals": draw_goals(config)}
             where = f"storage '{config.storage}'"
             if "config" not in shared:
-                raise ConfigError(f"{where} holds a study '{config.name}' that is none of co-design; use another name")
+                raise ConfigError(
+                    f"{where} has a study '{config.name}' that is not a co-design study; use another name"
+                )
             if mine not in (None, shared["id"]):
-                raise ConfigError(f"{where} holds another study '{config.name}' than folder '{shown}'; use another one")
+                raise ConfigError(
+                    f"{where} has another study '{config.name}' than folder '{shown}'; use another folder"
+                )
             old = check_config(StudyConfig, shared["config"], f"study '{config.name}' of {where}")
-            made = MADE_BY if storage.execute(TESTED, study=config.name) else self._made()
-            _accept(old, config, where, "name", made)
+            fixed = TEST_SETTINGS if storage.has_files("finalists") else self._tested_with()
+            _accept(old, config, where, "name", fixed)
             return {"config": config.model_dump(mode="json"), "goals": shared["goals"]}
 
-        shared = storage.agree(accept, 1 + len(config.also))
+        shared = storage.agree(accept, 1 + len(config.secondary_objectives))
         if mine is None:
             write_json(known, {"id": shared["id"]})
         return shared["goals"]
 
-    def _made(self) -> tuple[str, ...]:
-        """Keys of the configuration by which tests of finalists, or policies for them, in the folder were made."""
+    def _tested_with(self) -> tuple[str, ...]:
+        """Return the settings with which finalists in the folder were tested, or trained for their tests."""
         if any(self.path.glob("finalists/*.json")):
-            return MADE_BY
-        return MADE_BY[:1] if any(self.path.glob("finalists/*/")) else ()
+            return TEST_SETTINGS
+        return TEST_SETTINGS[:1] if any(self.path.glob("finalists/*/")) else ()
 
     def open_storage(self) -> StudyStorage:
         """Open the storage of the trials.
@@ -150,23 +150,23 @@ class StudyFolder:
         stored = read_json(self.path / "goals.json")
         return {name: np.array(stored[name], dtype=float) for name in ("training", "selection", "unseen")}
 
-    def account(self) -> dict[str, Any]:
-        """Command that last ran the study, and wall-clock time of each phase so far, added up over calls [s]."""
+    def account(self) -> Account:
+        """Return the time spent so far."""
         path = self.path / "account.json"
-        return read_json(path) if path.exists() else {"command": "", "wall_seconds": {}}
+        return Account.read(path) if path.exists() else Account()
 
     def lock(self, name: str) -> BaseFileLock:
         """Return a lock shared by all processes of the folder; see `codesign.scheduling.storage.file_lock`."""
         return file_lock(self.path, name)
 
     def policy(self, name: str) -> Path:
-        """Return the file of a policy; it and its card are copied from the storage where another machine made them.
+        """Return the file of a policy; one made on another machine is copied from the storage, with its card.
 
         Args:
             name: its path in the folder.
 
         Raises:
-            DataError: if it is in neither.
+            DataError: if the policy is in neither.
         """
         path = self.path / name
         missing = [file for file in (path, path.with_suffix(".json")) if not file.exists()]
@@ -183,31 +183,34 @@ class StudyFolder:
         return path
 
     def trial(self, number: int) -> Path:
-        """Folder of a trial."""
+        """Return the folder of a trial."""
         return self.path / "trials" / f"{number:04d}"
 
-    def result(self, number: int) -> dict[str, Any] | None:
-        """Result of a trial, or None if it is not finished."""
+    def result(self, number: int) -> TrialResult | None:
+        """Return the result of a trial, or None if it is not finished."""
         path = self.trial(number) / "result.json"
-        return read_json(path) if path.exists() else None
+        return TrialResult.read(path) if path.exists() else None
 
-    def results(self) -> list[dict[str, Any]]:
-        """Results of all finished trials, by number."""
-        paths = sorted((self.path / "trials").glob("[0-9]*/result.json"))
-        return [read_json(path) for path in paths]
+    def result_files(self) -> list[Path]:
+        """Return the results of all finished trials, by number."""
+        return sorted((self.path / "trials").glob("[0-9]*/result.json"))
+
+    def results(self) -> list[TrialResult]:
+        """Read the results of all finished trials, by number."""
+        return [TrialResult.read(path) for path in self.result_files()]
 
 
-def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str, made: tuple[str, ...]) -> None:
-    """Raise unless a study can go on with a new configuration.
+def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str, fixed: tuple[str, ...]) -> None:
+    """Raise ConfigError unless a study can continue with a new configuration.
 
     Args:
         old: its configuration so far.
-        new: what it is to be now.
-        where: that holds the study.
-        use: what to change to begin another one.
-        made: keys by which tests of finalists were made, and which must stay therefore.
+        new: the requested configuration.
+        where: the folder or storage that has the study.
+        use: what to change to start another one.
+        fixed: keys of `EXTENSIBLE` that must stay.
     """
-    fixed = made if new.storage == JOURNAL else ("name", *made)
+    fixed = fixed if new.storage == JOURNAL else ("name", *fixed)
     extensible = [key for key in EXTENSIBLE if key not in fixed] + ["storage"] * (new.storage != JOURNAL)
     if (old.storage == JOURNAL) != (new.storage == JOURNAL):
         raise ConfigError(f"{where} holds a study with storage '{old.storage}', got '{new.storage}'; use another {use}")

@@ -1,4 +1,4 @@
-"""Goals that compare bodies: the same for all of them, whoever can reach them."""
+"""Goals of a study: the same for all bodies, reachable or not."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from typing import Any
 import numpy as np
 
 from codesign.config import StudyConfig
-
-__all__ = ["draw_goals", "family_goals", "zone_goals"]
+from codesign.variables import is_option
 
 STREAM = 0x60A15
-"""Sets the seeds of goals that a task draws apart from those of trainings, whose environments it draws for as well."""
+"""Separates the seeds of a study's goals from those of trainings, which draw goals from the same task."""
 
 
 def family_goals(config: StudyConfig, count: int) -> np.ndarray:
-    """Effector positions [m] (count, 3) of random bodies under random commands, on the surrogate.
+    """Return effector positions [m] (count, 3) of random bodies under random commands, on the surrogate.
 
     The bodies differ from the baseline of the study in the variables ``goals.vary``.
     """
@@ -24,7 +23,8 @@ def family_goals(config: StudyConfig, count: int) -> np.ndarray:
 
     robot, goals = config.robot, config.goals
     rng = np.random.default_rng(goals.seed)
-    vary = tuple(config.variables if goals.vary is None else goals.vary)
+    optimised = [name for name in config.variables if not is_option(name)]
+    vary = tuple(optimised if goals.vary is None else goals.vary)
     drawn = [robot.design_space.sample(rng, vary) for _ in range(count)]
     designs = [[body[n] if n in vary else value for n, value in config.baseline.items()] for body in drawn]
     low = robot.lower + goals.command_low * (robot.upper - robot.lower)
@@ -38,32 +38,32 @@ def family_goals(config: StudyConfig, count: int) -> np.ndarray:
 
 
 def zone_goals(config: StudyConfig, count: int) -> np.ndarray:
-    """Points [m] (count, 3) spread evenly (scrambled Halton) over the work zone of a study."""
+    """Return points [m] (count, 3) spread evenly (scrambled Halton) over the work zone of a study."""
     from scipy.stats import qmc
 
     zone = config.goals.zone
-    assert zone is not None  # the configuration was checked
+    assert zone is not None  # checked by the configuration
     unit = qmc.Halton(3, rng=np.random.default_rng(config.goals.seed)).random(count)
-    # Shuffled, so that any part of them fills the zone.
+    # Shuffle the points so that any subset fills the zone.
     np.random.default_rng([config.goals.seed, 1]).shuffle(unit)
     return np.asarray(zone.center) + (2.0 * unit - 1.0) * np.asarray(zone.half_size)
 
 
 def draw_goals(config: StudyConfig) -> dict[str, Any]:
-    """Draw the three disjoint sets of goals of a study [m], as plain data.
+    """Return three disjoint sets of goals of a study [m], as plain data.
 
-    Where trainings draw their own goals as the task does, these are of other seeds than any training has.
+    If the task draws the goals, their seeds differ from those of every training.
 
     Returns:
-        ``training`` (k, 3), empty where the task draws its own; ``selection`` and ``unseen`` (k, p, 3), both the one
-        path of a task that has no other.
+        ``training`` (k, 3), empty if trainings draw goals from the task; ``selection`` and ``unseen`` (k, p, 3), which
+        are equal if the task has only one path.
     """
     goals = config.goals
     count = goals.count + goals.unseen_count
     if goals.source == "task":
         from agents.evaluation import sample_goals
 
-        # Beyond 32 bits, where no training has a seed.
+        # Larger than 32 bits, unlike the seeds of trainings.
         seed = (1 << 64) + int(np.random.SeedSequence([goals.seed, STREAM]).generate_state(1, np.uint64)[0])
         paths, training = sample_goals(config.environment, count, seed), np.zeros((0, 3))
     else:
@@ -71,6 +71,6 @@ def draw_goals(config: StudyConfig) -> dict[str, Any]:
         points = draw(config, count + goals.training_count)
         paths, training = points[:count, None], points[count:]
     drawn = {"training": training, "selection": paths[: goals.count], "unseen": paths[goals.count :]}
-    if (paths == paths[0]).all():  # a published path: once is enough, and there is no other to test on
+    if (paths == paths[0]).all():  # the task has only one path
         drawn |= {"selection": paths[:1], "unseen": paths[:1]}
     return {"unit": "m", **{name: array.tolist() for name, array in drawn.items()}}

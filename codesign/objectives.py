@@ -1,70 +1,207 @@
-"""What a body is judged by. A score is larger for a better body, whatever the objective."""
+"""Objectives: the numbers by which a study compares bodies.
+
+`OBJECTIVES` has those of the package. A study can also use one of your own by its place, ``my_module:my_objective``: an
+`Objective`, or a function of an `Outcome` that is to be minimised.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["OBJECTIVES", "Objective", "rank_key", "violations"]
+import numpy as np
+
+from softgym_envs.errors import unknown_name
+from softgym_envs.registry import import_object
+
+if TYPE_CHECKING:
+    from agents.evaluation import Evaluation
+    from softgym_envs.mechanics.model import MechanicalModel
+    from softgym_envs.robots.base import Robot
+
+EFFORT_UNITS = {"m": ("N", 1.0), "m3": ("kPa", 1e-3), "rad": ("N m", 1.0)}
+"""Unit of an actuator's displacement -> unit in which people read its effort, and the factor to it from SI."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an objective can use: one body and the evaluation of its controller.
+
+    Attributes:
+        evaluation: one episode per goal.
+        design: complete design [SI].
+        robot: the family of the body.
+    """
+
+    evaluation: Evaluation
+    design: Mapping[str, float]
+    robot: Robot
+
+    @cached_property
+    def model(self) -> MechanicalModel:
+        """Mechanical model of the body; built when it is first used (seconds)."""
+        return self.robot.build(self.design)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Value of an objective.
+
+    Attributes:
+        value: mean over the goals [SI].
+        per_goal: value for each goal [SI], or None if the objective has no such values.
+    """
+
+    value: float
+    per_goal: list[float] | None = None
 
 
 @dataclass(frozen=True)
 class Objective:
-    """One way to judge an evaluation.
+    """A number by which bodies are compared.
 
     Args:
-        key: field of a trial's evaluation, see `codesign.phases.trial.assess`.
-        label: for people.
-        unit: unit that people read.
-        scale: from SI to ``unit``.
-        sign: 1 if more is better, -1 if less is.
-        per_goal: field that has its value for each goal, where there is one.
-        of_body: whether it is a property of the body alone.
+        name: name in `OBJECTIVES`, or ``module:attribute``.
+        function: takes an `Outcome`, returns one number [SI] or one for each goal, whose mean is then the objective.
+        label: name in tables and figures.
+        unit: unit in tables and figures.
+        scale: factor from SI to ``unit``.
+        maximize: whether larger is better.
+        of_body: whether it depends on the body alone, and not on its controller.
     """
 
-    key: str
+    name: str
+    function: Callable[[Outcome], Any]
     label: str
-    unit: str
-    scale: float
-    sign: int
-    per_goal: str = ""
+    unit: str = ""
+    scale: float = 1.0
+    maximize: bool = False
     of_body: bool = False
 
-    def score(self, record: Mapping[str, Any]) -> float:
-        """Score of a stored evaluation, larger is better [SI]."""
-        return self.sign * float(record[self.key])
+    @property
+    def sign(self) -> int:
+        """1 if larger is better, else -1."""
+        return 1 if self.maximize else -1
+
+    def measure(self, outcome: Outcome) -> Measurement:
+        """Return the value for one body.
+
+        Raises:
+            ValueError: if a function of your own returns something else than finite numbers, one or one per goal.
+        """
+        found = np.asarray(self.function(outcome))
+        goals = len(outcome.evaluation.distances)
+        if found.dtype.kind not in "bif" or found.shape not in ((), (goals,)):
+            raise ValueError(
+                f"objective '{self.name}' returned {found!r}; it must return one number, or one for each of {goals} "
+                "goals"
+            )
+        if self.name not in OBJECTIVES and not np.isfinite(found).all():
+            raise ValueError(
+                f"objective '{self.name}' is not finite for design {dict(outcome.design)}; raise InfeasibleDesign if "
+                "the body cannot exist"
+            )
+        return Measurement(float(found.mean()), found.astype(float).tolist() if found.ndim else None)
+
+    def score(self, value: float) -> float:
+        """Score of a value [SI]; larger is better."""
+        return self.sign * value
 
     def shown(self, score: Any) -> Any:
-        """The value of the objective behind a score, or an array of them, in ``unit``."""
+        """Value behind a score, or an array of them, in ``unit``."""
         return self.sign * score * self.scale
 
-    def text(self, score: float | None) -> str:
-        """The value of the objective behind a score, with its unit."""
-        if score is None:
+    def text(self, value: float | None, sign: str = "") -> str:
+        """A value [SI] with its unit, or ``"-"``."""
+        if value is None:
             return "-"
-        return f"{self.shown(score):.{1 if self.unit == '%' else 2}f}{' ' + self.unit if self.unit else ''}"
+        unit = "pp" if sign and self.unit == "%" else self.unit
+        return f"{value * self.scale:{sign}.{1 if self.unit == '%' else 2}f}{' ' + unit if unit else ''}"
+
+    @property
+    def axis(self) -> str:
+        """Label with the unit, for figures and columns."""
+        return f"{self.label}{f' [{self.unit}]' if self.unit else ''}"
+
+    def excess(self, value: float, limit: float) -> float:
+        """By how much a value violates a constraint [SI]; positive if it does."""
+        return self.sign * (limit - value)
+
+    def constraint_text(self, limit: float) -> str:
+        """A constraint in words: ``"mean actuator effort at most 8.00 N"``."""
+        return f"{self.label.lower()} {'at least' if self.maximize else 'at most'} {self.text(limit)}"
+
+    def violation_text(self, value: float, limit: float) -> str:
+        """A violated constraint in words: ``"mean actuator effort 8.31 N exceeds 8.00 N by 0.31 N"``."""
+        verb = "is below" if self.maximize else "exceeds"
+        return f"{self.label.lower()} {self.text(value)} {verb} {self.text(limit)} by {self.text(abs(value - limit))}"
 
 
 OBJECTIVES: dict[str, Objective] = {
-    objective.key: objective
+    objective.name: objective
     for objective in (
-        Objective("success_rate", "Success rate", "%", 100.0, 1, "successes"),
-        Objective("mean_distance", "Mean final distance", "mm", 1e3, -1, "distances"),
-        Objective("mean_return", "Mean return", "", 1.0, 1, "returns"),
-        Objective("mean_tracking_distance", "Mean tracking distance", "mm", 1e3, -1, "mean_distances"),
-        Objective("mean_effort", "Mean actuator effort", "", 1.0, -1, "efforts"),
-        Objective("material_volume", "Material volume", "cm3", 1e6, -1, of_body=True),
+        Objective("success_rate", lambda o: o.evaluation.successes, "Success rate", "%", 100.0, maximize=True),
+        Objective("mean_distance", lambda o: o.evaluation.distances, "Mean final distance", "mm", 1e3),
+        Objective("mean_return", lambda o: o.evaluation.returns, "Mean return", maximize=True),
+        Objective("mean_tracking_distance", lambda o: o.evaluation.mean_distances, "Mean tracking distance", "mm", 1e3),
+        Objective("mean_effort", lambda o: o.evaluation.efforts, "Mean actuator effort", "N"),
+        Objective("material_volume", lambda o: o.model.volume, "Material volume", "cm3", 1e6, of_body=True),
     )
 }
 """Registry: name to objective."""
 
 
-def violations(limits: Mapping[str, float], record: Mapping[str, Any]) -> list[float]:
-    """By how much an evaluation breaks each limit [SI]; not positive where it keeps it."""
-    return [-(OBJECTIVES[name].sign) * (float(record[name]) - limit) for name, limit in limits.items()]
+def find_objective(name: str, robot: Robot) -> Objective:
+    """Return an objective, with the units that it has for a robot.
+
+    Args:
+        name: name in `OBJECTIVES`, or the place of one of your own, ``module:attribute``.
+        robot: decides the unit of efforts.
+
+    Raises:
+        ValueError: if there is no such objective.
+    """
+    if ":" in name:
+        return _import_objective(name)
+    if name not in OBJECTIVES:
+        raise ValueError(f"{unknown_name('objective', name, OBJECTIVES)}, or one of your own as 'module:attribute'")
+    objective = OBJECTIVES[name]
+    if name == "mean_effort":
+        units = {EFFORT_UNITS.get(actuator.unit, (f"J/{actuator.unit}", 1.0)) for actuator in robot.actuators}
+        unit, scale = units.pop() if len(units) == 1 else ("SI units", 1.0)
+        objective = replace(objective, unit=unit, scale=scale)
+    return objective
 
 
-def rank_key(score: float, record: Mapping[str, Any]) -> tuple[float, float]:
-    """Sort key of an evaluation, larger is better; equal scores are told apart by the mean distance."""
-    return (score, -float(record["mean_distance"]))
+def _import_objective(path: str) -> Objective:
+    found = import_object("objective", path)
+    if isinstance(found, Objective):
+        return replace(found, name=path)
+    if not callable(found):
+        raise ValueError(f"objective '{path}' must be an Objective or a function, got {type(found).__name__}")
+    return Objective(path, found, path.partition(":")[2].replace("_", " ").capitalize())
+
+
+def objective_name(objective: str | Objective | Callable[[Outcome], Any]) -> str:
+    """Return the name by which worker processes find an objective: in `OBJECTIVES`, or ``module:attribute``.
+
+    Raises:
+        ValueError: if workers cannot import it, such as a lambda or a function inside another one.
+    """
+    if isinstance(objective, str):
+        return objective
+    if isinstance(objective, Objective) and OBJECTIVES.get(objective.name) is objective:
+        return objective.name
+    function = objective.function if isinstance(objective, Objective) else objective
+    module = sys.modules.get(getattr(function, "__module__", ""))
+    for attribute, value in vars(module).items() if module is not None else ():
+        if value is objective:
+            name = module.__name__ if module is not None else ""
+            if name == "__main__":  # workers import the script by its file name
+                name = Path(getattr(module, "__file__", None) or "__main__").stem
+            return f"{name}:{attribute}"
+    raise ValueError(f"objective {objective!r} cannot be imported by workers: define it at the top level of a module")

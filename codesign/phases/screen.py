@@ -1,64 +1,63 @@
-"""The screen: many bodies scored cheaply by the inverse QP before any training."""
+"""Screen: the inverse QP scores many bodies cheaply before the trials."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from codesign.folder import StudyFolder
-from codesign.objectives import OBJECTIVES, rank_key
 from codesign.phases.trial import assess
-from codesign.scheduling.jobs import Job
-from softgym_envs.storage import read_json
-
-__all__ = ["candidates", "kept_bodies", "screen_jobs", "screen_records"]
+from codesign.records import Job, ScreenResult
+from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 
 def candidates(folder: StudyFolder) -> list[dict[str, float]]:
-    """Values of the optimised variables [SI], spread over the box by a Latin hypercube."""
+    """Return values of the optimised variables [SI], spread over their box by a Latin hypercube."""
     from scipy.stats import qmc
 
-    config, space = folder.config, folder.config.space
+    config = folder.config
     if not config.screen.enabled:
         return []
-    hypercube = qmc.LatinHypercube(len(config.variables), rng=np.random.default_rng(config.sampler.seed))
+    variables = config.optimised
+    hypercube = qmc.LatinHypercube(len(variables), rng=np.random.default_rng(config.sampler.seed))
     points = 2.0 * hypercube.random(config.screen.candidates) - 1.0
     return [
-        {name: float(space[name].from_unit(value)) for name, value in zip(config.variables, point, strict=True)}
+        {
+            name: float(variable.from_unit(value))
+            for (name, variable), value in zip(variables.items(), point, strict=True)
+        }
         for point in points
     ]
 
 
 def screen_jobs(folder: StudyFolder) -> list[Job]:
-    """One job per candidate."""
+    """Return one job per candidate."""
     config = folder.config
 
-    def make(values: dict[str, float]) -> dict[str, Any]:
-        design = dict(config.space.complete(values, config.baseline))
+    def make(index: int, values: dict[str, float]) -> ScreenResult:
+        design, options = config.body(values)
         goals = folder.goals["selection"][: config.screen.goals]
-        return {"values": values, "qp": assess("qp", config.environment, goals, design)}
+        try:
+            found = assess("qp", config, config.environment_of(options), goals, design)
+        except (InfeasibleDesign, ConvergenceError) as error:
+            return ScreenResult(index, values, error=str(error))
+        score = config.primary.score(found.values[config.objective])
+        return ScreenResult(index, values, found.evaluation, score)
 
     return [
-        Job(folder.path / "screen" / f"{index:03d}.json", partial(make, values))
+        Job(folder.path / "screen" / f"{index:03d}.json", partial(make, index, values))
         for index, values in enumerate(candidates(folder))
     ]
 
 
-def screen_records(folder: StudyFolder) -> list[dict[str, Any]]:
-    """What is known of the candidates, in order, each with its ``index`` and its ``score`` (None: infeasible)."""
-    objective = OBJECTIVES[folder.config.objective]
-    records = []
-    for path in sorted((folder.path / "screen").glob("[0-9]*.json")):
-        record = read_json(path)
-        score = None if "error" in record["qp"] else objective.score(record["qp"])
-        records.append({"index": int(path.stem), "score": score, **record})
-    return records
-
-
 def kept_bodies(folder: StudyFolder) -> list[tuple[str, dict[str, float]]]:
-    """Origin and values of the candidates that become trials, best first."""
-    feasible = [record for record in screen_records(folder) if record["score"] is not None]
-    feasible.sort(key=lambda record: rank_key(record["score"], record["qp"]), reverse=True)
-    return [(f"screen {record['index']}", record["values"]) for record in feasible[: folder.config.screen.kept]]
+    """Return origin and values of the candidates that become trials, best first."""
+
+    def key(result: ScreenResult) -> tuple[float, float]:
+        assert result.score is not None and result.evaluation is not None
+        return result.score, -result.evaluation.mean_distance
+
+    results = (ScreenResult.read(path) for path in sorted(folder.path.glob("screen/[0-9]*.json")))
+    feasible = sorted((result for result in results if result.score is not None), key=key, reverse=True)
+    return [(f"screen {result.index}", result.values) for result in feasible[: folder.config.screen.kept]]

@@ -1,7 +1,7 @@
-"""The judge of strategies whose trials train nothing: one policy that sees the body, the same for all of them.
+"""Shared policy: it observes the body and scores every design when trials do not train.
 
 It is given (strategy ``"policy"``), or trained together with the bodies before the first trial (``"critic"``,
-``"distribution"``; see `agents.joint`). Its most promising bodies then become trials.
+``"distribution"``; see `agents.joint`). The most promising bodies of that training then become trials.
 """
 
 from __future__ import annotations
@@ -13,45 +13,40 @@ from typing import Any
 from agents.config import TrainConfig
 from agents.joint import PROPOSERS
 from agents.policy import policy_path
+from agents.training import cpu_before, train
 from codesign.config import StudyConfig
-from codesign.folder import StudyFolder
-from codesign.scheduling.jobs import Job
+from codesign.folder import SHARED_POLICY, SHARED_POLICY_RECORD, StudyFolder
+from codesign.records import Job, SharedPolicy
 from softgym_envs.storage import atomic_write, read_json
 
-__all__ = ["JUDGE", "joint_config", "judge_jobs", "judge_policy", "promising_bodies"]
 
-JUDGE = "judge/policy.safetensors"
-"""The judge, relative to the folder of a study."""
-
-
-def judge_jobs(folder: StudyFolder) -> list[Job]:
-    """The job that makes the judge, or none where the strategy needs none."""
-    config = folder.config
-    if not config.plan.judges:
+def shared_policy_jobs(folder: StudyFolder) -> list[Job]:
+    """Return the job that makes the shared policy; none if the strategy needs no shared policy."""
+    if not folder.config.plan.shares_policy:
         return []
-    return [Job(folder.path / "judge" / "judge.json", lambda: _make(folder))]
+    return [Job(folder.path / SHARED_POLICY_RECORD, lambda: _make(folder))]
 
 
-def judge_policy(folder: StudyFolder) -> Path:
-    """The file of the judge, wherever it was made.
+def shared_policy(folder: StudyFolder) -> Path:
+    """Return the file of the shared policy; one made on another machine is copied.
 
     Raises:
         DataError: if there is none.
     """
-    return folder.policy(JUDGE)
+    return folder.policy(SHARED_POLICY)
 
 
 def promising_bodies(folder: StudyFolder) -> list[tuple[str, dict[str, float]]]:
-    """Origin and values [SI] of the bodies that joint training found best."""
-    path = folder.path / "judge" / "judge.json"
+    """Return origin and values [SI] of the bodies that joint training found best."""
+    path = folder.path / SHARED_POLICY_RECORD
     if folder.config.plan.proposer is None or not path.exists():
         return []
-    bodies = read_json(path)["bodies"][: folder.config.joint.keep]
+    bodies = SharedPolicy.read(path).bodies[: folder.config.joint.keep]
     return [(f"joint {index}", values) for index, values in enumerate(bodies)]
 
 
 def joint_config(folder: StudyFolder) -> TrainConfig:
-    """Configuration of the joint training, on the training goals of the study."""
+    """Return the configuration of the joint training, on the training goals of the study."""
     config = folder.config
     update: dict[str, Any] = {"design": dict(config.baseline), "sample_design": list(config.variables)}
     if len(goals := folder.goals["training"]):
@@ -61,53 +56,40 @@ def joint_config(folder: StudyFolder) -> TrainConfig:
 
 
 def _report_steps(config: StudyConfig) -> int:
-    """Environment steps of the points of the learning curve of joint training."""
+    """Return the environment steps of the points of the learning curve of joint training."""
     joint = config.joint
     points = -(-joint.steps // joint.report_every)
     return points * joint.evaluation_episodes * config.episode_steps
 
 
-def _make(folder: StudyFolder) -> dict[str, Any]:
-    """Train or copy the judge; what is told of it is a job's result."""
+def _make(folder: StudyFolder) -> SharedPolicy:
+    """Train or copy the shared policy."""
     config = folder.config
     started, cpu = time.perf_counter(), time.process_time()
-    bodies: list[dict[str, float]] = []
-    steps, before = 0, 0.0
+    record = SharedPolicy(SHARED_POLICY)
+    before = 0.0
     if config.plan.proposer is None:
-        assert config.policy is not None  # the configuration was checked
+        assert config.policy is not None  # checked by the configuration
         source = policy_path(config.policy)
     else:
-        from agents.training import cpu_before, train
-
-        training = folder.path / "judge" / "training"
+        training = folder.path / "shared_policy" / "training"
         options: dict[str, Any] = dict(config.joint.options)
-        source = train(
-            joint_config(folder), training, proposer=PROPOSERS[config.plan.proposer](**options), progress=False
-        )
+        proposer = PROPOSERS[config.plan.proposer](**options)
+        source = train(joint_config(folder), training, proposer=proposer, progress=False)
         before = cpu_before(source, cpu)
         found = read_json(training / "bodies.json")
         space = config.space
-        bodies = [
+        record.bodies = [
             {name: float(space[name].from_unit(value)) for name, value in zip(found["names"], body, strict=True)}
             for body in found["bodies"]
         ]
-        steps = config.joint.steps
-    files = {
-        name: path.read_bytes()
-        for name, path in (
-            (JUDGE, source),
-            (Path(JUDGE).with_suffix(".json").as_posix(), source.with_suffix(".json")),
-        )
-    }
+        record.training_steps, record.report_steps = config.joint.steps, _report_steps(config)
+    card = Path(SHARED_POLICY).with_suffix(".json").as_posix()
+    files = {SHARED_POLICY: source.read_bytes(), card: source.with_suffix(".json").read_bytes()}
     for name, content in files.items():
         with atomic_write(folder.path / name) as stream:
             stream.write(content)
     folder.open_storage().publish(files)
-    return {
-        "policy": JUDGE,
-        "bodies": bodies,
-        "training_steps": steps,
-        "report_steps": _report_steps(config) if steps else 0,
-        "seconds": time.perf_counter() - started,
-        "cpu_seconds": before + time.process_time() - cpu,
-    }
+    record.seconds = time.perf_counter() - started
+    record.cpu_seconds = before + time.process_time() - cpu
+    return record

@@ -5,81 +5,68 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from agents.config import EnvironmentConfig, TrainConfig
+from agents.evaluation import Evaluation, evaluate
+from agents.training import cpu_before, train
 from codesign.config import StudyConfig
-from codesign.folder import StudyFolder
-from codesign.objectives import OBJECTIVES, Objective, violations
-from codesign.phases.shared_policy import JUDGE, judge_policy
+from codesign.folder import SHARED_POLICY, StudyFolder
+from codesign.objectives import Objective, Outcome
+from codesign.phases.shared_policy import shared_policy
+from codesign.records import Assessment, TrialResult
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
-from softgym_envs.storage import read_json, write_json
+from softgym_envs.storage import read_json
 
 if TYPE_CHECKING:
     import optuna
 
-    from agents.evaluation import Evaluation
-
-__all__ = ["assess", "merge", "run_trial", "training_config"]
-
-PIECES = 4
-"""Into so many parts, of at most eight goals, the goals of a trial that trains nothing are divided; after each the
-pruner is asked."""
+GOAL_BATCHES = 4
+"""Number of parts, of at most eight goals each, after which the pruner may stop a trial that does not train."""
 
 
 def assess(
     agent: str | Path,
+    config: StudyConfig,
     environment: EnvironmentConfig,
     goals: np.ndarray,
     design: Mapping[str, float],
-) -> dict[str, Any]:
-    """Evaluate an agent on a body.
+) -> Assessment:
+    """Evaluate an agent on a body, and measure the objectives of a study.
 
     Args:
         agent: ``"qp"``, ``"random"`` or a policy file.
-        environment: environment of the trials.
+        config: names the objectives.
+        environment: where to evaluate.
         goals: goals [m], shape (k, p, 3).
         design: complete design [SI].
 
-    Returns:
-        The evaluation as plain data [SI], with its cost, or only ``"error"`` if the body cannot be simulated.
+    Raises:
+        InfeasibleDesign: if the body cannot exist.
+        ConvergenceError: if it cannot be simulated.
     """
-    from agents.evaluation import evaluate
-
-    started, cpu = time.perf_counter(), time.process_time()
-    try:
-        evaluation = evaluate(agent, environment, goals, design=dict(design), seed=0)
-    except (InfeasibleDesign, ConvergenceError) as error:
-        return {"error": str(error)}
-    return {
-        "success_rate": float(evaluation.success_rate),
-        "mean_distance": float(evaluation.mean_distance),
-        "worst_distance": float(evaluation.worst_distance),
-        "mean_return": float(evaluation.mean_return),
-        "distances": np.asarray(evaluation.distances, dtype=float).tolist(),
-        "returns": np.asarray(evaluation.returns, dtype=float).tolist(),
-        "mean_distances": np.asarray(evaluation.mean_distances, dtype=float).tolist(),
-        "efforts": np.asarray(evaluation.efforts, dtype=float).tolist(),
-        "successes": np.asarray(evaluation.successes, dtype=bool).tolist(),
-        "mean_tracking_distance": float(evaluation.mean_distances.mean()),
-        "mean_effort": float(evaluation.efforts.mean()),
-        "steps": int(evaluation.steps),
-        "seconds": time.perf_counter() - started,
-        "cpu_seconds": time.process_time() - cpu,
-    }
+    evaluation = evaluate(agent, environment, goals, design=dict(design), seed=0)
+    return _measured(config, environment, evaluation, design)
 
 
-def training_config(folder: StudyFolder, design: Mapping[str, float]) -> TrainConfig:
-    """Configuration of the training of one body, on the training goals of the study."""
+def _measured(
+    config: StudyConfig, environment: EnvironmentConfig, evaluation: Evaluation, design: Mapping[str, float]
+) -> Assessment:
+    outcome = Outcome(evaluation, design, environment.make_robot())
+    return Assessment(evaluation, {name: each.measure(outcome) for name, each in config.objectives.items()})
+
+
+def training_config(folder: StudyFolder, design: Mapping[str, float], options: Mapping[str, float]) -> TrainConfig:
+    """Return the configuration for training on one body and the training goals of the study."""
     config, goals = folder.config, folder.goals["training"]
-    update: dict[str, Any] = {"design": dict(design), "sample_design": False}
-    if len(goals):
-        update["task_options"] = {**config.environment.task_options, "goals": goals.tolist()}
-    training = config.training
+    environment, training = config.environment_of(options), config.training
+    task_options = {**environment.task_options, **({"goals": goals.tolist()} if len(goals) else {})}
     return TrainConfig(
-        environment=config.environment.model_copy(update=update),
+        environment=environment.model_copy(
+            update={"design": dict(design), "sample_design": False, "task_options": task_options}
+        ),
         sac=training.sac,
         steps=training.steps,
         num_envs=training.num_envs,
@@ -89,177 +76,175 @@ def training_config(folder: StudyFolder, design: Mapping[str, float]) -> TrainCo
     )
 
 
-def merge(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """One evaluation from those of parts of its goals."""
-    counts = [len(part["distances"]) for part in parts]
-    merged: dict[str, Any] = {}
-    for key in parts[0]:
-        values = [part[key] for part in parts]
-        if key == "worst_distance":
-            merged[key] = max(values)
-        elif isinstance(values[0], list):
-            merged[key] = [value for part in values for value in part]
-        elif key in ("steps", "seconds", "cpu_seconds"):
-            merged[key] = sum(values)
-        else:
-            merged[key] = float(np.average(values, weights=counts))
-    return merged
+def run_trial(folder: StudyFolder, trial: optuna.Trial) -> TrialResult:
+    """Run a claimed trial; write its ``result.json`` and return it.
 
-
-def _assess_by_goals(
-    folder: StudyFolder, trial: optuna.Trial, agent: str | Path, design: Mapping[str, float]
-) -> tuple[dict[str, Any], bool]:
-    """Evaluate an agent on a body, a few goals at a time, until the pruner has seen enough.
-
-    Returns:
-        The evaluation of the goals so far, and whether the pruner stopped it.
+    Only `InfeasibleDesign` and `ConvergenceError` make a body infeasible; other exceptions are bugs.
     """
-    config, goals = folder.config, folder.goals["selection"]
-    if config.pruner.name == "none":
-        return assess(agent, config.environment, goals, design), False
-    objective = OBJECTIVES[config.objective]
-    parts: list[dict[str, Any]] = []
-    piece = min(8, max(1, len(goals) // PIECES))
-    known = set(trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values)
-    for start in range(0, len(goals), piece):
-        part = assess(agent, config.environment, goals[start : start + piece], design)
-        if "error" in part:
-            return part, False
-        parts.append(part)
-        for k, value in enumerate(part[objective.per_goal]):
-            if start + k not in known:
-                trial.report(objective.sign * float(value), start + k)
-        if trial.user_attrs.get("origin") != "baseline" and start + piece < len(goals) and trial.should_prune():
-            return merge(parts), True
-    return merge(parts), False
-
-
-class _Reporter:
-    """Passes learning progress on to the pruner, and keeps the learning curve."""
-
-    def __init__(self, trial: optuna.Trial, objective: Objective) -> None:
-        self.trial = trial
-        self.objective = objective
-        self.curve: dict[int, float] = dict(trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values)
-        self.pruned = False
-        # Everything is compared with the baseline, so it is always trained to the end.
-        self.prunable = trial.user_attrs.get("origin") != "baseline"
-
-    def __call__(self, step: int, outcome: Evaluation) -> bool:
-        value = self.objective.score(outcome.to_json())
-        if step not in self.curve and np.isfinite(value):
-            self.curve[step] = float(value)
-            self.trial.report(float(value), step)
-        self.pruned = self.prunable and self.trial.should_prune()
-        return self.pruned
-
-
-def run_trial(folder: StudyFolder, trial: optuna.Trial) -> dict[str, Any]:
-    """Run a claimed trial, write its ``result.json`` and return it.
-
-    Returns:
-        ``state`` is ``"complete"``, ``"pruned"`` or ``"infeasible"``; ``score`` is larger for better bodies;
-        ``evaluation`` is that of the trial's controller, ``qp`` that of the inverse QP, on the selection goals.
-    """
-    config = folder.config
-    design = dict(config.space.complete(trial.params, config.baseline))
-    goals = folder.goals["selection"]
     started, cpu = time.perf_counter(), time.process_time()
-    result: dict[str, Any] = {
-        "number": trial.number,
-        "origin": trial.user_attrs["origin"],
-        "sampler_seed": trial.user_attrs.get("sampler_seed"),
-        "process": trial.user_attrs["process"],
-        "design": design,
-        "state": "complete",
-        "score": None,
-        "scores": None,
-        "violations": None,
-        "reason": None,
-        "agent": "qp",
-        "evaluation": None,
-        "qp": None,
-        "curve": [],
-        "training_steps": 0,
-        "cpu_seconds": 0.0,  # of earlier processes
-    }
-    evaluation: dict[str, Any] | None
+    result = _new_result(folder, trial)
     try:
-        if config.strategy == "qp":
-            result["qp"] = evaluation = _judged(folder, trial, "qp", result)
-        else:
-            result["qp"] = assess("qp", config.environment, goals, design)
-            if "error" in result["qp"]:
-                raise InfeasibleDesign(result["qp"]["error"])
-            if config.plan.trains:
-                evaluation = _train_and_assess(folder, trial, result)
-            else:
-                result["agent"] = JUDGE
-                evaluation = _judged(folder, trial, judge_policy(folder), result)
-        if evaluation is not None:
-            _score(config, evaluation, result)
-            for name, value in zip(config.limits, result["violations"] or (), strict=False):
-                trial.set_constraint(name, value)
+        _Runner(folder, trial, result).run()
     except (InfeasibleDesign, ConvergenceError) as error:
-        result.update(state="infeasible", reason=str(error))
-        result["qp"] = result["qp"] or {"error": str(error)}
-    if result["scores"] is not None and not np.isfinite(result["scores"]).all():
-        result.update(state="infeasible", reason=f"the scores are {result['scores']}", score=None, scores=None)
-    result["cpu_seconds"] += time.process_time() - cpu
-    result.update(seconds=time.perf_counter() - started, finished_at=time.time())
-    write_json(folder.trial(trial.number) / "result.json", result)
+        result.state, result.reason = "infeasible", str(error)
+    if result.scores is not None and not np.isfinite(result.scores).all():
+        result.state, result.reason = "infeasible", f"the scores are not finite: {result.scores}"
+        result.scores = None
+    result.cpu_seconds += time.process_time() - cpu
+    result.seconds, result.finished_at = time.perf_counter() - started, time.time()
+    result.write(folder.trial(trial.number) / "result.json")
     return result
 
 
-def _judged(folder: StudyFolder, trial: optuna.Trial, agent: str | Path, result: dict[str, Any]) -> dict[str, Any]:
-    """Evaluate an agent that is the same for all bodies; ``result`` tells if the pruner stopped it."""
-    evaluation, pruned = _assess_by_goals(folder, trial, agent, result["design"])
-    if "error" in evaluation:
-        raise InfeasibleDesign(evaluation["error"])
-    if pruned:
-        seen, count = len(evaluation["distances"]), len(folder.goals["selection"])
-        result.update(state="pruned", reason=f"stopped by the pruner after {seen} of {count} goals")
-    return evaluation
+def give_up(folder: StudyFolder, trial: optuna.Trial) -> TrialResult:
+    """Write and return the result of a body whose evaluation crashed too many workers; see `run_trial`."""
+    result = _new_result(folder, trial)
+    result.state, result.reason = "infeasible", f"evaluation crashed {folder.config.attempts} workers"
+    result.finished_at = time.time()
+    result.write(folder.trial(trial.number) / "result.json")
+    return result
 
 
-def _score(config: StudyConfig, evaluation: dict[str, Any], result: dict[str, Any]) -> None:
-    """Enter an evaluation, with what it says of the objectives and the limits."""
-    if "material_volume" in (config.objective, *config.also, *config.limits):
-        evaluation["material_volume"] = config.robot.build(result["design"]).volume
-    result["evaluation"] = evaluation
-    if result["state"] == "complete":
-        scores = [OBJECTIVES[name].score(evaluation) for name in (config.objective, *config.also)]
-        result.update(score=scores[0], scores=scores, violations=violations(config.limits, evaluation))
-
-
-def _train_and_assess(folder: StudyFolder, trial: optuna.Trial, result: dict[str, Any]) -> dict[str, Any] | None:
-    """Train the controller of a body and evaluate it; None if the pruner stopped it."""
-    from agents.training import cpu_before, train
-
-    config = folder.config
-    reporter = _Reporter(trial, OBJECTIVES[config.objective])
-    cpu = time.process_time()
-    policy = train(
-        training_config(folder, result["design"]),
-        folder.trial(trial.number),
-        initial=config.policy,
-        report=reporter,
-        progress=False,
+def _new_result(folder: StudyFolder, trial: optuna.Trial) -> TrialResult:
+    design, options = folder.config.body(trial.params)
+    attributes = trial.user_attrs
+    return TrialResult(
+        number=trial.number,
+        origin=attributes["origin"],
+        process=attributes["process"],
+        design=design,
+        options=options,
+        sampler_seed=attributes.get("sampler_seed"),
     )
-    before = cpu_before(policy, cpu)
-    # A trial that goes on after its worker died may have been stopped before.
-    pruned = reporter.pruned or read_json(policy.with_suffix(".json"))["stopped_early"]
-    steps = max(reporter.curve, default=0) if pruned else config.training.steps
-    result.update(
-        agent=Path(policy).resolve().relative_to(folder.path).as_posix(),
-        curve=[[step, value] for step, value in sorted(reporter.curve.items())],
-        training_steps=steps,
-        cpu_seconds=before,
-    )
-    if pruned:
-        result.update(state="pruned", reason=f"stopped by the pruner after {steps} steps")
+
+
+class _Runner:
+    """Runs one trial and fills its result."""
+
+    def __init__(self, folder: StudyFolder, trial: optuna.Trial, result: TrialResult) -> None:
+        self.folder = folder
+        self.config = folder.config
+        self.trial = trial
+        self.result = result
+        self.environment = self.config.environment_of(result.options)
+        self.goals = folder.goals["selection"]
+        # Everything is compared with the baseline, so it always runs to the end.
+        self.prunable = result.origin != "baseline"
+
+    def run(self) -> None:
+        """Evaluate the body by the strategy of the study."""
+        result, config = self.result, self.config
+        if config.strategy == "qp":
+            assessment = self._assess_by_goals("qp")
+            self._keep_qp(assessment)
+        else:
+            self._keep_qp(self._assess("qp", self.goals))
+            if config.plan.trains:
+                policy = self._train()
+                if policy is None:
+                    return
+                assessment = self._assess(policy, self.goals)
+            else:
+                result.controller = SHARED_POLICY
+                assessment = self._assess_by_goals(shared_policy(self.folder))
+        self._score(assessment)
+
+    def _assess(self, agent: str | Path, goals: np.ndarray) -> Assessment:
+        return assess(agent, self.config, self.environment, goals, self.result.design)
+
+    def _keep_qp(self, assessment: Assessment) -> None:
+        self.result.qp = assessment.evaluation
+        self.result.qp_value = assessment.values[self.config.objective]
+
+    def _score(self, assessment: Assessment) -> None:
+        """Record an evaluation, and for a complete trial its scores and violations."""
+        config, result = self.config, self.result
+        result.evaluation, result.values = assessment.evaluation, assessment.values
+        if result.state != "complete":
+            return
+        objectives = config.objectives
+        names = (config.objective, *config.secondary_objectives)
+        result.scores = [objectives[name].score(result.values[name]) for name in names]
+        for name, limit in config.constraints.items():
+            result.violations[name] = objectives[name].excess(result.values[name], limit)
+            self.trial.set_constraint(name, result.violations[name])
+
+    def _assess_by_goals(self, agent: str | Path) -> Assessment:
+        """Evaluate an agent a few goals at a time, until the pruner stops the trial."""
+        if self.config.pruner.name == "none":
+            return self._assess(agent, self.goals)
+        objective, trial, count = self.config.primary, self.trial, len(self.goals)
+        parts: list[Evaluation] = []
+        batch = min(8, max(1, count // GOAL_BATCHES))
+        known = set(trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values)
+        for start in range(0, count, batch):
+            part = self._assess(agent, self.goals[start : start + batch])
+            parts.append(part.evaluation)
+            values = part.measurements[objective.name].per_goal
+            if values is None:
+                raise ValueError(
+                    f"objective '{objective.name}' returns one number, but pruner '{self.config.pruner.name}' needs "
+                    "one for each goal"
+                )
+            for k, value in enumerate(values):
+                if start + k not in known:
+                    trial.report(objective.score(value), start + k)
+            if self.prunable and start + batch < count and trial.should_prune():
+                seen = start + len(values)
+                self.result.state = "pruned"
+                self.result.reason = f"stopped by the pruner after {seen} of {count} goals"
+                break
+        return _measured(self.config, self.environment, Evaluation.merge(parts), self.result.design)
+
+    def _train(self) -> Path | None:
+        """Train the policy of the body; None if the pruner stopped the training."""
+        config, result = self.config, self.result
+        reporter = _Reporter(self.trial, config.primary, result, self.environment, prunable=self.prunable)
+        cpu = time.process_time()
+        policy = train(
+            training_config(self.folder, result.design, result.options),
+            self.folder.trial(result.number),
+            initial=config.policy,
+            report=reporter,
+            progress=False,
+        )
+        result.cpu_seconds = cpu_before(policy, cpu)
+        # A trial that continues after its worker died may have been stopped before.
+        pruned = reporter.pruned or read_json(policy.with_suffix(".json"))["stopped_early"]
+        result.controller = Path(policy).resolve().relative_to(self.folder.path).as_posix()
+        result.curve = [[step, value] for step, value in sorted(reporter.curve.items())]
+        result.training_steps = max(reporter.curve, default=0) if pruned else config.training.steps
+        if not pruned:
+            return policy
+        result.state, result.reason = "pruned", f"stopped by the pruner after {result.training_steps} steps"
         return None
-    evaluation = assess(policy, config.environment, folder.goals["selection"], result["design"])
-    if "error" in evaluation:
-        raise ConvergenceError(evaluation["error"])
-    return evaluation
+
+
+class _Reporter:
+    """Reports the progress of a training to the pruner, and keeps the learning curve."""
+
+    def __init__(
+        self,
+        trial: optuna.Trial,
+        objective: Objective,
+        result: TrialResult,
+        environment: EnvironmentConfig,
+        *,
+        prunable: bool,
+    ) -> None:
+        self.trial = trial
+        self.objective = objective
+        self.design = result.design
+        self.robot = environment.make_robot()
+        self.curve: dict[int, float] = dict(trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values)
+        self.pruned = False
+        self.prunable = prunable
+
+    def __call__(self, step: int, evaluation: Evaluation) -> bool:
+        """Report an evaluation; return whether the training should stop."""
+        value = self.objective.score(self.objective.measure(Outcome(evaluation, self.design, self.robot)).value)
+        if step not in self.curve and np.isfinite(value):
+            self.curve[step] = value
+            self.trial.report(value, step)
+        self.pruned = self.prunable and self.trial.should_prune()
+        return self.pruned

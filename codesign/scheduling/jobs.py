@@ -1,38 +1,21 @@
-"""Jobs that several processes share: each is one file, made by whoever gets to it first."""
+"""Jobs that several processes share: each makes one file, and runs in the first process that gets to it."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable
 
 from codesign.folder import StudyFolder
+from codesign.records import Job
 from softgym_envs.storage import write_json
 
-__all__ = ["Job", "missing_jobs", "run_jobs"]
-
 POLL = 0.5
-"""Time between two looks at jobs that are all in other hands [s]."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """One result file and how to make it.
-
-    Args:
-        path: the JSON file.
-        make: returns its content.
-    """
-
-    path: Path
-    make: Callable[[], dict[str, Any]]
+"""Time between two looks at jobs that other processes are running [s]."""
 
 
 def missing_jobs(folder: StudyFolder, jobs: Iterable[Job]) -> list[Job]:
-    """Jobs that nobody has done; what was done on other machines is copied into the folder."""
+    """Return the jobs that nobody has done; files made on other machines are copied into the folder."""
     missing = [job for job in jobs if not job.path.exists()]
     if missing:
         storage = folder.open_storage()
@@ -42,10 +25,10 @@ def missing_jobs(folder: StudyFolder, jobs: Iterable[Job]) -> list[Job]:
     return [job for job in missing if not job.path.exists()]
 
 
-def run_jobs(folder: StudyFolder, jobs: Iterable[Job]) -> None:
-    """Do every job that is not done yet; when this returns all are, here or by another process.
+def run_pending(folder: StudyFolder, jobs: Iterable[Job]) -> None:
+    """Run every job that is not done yet; return when all are done, here or in another process.
 
-    First those that no other process is at, then, where one was stopped, what it left.
+    Free jobs come first; a job whose process stopped is taken over after them.
     """
     storage = folder.open_storage()
     missing = list(jobs)
@@ -56,13 +39,14 @@ def run_jobs(folder: StudyFolder, jobs: Iterable[Job]) -> None:
             if job.path.exists():
                 continue
             with storage.attempt(name) as mine:
-                if (content := storage.fetch(name)) is not None:  # it is done, and perhaps elsewhere
+                if (content := storage.fetch(name)) is not None:  # done, perhaps on another machine
                     if not job.path.exists():
                         write_json(job.path, json.loads(content))
                 elif mine:
-                    made = job.make()
+                    made = job.make().to_json()
                     storage.publish({name: json.dumps(made).encode()})
-                    first = storage.fetch(name)  # of two that did it, where a restart of the server let them
+                    # After a restart of the server two processes may have run the job: the first result counts.
+                    first = storage.fetch(name)
                     write_json(job.path, made if first is None else json.loads(first))
                 else:
                     busy.append(job)

@@ -1,11 +1,11 @@
-"""The trials of a study in a PostgreSQL database that many machines share.
+"""Storage of a study in a PostgreSQL database that many machines share.
 
-What must happen as one is one transaction of the database, Optuna's own writes included: it takes place whole, or not
-at all when a worker, the network or the server goes away under it, and then it is done again. Such transactions follow
-one another, by an advisory lock that ends with them.
+Everything that belongs together is one transaction, Optuna's own writes included. If the worker, the network or the
+server fails, the transaction has no effect and runs again. An advisory lock lets transactions run one after another.
 
-A worker gives signs of life by the clock of the server. It counts as dead after ``grace`` seconds without one, of which
-those do not count in which the server was down. One that comes back later finds its trial taken, and drops its result.
+Workers send heartbeats, timed by the clock of the server. A worker counts as dead after ``grace`` seconds without one;
+time during which the server was down does not count. If such a worker comes back, it finds its trial reassigned and
+drops its result.
 """
 
 from __future__ import annotations
@@ -20,24 +20,22 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from codesign.scheduling.storage import StudyStorage
+from codesign.scheduling.storage import SharedStorage
 from softgym_envs.errors import ConfigError, SoftGymError
 
 if TYPE_CHECKING:
     import optuna
-    from sqlalchemy.engine import Connection
-
-__all__ = ["PostgresStorage"]
+    from sqlalchemy.engine import Connection, Engine
 
 T = TypeVar("T")
 
-ATTEMPTS = 20
-"""Times that one action is begun; a server that is away is one of them, however long it is."""
+MAX_TRIES = 20
+"""Number of times that one action is tried; waiting for a server that is down counts as one."""
 
 IDLE_LIMIT = 60.0
-"""A machine that stops inside a transaction keeps the others out no longer than this [s]."""
+"""Time after which the server ends the transaction of a machine that stopped inside it [s]."""
 
-# A lost peer is told by either side within half a minute, and clocks read alike everywhere.
+# Either side notices a lost peer within half a minute; all machines read times in the same time zone.
 CONNECTION = {
     "connect_timeout": 10,
     "keepalives_idle": 10,
@@ -56,7 +54,7 @@ CREATE TABLE IF NOT EXISTS codesign_files (
     PRIMARY KEY (study_id, path)
 );
 """
-SIGN = """
+HEARTBEAT = """
 INSERT INTO codesign_workers VALUES (:worker, clock_timestamp())
 ON CONFLICT (worker) DO UPDATE SET seen = clock_timestamp()
 """
@@ -64,7 +62,7 @@ LIVES = """
 SELECT clock_timestamp() - greatest(seen, pg_postmaster_start_time()) < make_interval(secs => :grace)
 FROM codesign_workers WHERE worker = :worker
 """
-# Who is killed at the same instant gave the last sign up to a sixth of the grace earlier or later.
+# Processes that were killed at the same instant sent their last heartbeats up to a sixth of the grace apart.
 OUTLIVED = """
 SELECT clock_timestamp() - greatest(call.seen, pg_postmaster_start_time()) < make_interval(secs => :grace)
     AND (worker.seen IS NULL OR call.seen > worker.seen + make_interval(secs => :grace / 3))
@@ -75,27 +73,29 @@ PUBLISH = """
 INSERT INTO codesign_files SELECT study_id, :path, :content FROM studies WHERE study_name = :study
 ON CONFLICT DO NOTHING
 """
+HAS_FILES = """
+SELECT EXISTS (SELECT FROM codesign_files JOIN studies USING (study_id)
+               WHERE study_name = :study AND path LIKE :pattern)
+"""
 FETCH = "SELECT content FROM codesign_files JOIN studies USING (study_id) WHERE study_name = :study AND path = :path"
 
 
-class PostgresStorage(StudyStorage):
+class PostgresStorage(SharedStorage):
     """A study in a PostgreSQL database.
 
-    Beside the tables of Optuna it has two: signs of life of the workers, and files (policies, results of jobs). So the
-    database is all that machines need to have in common, and whatever it tells of is there.
+    Besides Optuna's tables the database has two: heartbeats of the workers, and files (policies, results of jobs). The
+    database is all that the machines need to have in common.
 
     Args:
         address: ``postgresql://user@host:port/database``; the password comes from ``~/.pgpass`` or ``PGPASSWORD``.
         study: name of the study.
-        grace: time without a sign of life after which a worker counts as dead [s].
-        patience: how long a server that went away is waited for [s].
-        wait: whether to wait for it from the start.
+        grace: time without a heartbeat after which a worker counts as dead [s].
+        patience: how long to wait for a server that does not answer [s].
+        wait: whether to wait for the server when the storage is opened.
 
     Raises:
         ConfigError: if the database cannot be opened.
     """
-
-    shared = True
 
     def __init__(
         self, address: str, study: str, *, grace: float = 60.0, patience: float = 600.0, wait: bool = False
@@ -104,7 +104,7 @@ class PostgresStorage(StudyStorage):
         from optuna.exceptions import OptunaError
 
         try:
-            import psycopg  # noqa: F401 - asked for here to name the extra that has it
+            import psycopg  # noqa: F401 - imported here to name the extra that installs it
         except ImportError as error:
             raise ConfigError(
                 f"storage '{address}' needs psycopg ({error}): pip install 'softgym-envs[postgres]'"
@@ -114,7 +114,7 @@ class PostgresStorage(StudyStorage):
         self.grace = grace
         self.patience = patience
         self._url = sql.engine.make_url(address).set(drivername="postgresql+psycopg").render_as_string()
-        # Hundreds of workers that train hold no connections.
+        # Workers hold no connection while they train: there may be hundreds.
         self._options = {"poolclass": sql.NullPool, "connect_args": CONNECTION}
         self._engine = sql.create_engine(self._url, **self._options)
         self._cache: optuna.storages.BaseStorage | None = None
@@ -128,7 +128,7 @@ class PostgresStorage(StudyStorage):
         from sqlalchemy import text
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        with self._engine.begin() as connection:  # two machines may come to an empty database at once
+        with self._engine.begin() as connection:  # two machines may find an empty database at the same time
             self._lock(connection, "tables")
             storage = optuna.storages.RDBStorage(self._url, engine_kwargs=self._options)
             connection.execute(text(TABLES))
@@ -148,28 +148,31 @@ class PostgresStorage(StudyStorage):
         return self.patiently(lambda: self._transaction(action))
 
     def _transaction(self, action: Callable[[], T]) -> T:
-        from sqlalchemy import orm, text
+        from sqlalchemy import text
 
         done = False
-        sessions = self._storage.scoped_session
         try:
             with self._engine.begin() as connection:
                 connection.execute(text(f"SET LOCAL idle_in_transaction_session_timeout = '{IDLE_LIMIT:g}s'"))
                 self._lock(connection, f"study {self.study}")
-                # What Optuna commits in here are parts of this transaction.
-                factory = orm.sessionmaker(bind=connection, join_transaction_mode="create_savepoint")
-                self._storage.scoped_session = orm.scoped_session(factory)
+                # Optuna's commits become savepoints of this transaction.
+                self._bind_sessions(connection, "create_savepoint")
                 result = action()
             done = True
             return result
         finally:
-            self._storage.scoped_session = sessions
-            if not done:  # it remembers what was never written
+            self._bind_sessions(self._storage.engine, "conditional_savepoint")
+            if not done:  # the cache contains what was never written
                 self._cache = None
+
+    def _bind_sessions(self, bind: Connection | Engine, mode: str) -> None:
+        """Let Optuna's sessions use a connection, or connections of their own from an engine."""
+        self._storage.scoped_session.remove()
+        self._storage.scoped_session.configure(bind=bind, join_transaction_mode=mode)
 
     @staticmethod
     def _lock(connection: Connection, name: str) -> None:
-        """Wait for an advisory lock, and keep it until the end of the transaction."""
+        """Wait for an advisory lock; it is held until the end of the transaction."""
         from sqlalchemy import text
 
         connection.execute(text("SELECT pg_advisory_xact_lock(hashtextextended(:name, 0))"), {"name": _key(name)})
@@ -178,17 +181,17 @@ class PostgresStorage(StudyStorage):
         from optuna.exceptions import StorageInternalError
         from sqlalchemy.exc import SQLAlchemyError
 
-        for attempt in range(1, ATTEMPTS + 1):
+        for attempt in range(1, MAX_TRIES + 1):
             try:
                 return action()
             except (StorageInternalError, SQLAlchemyError) as error:
-                if not _went_away(error) or attempt == ATTEMPTS:
+                if not _may_succeed_later(error) or attempt == MAX_TRIES:
                     raise SoftGymError(f"storage '{self.address}' failed: {_reason(error)}") from error
                 self._wait(error)
         raise AssertionError
 
     def _wait(self, error: Exception) -> None:
-        """Wait until the server answers, less and less often.
+        """Wait until the server answers; ask less and less often.
 
         Raises:
             SoftGymError: if it does not within ``patience``.
@@ -196,16 +199,16 @@ class PostgresStorage(StudyStorage):
         from sqlalchemy import text
         from sqlalchemy.exc import SQLAlchemyError
 
-        start, delay, told = time.monotonic(), 0.1, False
+        start, delay, reported = time.monotonic(), 0.1, False
         while True:
-            time.sleep(delay * random.uniform(0.5, 1.0))  # not all workers at once
+            time.sleep(delay * random.uniform(0.5, 1.0))  # so that the workers do not ask all at once
             try:
                 with self._engine.connect() as connection:
                     connection.execute(text("SELECT 1"))
             except SQLAlchemyError as failure:
                 error = failure
             else:
-                if told:
+                if reported:
                     self._say(f"answers again after {time.monotonic() - start:.0f} s")
                 return
             if time.monotonic() - start > self.patience:
@@ -213,9 +216,9 @@ class PostgresStorage(StudyStorage):
                     f"storage '{self.address}' has not answered for {self.patience:g} s: {_reason(error)}; nothing "
                     "finished is lost: start the server and run the same command again"
                 ) from None
-            if not told:
+            if not reported:
                 self._say(f"does not answer, waiting up to {self.patience:g} s: {_reason(error)}")
-                told = True
+                reported = True
             delay = min(2.0 * delay, 5.0)
 
     def _say(self, line: str) -> None:
@@ -224,17 +227,6 @@ class PostgresStorage(StudyStorage):
     # -- the study --------------------------------------------------------------------------------------------------
 
     def agree(self, accept: Callable[[dict[str, Any] | None], dict[str, Any]], objectives: int = 1) -> dict[str, Any]:
-        """Find or make the study, and what all its machines share.
-
-        Args:
-            accept: takes what is shared so far (None for a new study), returns what shall be, as plain data; what it
-                raises leaves everything as it was.
-            objectives: number of scores of a trial, all to be maximised.
-
-        Returns:
-            What is shared, with the ``id`` of the study.
-        """
-
         def action() -> dict[str, Any]:
             import optuna
 
@@ -262,16 +254,16 @@ class PostgresStorage(StudyStorage):
         from sqlalchemy.exc import SQLAlchemyError
 
         ended = threading.Event()
-        self.patiently(lambda: self.execute(SIGN, worker=worker))
+        self.patiently(lambda: self.execute(HEARTBEAT, worker=worker))
 
-        def signs() -> None:
+        def send() -> None:
             while not ended.wait(self.grace / 6.0):
                 try:
-                    self.execute(SIGN, worker=worker)
-                except SQLAlchemyError:  # the next one may come through
+                    self.execute(HEARTBEAT, worker=worker)
+                except SQLAlchemyError:  # the next one may arrive
                     continue
 
-        thread = threading.Thread(target=signs, name="signs of life", daemon=True)
+        thread = threading.Thread(target=send, name="heartbeat", daemon=True)
         thread.start()
         try:
             yield
@@ -280,8 +272,8 @@ class PostgresStorage(StudyStorage):
             thread.join()
             try:
                 self.execute("DELETE FROM codesign_workers WHERE worker = :worker", worker=worker)
-            except SQLAlchemyError as error:  # it will count as dead a little later
-                self._say(f"was not told that {worker} ended: {_reason(error)}")
+            except SQLAlchemyError as error:  # the worker counts as dead a little later
+                self._say(f"could not record the end of {worker}: {_reason(error)}")
 
     def lives(self, worker: str) -> bool:
         return bool(self.execute(LIVES, worker=worker, grace=self.grace))
@@ -293,10 +285,10 @@ class PostgresStorage(StudyStorage):
 
     @contextmanager
     def attempt(self, job: str) -> Iterator[bool]:
-        """Try to be the only one at a job.
+        """Try to lock a job.
 
-        A restart of the server frees the job while it runs: another worker may then do it too, to the same end, and
-        what is published first counts.
+        A restart of the server frees the lock. Another worker may then run the job too, with the same result; the
+        result that is published first counts.
         """
         connection, mine = self.patiently(lambda: self._try_lock(f"job {self.study} {job}"))
         try:
@@ -305,7 +297,7 @@ class PostgresStorage(StudyStorage):
             connection.close()
 
     def _try_lock(self, name: str) -> tuple[Connection, bool]:
-        """Return a connection, and whether it holds an advisory lock, which ends with it."""
+        """Return a connection, and whether it holds an advisory lock; the lock ends with the connection."""
         from sqlalchemy import text
 
         connection = self._engine.connect()
@@ -327,8 +319,11 @@ class PostgresStorage(StudyStorage):
         content = self.patiently(lambda: self.execute(FETCH, study=self.study, path=name))
         return None if content is None else bytes(content)
 
+    def has_files(self, folder: str) -> bool:
+        return bool(self.execute(HAS_FILES, study=self.study, pattern=f"{folder}/%"))
+
     def execute(self, statement: str, **parameters: Any) -> Any:
-        """Run a statement, and return the first value of what it gives."""
+        """Run a statement and return its first value, or None."""
         from sqlalchemy import text
 
         with self._engine.begin() as connection:
@@ -340,8 +335,8 @@ def _key(name: str) -> str:
     return f"softgym codesign {name}"
 
 
-def _went_away(error: BaseException) -> bool:
-    """Tell whether an error is of the connection or of a conflict, so that the same action may succeed later."""
+def _may_succeed_later(error: BaseException) -> bool:
+    """Return whether an error is a lost connection or a conflict, so that the same action may succeed later."""
     from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, PendingRollbackError
 
     cause = error.__cause__ if type(error).__name__ == "StorageInternalError" else error
@@ -350,7 +345,7 @@ def _went_away(error: BaseException) -> bool:
 
 
 def _reason(error: BaseException) -> str:
-    """First line of what the database said."""
+    """Return the first line of the database's message."""
     from sqlalchemy.exc import DBAPIError
 
     cause = error.__cause__ if type(error).__name__ == "StorageInternalError" and error.__cause__ else error

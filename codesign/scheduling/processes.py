@@ -17,9 +17,11 @@ from codesign.scheduling.queue import CALL
 from softgym_envs import errors
 from softgym_envs.executors import ray_cluster
 
-__all__ = ["run_workers"]
-
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+
+
+class WorkerError(RuntimeError):
+    """An exception ended a worker, for example a bug in the file of a robot. The message has the worker's traceback."""
 
 
 def run_workers(
@@ -27,7 +29,7 @@ def run_workers(
 ) -> str | None:
     """Run a phase of a study in workers of one thread each, and wait for all of them.
 
-    The workers end when this process does, however it ends. One that was killed is replaced, up to ``attempts`` times
+    The workers end with this process, however it ends. A worker that was killed is replaced, at most ``attempts`` times
     for each of them.
 
     Args:
@@ -38,27 +40,36 @@ def run_workers(
         interval: [s].
 
     Returns:
-        What ended a worker that was not replaced, or None.
+        How a worker ended that was not replaced, or None.
 
     Raises:
-        ConfigError: if Ray is asked for and missing, or has several machines and the storage is of one.
-        SoftGymError: if a worker ended with an error of the suite, or with one that is a bug.
+        ConfigError: if Ray is requested but not installed, or has several machines and the storage is for one.
+        SoftGymError: if an error of the suite ended a worker.
+        WorkerError: if any other exception ended a worker.
     """
     run = _run_on_ray if folder.config.executor == "ray" else _run_processes
     return run(folder, phase, count, tick, interval)
 
 
+def _search_path() -> str:
+    """``PYTHONPATH`` with which workers find the same modules as this process, those next to its script included."""
+    own = [str(Path(__file__).resolve().parents[2])]
+    installed = tuple({os.path.join(prefix, "") for prefix in (sys.prefix, sys.base_prefix)})
+    given = [os.path.abspath(entry) for entry in sys.path if not entry.startswith(installed)]
+    return os.pathsep.join(
+        dict.fromkeys([*own, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)), *given])
+    )
+
+
 def _run_processes(
     folder: StudyFolder, phase: str, count: int, tick: Callable[[], None], interval: float
 ) -> str | None:
-    root = str(Path(__file__).resolve().parents[2])
-    paths = [root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": os.pathsep.join(paths)}
+    environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": _search_path()}
     command = [sys.executable, "-m", "codesign.scheduling.worker", str(folder.path), phase]
-    with tempfile.TemporaryFile("w+") as complaints:
+    with tempfile.TemporaryFile("w+") as output:
 
         def start() -> subprocess.Popen[bytes]:
-            return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=complaints, env=environment)
+            return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=output, env=environment)
 
         workers = [start() for _ in range(count)]
         spare = folder.config.attempts * count
@@ -80,27 +91,26 @@ def _run_processes(
         tick()
         for status in failed:
             if status > 0:
-                complaints.seek(0)
-                raise _failure(phase, status, complaints.read())
+                output.seek(0)
+                raise _failure(phase, status, output.read())
     return f"killed by signal {-failed[0]}" if failed else None
 
 
 def _release(worker: subprocess.Popen[bytes]) -> None:
-    """End a worker by closing its standard input, and wait for its end."""
+    """End a worker by closing its standard input, and wait until it has ended."""
     if worker.stdin is not None:
         worker.stdin.close()
     worker.wait()
 
 
-def _failure(phase: str, status: int, text: str) -> errors.SoftGymError:
-    """The error of a worker, read back from its last line."""
+def _failure(phase: str, status: int, text: str) -> Exception:
+    """Return the error of a worker, read from what it wrote to standard error."""
     lines = [line for line in text.splitlines() if line.strip()]
-    last = lines[-1].strip() if lines else "no message"
-    kind, separator, message = last.partition(": ")
-    if status == 2 and separator and kind in errors.__all__:
-        return getattr(errors, kind)(message)
-    sys.stderr.write(text)
-    return errors.SoftGymError(f"a worker of phase '{phase}' stopped: {last}")
+    kind, separator, message = (lines[-1].strip() if lines else "").partition(": ")
+    error = getattr(errors, kind, None)
+    if status == 2 and separator and isinstance(error, type) and issubclass(error, errors.SoftGymError):
+        return error(message)
+    return WorkerError(f"a worker of phase '{phase}' failed with exit status {status}:\n\n{text.strip()}")
 
 
 def _run_on_ray(folder: StudyFolder, phase: str, count: int, tick: Callable[[], None], interval: float) -> str | None:
@@ -108,12 +118,12 @@ def _run_on_ray(folder: StudyFolder, phase: str, count: int, tick: Callable[[], 
         machines = len({node["NodeID"] for node in ray.nodes() if node["Alive"]})
         if machines > 1 and folder.config.storage == JOURNAL:
             raise errors.ConfigError(
-                f"storage '{JOURNAL}' serves one machine, and the Ray cluster has {machines}; set 'storage' to a "
+                f"storage '{JOURNAL}' is for one machine, and the Ray cluster has {machines}; set 'storage' to a "
                 "PostgreSQL database"
             )
         task = ray.remote(num_cpus=1, max_retries=folder.config.attempts)(_task)
         arguments = (str(folder.path), folder.config.model_dump(mode="json"), phase)
-        # A cluster that ran before does not have the call's environment.
+        # A cluster that was started earlier does not have the environment variables of this call.
         variables = dict.fromkeys(THREADS, "1") | {key: os.environ[key] for key in (CALL,) if key in os.environ}
         running = [task.options(runtime_env={"env_vars": variables}).remote(*arguments) for _ in range(count)]
         stopped = None
@@ -126,7 +136,7 @@ def _run_on_ray(folder: StudyFolder, phase: str, count: int, tick: Callable[[], 
                 except ray.exceptions.RayTaskError as error:
                     if isinstance(error.cause, errors.SoftGymError):
                         raise error.cause from None
-                    raise errors.SoftGymError(f"a worker of phase '{phase}' stopped: {error.cause!r}") from error
+                    raise WorkerError(f"a worker of phase '{phase}' failed:\n\n{error}") from error
                 except ray.exceptions.WorkerCrashedError:
                     stopped = "killed"
         tick()
@@ -134,7 +144,7 @@ def _run_on_ray(folder: StudyFolder, phase: str, count: int, tick: Callable[[], 
 
 
 def _task(path: str, config: dict[str, Any], phase: str) -> None:
-    """One worker as a task of Ray, perhaps on a machine that has no folder of the study yet."""
+    """One worker as a Ray task, perhaps on a machine that has no folder of the study yet."""
     from codesign.scheduling.worker import PHASES
 
     PHASES[phase](StudyFolder.create(path, StudyConfig.model_validate(config), wait=True))

@@ -1,14 +1,14 @@
-"""Who runs which trial.
+"""Queue of a study's trials.
 
-Every change of it happens while no other process is at it, so no trial is lost, run twice or one too many. A trial
-belongs to a worker, and a worker shows that it lives (`codesign.scheduling.storage`): a trial whose worker does not was
-left behind (``kill -9``, power cut). Its result is taken over if it was already written; else its body is queued again.
+Workers change the queue one at a time, so no trial is lost, run twice or added beyond the budget. A trial belongs to
+one worker, which shows that it is alive (`codesign.scheduling.storage`). If the worker dies (``kill -9``, power cut),
+the trial is recovered: its result is used if it was already written, otherwise its body is queued again.
 
-A body is blamed for the death of its worker if the call that had started the worker outlived it, or if it was an error
-that is a bug. It is not if the call has ended as well: Ctrl-C, ``kill -9`` of everything and a power cut say nothing
-about a body. One that takes its call down with it (all memory of the machine) cannot be told from these and is not
-blamed either; whoever starts the call again sees it. Nor is one whose worker died while it claimed the trial, before it
-looked at the body.
+A body counts as the cause of its worker's death if the call that started the worker is still alive. It does not if the
+call ended as well: Ctrl-C, ``kill -9`` of all processes and a power cut say nothing about a body. A body that takes its
+call down too (all memory of the machine) cannot be distinguished from these; whoever restarts the call will notice. A
+worker that dies while it claims a trial has not looked at the body yet, so the body is not to blame either. Exceptions
+are bugs: they end the study with their traceback, and its next call runs the body again.
 """
 
 from __future__ import annotations
@@ -20,92 +20,39 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from codesign.config import PRUNERS, StudyConfig
 from codesign.folder import StudyFolder
-from codesign.sampling import construct, make_sampler, trial_seed
-from codesign.scheduling.storage import StudyStorage
-from softgym_envs.errors import DataError
-from softgym_envs.storage import write_json
+from codesign.records import TrialResult
+from codesign.sampling import trial_seed
+from codesign.scheduling.optuna_study import distributions, open_study
 
 if TYPE_CHECKING:
     import optuna
 
-__all__ = ["Ledger", "open_study"]
-
 T = TypeVar("T")
 
 CALL = "SOFTGYM_STUDY_CALL"
-"""Environment variable by which workers know the ledger of the call that started them."""
+"""Environment variable that tells workers the queue of the call that started them."""
 
-TOLD = ("success_rate", "mean_distance", "mean_return")
-"""What Optuna is told of an evaluation beside its score, for people who look there (``optuna-dashboard``)."""
+REPORTED_METRICS = ("success_rate", "mean_distance", "mean_return")
+"""Metrics of an evaluation that Optuna stores besides the scores, for people who look there (``optuna-dashboard``)."""
 
 
 def _reports(trials: Sequence[optuna.trial.FrozenTrial], number: int) -> dict[int, float]:
-    """What was reported by a trial and by those that it replaces, by step: a worker may die before it says it again."""
+    """Return what a trial and those that it replaces reported, by step."""
     chain = [trials[number]]
     while "replaces" in chain[-1].user_attrs:
         chain.append(trials[chain[-1].user_attrs["replaces"]])
     found: dict[int, float] = {}
-    for trial in reversed(chain):
+    for trial in reversed(chain):  # a worker may die before it repeats the reports of the trial that it continues
         found |= trial.intermediate_values
     return dict(sorted(found.items()))
 
 
-def make_pruner(config: StudyConfig) -> optuna.pruners.BasePruner:
-    """Pruner of a study; those that count resources count environment steps."""
-    import optuna
+class TrialQueue:
+    """The trials of a study, as one worker sees them.
 
-    options = dict(config.pruner.options)
-    if config.pruner.name in ("hyperband", "successive_halving"):
-        options.setdefault("min_resource", config.training.report_every)
-    if config.pruner.name == "hyperband":
-        options.setdefault("max_resource", config.training.steps)
-    return construct(getattr(optuna.pruners, PRUNERS[config.pruner.name]), options)
-
-
-def distributions(config: StudyConfig) -> dict[str, optuna.distributions.BaseDistribution]:
-    """Range of each optimised variable [SI]."""
-    import optuna
-
-    space = config.space
-    return {
-        name: optuna.distributions.FloatDistribution(space[name].low, space[name].high, log=space[name].log)
-        for name in config.variables
-    }
-
-
-def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number: int = 0) -> optuna.Study:
-    """Open the Optuna study of a folder; it always maximises the scores, see `codesign.objectives`.
-
-    Args:
-        folder: the study.
-        storage: its storage, opened anew by default.
-        number: trial that the sampler is for.
-
-    Raises:
-        DataError: if a database does not have it any more.
-    """
-    import optuna
-
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = folder.open_storage() if storage is None else storage
-    sampler, pruner = make_sampler(folder.config.sampler, number), make_pruner(folder.config)
-    try:
-        return optuna.load_study(study_name=storage.study, storage=storage.optuna, sampler=sampler, pruner=pruner)
-    except KeyError:
-        if storage.shared:
-            raise DataError(f"storage '{folder.config.storage}' has no study '{storage.study}'") from None
-    directions = [optuna.study.StudyDirection.MAXIMIZE] * (1 + len(folder.config.also))
-    return optuna.create_study(
-        study_name=storage.study, storage=storage.optuna, directions=directions, sampler=sampler, pruner=pruner
-    )
-
-
-class Ledger:
-    """The trials of a study, as one worker sees them. Use it as a context: the worker lives as long as it is open.
-
-    The call that starts workers has one too, and must have it open as long as they run.
+    Use it as a context manager: the worker counts as alive while the context is open. The call that starts workers has
+    a queue of its own, which must be open while they run.
 
     Args:
         folder: the study.
@@ -121,7 +68,7 @@ class Ledger:
         self._mirrored: set[int] = set()
         self._exclusively(lambda study: None)
 
-    def __enter__(self) -> Ledger:
+    def __enter__(self) -> TrialQueue:
         self._presence.__enter__()
         os.environ[CALL] = self.worker
         return self
@@ -135,11 +82,11 @@ class Ledger:
 
     @property
     def study(self) -> optuna.Study:
-        """The Optuna study, to be read."""
+        """The Optuna study, for reading only."""
         return open_study(self.folder, self.storage)
 
     def enqueue(self, bodies: list[tuple[str, dict[str, float]]]) -> None:
-        """Queue bodies, each once however often this is called.
+        """Add bodies to the queue, each only once however often this is called.
 
         Args:
             bodies: unique origin (such as ``"baseline"``) and value of each optimised variable [SI].
@@ -154,34 +101,34 @@ class Ledger:
         self._exclusively(action)
 
     def claim(self) -> optuna.Trial | None:
-        """Take the next trial, or None if the study has as many as were asked for."""
+        """Take the next trial; None if the study has all its trials."""
         trial = self._exclusively(self._claim)
         if trial is not None:
             self._claimed.add(trial.number)
             self._inherit_folder(trial)
         return trial
 
-    def finish(self, result: dict[str, Any]) -> bool:
-        """Enter the result of a trial.
+    def finish(self, result: TrialResult) -> bool:
+        """Record the result of a trial.
 
         Returns:
-            False if the trial was taken from this worker, which was thought dead: the result is then dropped.
+            False if the trial was reassigned because this worker seemed dead; its result is then dropped.
         """
 
         def action(study: optuna.Study) -> bool:
             from optuna.trial import TrialState
 
-            trial = study.get_trials(deepcopy=False)[result["number"]]
+            trial = study.get_trials(deepcopy=False)[result.number]
             if trial.state == TrialState.RUNNING and trial.user_attrs.get("worker") == self.worker:
                 self._tell(study, trial, result)
                 return True
-            return trial.user_attrs.get("result") == result  # it was entered, and the answer got lost
+            return trial.user_attrs.get("result") == result.to_json()  # recorded, but the answer got lost
 
         self._publish(result)
         return self._exclusively(action)
 
     def left(self) -> int:
-        """Number of trials still to be finished, running ones included."""
+        """Return the number of unfinished trials, running ones included."""
         from optuna.trial import TrialState
 
         trials = self._exclusively(lambda study: study.get_trials(deepcopy=False))
@@ -190,7 +137,7 @@ class Ledger:
         return max(self.folder.config.trials - done, queued)
 
     def claimable(self) -> bool:
-        """Tell whether there is a trial to take, after taking over what dead workers left behind."""
+        """Return whether there is a trial to claim, after recovering the trials of dead workers."""
         return self._exclusively(self._claimable)
 
     def mirror(self) -> None:
@@ -203,24 +150,26 @@ class Ledger:
             if trial.number in self._mirrored or not trial.state.is_finished():
                 continue
             path = self.folder.trial(trial.number) / "result.json"
-            if trial.state == TrialState.FAIL:  # its body runs, or ran, again
+            if trial.state == TrialState.FAIL:  # another trial repeats it
                 path.unlink(missing_ok=True)
-            elif self.folder.result(trial.number) != trial.user_attrs["result"]:
-                write_json(path, trial.user_attrs["result"])
+            else:
+                result = TrialResult.from_json(trial.user_attrs["result"])
+                if self.folder.result(trial.number) != result:
+                    result.write(path)
             self._mirrored.add(trial.number)
 
-    def _publish(self, result: dict[str, Any]) -> None:
-        """Give the policy of a trial to other machines, before they can learn of it."""
-        if self.storage.shared and result["agent"] != "qp":
-            policy = Path(result["agent"])
+    def _publish(self, result: TrialResult) -> None:
+        """Send the policy of a trial to other machines, before they can learn of it."""
+        if self.storage.shared and result.controller != "qp":
+            policy = Path(result.controller)
             names = [path.as_posix() for path in (policy, policy.with_suffix(".json"))]
             self.storage.publish({name: (self.folder.path / name).read_bytes() for name in names})
 
     def _exclusively(self, action: Callable[[optuna.Study], T]) -> T:
-        """Return what ``action`` does with the study while no other process is at it."""
+        """Return the result of ``action`` on the study, which no other process changes meanwhile."""
         return self.storage.exclusively(lambda: action(open_study(self.folder, self.storage)))
 
-    # -- what happens exclusively -----------------------------------------------------------------------------------
+    # -- called exclusively ------------------------------------------------------------------------------------------
 
     def _claim(self, study: optuna.Study) -> optuna.Trial | None:
         import optuna
@@ -229,7 +178,7 @@ class Ledger:
         config = self.folder.config
         for taken in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             if taken.user_attrs.get("worker") == self.worker and taken.number not in self._claimed:
-                # It was claimed, and the answer got lost.
+                # Claimed, but the answer got lost.
                 return optuna.Trial(study, taken._trial_id)
         if not self._claimable(study):
             return None
@@ -244,7 +193,7 @@ class Ledger:
         if "replaces" in trial.user_attrs:
             for step, value in _reports(study.get_trials(deepcopy=False), trial.user_attrs["replaces"]).items():
                 trial.report(value, step)
-        trial.set_user_attr("worker", self.worker)  # the last: without it, it was not claimed
+        trial.set_user_attr("worker", self.worker)  # last: a trial without it was not claimed
         return trial
 
     def _claimable(self, study: optuna.Study) -> bool:
@@ -255,20 +204,22 @@ class Ledger:
         counted = sum(trial.state != TrialState.FAIL for trial in trials)
         return counted < self.folder.config.trials or any(trial.state == TrialState.WAITING for trial in trials)
 
-    def _tell(self, study: optuna.Study, trial: optuna.trial.FrozenTrial, result: dict[str, Any]) -> None:
+    def _tell(self, study: optuna.Study, trial: optuna.trial.FrozenTrial, result: TrialResult) -> None:
         from optuna.trial import TrialState
 
-        told = {key: value for key, value in (result.get("evaluation") or {}).items() if key in TOLD}
-        if result.get("reason"):
-            told["reason"] = result["reason"]
+        attributes: dict[str, Any] = {}
+        if result.evaluation is not None:
+            attributes = {name: getattr(result.evaluation, name) for name in REPORTED_METRICS}
+        if result.reason:
+            attributes["reason"] = result.reason
         if self.storage.shared:
-            told["result"] = result
-        for key, value in told.items():
+            attributes["result"] = result.to_json()
+        for key, value in attributes.items():
             self.storage.optuna.set_trial_user_attr(trial._trial_id, key, value)
-        if result["state"] == "complete":
-            study.tell(trial.number, result["scores"])
+        if result.state == "complete":
+            study.tell(trial.number, result.scores)
         else:
-            # An infeasible body is pruned without a value: samplers then rank it last, while failures teach nothing.
+            # Infeasible bodies are pruned without a value: samplers rank them last, but would ignore failed trials.
             study.tell(trial.number, state=TrialState.PRUNED)
 
     def _recover(self, study: optuna.Study) -> None:
@@ -280,15 +231,16 @@ class Ledger:
             if trial.state != TrialState.RUNNING or self._lives(trial.user_attrs.get("worker")):
                 continue
             result = self.folder.result(trial.number)
-            if result is not None and result["number"] == trial.number:
+            if result is not None and result.number == trial.number:
                 self._publish(result)
                 self._tell(study, trial, result)
                 continue
-            # Queued before it is written off: a crash between the two does not lose it, and the mark keeps it single.
+            # Queue it before it is marked as failed: a crash in between does not lose it, and ``replaces`` prevents
+            # that it is queued twice.
             if trial.number not in replaced:
                 complete = set(trial.params) == set(self.folder.config.variables)
                 values = trial.params if complete else trial.system_attrs.get("fixed_params")
-                if values:  # else it died before its body was drawn: the next one is drawn in its place
+                if values:  # otherwise the worker died before the sampler proposed a body
                     marks: dict[str, Any] = {"origin": f"sampler {trial.number}", "replaces": trial.number}
                     for key in ("origin", "sampler_seed"):
                         if key in trial.user_attrs:
@@ -302,22 +254,24 @@ class Ledger:
             study.tell(trial.number, state=TrialState.FAIL)
 
     def _lives(self, worker: str | None) -> bool:
-        # Without a worker it was left by one that was killed in here.
+        # A trial without a worker was left by one that was killed in `_claim`.
         return worker is not None and (worker == self.worker or self.storage.lives(worker))
 
     def _blamed(self, trial: optuna.trial.FrozenTrial) -> bool:
-        """Tell whether a trial counts as the cause of its worker's death; see the module."""
-        if "worker" not in trial.user_attrs:  # it was killed while it claimed the trial, before it looked at the body
+        """Return whether a trial counts as the cause of its worker's death; see the module docstring."""
+        if "worker" not in trial.user_attrs:  # killed while it claimed the trial, before it looked at the body
+            return False
+        if "raised" in trial.user_attrs:  # an exception ended the study: it is a bug to fix, not a property of the body
             return False
         call = trial.user_attrs.get("call")
-        if "raised" in trial.user_attrs or call is None or call == self.worker:
+        if call is None or call == self.worker:
             return True
         return self.storage.outlived(call, trial.user_attrs["worker"])
 
     # ---------------------------------------------------------------------------------------------------------------
 
     def _inherit_folder(self, trial: optuna.Trial) -> None:
-        """Give a trial that runs again what those before it left here of its training."""
+        """Move the training files of the trials that this one repeats to its folder."""
         new, marks = self.folder.trial(trial.number), trial.user_attrs
         if "replaces" not in marks:
             return

@@ -1,27 +1,20 @@
-"""Where the trials of a study are kept, and how its processes stay out of each other's way.
+"""Storage and locks of a study: what its processes share.
 
-`JournalStorage` is Optuna's journal in the folder of the study, for the processes of one machine, with locks of the
-operating system. `codesign.scheduling.postgres.PostgresStorage` is a PostgreSQL database, for many machines.
+`codesign.scheduling.journal.JournalStorage` keeps trials in the folder of the study, for the processes of one machine.
+`codesign.scheduling.postgres.PostgresStorage` keeps them in a database, for many machines.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
-
-from codesign.config import JOURNAL, StudyConfig
-from softgym_envs.storage import drop_torn_line
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     import optuna
     from filelock import BaseFileLock
-
-__all__ = ["JournalStorage", "StudyStorage", "file_lock", "open_storage"]
-
-JOURNAL_LOCK = "journal"
 
 T = TypeVar("T")
 
@@ -34,26 +27,13 @@ def file_lock(folder: Path, name: str) -> BaseFileLock:
     return FileLock(folder / "locks" / f"{name}.lock", poll_interval=0.01)
 
 
-def open_storage(folder: Path, config: StudyConfig) -> StudyStorage:
-    """Open the storage that a configuration names; a database that does not answer is waited for.
-
-    Raises:
-        ConfigError: if the database cannot be opened.
-    """
-    if config.storage == JOURNAL:
-        return JournalStorage(folder)
-    from codesign.scheduling.postgres import PostgresStorage
-
-    return PostgresStorage(config.storage, config.name, grace=config.heartbeat, patience=config.patience, wait=True)
-
-
 class StudyStorage(ABC):
-    """The trials of one study and what its workers must agree on.
+    """The trials of one study, and what its workers must agree on.
 
     Attributes:
         study: name of the Optuna study.
-        shared: whether workers may lie on other machines, with folders of their own. What they have to know of each
-            other is then kept here: results of trials, and files by `publish`.
+        shared: whether workers may run on other machines, each with a folder of its own. Everything that they need from
+            each other is then kept here: results of trials, and files (`publish`).
     """
 
     study: str
@@ -62,118 +42,62 @@ class StudyStorage(ABC):
     @property
     @abstractmethod
     def optuna(self) -> optuna.storages.BaseStorage:
-        """Storage to open the Optuna study with; ask anew for it in each call of `exclusively`."""
+        """Storage of the Optuna study; read this property again in each call of `exclusively`."""
 
     @abstractmethod
     def exclusively(self, action: Callable[[], T]) -> T:
-        """Return what ``action`` does while no other process of the study is here.
+        """Return the result of ``action``, which runs while no other process changes the study.
 
-        It may be called again, after its first effects on the database were taken back: beyond the database it must
-        have none.
+        It may be called again after its first effects on the database were undone, so it must have no other effects.
         """
 
     @abstractmethod
     def patiently(self, action: Callable[[], T]) -> T:
-        """Return what ``action`` does, called again whenever the storage went away under it."""
+        """Return the result of ``action``, called again whenever the connection to the storage breaks."""
 
     @abstractmethod
     def present(self, worker: str) -> AbstractContextManager[None]:
-        """Show a worker as alive while the block runs."""
+        """Mark a worker as alive while the block runs."""
 
     @abstractmethod
     def lives(self, worker: str) -> bool:
-        """Tell whether a worker shows as alive."""
+        """Return whether a worker is marked as alive."""
 
     @abstractmethod
     def outlived(self, call: str, worker: str) -> bool:
-        """Tell whether ``call`` shows as alive, and did so well after the last sign of a worker that is dead."""
+        """Return whether ``call`` is alive, and clearly was so after the last heartbeat of a dead worker."""
 
     @abstractmethod
     def attempt(self, job: str) -> AbstractContextManager[bool]:
-        """Try to be the only one at a job while the block runs, and tell whether this came true."""
+        """Try to lock a job while the block runs, and return whether the lock was free."""
 
     @abstractmethod
     def publish(self, files: Mapping[str, bytes]) -> None:
-        """Give files, by path in the folder of the study, to the other machines; a published file does not change."""
+        """Send files, by path in the folder of the study, to the other machines; a published file does not change."""
 
     @abstractmethod
     def fetch(self, name: str) -> bytes | None:
-        """Content of a published file, or None."""
+        """Return the content of a published file, or None."""
 
 
-class JournalStorage(StudyStorage):
-    """Optuna's journal in the folder of a study; a crash in the middle of its last line is mended.
+class SharedStorage(StudyStorage):
+    """A storage for many machines."""
 
-    Args:
-        folder: the folder of the study.
-    """
+    shared = True
 
-    study = "codesign"
-    shared = False
+    @abstractmethod
+    def agree(self, accept: Callable[[dict[str, Any] | None], dict[str, Any]], objectives: int = 1) -> dict[str, Any]:
+        """Find or make the study, and return what all its machines share.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._optuna = self._open()
+        Args:
+            accept: takes what is shared so far (None for a new study) and returns what to share from now on, as plain
+                data. If it raises, nothing changes.
+            objectives: number of scores of a trial, all to be maximised.
 
-    def _open(self) -> optuna.storages.BaseStorage:
-        from optuna import storages
-        from optuna.storages.journal import JournalFileBackend
+        Returns:
+            What is shared, with the ``id`` of the study.
+        """
 
-        path = self.folder / "journal.log"
-        lock = file_lock(self.folder, JOURNAL_LOCK)
-        with lock:
-            # Whoever held this lock is gone, so a line without an end was cut off by a crash and was never acted upon.
-            drop_torn_line(path)
-        # Unlike Optuna's own lock files, these are freed by the kernel when their holder is killed.
-        return storages.JournalStorage(JournalFileBackend(str(path), lock_obj=lock))  # type: ignore[arg-type]
-
-    @property
-    def optuna(self) -> optuna.storages.BaseStorage:
-        return self._optuna
-
-    def exclusively(self, action: Callable[[], T]) -> T:
-        with file_lock(self.folder, "study"):
-            return action()
-
-    def patiently(self, action: Callable[[], T]) -> T:
-        return action()
-
-    @contextmanager
-    def present(self, worker: str) -> Iterator[None]:
-        lock = file_lock(self.folder, worker)
-        with lock:
-            try:
-                yield
-            finally:
-                Path(lock.lock_file).unlink(missing_ok=True)
-
-    def lives(self, worker: str) -> bool:
-        with self.attempt(worker) as free:
-            if free:
-                (self.folder / "locks" / f"{worker}.lock").unlink(missing_ok=True)
-            return not free
-
-    def outlived(self, call: str, worker: str) -> bool:
-        return self.lives(call)  # a lock ends with its holder
-
-    @contextmanager
-    def attempt(self, job: str) -> Iterator[bool]:
-        from filelock import Timeout
-
-        lock = file_lock(self.folder, job.replace("/", "-"))
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            yield False
-            return
-        try:
-            yield True
-        finally:
-            lock.release()
-
-    def publish(self, files: Mapping[str, bytes]) -> None:
-        """Do nothing: they lie in the folder already."""
-
-    def fetch(self, name: str) -> bytes | None:
-        path = self.folder / name
-        return path.read_bytes() if path.exists() else None
+    @abstractmethod
+    def has_files(self, folder: str) -> bool:
+        """Return whether a folder of the study has published files."""

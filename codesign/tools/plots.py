@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from codesign.report.plots import BASELINE, MUTED, OTHER, STYLE, WINNER, shown_unit
+from codesign.report.plots import BASELINE, MUTED, OTHER, STYLE, WINNER
+from codesign.report.units import shown_unit
 from codesign.tools.metrics import Metric
 from codesign.tools.records import CalibrationResult
 from softgym_envs.storage import atomic_write

@@ -1,4 +1,4 @@
-"""A small study that is fast because it needs no training: bodies are scored by the inverse QP."""
+"""A small study that is fast because it trains nothing: the inverse QP scores bodies."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ import sys
 from codesign.config import StudyConfig
 from codesign.study import run_study
 from softgym_envs.config import load_config
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a parent in the background has it ignored
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if the parent runs in the background
 run_study(load_config(sys.argv[1], StudyConfig), sys.argv[2])
 """
 
@@ -47,13 +47,13 @@ def tiny():
 
 @pytest.fixture
 def study(tmp_path):
-    """Function ``study(**changes) -> StudyFolder``: the folder of a tiny study in which nothing has run yet."""
+    """Function ``study(**changes) -> StudyFolder``: the folder of a tiny study that has not run yet."""
     return lambda **changes: StudyFolder.create(tmp_path / "study", StudyConfig.model_validate(_tiny(**changes)))
 
 
 @pytest.fixture(scope="session")
 def start_study():
-    """Function ``start_study(folder, data)``: run a study in a process of its own."""
+    """Function ``start_study(folder, data)``: run a study in another process."""
 
     def start(folder, data):
         path = folder.with_suffix(".yaml")

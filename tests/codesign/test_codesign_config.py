@@ -18,7 +18,7 @@ from softgym_envs.storage import write_json
 
 ROOT = Path(__file__).resolve().parents[2]
 BAD = {
-    "name that is no folder": ({"name": "../x"}, "name", "pattern"),
+    "name that is not a folder": ({"name": "../x"}, "name", "pattern"),
     "unknown key": ({"colour": "red"}, "colour", "variables"),
     "unknown variable": ({"variables": ["width"]}, "width", "joint_height"),
     "repeated variable": ({"variables": ["height", "height"]}, "height", "twice"),
@@ -44,17 +44,50 @@ BAD = {
     ),
     "pruner without reports": ({"pruner": {"name": "median"}}, "median", "none"),
     "unknown objective": ({"objective": "beauty"}, "beauty", "success_rate"),
-    "unknown second objective": ({"also": ["beauty"]}, "beauty", "success_rate"),
-    "unknown limit": ({"limits": {"beauty": 1.0}}, "beauty", "success_rate"),
-    "limit that is no number": ({"limits": {"mean_effort": float("nan")}}, "limits.mean_effort", "finite"),
-    "an objective twice": ({"also": ["mean_distance"]}, "mean_distance", "twice"),
-    "limits for a sampler that knows none": (
-        {"limits": {"mean_effort": 1.0}, "sampler": {"name": "cmaes"}},
+    "unknown secondary objective": ({"secondary_objectives": ["beauty"]}, "beauty", "success_rate"),
+    "unknown constraint": ({"constraints": {"beauty": 1.0}}, "beauty", "success_rate"),
+    "misspelt objective": ({"objective": "mean_distnace"}, "mean_distnace", "did you mean 'mean_distance'?"),
+    "objective of a module that does not exist": ({"objective": "no_module:f"}, "no_module:f", "no module"),
+    "objective that its module lacks": ({"objective": "math:beauty"}, "math:beauty", "has no 'beauty'"),
+    "objective that is not a function": ({"objective": "math:pi"}, "math:pi", "an Objective or a function"),
+    "constraint that is not a number": (
+        {"constraints": {"mean_effort": float("nan")}},
+        "constraints.mean_effort",
+        "finite",
+    ),
+    "an objective twice": ({"secondary_objectives": ["mean_distance"]}, "mean_distance", "twice"),
+    "constraints for a sampler that does not support them": (
+        {"constraints": {"mean_effort": 1.0}, "sampler": {"name": "cmaes"}},
         "cmaes",
         "tpe",
     ),
-    "pruner of several objectives": ({"also": ["mean_effort"], "pruner": {"name": "wilcoxon"}}, "wilcoxon", "none"),
-    "body alone as objective": ({"objective": "material_volume"}, "material_volume", "also"),
+    "pruner of several objectives": (
+        {"secondary_objectives": ["mean_effort"], "pruner": {"name": "wilcoxon"}},
+        "wilcoxon",
+        "none",
+    ),
+    "body alone as objective": ({"objective": "material_volume"}, "material_volume", "secondary_objectives"),
+    "zone in millimetres": (
+        {"goals": {"source": "zone", "zone": {"center": [0, 66, -72], "half_size": [10, 3, 3]}}},
+        "goals.zone.center = [0.0, 66.0, -72.0]",
+        "did you mean metres?",
+    ),
+    "size of a zone in millimetres": (
+        {"goals": {"source": "zone", "zone": {"center": [0, 0.066, -0.072], "half_size": [10, 3, 3]}}},
+        "corner of goals.zone",
+        "did you mean metres?",
+    ),
+    "option without bounds": ({"variables": ["height", "task.spread"]}, "task.spread", "'ranges'"),
+    "option of a trained policy": (
+        {
+            "strategy": "warm_start",
+            "policy": "finger_reach_designs",
+            "variables": ["height", "task.spread"],
+            "ranges": {"task.spread": {"low": 0.0, "high": 0.01, "baseline": 0.0}},
+        },
+        "task.spread",
+        "allowed: qp, scratch",
+    ),
     "points for a task of paths": (
         {"strategy": "scratch", "environment": {"id": "SoftGym/FingerTrack-v0"}},
         "goals.source",
@@ -65,7 +98,7 @@ BAD = {
         "family",
         "zone",
     ),
-    "judge that does not see the body": ({"strategy": "critic"}, "critic", "design_in_observation"),
+    "shared policy that does not observe the body": ({"strategy": "critic"}, "critic", "design_in_observation"),
     "unknown option of joint training": (
         {
             "strategy": "critic",
@@ -122,7 +155,7 @@ BAD = {
         "training.sac.learning_starts = 1000",
         "finalists.steps = 500",
     ),
-    "a judge that learns nothing": (
+    "a shared policy that learns nothing": (
         {
             "strategy": "critic",
             "environment": {"id": "SoftGym/FingerReach-v0", "design_in_observation": True},
@@ -180,7 +213,7 @@ def test_missing_policy(tmp_path, tiny):
 
 
 SHOWN = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
-JUDGED = {"strategy": "policy", "policy": "finger_reach_designs"}
+SHARED = {"strategy": "policy", "policy": "finger_reach_designs"}
 
 
 @pytest.mark.parametrize(
@@ -192,32 +225,35 @@ JUDGED = {"strategy": "policy", "policy": "finger_reach_designs"}
         ({"sampler": {"name": "tpe", "options": {"n_startup_trials": "x"}}}, "sampler 'tpe'.*'n_startup_trials': 'x'"),
         ({"sampler": {"name": "tpe", "options": {"n_ei_candidates": "x"}}}, "sampler 'tpe'.*'n_ei_candidates': 'x'"),
         (
-            {**JUDGED, "environment": {**SHOWN, "residual_scale": 0.3}},
+            {**SHARED, "environment": {**SHOWN, "residual_scale": 0.3}},
             r"environment\.residual_scale = 0\.3.*finger_reach_designs",
         ),
         (
-            {**JUDGED, "environment": {**SHOWN, "design_in_observation": ["height", "length", "joint_height"]}},
+            {**SHARED, "environment": {**SHOWN, "design_in_observation": ["height", "length", "joint_height"]}},
             r"environment\.design_in_observation = \['height'",
         ),
-        ({**JUDGED, "environment": {"id": SHOWN["id"]}}, "strategy 'policy' needs a policy that sees the body: name h"),
         (
-            {**JUDGED, "environment": {**SHOWN, "design_in_observation": True}, "variables": ["young_modulus"]},
+            {**SHARED, "environment": {"id": SHOWN["id"]}},
+            "strategy 'policy' needs a policy that observes the body: add h",
+        ),
+        (
+            {**SHARED, "environment": {**SHOWN, "design_in_observation": True}, "variables": ["young_modulus"]},
             r"environment\.design_in_observation = .*'young_modulus'",
         ),
     ],
 )
-def test_wrong_values_are_told_before_the_folder_is_taken(changes, words, tmp_path, tiny):
+def test_wrong_values_are_found_before_the_folder_is_made(changes, words, tmp_path, tiny):
     with pytest.raises(ValueError, match=words):
         run_study(StudyConfig.model_validate(tiny(**changes)), tmp_path / "study", progress=False)
     assert not (tmp_path / "study").exists()
 
 
-def test_a_judge_has_seen_what_varies(tmp_path, tiny, monkeypatch):
+def test_a_shared_policy_was_trained_on_what_varies(tmp_path, tiny, monkeypatch):
     policy = Policy("finger_reach_designs")
     monkeypatch.setattr(policy, "environment", policy.environment.model_copy(update={"sample_design": ["length"]}))
     monkeypatch.setattr("codesign.study.Policy", lambda name: policy)
-    config = StudyConfig.model_validate(tiny(**JUDGED, environment=SHOWN, variables=["length", "height"]))
-    with pytest.raises(ConfigError, match="has not seen height vary in its training; allowed variables: length"):
+    config = StudyConfig.model_validate(tiny(**SHARED, environment=SHOWN, variables=["length", "height"]))
+    with pytest.raises(ConfigError, match="was trained without variation of height.*allowed variables: length"):
         run_study(config, tmp_path / "study", progress=False)
     assert not (tmp_path / "study").exists()
 
@@ -232,14 +268,16 @@ def test_folder_keeps_its_study(study):
     assert (first.goals["selection"].shape, first.goals["unseen"].shape) == ((6, 1, 3), (3, 1, 3))
 
 
-def test_options_of_fem(study):
-    """They are tried before the trials, and stay once there is a test."""
+def test_options_of_fem(study, tmp_path, tiny):
+    """They are tried before the trials, and cannot change once there is a test."""
 
     def asked(**finalists):
         return study(finalists={"count": 1, **finalists})
 
+    wrong = StudyConfig.model_validate(tiny(finalists={"count": 1, "fem_options": {"dinamics": True}}))
     with pytest.raises(ConfigError, match=r"finalists.fem_options = \{'dinamics': True\}: .*option 'dinamics'"):
-        asked(fem_options={"dinamics": True})
+        run_study(wrong, tmp_path / "study", progress=False)
+    assert not (tmp_path / "study").exists()
     folder = asked(fem_options={"dynamics": True})
     assert asked(fem_options={"dynamics": False}).config.finalists.fem_options == {"dynamics": False}
     (folder.path / "finalists" / "trial0000-seed1").mkdir(parents=True)

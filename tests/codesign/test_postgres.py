@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
 import optuna
@@ -16,11 +17,11 @@ from benchmarks.codesign_scale import Sweep, faults
 from benchmarks.postgres_server import find_programs, temporary_server
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
-from codesign.phases import finalists
+from codesign.records import Account, Job, TrialResult
 from codesign.scheduling import worker
-from codesign.scheduling.jobs import Job, missing_jobs, run_jobs
-from codesign.scheduling.postgres import SIGN, PostgresStorage
-from codesign.scheduling.queue import Ledger
+from codesign.scheduling.jobs import missing_jobs, run_pending
+from codesign.scheduling.postgres import HEARTBEAT, PostgresStorage
+from codesign.scheduling.queue import TrialQueue
 from codesign.study import run_study
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 
@@ -48,24 +49,24 @@ def machine(server, tmp_path, tiny, request):
 
 @contextmanager
 def doomed(folder):
-    """A ledger whose worker is killed at the end of the block: its signs of life stop, and nobody is told."""
-    ledger = Ledger(folder)
-    execute = ledger.storage.execute
+    """A queue whose worker is killed at the end of the block: its heartbeats stop without notice."""
+    queue = TrialQueue(folder)
+    execute = queue.storage.execute
 
     def silent(statement, **parameters):
         return None if "codesign_workers" in statement else execute(statement, **parameters)
 
-    with ledger:
-        yield ledger
-        ledger.storage.execute = silent
+    with queue:
+        yield queue
+        queue.storage.execute = silent
 
 
 def result(trial, score=0.5):
-    return {"number": trial.number, "state": "complete", "score": score, "scores": [score], "agent": "qp"}
+    return TrialResult(trial.number, origin="", process="", design={}, scores=[score])
 
 
-def states(ledger):
-    return [trial.state.name for trial in ledger.study.get_trials(deepcopy=False)]
+def states(queue):
+    return [trial.state.name for trial in queue.study.get_trials(deepcopy=False)]
 
 
 def wait_for(condition, seconds=20.0):
@@ -79,7 +80,7 @@ def test_machines_share_the_budget_and_the_goals(machine):
     a, b = machine("a", trials=3), machine("b", trials=3)
     assert (a.path / "goals.json").read_bytes() == (b.path / "goals.json").read_bytes()
     assert (a.path / "study.json").read_bytes() == (b.path / "study.json").read_bytes()
-    with Ledger(a) as one, Ledger(b) as two:
+    with TrialQueue(a) as one, TrialQueue(b) as two:
         bodies = [("baseline", {"height": 0.02, "joint_height": 0.006})]
         one.enqueue(bodies)
         two.enqueue(bodies)
@@ -87,19 +88,19 @@ def test_machines_share_the_budget_and_the_goals(machine):
         assert [trial.number for trial in claimed] == [0, 1, 2]
         assert [trial.user_attrs["origin"] for trial in claimed] == ["baseline", "sampler 1", "sampler 2"]
         assert two.claim() is None
-        for ledger, trial in zip((one, two, one), claimed, strict=True):
-            assert ledger.finish(result(trial))
+        for queue, trial in zip((one, two, one), claimed, strict=True):
+            assert queue.finish(result(trial))
         assert one.left() == two.left() == 0
-        for ledger in (one, two):
-            ledger.mirror()
+        for queue in (one, two):
+            queue.mirror()
         assert a.results() == b.results() == [result(trial) for trial in claimed]
 
 
 @pytest.mark.parametrize("call_lives", [False, True])
-def test_who_was_killed_together_is_told_from_who_died_alone(machine, call_lives):
-    """The last sign of life of the call came a little later: when the worker counts as dead, the call does not yet."""
+def test_worker_killed_with_its_call_does_not_blame_the_body(machine, call_lives):
+    """The last heartbeat of the call came a little later: the call is not dead yet when the worker counts as dead."""
     folder = machine(trials=1)
-    with Ledger(folder) as survivor:
+    with TrialQueue(folder) as survivor:
         with doomed(folder) as call, doomed(folder) as victim:
             assert victim.call == call.worker
             lost = victim.claim()
@@ -111,7 +112,7 @@ def test_who_was_killed_together_is_told_from_who_died_alone(machine, call_lives
 
         def claimable():
             if call_lives:
-                survivor.storage.execute(SIGN, worker=call.worker)
+                survivor.storage.execute(HEARTBEAT, worker=call.worker)
             return survivor.claimable()
 
         wait_for(claimable)
@@ -122,17 +123,17 @@ def test_who_was_killed_together_is_told_from_who_died_alone(machine, call_lives
 
 def test_body_of_a_dead_worker_runs_again_on_another_machine(machine):
     a, b = machine("a", trials=1), machine("b", trials=1)
-    with Ledger(b) as survivor:
+    with TrialQueue(b) as survivor:
         with doomed(a) as victim:
             lost = victim.claim()
             lost.report(0.25, 10)
-            assert survivor.claim() is None  # it gave a sign of life just now
+            assert survivor.claim() is None  # its last heartbeat is recent
         wait_for(lambda: survivor.claimable())
         again = survivor.claim()
         assert (again.number, again.params) == (1, lost.params)
         assert again.user_attrs["origin"] == lost.user_attrs["origin"]
         assert survivor.study.trials[1].intermediate_values == {10: 0.25}
-        # It was not dead, only out of reach: too late, its trial is another's.
+        # The worker was only out of reach; meanwhile its trial was reassigned.
         assert not victim.finish(result(lost, score=9.0))
         assert survivor.finish(result(again))
         assert states(survivor) == ["FAIL", "COMPLETE"]
@@ -140,9 +141,9 @@ def test_body_of_a_dead_worker_runs_again_on_another_machine(machine):
         assert a.results() == [result(again)]
 
 
-def test_signs_of_life_keep_a_trial(machine):
+def test_heartbeats_keep_a_trial(machine):
     folder = machine(trials=1)
-    with Ledger(folder) as busy, Ledger(folder) as other:
+    with TrialQueue(folder) as busy, TrialQueue(folder) as other:
         trial = busy.claim()
         time.sleep(2.5 * GRACE)
         assert not other.claimable()
@@ -152,7 +153,7 @@ def test_signs_of_life_keep_a_trial(machine):
 def test_time_without_the_server_does_not_count(machine, server):
     storage = machine(heartbeat=60.0).open_storage()
     assert not storage.lives("worker")
-    storage.execute(SIGN, worker="worker")
+    storage.execute(HEARTBEAT, worker="worker")
     assert storage.lives("worker")
     storage.execute("UPDATE codesign_workers SET seen = now() - interval '1 hour'")
     storage.grace = 1e-3  # the server has run for longer
@@ -162,45 +163,45 @@ def test_time_without_the_server_does_not_count(machine, server):
     assert storage.lives("worker")
 
 
-def test_transaction_takes_place_whole_or_not_at_all(machine):
+def test_transaction_is_atomic(machine):
     folder = machine(trials=2)
-    with Ledger(folder) as ledger:
-        original, cut = ledger._claim, []
+    with TrialQueue(folder) as queue:
+        original, cut = queue._claim, []
 
         def claim(study):
             trial = original(study)
             if not cut:  # the server ends the connection at the last moment
-                with ledger.storage._engine.connect() as connection:
+                with queue.storage._engine.connect() as connection:
                     ended = connection.execute(
                         sql.text("SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE state LIKE 'idle in%'")
                     )
                     cut.extend(ended.scalars())
             return trial
 
-        ledger._claim = claim
-        trial = ledger.claim()
+        queue._claim = claim
+        trial = queue.claim()
         assert cut == [True]
-        assert (trial.number, states(ledger)) == (0, ["RUNNING"])
-        assert ledger.finish(result(trial))
-        assert ledger.claim().number == 1
-        assert ledger.claim() is None
+        assert (trial.number, states(queue)) == (0, ["RUNNING"])
+        assert queue.finish(result(trial))
+        assert queue.claim().number == 1
+        assert queue.claim() is None
 
 
 def test_answers_that_got_lost(machine):
     folder = machine(trials=2)
-    with Ledger(folder) as ledger:
-        first = ledger._exclusively(ledger._claim)  # done, but nobody was told
-        trial = ledger.claim()
+    with TrialQueue(folder) as queue:
+        first = queue._exclusively(queue._claim)  # done, but the answer got lost
+        trial = queue.claim()
         assert (trial.number, trial.params) == (first.number, first.params)
-        assert ledger.finish(result(trial))
-        assert ledger.finish(result(trial))
-        assert not ledger.finish(result(trial, score=1.0))
-        assert states(ledger) == ["COMPLETE"]
+        assert queue.finish(result(trial))
+        assert queue.finish(result(trial))
+        assert not queue.finish(result(trial, score=1.0))
+        assert states(queue) == ["COMPLETE"]
 
 
 def test_body_that_kills_its_workers_is_given_up(machine):
     folder = machine(trials=1, attempts=2)
-    with Ledger(folder) as watcher:
+    with TrialQueue(folder) as watcher:
         for number in range(2):
             wait_for(watcher.claimable)
             with doomed(folder) as victim:
@@ -209,7 +210,7 @@ def test_body_that_kills_its_workers_is_given_up(machine):
         worker.run_trials(folder)
         watcher.mirror()
         (found,) = folder.results()
-    assert (found["number"], found["state"], found["reason"]) == (2, "infeasible", "2 workers died of it")
+    assert (found.number, found.state, found.reason) == (2, "infeasible", "evaluation crashed 2 workers")
 
 
 def test_jobs_are_shared(machine):
@@ -217,13 +218,13 @@ def test_jobs_are_shared(machine):
     made = []
 
     def job(folder, name):
-        return Job(folder.path / "screen" / f"{name}.json", lambda: made.append(name) or {"name": name})
+        return Job(folder.path / "screen" / f"{name}.json", lambda: made.append(name) or Account(name))
 
-    run_jobs(a, [job(a, "0")])
+    run_pending(a, [job(a, "0")])
     assert missing_jobs(b, [job(b, "0")]) == []
     with a.open_storage().attempt("screen/1.json") as mine:
         assert mine
-        thread = threading.Thread(target=run_jobs, args=(b, [job(b, "1"), job(b, "2")]))
+        thread = threading.Thread(target=run_pending, args=(b, [job(b, "1"), job(b, "2")]))
         thread.start()
         wait_for(lambda: (b.path / "screen" / "2.json").exists())
         assert not (b.path / "screen" / "1.json").exists()
@@ -247,14 +248,14 @@ def test_policies_come_from_the_machine_that_trained_them(machine, monkeypatch):
     (a.path / name).write_bytes(b"weights")
     (a.path / name).with_suffix(".json").write_bytes(b"{}")
     tested = []
-    monkeypatch.setattr(worker, "run_jobs", lambda folder, jobs: tested.append(folder))
-    monkeypatch.setattr(finalists, "finalists", lambda folder: [SimpleNamespace(policy=name)])
-    monkeypatch.setattr(worker, "finalist_jobs", lambda folder: [])
-    with Ledger(a) as ledger:
-        trial = ledger.claim()
+    monkeypatch.setattr(worker, "run_pending", lambda folder, jobs: tested.append(folder))
+    snapshot = SimpleNamespace(folder=b, finalists=[SimpleNamespace(policy=name)], planned_tests=[])
+    monkeypatch.setattr(worker, "load_study", lambda folder: snapshot)
+    with TrialQueue(a) as queue:
+        trial = queue.claim()
         with pytest.raises(DataError, match=f"policy '{name}' is neither in folder .* nor in storage"):
             worker.PHASES["finalists"](b)
-        assert ledger.finish({**result(trial), "agent": name})
+        assert queue.finish(replace(result(trial), controller=name))
     worker.PHASES["finalists"](b)
     assert tested == [b]
     assert (b.path / name).read_bytes() == b"weights"
@@ -276,14 +277,14 @@ def test_other_studies_are_refused(machine, server, tmp_path, tiny):
     with pytest.raises(ConfigError, match="is not in storage"):
         machine("a")
     with pytest.raises(DataError, match="has no study"):
-        Ledger(a)
+        TrialQueue(a)
     machine("c")
     with pytest.raises(ConfigError, match="holds another study"):
         machine("a")
 
 
 def test_options_of_tests_stay_once_there_is_one(machine):
-    """Also on a machine that has none of them."""
+    """Also on a machine without tests in its folder."""
 
     def on(folder, **options):
         return machine(folder, finalists={"count": 1, "fem_options": options})
@@ -309,7 +310,7 @@ def test_server_that_cannot_be_reached(tiny, tmp_path):
 
 
 def test_sweep_with_killed_workers_and_a_restarted_server(machine, server):
-    """Forty trials on two machines; two workers killed, and two restarts of the server, of which one is a crash."""
+    """Forty trials on two machines; two workers are killed, the server is restarted and crashes."""
     folders = [machine(name, trials=40, goals={"count": 20, "unseen_count": 2, "training_count": 2}) for name in "ab"]
     with Sweep(folders, seed=0) as sweep:
         for step in ("restart", "kill", "crash", "kill"):
@@ -321,7 +322,7 @@ def test_sweep_with_killed_workers_and_a_restarted_server(machine, server):
         assert len(sweep.seen) < 40
         sweep.run_for(trials=40)
     for folder in folders:
-        with Ledger(folder) as ledger:
-            ledger.mirror()
+        with TrialQueue(folder) as queue:
+            queue.mirror()
         assert faults(folder, sweep.seen) == []
     assert folders[0].results() == folders[1].results()

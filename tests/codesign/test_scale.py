@@ -1,4 +1,4 @@
-"""Workers that are killed, executors, and the dashboard: what needs no database."""
+"""Killed workers, executors, and the dashboard, without a database."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 from wsgiref.util import setup_testing_defaults
 
 import optuna
@@ -16,19 +17,22 @@ from optuna.trial import TrialState
 from benchmarks.codesign_scale import Sweep, faults
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
+from codesign.phases.trial import give_up
 from codesign.report.results import write_results
 from codesign.scheduling import worker
-from codesign.scheduling.processes import run_workers
-from codesign.scheduling.queue import CALL, Ledger, open_study
+from codesign.scheduling.optuna_study import open_study
+from codesign.scheduling.processes import WorkerError, run_workers
+from codesign.scheduling.queue import CALL, TrialQueue
 from codesign.scheduling.worker import run_trials
+from codesign.snapshot import load_study
 from codesign.study import run_study
-from softgym_envs.errors import ConfigError, DataError, MeshingError
+from softgym_envs.errors import ConfigError, DataError, MeshingError, SoftGymError
 
 SMALL = {"count": 2, "unseen_count": 2, "training_count": 2}
 
 
 def test_sweep_with_killed_workers(study):
-    """Forty trials on the journal, more than are done by then, by two workers of which one is killed three times."""
+    """Forty trials on the journal by two workers, of which one is killed three times before all trials are finished."""
     folder = study(trials=40, goals={**SMALL, "count": 20})
     with Sweep([folder, folder], seed=1) as sweep:
         for _ in range(3):
@@ -43,14 +47,14 @@ def test_sweep_with_killed_workers(study):
 def test_faults_are_seen(study):
     folder = study(trials=3, goals=SMALL)
     run_trials(folder)
-    seen = {record["number"]: record for record in folder.results()}
+    seen = {record.number: record for record in folder.results()}
     assert faults(folder, seen) == []
     assert faults(folder, {**seen, 7: seen[0]}) == ["trial 7 was lost or changed"]
     record = folder.trial(1) / "result.json"
-    record.write_text(json.dumps({**seen[1], "scores": [0.0]}))
-    assert faults(folder, seen) == ["trial 1 was lost or changed", "trial 1 has the result of another one"]
+    replace(seen[1], scores=[0.0]).write(record)
+    assert faults(folder, seen) == ["trial 1 was lost or changed", "trial 1 has the result of another trial"]
     record.unlink()
-    assert faults(folder, seen) == ["trial 1 was lost or changed", "trial 1 and its result are not both there"]
+    assert faults(folder, seen) == ["trial 1 was lost or changed", "trial 1 has no result, or its result has no trial"]
 
 
 def test_worker_that_is_killed_is_replaced(study, monkeypatch, tmp_path):
@@ -74,29 +78,29 @@ def test_worker_that_is_killed_is_replaced(study, monkeypatch, tmp_path):
 
 def test_given_up_body_has_the_record_of_a_trial(study):
     folder = study(trials=2, goals=SMALL)
-    with Ledger(folder) as ledger:
-        given_up = worker._give_up(folder, ledger.claim())
-        ledger.finish(given_up)
+    with TrialQueue(folder) as queue:
+        given_up = give_up(folder, queue.claim())
+        queue.finish(given_up)
     run_trials(folder)
     first, whole = folder.results()
     assert first == given_up
-    assert given_up.keys() == whole.keys()
-    counts = write_results(folder)["trials"]
+    assert whole.state == "complete"
+    counts = write_results(load_study(folder)).trials
     assert (counts["complete"], counts["infeasible"]) == (1, 1)
-    assert "5 workers died of it" in (folder.path / "trials.csv").read_text()
+    assert "evaluation crashed 5 workers" in (folder.path / "trials.csv").read_text()
 
 
 def test_attempts_count_only_without_progress(study):
     folder = study(trials=1)
     attempts = []
-    with Ledger(folder) as ledger:
+    with TrialQueue(folder) as queue:
         for step in (0, 0, 100, 0):
-            with Ledger(folder) as victim:
+            with TrialQueue(folder) as victim:
                 trial = victim.claim()
                 attempts.append(trial.user_attrs.get("attempt", 1))
                 if step:
                     trial.report(0.5, step)
-        attempts.append(ledger.claim().user_attrs["attempt"])
+        attempts.append(queue.claim().user_attrs["attempt"])
     assert attempts == [1, 2, 3, 1, 2]
 
 
@@ -105,37 +109,73 @@ def test_attempts_do_not_count_workers_that_ended_with_their_call(study):
     folder = study(trials=1)
     attempts = []
     for _ in range(3):
-        with Ledger(folder), Ledger(folder) as victim:
+        with TrialQueue(folder), TrialQueue(folder) as victim:
             attempts.append(victim.claim().user_attrs.get("attempt", 1))
     assert attempts == [1, 1, 1]
     assert CALL not in os.environ
 
 
-def test_body_that_raises_is_blamed(study, monkeypatch):
-    """An error that is a bug ends the call, and is the body's all the same; one of the installation is not."""
-    folder = study(trials=1, attempts=2)
+def test_exception_ends_every_call_until_it_is_fixed(study, monkeypatch):
+    """An exception is a bug or a problem of the installation: it never makes a body infeasible."""
+    folder = study(trials=1, goals=SMALL, attempts=1)
+    with monkeypatch.context() as patch:
+        for error in (ZeroDivisionError(), MeshingError(), ZeroDivisionError(), ZeroDivisionError()):
 
-    def run(error):
-        def fail(folder, trial):
-            raise error
+            def fail(folder, trial, error=error):
+                raise error
 
-        monkeypatch.setattr(worker, "run_trial", fail)
-        with Ledger(folder), pytest.raises(type(error)):
-            run_trials(folder)
-
-    run(ZeroDivisionError())
-    run(MeshingError())
-    run(ZeroDivisionError())
-    with Ledger(folder):
+            patch.setattr(worker, "run_trial", fail)
+            with TrialQueue(folder), pytest.raises(type(error)):
+                run_trials(folder)
+            assert folder.results() == []
+    with TrialQueue(folder):
         run_trials(folder)
     (found,) = folder.results()
-    assert (found["state"], found["reason"]) == ("infeasible", "2 workers died of it")
+    assert found.state == "complete"
+
+
+def test_exception_next_to_other_workers(study, monkeypatch):
+    """A worker that claims the trial while the call is still alive fails as well, and does not give the body up."""
+    folder = study(trials=1, goals=SMALL, attempts=1)
+
+    def fail(folder, trial):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(worker, "run_trial", fail)
+    with TrialQueue(folder):
+        for _ in range(3):
+            with pytest.raises(ZeroDivisionError):
+                run_trials(folder)
+    assert folder.results() == []
+
+
+def test_bug_in_the_file_of_a_robot_ends_a_study_with_its_traceback(study, monkeypatch, tmp_path):
+    """It reaches the call from a worker process, and the process does not end with one line and status 2."""
+    module = tmp_path / "site" / "sitecustomize.py"
+    module.parent.mkdir()
+    module.write_text(
+        "import softgym_envs.robots.soft_finger as finger\n"
+        "def assemble(self, design):\n"
+        "    import numpy as np\n"
+        "    return np.ones(3) @ np.ones(4)  # the bug\n"
+        "finger.SoftFinger.assemble = assemble\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(module.parent))
+    folder = study(trials=2, goals=SMALL, environment={"id": "SoftGym/FingerReach-v0", "backend": "fem"})
+    with pytest.raises(WorkerError) as caught:
+        run_study(folder.config, folder.path, progress=False)
+    message = str(caught.value)
+    assert not isinstance(caught.value, SoftGymError | ValueError)  # which the command line prints as one line
+    assert message.startswith("a worker of phase 'trials' failed with exit status 1:")
+    assert "Traceback (most recent call last):" in message and "sitecustomize.py" in message
+    assert "# the bug" in message and "ValueError: matmul" in message
+    assert folder.results() == []
 
 
 def test_interrupted_baseline_is_not_given_up(tmp_path, tiny, start_study):
-    """Though a single death would be enough."""
+    """Although a single crash would be enough."""
     folder = tmp_path / "study"
-    # On FEM a trial takes longer than it takes to see it and to stop it.
+    # On FEM a trial takes longer than it takes to notice and to stop it.
     environment = {"id": "SoftGym/FingerReach-v0", "backend": "fem"}
     goals = {"count": 300, "unseen_count": 2, "training_count": 2}
     data = tiny(trials=1, attempts=1, environment=environment, goals=goals)
@@ -155,14 +195,14 @@ def test_interrupted_baseline_is_not_given_up(tmp_path, tiny, start_study):
             time.sleep(0.05)
         process.send_signal(how)
         process.communicate(timeout=120)
-    with Ledger(StudyFolder(folder)), Ledger(StudyFolder(folder)) as ledger:
-        again = ledger.claim()
+    with TrialQueue(StudyFolder(folder)), TrialQueue(StudyFolder(folder)) as queue:
+        again = queue.claim()
         assert (again.number, again.user_attrs["origin"], again.user_attrs["attempt"]) == (3, "baseline", 1)
 
 
 @pytest.mark.parametrize("marks", [0, 1, 2])
-def test_worker_that_dies_while_it_claims_blames_no_body(study, monkeypatch, marks):
-    """Though the call that started it lives on: the body was not looked at yet."""
+def test_worker_that_dies_while_it_claims_does_not_blame_the_body(study, monkeypatch, marks):
+    """Although the call that started it is still alive: the worker has not looked at the body yet."""
     folder = study(trials=1, attempts=1)
     original, written = optuna.Trial.set_user_attr, []
 
@@ -172,23 +212,23 @@ def test_worker_that_dies_while_it_claims_blames_no_body(study, monkeypatch, mar
         written.append(key)
         original(trial, key, value)
 
-    with Ledger(folder) as call:
+    with TrialQueue(folder) as call:
         call.enqueue([("baseline", {name: folder.config.baseline[name] for name in folder.config.variables})])
         monkeypatch.setattr(optuna.Trial, "set_user_attr", set_user_attr)
-        with Ledger(folder) as ledger, pytest.raises(KeyboardInterrupt):
-            ledger.claim()
+        with TrialQueue(folder) as queue, pytest.raises(KeyboardInterrupt):
+            queue.claim()
         monkeypatch.undo()
-        with Ledger(folder) as ledger:
-            again = ledger.claim()
+        with TrialQueue(folder) as queue:
+            again = queue.claim()
     assert (again.number, again.user_attrs["origin"], again.user_attrs["attempt"]) == (1, "baseline", 1)
 
 
 @pytest.mark.parametrize("method", ["set_user_attr", "report"])
 def test_reports_outlive_a_worker_that_dies_while_it_claims(study, monkeypatch, method):
     folder = study(trials=1, attempts=3)
-    with Ledger(folder) as ledger:
-        ledger.enqueue([("baseline", {name: folder.config.baseline[name] for name in folder.config.variables})])
-        first = ledger.claim()
+    with TrialQueue(folder) as queue:
+        queue.enqueue([("baseline", {name: folder.config.baseline[name] for name in folder.config.variables})])
+        first = queue.claim()
         for step in (10, 20, 30):
             first.report(0.1 * step, step)
     original = getattr(optuna.Trial, method)
@@ -197,10 +237,10 @@ def test_reports_outlive_a_worker_that_dies_while_it_claims(study, monkeypatch, 
         original(trial, *arguments)
         raise KeyboardInterrupt
 
-    with Ledger(folder) as call:
+    with TrialQueue(folder) as call:
         monkeypatch.setattr(optuna.Trial, method, die)
-        with Ledger(folder) as ledger, pytest.raises(KeyboardInterrupt):
-            ledger.claim()
+        with TrialQueue(folder) as queue, pytest.raises(KeyboardInterrupt):
+            queue.claim()
         monkeypatch.undo()
         again = call.claim()
     trial = open_study(folder).get_trials()[again.number]
@@ -208,7 +248,7 @@ def test_reports_outlive_a_worker_that_dies_while_it_claims(study, monkeypatch, 
     assert (trial.number, trial.user_attrs["attempt"]) == (2, 1)
 
 
-def test_worker_goes_on_when_its_trial_was_given_away(study, monkeypatch):
+def test_worker_continues_when_its_trial_was_reassigned(study, monkeypatch):
     folder = study(trials=2, goals=SMALL)
     original = worker.run_trial
 
@@ -221,7 +261,7 @@ def test_worker_goes_on_when_its_trial_was_given_away(study, monkeypatch):
     monkeypatch.setattr(worker, "run_trial", run_trial)
     worker.run_trials(folder)
     assert [trial.state.name for trial in open_study(folder).trials] == ["FAIL", "COMPLETE", "COMPLETE"]
-    assert [record["number"] for record in folder.results()] == [1, 2]
+    assert [record.number for record in folder.results()] == [1, 2]
 
 
 def test_ray_that_is_not_installed(study, monkeypatch):
@@ -237,7 +277,7 @@ def test_ray(tmp_path, tiny):
 
     config = StudyConfig.model_validate(tiny(trials=4, goals=SMALL, executor="ray", workers=2))
     results = run_study(config, tmp_path / "study", progress=False)
-    assert results["trials"]["complete"] == 4
+    assert results.trials["complete"] == 4
     assert not ray.is_initialized()
     folder = StudyFolder(tmp_path / "study")
     assert faults(folder, {}) == []
@@ -249,16 +289,16 @@ def test_ray(tmp_path, tiny):
         ("sqlite:///study.db", "allowed: journal, postgresql://"),
         ("postgresql://host", "allowed: journal, postgresql://"),
         ("somewhere", "allowed: journal, postgresql://"),
-        ("postgresql://me:secret@host/studies", "must hold no password"),
+        ("postgresql://me:secret@host/studies", "remove the password"),
     ],
 )
-def test_storages_that_are_none(storage, message, tiny):
+def test_wrong_storages(storage, message, tiny):
     with pytest.raises(ValueError, match=message):
         StudyConfig.model_validate(tiny(storage=storage))
 
 
 def test_dashboard(study):
-    """It opens the journal and tells what people look for."""
+    """It opens the journal and shows scores and metrics."""
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend
     from optuna_dashboard import wsgi
@@ -277,7 +317,7 @@ def test_dashboard(study):
 
     (summary,) = get("/api/studies")["study_summaries"]
     trials = get(f"/api/studies/{summary['study_id']}")["trials"]
-    assert [trial["values"] for trial in trials] == [record["scores"] for record in folder.results()]
-    told = {attribute["key"]: attribute["value"] for attribute in trials[0]["user_attrs"]}
-    assert float(told["mean_distance"]) == folder.result(0)["evaluation"]["mean_distance"]
-    assert {"origin", "process", "success_rate"} <= told.keys()
+    assert [trial["values"] for trial in trials] == [record.scores for record in folder.results()]
+    shown = {attribute["key"]: attribute["value"] for attribute in trials[0]["user_attrs"]}
+    assert float(shown["mean_distance"]) == folder.result(0).evaluation.mean_distance
+    assert {"origin", "process", "success_rate"} <= shown.keys()

@@ -1,21 +1,24 @@
-"""Whole tiny studies of the strategies whose trials train nothing, of several objectives and of retrained finalists."""
+"""Whole tiny studies: strategies whose trials do not train, several objectives, and retrained finalists."""
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from codesign.config import StudyConfig
-from codesign.folder import StudyFolder
-from codesign.phases.finalists import evaluations, finalists, pareto_trials
-from codesign.phases.shared_policy import JUDGE, joint_config
+from codesign.folder import SHARED_POLICY, StudyFolder
+from codesign.phases.shared_policy import joint_config
+from codesign.records import FinalistTest
 from codesign.report.page import write_report
-from codesign.scheduling.queue import open_study
+from codesign.scheduling.optuna_study import open_study
+from codesign.snapshot import load_study
 from codesign.study import run_study
 
 SHOWN = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
@@ -36,7 +39,7 @@ def run(tmp_path, tiny):
     return start
 
 
-def test_policy_as_judge_with_pruning_by_goals(run):
+def test_shared_policy_with_pruning_by_goals(run):
     folder, results = run(
         strategy="policy",
         policy="finger_reach_designs",
@@ -45,65 +48,76 @@ def test_policy_as_judge_with_pruning_by_goals(run):
         goals={"count": 24, "unseen_count": 2, "training_count": 4},
         pruner={"name": "wilcoxon", "options": {"p_threshold": 0.3}},
     )
-    assert results["trials"]["infeasible"] == 0 and results["cost"]["training_steps"] == 0
-    assert (folder.path / JUDGE).exists()
+    assert results.trials["infeasible"] == 0 and results.cost.training_steps == 0
+    assert (folder.path / SHARED_POLICY).exists()
     for trial in folder.results():
-        seen = len(trial["evaluation"]["distances"])
-        assert trial["agent"] == JUDGE
-        assert seen == 24 if trial["state"] == "complete" else seen in (6, 12, 18)
-    states = [trial["state"] for trial in folder.results()]
+        seen = len(trial.evaluation)
+        assert trial.controller == SHARED_POLICY
+        assert seen == 24 if trial.state == "complete" else seen in (6, 12, 18)
+    states = [trial.state for trial in folder.results()]
     assert states[0] == "complete"  # the baseline is never pruned
     # Each goal was reported once, under its own number.
     for trial in open_study(folder).get_trials():
-        record = folder.result(trial.number)["evaluation"]["distances"]
+        record = folder.result(trial.number).evaluation.distances
         np.testing.assert_allclose([-trial.intermediate_values[k] for k in range(len(record))], record)
 
 
 @pytest.mark.parametrize("strategy", ["critic", "distribution"])
-def test_joint_training_gives_the_judge_and_the_first_bodies(strategy, run):
+def test_joint_training_gives_the_shared_policy_and_the_first_bodies(strategy, run):
     joint = {"steps": 320, "report_every": 160, "evaluation_episodes": 2, "keep": 2, "sac": QUICK}
     folder, results = run(strategy=strategy, environment=SHOWN, trials=4, joint=joint)
     trials = folder.results()
-    assert [trial["origin"] for trial in trials] == ["baseline", "joint 0", "joint 1", "sampler 3"]
-    told = json.loads((folder.path / "judge" / "judge.json").read_text())
-    for trial, body in zip(trials[1:3], told["bodies"], strict=False):
-        assert {name: trial["design"][name] for name in body} == pytest.approx(body)
+    assert [trial.origin for trial in trials] == ["baseline", "joint 0", "joint 1", "sampler 3"]
+    bodies = load_study(folder).shared_policy.bodies
+    assert bodies
+    for trial, body in zip(trials[1:3], bodies, strict=False):
+        assert {name: trial.design[name] for name in body} == pytest.approx(body)
         assert set(body) == set(folder.config.variables)
     config = joint_config(folder)
     assert config.environment.sample_design == list(folder.config.variables)
     assert config.environment.task_options["goals"] == folder.goals["training"].tolist()
-    assert results["cost"]["joint_report_steps"] == 2 * 2 * 50
-    assert results["cost"]["joint_steps"] == 320 and results["cost"]["cpu_seconds"]["judge"] > 0.0
+    assert results.cost.joint_report_steps == 2 * 2 * 50
+    assert results.cost.joint_steps == 320 and results.cost.cpu_seconds["shared_policy"] > 0.0
     assert "trained together" in write_report(folder.path).read_text()
 
 
-def test_several_objectives_and_limits(run):
+def test_several_objectives_and_constraints(run):
     folder, results = run(
-        also=["material_volume"], limits={"material_volume": LIMIT}, sampler={"name": "nsgaii"}, trials=10
+        secondary_objectives=["material_volume"],
+        constraints={"material_volume": LIMIT},
+        sampler={"name": "nsgaii"},
+        trials=10,
     )
     trials = folder.results()
     study = open_study(folder)
     assert len(study.directions) == 2
     for trial in trials:
-        record = trial["evaluation"]
-        assert trial["scores"] == [-record["mean_distance"], -record["material_volume"]]
-        assert trial["violations"] == pytest.approx([record["material_volume"] - LIMIT])
-        assert study.get_trials()[trial["number"]].values == trial["scores"]
-        assert study.get_trials()[trial["number"]].constraints == {"material_volume": trial["violations"][0]}
-        volume = folder.config.robot.build(trial["design"]).volume
-        assert record["material_volume"] == pytest.approx(volume, rel=1e-12)
-    allowed = [trial for trial in trials if trial["violations"][0] <= 0.0]
+        volume = trial.values["material_volume"]
+        assert trial.scores == [-trial.evaluation.mean_distance, -volume]
+        assert trial.violations == pytest.approx({"material_volume": volume - LIMIT})
+        assert study.get_trials()[trial.number].values == trial.scores
+        assert study.get_trials()[trial.number].constraints == trial.violations
+        assert volume == pytest.approx(folder.config.robot.build(trial.design).volume, rel=1e-12)
+    allowed = [trial for trial in trials if trial.feasible]
     assert 0 < len(allowed) < len(trials)
-    front = pareto_trials(folder)
-    assert results["pareto"] == [trial["number"] for trial in front]
+    assert results.trials["feasible"] == len(allowed)
     for trial in allowed:
         beaten = any(
-            all(a >= b for a, b in zip(other["scores"], trial["scores"], strict=True))
-            and other["scores"] != trial["scores"]
+            all(a >= b for a, b in zip(other.scores, trial.scores, strict=True)) and other.scores != trial.scores
             for other in allowed
         )
-        assert beaten != (trial["number"] in results["pareto"])
-    assert "Pareto" in write_report(folder.path).read_text()
+        assert beaten != (trial.number in results.pareto)
+    page = write_report(folder.path).read_text()
+    assert "Pareto" in page
+    assert f"{len(allowed)} of 10 complete trials satisfy them" in page
+    assert f"material volume at most {1e6 * LIMIT:.2f} cm3" in page
+    with (folder.path / "trials.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["feasible"] for row in rows] == [str(trial.feasible) for trial in trials]
+    for row, trial in zip(rows, trials, strict=True):
+        assert float(row["material_volume [SI]"]) == trial.values["material_volume"]
+        assert float(row["violation of material_volume [SI]"]) == trial.violations["material_volume"]
+        assert bool(row["reason"]) != trial.feasible
 
 
 def test_finalists_are_trained_anew_with_several_seeds(run):
@@ -119,29 +133,23 @@ def test_finalists_are_trained_anew_with_several_seeds(run):
             card = json.loads((folder.path / "finalists" / f"trial000{body}-seed{seed}" / "policy.json").read_text())
             assert card["config"]["seed"] == seed and card["steps"] == 240
             assert f"trial000{body}-sac-seed{seed}-fem-unseen.json" in names
-    both = [r for r in evaluations(folder) if (r["agent"], r["backend"]) == ("sac", "surrogate")]
+    both = [group for group in load_study(folder).tests if (group.agent, group.backend) == ("sac", "surrogate")]
     assert len(both) == 2
-    for record in both:
-        parts = [
-            json.loads(
-                (
-                    folder.path / "finalists" / f"trial{record['trial']:04d}-sac-seed{s}-surrogate-unseen.json"
-                ).read_text()
-            )
-            for s in (1, 2)
-        ]
-        np.testing.assert_allclose(record["distances"], np.mean([part["distances"] for part in parts], axis=0))
-        assert record["of_seeds"]["distances"] == [part["distances"] for part in parts]
-    assert {row["agent"] for row in results["comparison"]} == {"sac", "qp"}
-    assert results["cost"]["retraining_steps"] == 2 * 2 * 240
-    assert results["cost"]["retraining_report_steps"] == 2 * 2 * 3 * 2 * 50
-    told = {(row["trial"], row["seed"]): row["curve"] for row in results["trainings"]}
-    assert sorted(told) == [(0, 1), (0, 2), (1, 1), (1, 2)]
-    for (number, seed), curve in told.items():
+    for group in both:
+        files = (f"trial{group.trial:04d}-sac-seed{seed}-surrogate-unseen.json" for seed in (1, 2))
+        parts = [FinalistTest.read(folder.path / "finalists" / name).evaluation.distances for name in files]
+        np.testing.assert_allclose(group.mean.distances, np.mean(parts, axis=0))
+        np.testing.assert_array_equal(group.table("distances"), parts)
+    assert {row.agent for row in results.comparison} == {"sac", "qp"}
+    assert results.cost.retraining_steps == 2 * 2 * 240
+    assert results.cost.retraining_report_steps == 2 * 2 * 3 * 2 * 50
+    curves = {(training.trial, training.seed): training.curve for training in results.trainings}
+    assert sorted(curves) == [(0, 1), (0, 2), (1, 1), (1, 2)]
+    for (number, seed), curve in curves.items():
         card = json.loads((folder.path / "finalists" / f"trial{number:04d}-seed{seed}" / "policy.json").read_text())
         assert curve == [[row["step"], -row["mean_distance"]] for row in card["curve"]]
     assert "Learning of the finalists" in write_report(folder.path).read_text()
-    winner = f"winner-trial{results['winner']['trial']:04d}"
+    winner = f"winner-trial{results.winner.trial:04d}"
     assert (folder.path / f"{winner}.stl").stat().st_size > 10_000
     assert (folder.path / f"{winner}.rrd").read_bytes()[:3] == b"RRF"
 
@@ -161,7 +169,7 @@ def test_report_opens_in_a_browser(run, tmp_path, require_program):
     dumped = subprocess.run(
         [CHROMIUM, *options, "--dump-dom", page.as_uri()], check=True, capture_output=True, text=True
     ).stdout
-    assert f"winner-trial{results['winner']['trial']:04d}.stl" in dumped
+    assert f"winner-trial{results.winner.trial:04d}.stl" in dumped
     assert dumped.count("data:image/png") >= 4 and dumped.count("data:image/svg") >= 4
     assert 'src="http' not in dumped and 'href="http' not in dumped  # self-contained
 
@@ -175,12 +183,11 @@ def test_every_strategy_is_described():
 
 def test_a_body_that_was_proposed_twice_is_one_finalist(run):
     folder, _ = run(trials=5, finalists={"count": 3})
-    before = finalists(folder)
+    before = load_study(folder).finalists
     assert len({tuple(body.design.values()) for body in before}) == len(before) == 4
     best = folder.result(before[1].number)
-    again = folder.trial(before[3].number) / "result.json"
-    again.write_text(json.dumps({**best, "number": before[3].number}))
-    after = finalists(folder)
+    replace(best, number=before[3].number).write(folder.trial(before[3].number) / "result.json")
+    after = load_study(folder).finalists
     assert len({tuple(body.design.values()) for body in after}) == len(after) == 4
     first = min(before[1].number, before[3].number)
     assert [body.number for body in after[:2]] == [0, first]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import signal
 import time
 from collections import Counter
@@ -13,15 +14,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from agents.evaluation import Evaluation
 from codesign.config import StudyConfig
-from codesign.folder import StudyFolder
-from codesign.phases.finalists import choose_winner, evaluations, finalist_jobs
+from codesign.folder import SHARED_POLICY, SHARED_POLICY_RECORD, StudyFolder
+from codesign.records import FinalistTest, SharedPolicy, TrialResult
 from codesign.report.page import write_report
-from codesign.report.results import mean_interval, rank_correlation, rate_interval
-from codesign.scheduling.queue import open_study
+from codesign.report.statistics import mean_interval, rank_correlation, rate_interval
+from codesign.scheduling.optuna_study import open_study
+from codesign.snapshot import load_study
 from codesign.study import run_study
 from softgym_envs.errors import WeightsError
-from softgym_envs.storage import write_json
 
 TRIALS = 7
 
@@ -45,7 +47,7 @@ def finished(tmp_path_factory, tiny, start_study):
     data = tiny(
         trials=TRIALS,
         workers=2,
-        goals={"count": 12, "unseen_count": 2, "training_count": 2},
+        goals={"count": 12, "unseen_count": 5, "training_count": 2},
         screen={"enabled": True, "candidates": 3, "keep": 0.7, "goals": 2},
         finalists={"count": 1},
     )
@@ -67,7 +69,7 @@ def finished(tmp_path_factory, tiny, start_study):
     )
 
 
-def test_interruption_tells_how_to_go_on(finished):
+def test_interruption_says_how_to_continue(finished):
     assert "run the same command again to continue" in finished.output
     assert 1 <= len(finished.interrupted) < TRIALS
 
@@ -87,7 +89,7 @@ def test_nothing_is_lost_or_duplicated(finished):
     assert sum(origin.startswith("screen") for origin in origins) == 2
     assert len({tuple(trial.params.values()) for trial in counted}) == TRIALS
     for trial in counted:
-        assert json.loads(now[f"{trial.number:04d}"])["score"] == trial.value
+        assert json.loads(now[f"{trial.number:04d}"])["scores"] == trial.values
 
 
 def test_the_other_call_finished_the_study(finished):
@@ -96,19 +98,18 @@ def test_the_other_call_finished_the_study(finished):
 
 def test_continuing_a_finished_study_does_nothing(finished):
     before = {path: path.stat().st_mtime_ns for path in finished.folder.path.glob("*/**/*.json")}
-    assert run_study(finished.folder.config, finished.folder.path, progress=False)["trials"]["complete"] == TRIALS
+    assert run_study(finished.folder.config, finished.folder.path, progress=False).trials["complete"] == TRIALS
     assert {path: path.stat().st_mtime_ns for path in finished.folder.path.glob("*/**/*.json")} == before
 
 
 def test_winner_is_the_best_of_the_search(finished):
-    best = max(finished.folder.results(), key=lambda result: result["score"])
-    assert finished.results["winner"]["trial"] == best["number"]
-    assert finished.results["baseline"]["design"] == finished.folder.config.baseline
-    # The inverse QP reads both physics alike: the surrogate is good to a tenth of a millimetre.
-    for row in finished.results["transfer"]:
-        if row["objective"] == "mean_distance":
-            assert row["worst_gap"] < 5e-4
-    assert [row["backend"] for row in finished.results["comparison"]] == ["fem", "surrogate"]
+    best = max(finished.folder.results(), key=lambda result: result.score)
+    assert finished.results.winner.trial == best.number
+    assert finished.results.baseline.design == finished.folder.config.baseline
+    # The inverse QP does about the same on both: the surrogate is accurate to a tenth of a millimetre.
+    assert [row.objective for row in finished.results.transfer] == ["mean_distance", "success_rate"]
+    assert finished.results.transfer[0].worst_gap < 5e-4
+    assert [row.backend for row in finished.results.comparison] == ["fem", "surrogate"]
 
 
 class Balance(HTMLParser):
@@ -142,14 +143,16 @@ def test_report(finished):
     assert len(page.sources) > 8
     beside = {path.name for path in finished.folder.path.glob("winner-trial*")}
     assert len(beside) == 2
-    assert all(source.startswith("data:image/") or source in beside for source in page.sources)
+    tables = {"results.json", "trials.csv", "finalists.csv"}
+    assert all(source.startswith("data:image/") or source in beside | tables for source in page.sources)
     text = " ".join(page.text)
-    row = finished.results["comparison"][0]
+    row = finished.results.comparison[0]
     for role in ("baseline", "winner"):
-        assert f"{1e3 * row[role]['mean_distance']:.2f} mm" in text
-        assert f"{100 * row[role]['success_rate']:.1f} %" in text
-    for variable in finished.results["variables"][1:3]:
-        assert f"{1e3 * variable['winner']:.2f} mm" in text
+        assert f"{1e3 * getattr(row, role).mean_distance:.2f} mm" in text
+        assert f"{100 * getattr(row, role).success_rate:.1f} %" in text
+    for variable in finished.results.variables[1:3]:
+        assert f"{1e3 * variable.winner:.2f} mm" in text
+        assert (f"at its {variable.at_limit} limit" in text) == bool(variable.at_limit)
     assert "softgym codesign --config" in text
     assert "nan" not in text.lower().replace("nanmean", "").split()
 
@@ -160,43 +163,48 @@ def test_tables(finished):
     with (folder / "trials.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == TRIALS
-    assert float(rows[0]["height [m]"]) == pytest.approx(
-        finished.folder.result(int(rows[0]["trial"]))["design"]["height"]
-    )
+    assert float(rows[0]["height [m]"]) == pytest.approx(finished.folder.result(int(rows[0]["trial"])).design["height"])
     with (folder / "finalists.csv").open() as stream:
         assert {(row["role"], row["backend"]) for row in csv.DictReader(stream)} == {
             (role, backend) for role in ("baseline", "finalist") for backend in ("fem", "surrogate")
         }
 
 
-def write_trial(folder, number, evaluation, violations):
-    """Leave the result of a finished trial, each of another body."""
-    result = {
-        "number": number,
-        "origin": "baseline" if number == 0 else f"sampler {number}",
-        "state": "complete",
-        "design": {**folder.config.baseline, "height": 0.020 + 1e-4 * number},
-        "agent": "qp",
-        "score": -evaluation["mean_distance"],
-        "violations": violations,
-        "evaluation": evaluation,
-    }
-    write_json(folder.trial(number) / "result.json", result)
+def evaluation(distance, effort=0.5):
+    return Evaluation(*(np.full(2, value) for value in (distance, distance, 1.0, 0.5, effort)), steps=1)
+
+
+def write_trial(folder, number, distance, effort=0.5):
+    """Write the result of a finished trial, each of another body."""
+    limits = folder.config.constraints
+    TrialResult(
+        number=number,
+        origin="baseline" if number == 0 else f"sampler {number}",
+        process="",
+        design={**folder.config.baseline, "height": 0.020 + 1e-4 * number},
+        values={"mean_distance": distance, "mean_effort": effort},
+        scores=[-distance],
+        violations={name: effort - limit for name, limit in limits.items()},
+        evaluation=evaluation(distance, effort),
+    ).write(folder.trial(number) / "result.json")
+
+
+def write_test(folder, number, distance, effort=0.5):
+    """Write the test of a body on FEM and the selection goals."""
+    values = {"mean_distance": distance, "mean_effort": effort}
+    test = FinalistTest(number, "qp", "fem", "selection", 0, evaluation(distance, effort), values, [distance] * 2)
+    test.write(folder.path / "finalists" / f"trial{number:04d}-qp-fem-selection.json")
 
 
 @pytest.mark.parametrize("choose, winner", [("surrogate", 2), ("fem", 1)])
-def test_who_names_the_winner(choose, winner, study):
+def test_what_decides_who_wins(choose, winner, study):
     folder = study(finalists={"count": 2, "choose": choose})
-
-    def record(distance):
-        return {"success_rate": 0.5, "mean_distance": distance, "mean_return": 1.0}
-
     for number, (searched, tested) in enumerate([(3e-3, 3e-3), (2e-3, 1e-3), (1e-3, 2e-3)]):
-        write_trial(folder, number, record(searched), [])
-        path = folder.path / "finalists" / f"trial{number:04d}-qp-fem-selection.json"
-        write_json(path, {"trial": number, "agent": "qp", "backend": "fem", "goals": "selection", **record(tested)})
-    assert choose_winner(folder, evaluations(folder)).number == winner
-    goals = {job.path.stem.rpartition("-")[2] for job in finalist_jobs(folder)}
+        write_trial(folder, number, searched)
+        write_test(folder, number, tested)
+    snapshot = load_study(folder)
+    assert snapshot.winner.number == winner
+    goals = {plan.goals for plan in snapshot.planned_tests}
     assert goals == ({"unseen", "selection"} if choose == "fem" else {"unseen"})
 
 
@@ -204,10 +212,11 @@ def test_error_of_a_worker_is_one_line(tmp_path, tiny):
     shown = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
     config = StudyConfig.model_validate(tiny(strategy="policy", policy="finger_reach_designs", environment=shown))
     folder = StudyFolder.create(tmp_path / "study", config)
-    # The judge was damaged after it was made, so that only the trials find out.
-    write_json(folder.path / "judge" / "judge.json", {})
-    (folder.path / "judge" / "policy.safetensors").write_bytes(b"not a policy")
-    (folder.path / "judge" / "policy.json").write_text("{}")
+    # The shared policy was damaged after it was made, so only the trials notice.
+    (folder.path / "shared_policy").mkdir()
+    SharedPolicy(SHARED_POLICY).write(folder.path / SHARED_POLICY_RECORD)
+    (folder.path / SHARED_POLICY).write_bytes(b"not a policy")
+    (folder.path / "shared_policy" / "policy.json").write_text("{}")
     with pytest.raises(WeightsError) as caught:
         run_study(config, folder.path, progress=False)
     assert "policy.safetensors" in str(caught.value)
@@ -219,9 +228,9 @@ def test_tests_of_former_finalists_stay_in_the_cost(study):
     before = run_study(folder.config, folder.path, progress=False)
     finalists = folder.config.finalists.model_copy(update={"count": 1})
     after = run_study(folder.config.model_copy(update={"finalists": finalists}), folder.path, progress=False)
-    assert len(after["finalists"]) < len(before["finalists"])
-    assert after["cost"]["test_steps_surrogate"] == before["cost"]["test_steps_surrogate"]
-    assert after["cost"]["cpu_seconds"] == before["cost"]["cpu_seconds"]
+    assert len(after.finalists) < len(before.finalists)
+    assert after.cost.test_steps_surrogate == before.cost.test_steps_surrogate
+    assert after.cost.cpu_seconds == before.cost.cpu_seconds
 
 
 def test_statistics(rng):
@@ -229,11 +238,12 @@ def test_statistics(rng):
     low, high = mean_interval(values)
     assert low < values.mean() < high
     assert high - low == pytest.approx(2 * 1.972 * values.std(ddof=1) / np.sqrt(200), rel=1e-3)
-    assert mean_interval(np.full((1, 2), 2.0)) == (2.0, 2.0)
-    assert mean_interval(np.ones((1, 1))) is None and mean_interval(np.ones((3, 1))) is None
+    assert mean_interval(np.full((1, 5), 2.0)) == (2.0, 2.0)
+    for goals in (1, 2, 4):  # too few
+        assert mean_interval(np.ones((3, goals))) is None and rate_interval(np.ones((3, goals))) is None
     assert rate_interval(np.ones((1, 10)))[0] == pytest.approx(0.7225, abs=1e-3)
-    low, high = rate_interval(np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]]))
-    assert 0.0 <= low < 5.0 / 6.0 < high <= 1.0
+    low, high = rate_interval(np.array([[1.0, 1.0, 0.0, 1.0, 1.0], [1.0, 1.0, 1.0, 1.0, 1.0]]))
+    assert 0.0 <= low < 9.0 / 10.0 < high <= 1.0
     assert rank_correlation([1, 2, 3], [10, 20, 15]) == pytest.approx(0.5)
     assert rank_correlation([1, 1, 1], [1, 2, 3]) is None
 
@@ -277,17 +287,68 @@ def test_intervals_over_seeds_and_goals_cover(rng, seeds, spread):
     assert covered / 400 > 0.915  # three standard deviations of the count below 0.95
 
 
-def test_limits_decide_before_scores(study):
-    folder = study(finalists={"count": 2, "choose": "fem"}, limits={"mean_effort": 1.0})
+def test_constraints_decide_before_scores(study):
+    folder = study(finalists={"count": 2, "choose": "fem"}, constraints={"mean_effort": 1.0})
+    found = [(3e-3, 0.5, 0.5), (2e-3, 0.9, 1.2), (1e-3, 1.5, 1.5)]  # distance, effort in the search, effort on FEM
+    for number, (distance, effort, _) in enumerate(found):
+        write_trial(folder, number, distance, effort)
+    assert load_study(folder).winner.number == 1  # trial 2 violates the constraint in the search
+    for number, (distance, _, effort) in enumerate(found):
+        write_test(folder, number, distance, effort)
+    assert load_study(folder).winner.number == 0  # trial 1 violates it on FEM
+    assert load_study(folder).best.number == 1
 
-    def record(distance, effort):
-        return {"success_rate": 0.5, "mean_distance": distance, "mean_return": 1.0, "mean_effort": effort}
 
-    found = [(3e-3, 0.5, 0.5), (2e-3, 0.9, 1.2), (1e-3, 1.5, 1.5)]  # distance, effort in search, effort on FEM
-    for number, (distance, effort, tested) in enumerate(found):
-        write_trial(folder, number, record(distance, effort), [effort - 1.0])
-        path = folder.path / "finalists" / f"trial{number:04d}-qp-fem-selection.json"
-        test = {"trial": number, "agent": "qp", "backend": "fem", "goals": "selection", **record(distance, tested)}
-        write_json(path, test)
-    assert choose_winner(folder, evaluations(folder)).number == 0  # trial 1 breaks it on FEM, trial 2 in the search
-    assert choose_winner(folder, []).number == 1
+def test_no_winner_names_the_cause_and_the_nearest_miss(study):
+    folder = study(finalists={"count": 1, "choose": "fem"}, constraints={"mean_effort": 1.0})
+    assert load_study(folder).verdict.reason == "no trial is finished"
+    for number, effort in enumerate((1.5, 1.31)):
+        write_trial(folder, number, 1e-3, effort)
+    verdict = load_study(folder).verdict
+    assert verdict.winner is None
+    assert verdict.reason == (
+        "no body satisfies the constraints; nearest: trial 1, mean actuator effort 1.31 N exceeds 1.00 N by 0.31 N"
+    )
+    write_trial(folder, 2, 1e-3, 0.9)
+    write_test(folder, 2, 1e-3, 1.2)
+    assert load_study(folder).verdict.reason == (
+        "no finalist satisfies the constraints on FEM; nearest: trial 2, mean actuator effort 1.20 N exceeds 1.00 N by "
+        "0.20 N"
+    )
+
+
+def test_study_whose_constraints_nobody_satisfies(study, capsys):
+    folder = study(trials=3, constraints={"mean_effort": 0.1, "success_rate": 1.0}, finalists={"count": 1})
+    results = run_study(folder.config, folder.path)
+    lines = capsys.readouterr().out.splitlines()
+    finished = [line for line in lines if line.startswith("[")]
+    assert len(finished) == 3
+    for line in finished:
+        assert re.search(
+            r"violates a constraint: mean actuator effort \d+\.\d\d N exceeds 0\.10 N by \d+\.\d\d N", line
+        )
+        assert "success rate" in line and "is below 100.0 % by" in line
+        assert "no body satisfies the constraints yet" in line
+    assert results.winner is None and results.trials["feasible"] == 0
+    assert lines[-1].startswith("no winner: no body satisfies the constraints; nearest: trial ")
+    assert not any(trial.feasible for trial in folder.results())
+    page = write_report(folder.path).read_text()
+    assert "The study has no winner: no body satisfies the constraints; nearest: trial" in page
+    assert "0 of 3 complete trials satisfy them" in page and page.count(">violated<") >= 3
+    assert not list(folder.path.glob("winner-*"))
+
+
+def test_objective_stands_in_terminal_and_report(study, capsys):
+    folder = study(trials=2, objective="mean_effort", finalists={"count": 1})
+    results = run_study(folder.config, folder.path)
+    output = capsys.readouterr().out
+    row = results.comparison[0]
+    change = f"mean actuator effort {row.baseline.objective:.2f} N -> {row.winner.objective:.2f} N"
+    assert change in output
+    assert "Only 3 test goals: the difference may be chance." in output
+    assert row.objective_change_interval is row.distance_change_interval is row.winner.success_interval is None
+    assert re.search(r"  joint_height \d\.\d\d mm \(baseline 6\.00 mm\)", output)
+    page = write_report(folder.path).read_text()
+    assert f"{row.baseline.objective:.2f} → {row.winner.objective:.2f} N" in page
+    assert "mean actuator effort [N] on 6 goals, as small as possible" in page
+    assert "Only 3 test goals: the difference may be chance." in page

@@ -1,4 +1,4 @@
-"""One trial, with a training and an evaluation that are pretended."""
+"""One trial, with fake training and evaluation."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from codesign.objectives import OBJECTIVES
-from codesign.phases.finalists import _mean
+from agents.evaluation import Evaluation
+from codesign.phases import trial as trial_module
 from codesign.phases.trial import run_trial
-from codesign.scheduling.queue import Ledger
+from codesign.records import FinalistTest, TestGroup
+from codesign.scheduling.queue import TrialQueue
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 
-def outcome_of(score):
-    """An evaluation of which every objective has this score."""
-    return SimpleNamespace(to_json=lambda: {key: score * objective.sign for key, objective in OBJECTIVES.items()})
+def evaluation(distances, steps=50, **changes):
+    """An evaluation with these final distances [m]."""
+    distances = np.array(distances, dtype=float)
+    ones = np.ones(len(distances))
+    fields = {"mean_distances": distances, "returns": ones, "successes": distances < 2e-3, "efforts": ones}
+    return Evaluation(distances=distances, steps=steps, **{**fields, **changes})
 
 
 @pytest.fixture
 def pretend(monkeypatch):
-    """Replace training and evaluation; the record tells how they were called."""
-    import agents.evaluation
-    import agents.training
-
+    """Replace training and evaluation; return how they were called."""
     called = SimpleNamespace(train=[], evaluate=[], reports=[0.2, 0.4, 0.6], error=None)
 
     def train(config, folder, *, initial=None, report=None, progress=True):
@@ -33,7 +34,7 @@ def pretend(monkeypatch):
         folder.mkdir(parents=True, exist_ok=True)
         stopped = False
         for k, value in enumerate(called.reports):
-            stopped = stopped or report((k + 1) * config.report_every, outcome_of(value))
+            stopped = stopped or report((k + 1) * config.report_every, evaluation([-value]))
         policy = folder / "policy.safetensors"
         policy.write_bytes(b"")
         policy.with_suffix(".json").write_text(json.dumps({"stopped_early": stopped, "cpu_seconds": 0.0}))
@@ -43,22 +44,10 @@ def pretend(monkeypatch):
         if called.error is not None:
             raise called.error
         called.evaluate.append((agent, environment, goals, design))
-        distances = np.full(len(goals), 1e-3 if agent == "qp" else 3e-3)
-        return SimpleNamespace(
-            distances=distances,
-            returns=np.ones(len(goals)),
-            successes=distances < 2e-3,
-            efforts=np.ones(len(goals)),
-            success_rate=float((distances < 2e-3).mean()),
-            mean_distance=float(distances.mean()),
-            mean_distances=distances,
-            worst_distance=float(distances.max()),
-            mean_return=1.0,
-            steps=50,
-        )
+        return evaluation(np.full(len(goals), 1e-3 if agent == "qp" else 3e-3))
 
-    monkeypatch.setattr(agents.training, "train", train)
-    monkeypatch.setattr(agents.evaluation, "evaluate", evaluate)
+    monkeypatch.setattr(trial_module, "train", train)
+    monkeypatch.setattr(trial_module, "evaluate", evaluate)
     return called
 
 
@@ -67,10 +56,10 @@ TRAINED = {"strategy": "scratch", "training": {"steps": 300, "report_every": 100
 
 def test_complete(study, pretend):
     folder = study(**{**TRAINED, "strategy": "warm_start", "policy": "start.safetensors"})
-    with Ledger(folder) as ledger:
-        found = run_trial(folder, trial := ledger.claim())
-        ledger.finish(found)
-        assert ledger.study.trials[0].value == found["score"] == pytest.approx(-3e-3)
+    with TrialQueue(folder) as queue:
+        found = run_trial(folder, trial := queue.claim())
+        queue.finish(found)
+        assert queue.study.trials[0].value == found.score == pytest.approx(-3e-3)
     config, initial = pretend.train[0]
     assert str(initial) == "start.safetensors"
     assert config.environment.design == {**folder.config.baseline, **trial.params}
@@ -80,33 +69,34 @@ def test_complete(study, pretend):
         np.testing.assert_array_equal(goals, folder.goals["selection"])
         assert design == config.environment.design
     assert found == folder.result(0)
-    assert found["state"] == "complete"
-    assert found["agent"] == "trials/0000/policy.safetensors"
-    assert found["curve"] == [[100, 0.2], [200, 0.4], [300, 0.6]]
-    assert (found["qp"]["mean_distance"], found["training_steps"]) == (1e-3, 300)
+    assert found.state == "complete"
+    assert found.controller == "trials/0000/policy.safetensors"
+    assert found.curve == [[100, 0.2], [200, 0.4], [300, 0.6]]
+    assert (found.qp.mean_distance, found.qp_value, found.training_steps) == (1e-3, 1e-3, 300)
+    assert found.values == {"mean_distance": pytest.approx(3e-3)}
 
 
 @pytest.mark.parametrize("objective, score", [("success_rate", 0.0), ("mean_distance", -3e-3), ("mean_return", 1.0)])
 def test_score_is_larger_for_better(objective, score, study, pretend):
     folder = study(**TRAINED, objective=objective)
-    with Ledger(folder) as ledger:
-        assert run_trial(folder, ledger.claim())["score"] == pytest.approx(score)
+    with TrialQueue(folder) as queue:
+        assert run_trial(folder, queue.claim()).score == pytest.approx(score)
 
 
 def test_pruned(study, pretend):
     folder = study(**TRAINED, pruner={"name": "threshold", "options": {"lower": 0.5}})
-    with Ledger(folder) as ledger:
-        found = run_trial(folder, ledger.claim())
-        ledger.finish(found)
-    assert (found["state"], found["score"], found["evaluation"]) == ("pruned", None, None)
-    assert "pruner after 100 steps" in found["reason"]
+    with TrialQueue(folder) as queue:
+        found = run_trial(folder, queue.claim())
+        queue.finish(found)
+    assert (found.state, found.score, found.evaluation) == ("pruned", None, None)
+    assert "pruner after 100 steps" in found.reason
 
 
 def test_baseline_is_never_pruned(study, pretend):
     folder = study(**TRAINED, pruner={"name": "threshold", "options": {"lower": 0.9}})
-    with Ledger(folder) as ledger:
-        ledger.enqueue([("baseline", {"height": 0.02, "joint_height": 0.006})])
-        assert run_trial(folder, ledger.claim())["state"] == "complete"
+    with TrialQueue(folder) as queue:
+        queue.enqueue([("baseline", {"height": 0.02, "joint_height": 0.006})])
+        assert run_trial(folder, queue.claim()).state == "complete"
 
 
 @pytest.mark.parametrize("error", [InfeasibleDesign("the notches meet"), ConvergenceError("no equilibrium")])
@@ -114,31 +104,53 @@ def test_baseline_is_never_pruned(study, pretend):
 def test_infeasible_is_a_result(error, strategy, study, pretend):
     pretend.error = error
     folder = study(**{**TRAINED, "strategy": strategy})
-    with Ledger(folder) as ledger:
-        found = run_trial(folder, ledger.claim())
-        ledger.finish(found)
-        assert ledger.left() == folder.config.trials - 1
-    assert (found["state"], found["score"]) == ("infeasible", None)
-    assert str(error) in found["reason"]
+    with TrialQueue(folder) as queue:
+        found = run_trial(folder, queue.claim())
+        queue.finish(found)
+        assert queue.left() == folder.config.trials - 1
+    assert (found.state, found.score) == ("infeasible", None)
+    assert str(error) in found.reason
     assert not pretend.train
 
 
 def test_reports_of_a_continued_trial_are_not_repeated(study, pretend):
     folder = study(**TRAINED)
-    with Ledger(folder) as ledger:
-        trial = ledger.claim()
+    with TrialQueue(folder) as queue:
+        trial = queue.claim()
         trial.report(0.15, 100)
-        assert run_trial(folder, trial)["curve"] == [[100, 0.15], [200, 0.4], [300, 0.6]]
+        assert run_trial(folder, trial).curve == [[100, 0.15], [200, 0.4], [300, 0.6]]
 
 
-def test_mean_of_seeds():
+def test_average_over_seeds():
     """Steps are whole numbers, as the report prints them."""
 
-    def record(seed, steps, distance):
-        told = {"trial": 1, "agent": "sac", "backend": "fem", "goals": "unseen", "seed": seed, "steps": steps}
-        return {**told, "seconds": 0.5, "worst_distance": distance, "mean_distance": distance, "distances": [distance]}
+    def test(seed, distance):
+        found = evaluation([distance], steps=2700, seconds=0.5)
+        return FinalistTest(1, "sac", "fem", "unseen", seed, found, {"mean_distance": distance}, [distance])
 
-    merged = _mean([record(1, 2700, 1e-3), record(2, 2700, 3e-3)])
-    assert merged["steps"] == 5400 and isinstance(merged["steps"], int)
-    assert (merged["seeds"], merged["seconds"], merged["worst_distance"]) == ([1, 2], 1.0, 3e-3)
-    assert merged["distances"] == [merged["mean_distance"]] == [pytest.approx(2e-3)]
+    group = TestGroup([test(1, 1e-3), test(2, 3e-3)])
+    assert group.mean.steps == 5400 and isinstance(group.mean.steps, int)
+    assert (group.mean.seconds, group.worst_distance) == (1.0, 3e-3)
+    assert group.mean.distances == [group.value("mean_distance")] == [pytest.approx(2e-3)]
+    np.testing.assert_array_equal(group.objective_table, [[1e-3], [3e-3]])
+    stored = group.to_json()
+    assert (stored["seeds"], stored["worst_distance"]) == ([1, 2], 3e-3)
+    assert stored["of_seeds"]["distances"] == [[1e-3], [3e-3]]
+
+
+def test_an_error_that_is_a_bug_is_not_a_result(study, pretend):
+    """Only InfeasibleDesign and ConvergenceError are."""
+    pretend.error = ValueError("shapes (3,) and (4,) do not match")
+    folder = study()
+    with TrialQueue(folder) as queue, pytest.raises(ValueError, match="do not match"):
+        run_trial(folder, queue.claim())
+    assert folder.results() == []
+
+
+def test_records_survive_their_files(study, pretend):
+    folder = study(constraints={"mean_effort": 2.0})
+    with TrialQueue(folder) as queue:
+        found = run_trial(folder, queue.claim())
+    assert folder.result(0) == found and folder.result(0) is not found
+    assert found.violations == {"mean_effort": -1.0} and found.feasible
+    assert folder.results() == [found]

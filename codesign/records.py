@@ -1,0 +1,364 @@
+"""Typed records of what a study has found; each is one JSON file in the folder of the study."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+
+from agents.evaluation import Evaluation
+from codesign.objectives import Measurement
+from softgym_envs.errors import DataError
+from softgym_envs.storage import read_json, write_json
+
+
+class Record:
+    """Base of the records: plain data both ways. Fields named in ``EVALUATIONS`` hold an `Evaluation` or None."""
+
+    EVALUATIONS: ClassVar[tuple[str, ...]] = ()
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and self.to_json() == other.to_json()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        data = {item.name: getattr(self, item.name) for item in fields(self)}  # type: ignore[arg-type]
+        return {key: value.to_json() if isinstance(value, Evaluation) else value for key, value in data.items()}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Return the record that `to_json` wrote.
+
+        Raises:
+            DataError: if a field is missing, unknown or damaged.
+        """
+        values = dict(data)
+        for name in cls.EVALUATIONS:
+            if values.get(name) is not None:
+                values[name] = Evaluation.from_json(values[name])
+        try:
+            return cls(**values)
+        except TypeError as error:
+            raise DataError(f"stored {cls.__name__} cannot be read: {error}") from None
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a file; see `from_json`."""
+        try:
+            return cls.from_json(read_json(path))
+        except (DataError, TypeError, ValueError) as error:
+            raise DataError(f"'{path}': {error}") from None
+
+    def write(self, path: Path) -> None:
+        """Write a file, whole or not at all."""
+        write_json(path, self.to_json())
+
+
+@dataclass(eq=False)
+class TrialResult(Record):
+    """Result of one trial.
+
+    Attributes:
+        number: number of the trial.
+        origin: where its body comes from: ``"baseline"``, ``"screen 3"``, ``"joint 0"`` or ``"sampler 7"``.
+        process: ``host:pid`` of the worker.
+        design: complete design [SI].
+        options: values of the variables that are options of robot or task, by their full names [SI].
+        sampler_seed: seed of the sampler that proposed the body, if one did.
+        state: ``"pruned"`` and ``"infeasible"`` trials have no scores.
+        reason: why a trial was pruned or is infeasible.
+        values: value of each objective that the study names, constraints included [SI].
+        scores: scores of objective and secondary objectives; larger is better.
+        violations: by how much each constraint is violated [SI]; not positive where it is satisfied.
+        controller: ``"qp"``, or the file of the policy, relative to the folder of the study.
+        evaluation: evaluation of the controller on the selection goals.
+        qp: evaluation of the inverse QP on the same goals.
+        qp_value: value of the objective with the inverse QP [SI].
+        curve: environment steps and score of each report during training.
+        training_steps: environment steps of training.
+        seconds: wall-clock time [s].
+        cpu_seconds: CPU time, that of earlier workers of the trial included [s].
+        finished_at: time of the end [s since 1970].
+    """
+
+    EVALUATIONS = ("evaluation", "qp")
+
+    number: int
+    origin: str
+    process: str
+    design: dict[str, float]
+    options: dict[str, float] = field(default_factory=dict)
+    sampler_seed: int | None = None
+    state: Literal["complete", "pruned", "infeasible"] = "complete"
+    reason: str | None = None
+    values: dict[str, float] = field(default_factory=dict)
+    scores: list[float] | None = None
+    violations: dict[str, float] = field(default_factory=dict)
+    controller: str = "qp"
+    evaluation: Evaluation | None = None
+    qp: Evaluation | None = None
+    qp_value: float | None = None
+    curve: list[list[float]] = field(default_factory=list)
+    training_steps: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    finished_at: float = 0.0
+
+    @property
+    def score(self) -> float | None:
+        """Score of the objective; larger is better."""
+        return None if self.scores is None else self.scores[0]
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the trial is complete and its body satisfies all constraints."""
+        return self.state == "complete" and all(excess <= 0.0 for excess in self.violations.values())
+
+    @property
+    def steps_of_scores(self) -> int:
+        """Environment steps of the evaluations."""
+        evaluations = [self.evaluation] if self.controller == "qp" else [self.qp, self.evaluation]
+        return sum(evaluation.steps for evaluation in evaluations if evaluation is not None)
+
+
+@dataclass(eq=False)
+class ScreenResult(Record):
+    """Score of one candidate of the screen.
+
+    Attributes:
+        index: number of the candidate.
+        values: value of each optimised variable [SI].
+        evaluation: evaluation of the inverse QP, or None if the body is infeasible.
+        score: score of the objective, larger is better, or None.
+        error: why the body is infeasible.
+    """
+
+    EVALUATIONS = ("evaluation",)
+
+    index: int
+    values: dict[str, float]
+    evaluation: Evaluation | None = None
+    score: float | None = None
+    error: str | None = None
+
+
+@dataclass(eq=False)
+class SharedPolicy(Record):
+    """The policy that scores every body, and what it cost.
+
+    Attributes:
+        policy: its file, relative to the folder of the study.
+        bodies: values [SI] of the optimised variables of the bodies that joint training found best.
+        training_steps: environment steps of joint training.
+        report_steps: environment steps of the points of its learning curve.
+        seconds: wall-clock time [s].
+        cpu_seconds: CPU time [s].
+    """
+
+    policy: str
+    bodies: list[dict[str, float]] = field(default_factory=list)
+    training_steps: int = 0
+    report_steps: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+
+@dataclass(eq=False)
+class FinalistTraining(Record):
+    """A policy that was trained anew for a finalist.
+
+    Attributes:
+        trial: trial of the finalist.
+        seed: seed of the training.
+        steps: environment steps.
+        report_steps: environment steps of the points of the learning curve.
+        cpu_seconds: CPU time [s].
+        curve: environment steps and score of each report; empty if training does not report the objective.
+    """
+
+    trial: int
+    seed: int
+    steps: int
+    report_steps: int
+    cpu_seconds: float
+    curve: list[list[float]]
+
+
+@dataclass(eq=False)
+class FinalistTest(Record):
+    """Evaluation of one finalist with one controller on one backend.
+
+    Attributes:
+        trial: trial of the finalist.
+        agent: ``"sac"`` or ``"qp"``.
+        backend: ``"fem"`` or ``"surrogate"``.
+        goals: ``"unseen"`` or ``"selection"``.
+        seed: training seed of the policy; 0 for the policy of the trial itself.
+        evaluation: the evaluation, or None if the body cannot be simulated.
+        values: value of each objective that the study names [SI].
+        goal_values: value of the objective for each goal [SI], if it has such values.
+        error: why the body cannot be simulated.
+    """
+
+    EVALUATIONS = ("evaluation",)
+
+    trial: int
+    agent: str
+    backend: str
+    goals: str
+    seed: int = 0
+    evaluation: Evaluation | None = None
+    values: dict[str, float] = field(default_factory=dict)
+    goal_values: list[float] | None = None
+    error: str | None = None
+
+
+@dataclass(eq=False)
+class Account(Record):
+    """Time that a study took.
+
+    Attributes:
+        command: command that last ran it.
+        wall_seconds: wall-clock time of each phase, over all calls [s].
+    """
+
+    command: str = ""
+    wall_seconds: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Finalist:
+    """A body in the final test.
+
+    Args:
+        number: its trial.
+        role: ``"baseline"`` or ``"finalist"``.
+        design: complete design [SI].
+        options: values of the variables that are options of robot or task [SI].
+        score: score of its trial; larger is better.
+        policy: policy of its trial relative to the folder, or None if the strategy has none.
+    """
+
+    number: int
+    role: Literal["baseline", "finalist"]
+    design: dict[str, float]
+    options: dict[str, float]
+    score: float
+    policy: str | None
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Controllers to test; that of the trial first."""
+        return ("qp",) if self.policy is None else ("sac", "qp")
+
+
+@dataclass(frozen=True)
+class PlannedTest:
+    """One test of a finalist: which controller, on which backend and goals; see `FinalistTest`."""
+
+    finalist: Finalist
+    agent: str
+    backend: str
+    goals: str
+    seed: int
+
+    @property
+    def file(self) -> str:
+        """Path of the result, relative to the folder of the study."""
+        seed = f"-seed{self.seed}" if self.seed else ""
+        return f"finalists/trial{self.finalist.number:04d}-{self.agent}{seed}-{self.backend}-{self.goals}.json"
+
+
+class TestGroup:
+    """Tests that differ in the training seed only.
+
+    Args:
+        tests: one test per seed; if one failed, the group has its error and no numbers.
+    """
+
+    __test__ = False  # not for pytest
+
+    def __init__(self, tests: Sequence[FinalistTest]) -> None:
+        self.tests = tuple(tests)
+        first = tests[0]
+        self.trial, self.agent, self.backend, self.goals = first.trial, first.agent, first.backend, first.goals
+        self.error = next((test.error for test in tests if test.error is not None), None)
+        self.evaluations = [test.evaluation for test in tests if test.evaluation is not None]
+
+    @property
+    def key(self) -> tuple[int, str, str]:
+        """Trial, controller and backend."""
+        return self.trial, self.agent, self.backend
+
+    def table(self, name: str) -> np.ndarray:
+        """A per-goal field of `Evaluation`, shape (seeds, goals)."""
+        return np.array([getattr(evaluation, name) for evaluation in self.evaluations], dtype=float)
+
+    @property
+    def objective_table(self) -> np.ndarray | None:
+        """Objective of the study [SI], shape (seeds, goals), or None if it has no values per goal."""
+        rows = [test.goal_values for test in self.tests]
+        return None if any(row is None for row in rows) else np.array(rows, dtype=float)
+
+    def value(self, name: str) -> float:
+        """Mean over the seeds of an objective that the study names [SI]."""
+        return float(np.mean([test.values[name] for test in self.tests]))
+
+    @property
+    def mean(self) -> Evaluation:
+        """Evaluation averaged over the seeds, goal by goal; costs add up."""
+        return self.evaluations[0] if len(self.evaluations) == 1 else Evaluation.average(self.evaluations)
+
+    @property
+    def worst_distance(self) -> float:
+        """Largest final distance of any seed [m]."""
+        return max(evaluation.worst_distance for evaluation in self.evaluations)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the average and the values of each seed as plain data."""
+        data: dict[str, Any] = {"trial": self.trial, "agent": self.agent, "backend": self.backend, "goals": self.goals}
+        if self.error is not None:
+            return {**data, "error": self.error}
+        data |= {**self.mean.to_json(), "worst_distance": self.worst_distance}
+        data["values"] = {name: self.value(name) for name in self.tests[0].values}
+        if len(self.tests) > 1:
+            names = ("distances", "mean_distances", "returns", "successes", "efforts")
+            data["seeds"] = [test.seed for test in self.tests]
+            data["of_seeds"] = {name: self.table(name).tolist() for name in names}
+        return data
+
+
+@dataclass(frozen=True)
+class Job:
+    """One result file and how to make it.
+
+    Args:
+        path: the JSON file.
+        make: returns its content.
+    """
+
+    path: Path
+    make: Callable[[], Record]
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """An evaluation on one body and what it says about the objectives of a study.
+
+    Attributes:
+        evaluation: one episode per goal.
+        measurements: objectives by name.
+    """
+
+    evaluation: Evaluation
+    measurements: dict[str, Measurement]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Value of each objective [SI]."""
+        return {name: measurement.value for name, measurement in self.measurements.items()}

@@ -1,0 +1,75 @@
+"""Intervals and correlations of what a study measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+CONFIDENCE = 0.95
+MIN_GOALS = 5
+"""Fewest goals for an interval: from fewer goals it would be meaningless."""
+
+Interval = tuple[float, float] | None
+"""Ends of a 95 % interval; None with fewer than `MIN_GOALS` goals."""
+
+
+def mean_interval(table: np.ndarray, minus: np.ndarray | None = None) -> Interval:
+    """Return the interval of a mean, or of the difference of two, over goals and training seeds.
+
+    Both tables have the same goals, but each has its own seeds. The interval is Student's. With several seeds the
+    variance over the seeds is added to that over the goals, with Satterthwaite's degrees of freedom (1946). It covers
+    95 % for a normal distribution, and 93 to 99 % with two to five seeds. If most goals do not change and a few change
+    much it covers less: 75 % over 12 goals, 89 % over 40; a bootstrap is no better.
+
+    Args:
+        table: values, shape (seeds, goals).
+        minus: values to subtract, shape (other seeds, goals).
+    """
+    from scipy.stats import t
+
+    tables = [table] if minus is None else [table, minus]
+    goals = table.mean(axis=0) - (0.0 if minus is None else minus.mean(axis=0))
+    samples = [goals] + [each.mean(axis=1) for each in tables]
+    if len(goals) < MIN_GOALS:
+        return None
+    # Variances of a mean, and their degrees of freedom.
+    parts = [(x.var(ddof=1) / len(x), len(x) - 1) for x in samples if len(x) > 1]
+    variance = sum(v for v, _ in parts)
+    mean = float(goals.mean())
+    if variance == 0.0:
+        return mean, mean
+    freedom = variance**2 / sum(v * v / f for v, f in parts)
+    half = float(t.ppf(0.5 + 0.5 * CONFIDENCE, freedom) * np.sqrt(variance))
+    return mean - half, mean + half
+
+
+def rate_interval(successes: np.ndarray) -> Interval:
+    """Return the interval of a success rate: Wilson's over goals, widened to `mean_interval` with several seeds.
+
+    Wilson's interval counts each goal once, whatever the number of seeds: several policies that reach all goals say
+    little more about other goals than one does.
+
+    Args:
+        successes: shape (seeds, goals).
+    """
+    from scipy.stats import binomtest
+
+    goals, reached = successes.shape[1], float(successes.mean(axis=0).sum())
+    if goals < MIN_GOALS:
+        return None
+    # Round fractions of goals in the direction that widens the interval.
+    ends = (int(np.floor(reached + 1e-9)), int(np.ceil(reached - 1e-9)))
+    low, high = (binomtest(k, goals).proportion_ci(CONFIDENCE, method="wilson") for k in ends)
+    found = float(low.low), float(high.high)
+    wide = mean_interval(successes) if len(successes) > 1 else None
+    return found if wide is None else (max(min(found[0], wide[0]), 0.0), min(max(found[1], wide[1]), 1.0))
+
+
+def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float | None:
+    """Return Spearman's rank correlation; None with fewer than three pairs or without any variation."""
+    from scipy.stats import spearmanr
+
+    if len(first) < 3 or np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
+        return None
+    return float(spearmanr(first, second).statistic)

@@ -1,0 +1,233 @@
+"""Tables of a report: rows of text cells for its template."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from codesign.objectives import OBJECTIVES, Objective
+from codesign.records import TrialResult
+from codesign.report.results import BodyStatistics, Comparison, Cost, StudyResults, Transfer, VariableResult
+from codesign.report.units import present, shown_unit
+from codesign.snapshot import StudySnapshot
+
+AGENTS = {"sac": "SAC policy", "qp": "Inverse QP"}
+BACKENDS = {"fem": "FEM", "surrogate": "Surrogate"}
+SHOWN_ALWAYS = ("mean_distance", "success_rate")
+"""Objectives that every comparison shows, whatever the objective of the study."""
+
+
+def percent(value: float) -> str:
+    """Return a share in percent."""
+    return f"{100 * value:.1f} %"
+
+
+def millimetres(value: float, sign: str = "") -> str:
+    """Return a length in millimetres."""
+    return f"{1e3 * value:{sign}.2f} mm"
+
+
+def design_row(variable: VariableResult) -> dict[str, Any]:
+    """Return a variable of baseline and winner."""
+    unit, baseline, winner = variable.unit, variable.baseline, variable.winner
+    name, factor, decimals = shown_unit(unit)
+    changed = winner is not None and winner != baseline
+    change = f"{(winner - baseline) * factor:+.{decimals}f}{' ' + name if name else ''}" if changed and winner else "-"
+    return {
+        "name": variable.name.replace("_", " "),
+        "optimised": variable.optimised,
+        "description": variable.description,
+        "baseline": present(baseline, unit),
+        "winner": "-" if winner is None else present(winner, unit),
+        "at_limit": f"at its {variable.at_limit} limit" if variable.at_limit else "",
+        "change": change,
+        "low": present(variable.low, unit),
+        "high": present(variable.high, unit),
+        "baseline_place": round(100 * variable.place(baseline), 1),
+        "winner_place": None if winner is None else round(100 * variable.place(winner), 1),
+    }
+
+
+def _cell(
+    value: str, interval: Sequence[float] | None, show: Callable[[float], str], better: int = 0
+) -> dict[str, Any]:
+    """Return a cell; ``better`` is the sign of an improvement, 0 for a value that is not a change."""
+    if interval is None:
+        return {"value": value, "interval": "", "good": False}
+    low, high = (show(end) for end in interval)
+    return {"value": value, "interval": f"{low} to {high}", "good": min(better * end for end in interval) > 0.0}
+
+
+def comparison_columns(objective: Objective) -> list[str]:
+    """Return the columns of the comparison of baseline and winner."""
+    measures = [] if objective.name in SHOWN_ALWAYS else [objective.label]
+    return [
+        f"{measure}, {what}"
+        for measure in (*measures, "Success", "Distance")
+        for what in ("baseline", "winner", "change")
+    ]
+
+
+def comparison_row(row: Comparison, objective: Objective) -> dict[str, Any]:
+    """Return the comparison for one controller and backend."""
+    cells: list[dict[str, Any]] = []
+
+    def add(
+        measure: Objective, value: str, interval: str, change: float, change_interval: Sequence[float] | None
+    ) -> None:
+        bodies: tuple[BodyStatistics, ...] = (row.baseline, row.winner)
+        for body in bodies:
+            cells.append(_cell(measure.text(getattr(body, value)), getattr(body, interval), _ends(measure)))
+        text = measure.text(change, "+")
+        cells.append(_cell(text, change_interval, _ends(measure, "+"), measure.sign))
+
+    if objective.name not in SHOWN_ALWAYS:
+        add(objective, "objective", "objective_interval", row.objective_change, row.objective_change_interval)
+    success, distance = OBJECTIVES["success_rate"], OBJECTIVES["mean_distance"]
+    add(success, "success_rate", "success_interval", row.success_change, row.success_change_interval)
+    add(distance, "mean_distance", "distance_interval", row.distance_change, row.distance_change_interval)
+    return {
+        "backend": BACKENDS[row.backend],
+        "agent": AGENTS[row.agent],
+        "cells": cells,
+        "closer": row.goals_closer,
+        "farther": row.goals_farther,
+    }
+
+
+def _ends(measure: Objective, sign: str = "") -> Callable[[float], str]:
+    decimals = 0 if measure.unit == "%" else 2
+    return lambda value: f"{value * measure.scale:{sign}.{decimals}f}"
+
+
+def transfer_row(row: Transfer, objective: Objective) -> dict[str, Any]:
+    """Return how an objective differs between surrogate and FEM."""
+
+    def gap(value: float, sign: str) -> str:
+        rounded = round(value * objective.scale, 2) + 0.0  # no negative zero
+        return f"{rounded:{sign}.2f} {'pp' if objective.unit == '%' else objective.unit}".rstrip()
+
+    return {
+        "agent": AGENTS[row.agent],
+        "measure": objective.label,
+        "bodies": len(row.trials),
+        "mean": gap(row.mean_gap, "+"),
+        "worst": gap(row.worst_gap, ""),
+        "spearman": "-" if row.spearman is None else f"{row.spearman:.2f}",
+    }
+
+
+def finalist_table(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
+    """Return columns and rows of the table of all finalists."""
+    objective, config = snapshot.objective, snapshot.config
+    optimised = [variable for variable in results.variables if variable.optimised]
+    tests = {group.key: group for group in results.tests if group.goals == "unseen"}
+    kinds = [(a, b) for a in AGENTS for b in BACKENDS if any(key[1:] == (a, b) for key in tests)]
+    trials = {trial.number: trial for trial in snapshot.trials}
+    limits = config.controller_constraints
+    rows = []
+    for body in results.finalists:
+        values = {**body.design, **body.options}
+        cells = [(present(values[variable.name], variable.unit), "") for variable in optimised]
+        cells.append((objective.text(objective.sign * body.score), ""))
+        if config.constraints:
+            cells.append(
+                ("satisfied" if trials[body.trial].feasible else "violated", _broken(snapshot, trials[body.trial]))
+            )
+        for kind in kinds:
+            group = tests.get((body.trial, *kind))
+            if group is None or group.error is not None:
+                cells.append(("-" if group is None else "failed", ""))
+                continue
+            below = millimetres(group.mean.mean_distance)
+            if objective.name not in SHOWN_ALWAYS:
+                below = f"{objective.text(group.value(objective.name))}; {below}"
+            broken = config.violations_text({name: group.value(name) for name in limits}, limits)
+            cells.append((percent(group.mean.success_rate), f"{below}; {broken}" if broken else below))
+        role = results.roles.get(body.trial, "")
+        rows.append({"trial": body.trial, "role": role, "winner": role == "winner", "cells": cells})
+    columns = [variable.name.replace("_", " ") for variable in optimised] + [f"{objective.label} in search"]
+    columns += ["constraints in search"] if config.constraints else []
+    columns += [f"{AGENTS[agent]}, {BACKENDS[backend]}" for agent, backend in kinds]
+    return {"finalist_columns": columns, "finalists": rows}
+
+
+def _broken(snapshot: StudySnapshot, trial: TrialResult) -> str:
+    return snapshot.config.violations_text(trial.values, snapshot.config.constraints)
+
+
+def trial_table(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
+    """Return columns and rows of the table of all trials."""
+    optimised = [variable for variable in results.variables if variable.optimised]
+    config, objective = snapshot.config, snapshot.objective
+    others = [name for name in config.objectives if name != objective.name]
+
+    def cells(trial: TrialResult) -> list[str]:
+        values = {**trial.design, **trial.options}
+        found = [present(values[variable.name], variable.unit) for variable in optimised]
+        found.append("-" if trial.score is None else objective.text(trial.values[objective.name]))
+        found += [config.objectives[name].text(trial.values.get(name)) for name in others]
+        if config.constraints:
+            found.append("-" if trial.score is None else "satisfied" if trial.feasible else "violated")
+        return [*found, objective.text(trial.qp_value), f"{trial.training_steps:,}", f"{trial.seconds:.1f} s"]
+
+    rows = [
+        {
+            "number": trial.number,
+            "state": trial.state,
+            "reason": trial.reason or _broken(snapshot, trial),
+            "origin": trial.origin,
+            "cells": cells(trial),
+        }
+        for trial in snapshot.trials
+    ]
+    columns = [variable.name.replace("_", " ") for variable in optimised]
+    columns += [objective.label, *(config.objectives[name].label for name in others)]
+    columns += ["constraints"] if config.constraints else []
+    return {"trial_columns": [*columns, "by inverse QP", "training steps", "time"], "trials": rows}
+
+
+def cost_rows(cost: Cost) -> list[dict[str, str]]:
+    """Return environment steps and time of each phase."""
+    retraining = (
+        f"{cost.retraining_steps:,} of training, {cost.retraining_report_steps:,} of its reports, "
+        if cost.retraining_steps
+        else ""
+    )
+    parts = {
+        "screen": ("Screen by the inverse QP", f"{cost.screen_steps:,}"),
+        "shared_policy": (
+            "Bodies and policy together",
+            f"{cost.joint_steps:,} of training, {cost.joint_report_steps:,} of its reports",
+        ),
+        "trials": (
+            "Trials",
+            f"{cost.training_steps:,} of training, {cost.report_steps:,} of its reports, {cost.selection_steps:,} of "
+            "scores",
+        ),
+        "finalists": (
+            "Final test",
+            f"{retraining}{cost.test_steps_fem:,} on FEM, {cost.test_steps_surrogate:,} on the surrogate",
+        ),
+    }
+
+    def minutes(seconds: float | None) -> str:
+        return "-" if seconds is None else f"{seconds / 60:.1f} min"
+
+    rows = [
+        {
+            "part": title,
+            "steps": steps,
+            "cpu": minutes(cost.cpu_seconds[part]),
+            "wall": minutes(cost.wall_seconds.get(part)),
+        }
+        for part, (title, steps) in parts.items()
+        if part not in ("screen", "shared_policy") or cost.cpu_seconds[part]
+    ]
+    total = {
+        "part": "Total",
+        "steps": "",
+        "cpu": minutes(sum(cost.cpu_seconds.values())),
+        "wall": minutes(sum(cost.wall_seconds.values())),
+    }
+    return [*rows, total]

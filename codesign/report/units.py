@@ -1,0 +1,16 @@
+"""Units that people read: lengths in mm, pressures in kPa."""
+
+from __future__ import annotations
+
+SHOWN = {"m": ("mm", 1e3, 2), "Pa": ("kPa", 1e-3, 0), "1": ("", 1.0, 3)}
+
+
+def shown_unit(unit: str) -> tuple[str, float, int]:
+    """Return the unit that people read, the factor to it from SI, and the number of decimals."""
+    return SHOWN.get(unit, (unit, 1.0, 3))
+
+
+def present(value: float, unit: str, sign: str = "") -> str:
+    """Return a quantity [unit] as people read it: ``"41.50 mm"``."""
+    name, factor, decimals = shown_unit(unit)
+    return f"{value * factor:{sign}.{decimals}f}{' ' + name if name else ''}"

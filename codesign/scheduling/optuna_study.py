@@ -1,0 +1,63 @@
+"""The Optuna study behind a co-design study: its sampler, its pruner and the ranges of its variables."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from codesign.config import PRUNERS, StudyConfig
+from codesign.folder import StudyFolder
+from codesign.sampling import construct, make_sampler
+from codesign.scheduling.storage import StudyStorage
+from softgym_envs.errors import DataError
+
+if TYPE_CHECKING:
+    import optuna
+
+
+def make_pruner(config: StudyConfig) -> optuna.pruners.BasePruner:
+    """Return the pruner of a study; pruners that count resources count environment steps."""
+    import optuna
+
+    options = dict(config.pruner.options)
+    if config.pruner.name in ("hyperband", "successive_halving"):
+        options.setdefault("min_resource", config.training.report_every)
+    if config.pruner.name == "hyperband":
+        options.setdefault("max_resource", config.training.steps)
+    return construct(getattr(optuna.pruners, PRUNERS[config.pruner.name]), options)
+
+
+def distributions(config: StudyConfig) -> dict[str, optuna.distributions.BaseDistribution]:
+    """Return the range of each optimised variable [SI]."""
+    import optuna
+
+    return {
+        name: optuna.distributions.FloatDistribution(variable.low, variable.high, log=variable.log)
+        for name, variable in config.optimised.items()
+    }
+
+
+def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number: int = 0) -> optuna.Study:
+    """Open the Optuna study of a folder; it always maximises scores, see `codesign.objectives`.
+
+    Args:
+        folder: the study.
+        storage: its storage; opened by default.
+        number: trial that the sampler will propose.
+
+    Raises:
+        DataError: if the database no longer has the study.
+    """
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    storage = folder.open_storage() if storage is None else storage
+    sampler, pruner = make_sampler(folder.config.sampler, number), make_pruner(folder.config)
+    try:
+        return optuna.load_study(study_name=storage.study, storage=storage.optuna, sampler=sampler, pruner=pruner)
+    except KeyError:
+        if storage.shared:
+            raise DataError(f"storage '{folder.config.storage}' has no study '{storage.study}'") from None
+    directions = [optuna.study.StudyDirection.MAXIMIZE] * (1 + len(folder.config.secondary_objectives))
+    return optuna.create_study(
+        study_name=storage.study, storage=storage.optuna, directions=directions, sampler=sampler, pruner=pruner
+    )

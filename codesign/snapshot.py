@@ -1,0 +1,274 @@
+"""All that a study has found so far, read once: who ranks first, who is tested, who wins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from codesign.config import StudyConfig
+from codesign.folder import SHARED_POLICY_RECORD, StudyFolder
+from codesign.objectives import Objective
+from codesign.records import (
+    Account,
+    Finalist,
+    FinalistTest,
+    FinalistTraining,
+    PlannedTest,
+    ScreenResult,
+    SharedPolicy,
+    TestGroup,
+    TrialResult,
+)
+
+if TYPE_CHECKING:
+    import optuna
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Who won.
+
+    Attributes:
+        winner: the best body that satisfies the constraints; it may be the baseline. None if there is none.
+        reason: why there is no winner, with the nearest miss; empty with one.
+    """
+
+    winner: Finalist | None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class StudySnapshot:
+    """A study as it was when `load_study` read it; it need not be finished.
+
+    Attributes:
+        folder: the folder of the study.
+        trials: results of all finished trials, by number.
+        screen: results of the screen, by number.
+        shared_policy: the policy that scores every body, if there is one.
+        all_tests: tests of all bodies that ever were finalists.
+        all_trainings: policies trained anew for bodies that ever were finalists.
+        account: time spent.
+    """
+
+    folder: StudyFolder
+    trials: list[TrialResult]
+    screen: list[ScreenResult]
+    shared_policy: SharedPolicy | None
+    all_tests: list[FinalistTest]
+    all_trainings: list[FinalistTraining]
+    account: Account
+
+    @property
+    def config(self) -> StudyConfig:
+        """Configuration of the study."""
+        return self.folder.config
+
+    @property
+    def objective(self) -> Objective:
+        """The objective that decides who wins."""
+        return self.config.primary
+
+    @cached_property
+    def ranked(self) -> list[TrialResult]:
+        """Complete trials, best first: those that satisfy the constraints, then those that violate them least."""
+        limits = self.config.constraints
+
+        def key(trial: TrialResult) -> tuple[float, ...]:
+            excess = sum(max(0.0, value) / (abs(limits[name]) or 1.0) for name, value in trial.violations.items())
+            assert trial.score is not None and trial.evaluation is not None
+            return (-excess, trial.score, -trial.evaluation.mean_distance, -trial.number)
+
+        return sorted((trial for trial in self.trials if trial.state == "complete"), key=key, reverse=True)
+
+    @property
+    def best(self) -> TrialResult | None:
+        """The best trial that satisfies the constraints."""
+        return next((trial for trial in self.ranked if trial.feasible), None)
+
+    @cached_property
+    def optuna_study(self) -> optuna.Study:
+        """Optuna study in memory with the complete trials that satisfy the constraints, for Optuna's own analyses."""
+        import optuna
+
+        from codesign.scheduling.optuna_study import distributions
+
+        directions = [optuna.study.StudyDirection.MAXIMIZE] * (1 + len(self.config.secondary_objectives))
+        study = optuna.create_study(directions=directions)
+        space = distributions(self.config)
+        for trial in self.trials:
+            if trial.state == "complete":
+                params = {name: {**trial.design, **trial.options}[name] for name in space}
+                attributes = {"number": trial.number}
+                study.add_trial(
+                    optuna.create_trial(
+                        params=params,
+                        distributions=space,
+                        values=trial.scores,
+                        user_attrs=attributes,
+                        constraints=trial.violations,
+                    )
+                )
+        return study
+
+    @cached_property
+    def pareto(self) -> list[int]:
+        """Trials that satisfy the constraints and that no other such trial beats in every objective."""
+        return sorted(trial.user_attrs["number"] for trial in self.optuna_study.best_trials)
+
+    @cached_property
+    def finalists(self) -> list[Finalist]:
+        """The baseline and the best other bodies, best first; without the baseline if it is infeasible.
+
+        A body that samplers proposed several times counts once, as its first trial.
+        """
+        bodies: dict[tuple[float, ...], TrialResult] = {}
+        for trial in self.ranked:
+            key = (*trial.design.values(), *trial.options.values())
+            if key not in bodies or trial.origin == "baseline":
+                bodies[key] = trial
+        baseline = [trial for trial in bodies.values() if trial.origin == "baseline"]
+        others = [trial for trial in bodies.values() if trial.origin != "baseline"][: self.config.finalists.count]
+        return [_finalist(trial) for trial in (baseline + others if self.config.finalists.count else [])]
+
+    @property
+    def baseline(self) -> Finalist | None:
+        """The baseline, if it is among the finalists."""
+        return next((finalist for finalist in self.finalists if finalist.role == "baseline"), None)
+
+    def seeds(self, agent: str) -> range:
+        """Return the seeds of the policies that a finalist is tested with; 0 is the policy of its trial."""
+        count = self.config.finalists.seeds
+        return range(1, count + 1) if agent == "sac" and count else range(1)
+
+    @cached_property
+    def planned_tests(self) -> list[PlannedTest]:
+        """All tests of the present finalists, the slow ones first."""
+        planned = []
+        for backend in self.config.test_backends:
+            for finalist in self.finalists:
+                kinds = [(agent, "unseen") for agent in finalist.agents]
+                if self.config.finalists.choose == "fem" and backend == "fem":
+                    kinds.append((finalist.agents[0], "selection"))
+                planned += [
+                    PlannedTest(finalist, agent, backend, goals, seed)
+                    for agent, goals in kinds
+                    for seed in self.seeds(agent)
+                ]
+        return planned
+
+    @cached_property
+    def tests(self) -> list[TestGroup]:
+        """Finished tests of the present finalists, those with several training seeds together."""
+        planned = {(p.finalist.number, p.agent, p.backend, p.goals, p.seed) for p in self.planned_tests}
+        groups: dict[tuple[int, str, str, str], list[FinalistTest]] = {}
+        for test in self.all_tests:
+            key = (test.trial, test.agent, test.backend, test.goals)
+            if (*key, test.seed) in planned:
+                groups.setdefault(key, []).append(test)
+        return [TestGroup(tests) for tests in groups.values()]
+
+    @property
+    def unseen_tests(self) -> list[TestGroup]:
+        """Successful tests of the present finalists on unseen goals."""
+        return [group for group in self.tests if group.goals == "unseen" and group.error is None]
+
+    @property
+    def trainings(self) -> list[FinalistTraining]:
+        """Policies trained anew for the present finalists."""
+        numbers = [finalist.number for finalist in self.finalists]
+        return [training for training in self.all_trainings if training.trial in numbers]
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Who wins, decided without the unseen goals."""
+        complete = self.ranked
+        if not complete:
+            return Verdict(None, self._nothing_complete())
+        feasible = [trial.number for trial in complete if trial.feasible]
+        if not feasible:
+            return Verdict(None, f"no body satisfies the constraints; nearest: {self.violations_text(complete[0])}")
+        if not self.config.finalists.count:
+            return Verdict(None, f"no finalists were requested (finalists.count = 0); best: trial {feasible[0]}")
+        bodies = {finalist.number: finalist for finalist in self.finalists if finalist.number in feasible}
+        tests = [g for g in self.tests if g.goals == "selection" and g.error is None and g.trial in bodies]
+        if self.config.finalists.choose == "fem" and tests:
+            return self._verdict_on_fem(bodies, tests)
+        return Verdict(next(bodies[number] for number in feasible if number in bodies))
+
+    def _verdict_on_fem(self, bodies: dict[int, Finalist], tests: Sequence[TestGroup]) -> Verdict:
+        objective, limits = self.objective, self.config.controller_constraints
+
+        def excess(group: TestGroup) -> float:
+            amounts = (
+                self.config.objectives[name].excess(group.value(name), limit) / (abs(limit) or 1.0)
+                for name, limit in limits.items()
+            )
+            return sum(max(0.0, amount) for amount in amounts)
+
+        def key(group: TestGroup) -> tuple[float, ...]:
+            score = objective.score(group.value(objective.name))
+            return (-excess(group), score, -group.mean.mean_distance, -group.trial)
+
+        best = max(tests, key=key)
+        if excess(best) > 0.0:
+            broken = self.config.violations_text({name: best.value(name) for name in limits}, limits)
+            return Verdict(None, f"no finalist satisfies the constraints on FEM; nearest: trial {best.trial}, {broken}")
+        return Verdict(bodies[best.trial])
+
+    def _nothing_complete(self) -> str:
+        if not self.trials:
+            return "no trial is finished"
+        states = [trial.state for trial in self.trials]
+        counts = ", ".join(f"{states.count(s)} {s}" for s in ("pruned", "infeasible") if s in states)
+        first = next((trial for trial in self.trials if trial.state == "infeasible"), self.trials[0])
+        return f"no trial is complete ({counts}); trial {first.number}: {first.reason}"
+
+    def violations_text(self, trial: TrialResult) -> str:
+        """Return the constraints that a trial violates in words; empty if there are none."""
+        broken = self.config.violations_text(trial.values, self.config.constraints)
+        return f"trial {trial.number}, {broken}" if broken else ""
+
+    @property
+    def winner(self) -> Finalist | None:
+        """The body that wins, if there is one."""
+        return self.verdict.winner
+
+
+def _finalist(trial: TrialResult) -> Finalist:
+    assert trial.score is not None
+    return Finalist(
+        number=trial.number,
+        role="baseline" if trial.origin == "baseline" else "finalist",
+        design=trial.design,
+        options=trial.options,
+        score=trial.score,
+        policy=None if trial.controller == "qp" else trial.controller,
+    )
+
+
+def load_study(folder: str | Path | StudyFolder) -> StudySnapshot:
+    """Read all that a study has found so far.
+
+    Args:
+        folder: the folder of a study, finished or not.
+
+    Raises:
+        DataError: if the folder has no study, or a file is damaged.
+    """
+    study = folder if isinstance(folder, StudyFolder) else StudyFolder(folder)
+    path = study.path
+    study.config  # noqa: B018 - raises where there is no study
+    shared = path / SHARED_POLICY_RECORD
+    return StudySnapshot(
+        folder=study,
+        trials=study.results(),
+        screen=[ScreenResult.read(file) for file in sorted(path.glob("screen/[0-9]*.json"))],
+        shared_policy=SharedPolicy.read(shared) if shared.exists() else None,
+        all_tests=[FinalistTest.read(file) for file in sorted(path.glob("finalists/trial*.json"))],
+        all_trainings=[FinalistTraining.read(file) for file in sorted(path.glob("finalists/*/training.json"))],
+        account=study.account(),
+    )
