@@ -1,4 +1,38 @@
-"""Co-design: the body is optimised outside (Optuna), the controller inside each trial; winners are checked on FEM.
+"""Co-design: Optuna proposes bodies, each is scored with its controller, and the best are checked on FEM.
 
-The two verbs are `codesign.study.run_study` and `codesign.report.page.write_report`.
+`run_study` runs a study, `write_report` writes its report, and `load_study` reads what it has found so far.
 """
+
+from typing import TYPE_CHECKING
+
+from softgym_envs._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from codesign.config import StudyConfig as StudyConfig
+    from codesign.objectives import Objective as Objective
+    from codesign.objectives import Outcome as Outcome
+    from codesign.report.page import write_report as write_report
+    from codesign.report.results import StudyResults as StudyResults
+    from codesign.snapshot import StudySnapshot as StudySnapshot
+    from codesign.snapshot import load_study as load_study
+    from codesign.study import run_study as run_study
+    from codesign.tools.calibration import calibrate as calibrate
+    from codesign.tools.gradient import optimise as optimise
+    from codesign.tools.search import search as search
+    from codesign.tools.sensitivity import analyse_sensitivity as analyse_sensitivity
+
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "config": ["StudyConfig"],
+        "objectives": ["Objective", "Outcome"],
+        "report.page": ["write_report"],
+        "report.results": ["StudyResults"],
+        "snapshot": ["StudySnapshot", "load_study"],
+        "study": ["run_study"],
+        "tools.calibration": ["calibrate"],
+        "tools.gradient": ["optimise"],
+        "tools.search": ["search"],
+        "tools.sensitivity": ["analyse_sensitivity"],
+    },
+)

@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[1]
 # A package joins this list when its __init__ uses `lazy_exports`.
 PACKAGES = [
     "agents",
+    "codesign",
     "softgym_envs",
     "softgym_envs.backends",
     "softgym_envs.control",

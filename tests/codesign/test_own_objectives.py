@@ -1,0 +1,144 @@
+"""Objectives of one's own, options as variables, and a robot of one's own, without a change in the package."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from agents.evaluation import Evaluation
+from codesign import Objective, StudyConfig, load_study, run_study, write_report
+from codesign.objectives import OBJECTIVES, Outcome, find_objective, objective_name
+from softgym_envs.robots import SoftFinger, Tetrapod, make_robot
+
+ROBOT = make_robot("finger")
+
+
+def effort_per_reach(outcome):
+    """Effort for each goal, larger where the goal is missed."""
+    return outcome.evaluation.efforts * (1.0 + outcome.evaluation.distances / 1e-3)
+
+
+lightness = Objective(
+    "lightness", lambda outcome: 1.0 / outcome.model.volume, "Lightness", "1/cm3", 1e-6, maximize=True, of_body=True
+)
+
+
+class StiffFinger(SoftFinger):
+    """A robot of one's own."""
+
+    name = "stiff_finger"
+    weights_name = "stiff_finger"
+
+
+def outcome(distances, efforts):
+    distances, efforts = np.array(distances), np.array(efforts)
+    ones = np.ones(len(distances))
+    return Outcome(Evaluation(distances, distances, ones, ones, efforts, steps=1), ROBOT.design_space.baseline, ROBOT)
+
+
+def test_names_of_objectives():
+    assert objective_name("mean_distance") == objective_name(OBJECTIVES["mean_distance"]) == "mean_distance"
+    assert objective_name(effort_per_reach) == f"{__name__}:effort_per_reach"
+    assert objective_name(lightness) == f"{__name__}:lightness"
+    with pytest.raises(ValueError, match="cannot be imported by workers: define it at the top level of a module"):
+        objective_name(lambda outcome: 0.0)
+
+
+def test_units_of_efforts_are_those_of_the_robot():
+    assert find_objective("mean_effort", ROBOT).text(2.0) == "2.00 N"
+    assert find_objective("mean_effort", make_robot("trunk")).text(2e3) == "2.00 kPa"
+    assert find_objective("mean_effort", Tetrapod()).text(2.0) == "2.00 N m"
+
+
+def test_measurements():
+    found = find_objective(f"{__name__}:effort_per_reach", ROBOT)
+    assert (found.label, found.sign) == ("Effort per reach", -1)
+    measured = found.measure(outcome([0.0, 1e-3], [1.0, 2.0]))
+    assert (measured.value, measured.per_goal) == (2.5, [1.0, 4.0])
+    body = find_objective(f"{__name__}:lightness", ROBOT).measure(outcome([0.0], [1.0]))
+    assert body.per_goal is None and body.value == pytest.approx(1.0 / ROBOT.build().volume)
+
+
+@pytest.mark.parametrize(
+    "returned, message",
+    [
+        ("much", "returned .*much.*must return one number, or one for each of 2 goals"),
+        (np.ones(3), "one for each of 2 goals"),
+        (float("nan"), "is not finite for design .*length"),
+    ],
+)
+def test_wrong_values_of_an_objective(returned, message):
+    with pytest.raises(ValueError, match=message):
+        Objective("my:own", lambda outcome: returned, "Own").measure(outcome([0.0, 0.0], [1.0, 1.0]))
+
+
+def test_study_with_an_objective_of_ones_own(tmp_path, tiny):
+    """As a function in Python; workers import it."""
+    name = f"{__name__}:lightness"
+    data = tiny(trials=3, finalists={"count": 1}, constraints={name: 1e4}, sampler={"name": "random"})
+    config = StudyConfig.model_validate(data)
+    results = run_study(config, tmp_path / "study", objective=effort_per_reach, progress=False)
+    assert results.objective == f"{__name__}:effort_per_reach"
+    snapshot = load_study(tmp_path / "study")
+    for trial in snapshot.trials:
+        each = trial.evaluation.efforts * (1.0 + trial.evaluation.distances / 1e-3)
+        assert trial.score == pytest.approx(-each.mean())
+        volume = config.robot.build(trial.design).volume
+        assert trial.values[name] == pytest.approx(1.0 / volume)
+        assert trial.violations[name] == pytest.approx(1e4 - 1.0 / volume)
+    best = min((trial.values[results.objective], trial.number) for trial in snapshot.trials if trial.feasible)
+    assert results.winner.trial == best[1]
+    for row in results.comparison:
+        assert row.objective_change == pytest.approx(row.winner.objective - row.baseline.objective)
+    assert "Effort per reach" in write_report(tmp_path / "study").read_text()
+
+
+def test_option_of_the_robot_as_a_variable(tmp_path, tiny):
+    """Gravity on finite elements."""
+    name = "robot.gravity[2]"
+    data = tiny(
+        environment={"id": "SoftGym/FingerReach-v0", "backend": "fem", "robot_options": {"gravity": [0.0, 0.0, 0.0]}},
+        variables=["height", name],
+        ranges={name: {"low": -9.81, "high": 0.0, "baseline": 0.0, "unit": "m/s2", "description": "gravity"}},
+        goals={
+            "source": "zone",
+            "zone": {"center": [0.0, 0.0, -0.11], "half_size": [0.0, 0.01, 0.002]},
+            "count": 1,
+            "unseen_count": 2,
+            "training_count": 1,
+        },
+        trials=2,
+        sampler={"name": "random"},
+    )
+    config = StudyConfig.model_validate(data)
+    assert config.test_backends == ("fem",)
+    results = run_study(config, tmp_path / "study", progress=False)
+    first, second = load_study(tmp_path / "study").trials
+    assert first.options == {name: 0.0} and -9.81 < second.options[name] < 0.0
+    assert set(second.design) == set(config.space.names)
+    (variable,) = [variable for variable in results.variables if variable.name == name]
+    assert variable.optimised and variable.unit == "m/s2"
+    # The same body without gravity moves differently.
+    from codesign.phases.trial import assess
+
+    goals = load_study(tmp_path / "study").folder.goals["selection"]
+    same = assess("qp", config, config.environment_of(second.options), goals, second.design)
+    other = assess("qp", config, config.environment_of({name: 0.0}), goals, second.design)
+    assert same.evaluation.distances == pytest.approx(second.evaluation.distances, rel=1e-6)
+    assert other.evaluation.distances != pytest.approx(second.evaluation.distances, rel=1e-6)
+
+
+def test_robot_of_ones_own(tmp_path, tiny):
+    """By its class; there are no weights, so everything runs on finite elements."""
+    zone = {"center": [0.0, 0.0, -0.11], "half_size": [0.0, 0.01, 0.002]}
+    data = tiny(
+        environment={"robot": StiffFinger, "task": "reach"},
+        goals={"source": "zone", "zone": zone, "count": 1, "unseen_count": 2, "training_count": 1},
+        trials=2,
+        finalists={"count": 1},
+    )
+    config = StudyConfig.model_validate(data)
+    assert config.environment.robot == f"{__name__}:StiffFinger"
+    results = run_study(config, tmp_path / "study", progress=False)
+    assert results.trials["complete"] == 2
+    assert {row.backend for row in results.comparison} == {"fem"}
