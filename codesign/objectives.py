@@ -124,8 +124,13 @@ class Objective:
 
     @property
     def axis(self) -> str:
-        """Label with the unit, for figures and columns."""
+        """Label and unit, for figures: ``"Mean actuator effort [N]"``."""
         return f"{self.label}{f' [{self.unit}]' if self.unit else ''}"
+
+    @property
+    def axis_inside(self) -> str:
+        """Label and unit inside a sentence: ``"mean actuator effort [N]"``."""
+        return self.axis[0].lower() + self.axis[1:]
 
     def excess(self, value: float, limit: float) -> float:
         """By how much a value violates a constraint [SI]; positive if it does."""

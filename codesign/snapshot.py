@@ -96,6 +96,7 @@ class StudySnapshot:
 
         from codesign.scheduling.optuna_study import distributions
 
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
         directions = [optuna.study.StudyDirection.MAXIMIZE] * (1 + len(self.config.secondary_objectives))
         study = optuna.create_study(directions=directions)
         space = distributions(self.config)

@@ -192,7 +192,6 @@ def _question(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str,
         f"{v.name.replace('_', ' ')} from {present(v.low, v.unit)} to {present(v.high, v.unit)}" for v in optimised
     )
     direction = "as large as possible" if objective.maximize else "as small as possible"
-    unit = f" [{objective.unit}]" if objective.unit else ""
     count, unseen = len(snapshot.folder.goals["selection"]), len(snapshot.folder.goals["unseen"])
     others = f"{unseen} others for the final test"
     if _same_goals(snapshot):
@@ -202,14 +201,14 @@ def _question(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str,
     rows = [
         ("Task", f"{results.environment}, success within {1e3 * results.success_distance:g} mm at the end"),
         ("Body", f"{len(optimised)} variables: {ranges}"),
-        ("Objective", f"{objective.label.lower()}{unit} on {count} goals, {direction}"),
+        ("Objective", f"{objective.axis_inside} on {count} goals, {direction}"),
     ]
     if config.constraints:
         texts = (config.objectives[name].constraint_text(limit) for name, limit in config.constraints.items())
         satisfied = f"{results.trials['feasible']} of {results.trials['complete']} complete trials satisfy them"
         rows.append(("Constraints", f"{'; '.join(texts)}; {satisfied}"))
     if config.secondary_objectives:
-        labels = ", ".join(config.objectives[name].axis.lower() for name in config.secondary_objectives)
+        labels = ", ".join(config.objectives[name].axis_inside for name in config.secondary_objectives)
         rows.append(("Secondary objectives", f"{labels}; {len(results.pareto)} bodies on the Pareto front"))
     rows += [
         ("Physics", f"{backend} in the search, FEM in the test"),

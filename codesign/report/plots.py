@@ -305,7 +305,7 @@ def screen(snapshot: StudySnapshot, results: StudyResults) -> str | None:
             ax.scatter(
                 x, y, 80 if role else 26, colour, marker="*" if role else "o", label=role, zorder=4 if role else 3
             )
-        ax.set(xlabel=f"inverse QP: {objective.axis.lower()}", ylabel=f"SAC: {objective.axis.lower()}")
+        ax.set(xlabel=f"inverse QP: {objective.axis_inside}", ylabel=f"SAC: {objective.axis_inside}")
         if roles:
             ax.legend(fontsize=8)
     return out[0]
@@ -333,7 +333,7 @@ def transfer(snapshot: StudySnapshot, results: StudyResults) -> str | None:
                 ax.scatter([], [], s=40, c="white", marker=marker, edgecolors="#334155", label=label)
             for colour, label in ((WINNER, "winner"), (BASELINE, "baseline"), (OTHER, "other finalist")):
                 ax.scatter([], [], s=40, c=colour, marker="o", label=label)
-            ax.set(xlabel=f"surrogate: {objective.axis.lower()}", ylabel=f"FEM: {objective.axis.lower()}")
+            ax.set(xlabel=f"surrogate: {objective.axis_inside}", ylabel=f"FEM: {objective.axis_inside}")
             ax.set(xlim=ends, ylim=ends, aspect="equal")
         axes[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
     return out[0]
