@@ -12,6 +12,7 @@ import pytest
 from _pytest.faulthandler import fault_handler_stderr_fd_key
 from hypothesis import settings
 
+from softgym_envs.cli import main
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -103,6 +104,37 @@ def require_program():
             pytest.skip(reason)
 
     return require
+
+
+@pytest.fixture
+def softgym(monkeypatch, capsys):
+    """Function ``softgym(*arguments) -> status, stdout, stderr``: the command line in this process."""
+
+    def run(*arguments):
+        monkeypatch.setattr("sys.argv", ["softgym", *map(str, arguments)])
+        status = 0
+        try:
+            main()
+        except SystemExit as leave:
+            status = leave.code or 0
+        return status, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def refused(softgym, monkeypatch, tmp_path):
+    """Function ``refused(*arguments) -> line``: the error of a command that leaves no file behind."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        status, _, err = softgym(*arguments)
+        (line,) = [line for line in err.splitlines() if line.strip()]
+        assert status == 2 and line.startswith("softgym: error: ")
+        assert list(tmp_path.iterdir()) == []
+        return line
+
+    return run
 
 
 @pytest.fixture

@@ -8,60 +8,47 @@ from pathlib import Path
 
 import pytest
 
-from softgym_envs import cli
 from softgym_envs.cli import app
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def run(monkeypatch, capsys, *arguments):
-    """Run the command line in this process; returns (status, stdout, stderr)."""
-    monkeypatch.setattr(sys, "argv", ["softgym", *map(str, arguments)])
-    status = 0
-    try:
-        cli.main()
-    except SystemExit as leave:
-        status = leave.code or 0
-    out, err = capsys.readouterr()
-    return status, out, err
-
-
-def test_list_and_show(monkeypatch, capsys, tmp_path):
-    status, out, _ = run(monkeypatch, capsys, "list")
+def test_list_and_show(softgym, tmp_path):
+    status, out, _ = softgym("list")
     assert status == 0 and "SoftGym/FingerReach-v0" in out and "surrogate" in out
     picture = tmp_path / "body.png"
-    status, out, _ = run(monkeypatch, capsys, "show", "finger", "--design", "length=0.041", "--picture", picture)
+    status, out, _ = softgym("show", "finger", "--design", "length=0.041", "--picture", picture)
     assert status == 0 and "joint_height" in out and "nodes" in out
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_rollout_evaluate_and_record(monkeypatch, capsys, tmp_path):
-    status, out, _ = run(monkeypatch, capsys, "rollout", "SoftGym/FingerReach-v0", "--backend", "fem")
+def test_rollout_evaluate_and_record(softgym, tmp_path):
+    status, out, _ = softgym("rollout", "SoftGym/FingerReach-v0", "--backend", "fem")
     assert status == 0 and "success True" in out
     recording = tmp_path / "episode.rrd"
-    status, out, _ = run(monkeypatch, capsys, "rollout", "SoftGym/FingerTrack-v0", "--record", recording)
+    status, out, _ = softgym("rollout", "SoftGym/FingerTrack-v0", "--record", recording)
     assert status == 0 and recording.stat().st_size > 10_000
     config = ROOT / "configs" / "agents" / "finger_reach.yaml"
     output = tmp_path / "table.json"
-    status, out, _ = run(monkeypatch, capsys, "evaluate", "--config", config, "--goals", 4, "--output", output)
+    status, out, _ = softgym("evaluate", "--config", config, "--goals", 4, "--output", output)
     assert status == 0
     table = json.loads(output.read_text())
     assert {r["agent"] for r in table["results"]} == {"qp", "random"}
     assert table["results"][0]["success_rate"] == 1.0
 
 
-def test_dataset_fit_and_train(monkeypatch, capsys, tmp_path):
+def test_dataset_fit_and_train(softgym, tmp_path):
     tiny = ["workers=1", "network.steps=3", "network.width=16", "robot_options.cables=1"]
     tiny += [f"data.{s}.groups=2" for s in ("train", "validation", "test")]
     tiny += [f"data.{s}.states=3" for s in ("train", "validation", "test")]
     config = ROOT / "configs" / "surrogate" / "finger_1cable.yaml"
     data = tmp_path / "data"
-    status, out, err = run(monkeypatch, capsys, "dataset", "--config", config, "--folder", data, "--quiet", *tiny)
+    status, out, err = softgym("dataset", "--config", config, "--folder", data, "--quiet", *tiny)
     assert status == 0, err
     assert "train: 8 states of 2 designs" in out
     fitted = tmp_path / "fit"
     arguments = ["fit", "--config", config, "--folder", fitted, "--data", data, "--quiet", *tiny]
-    status, out, err = run(monkeypatch, capsys, *arguments)
+    status, out, err = softgym(*arguments)
     assert status == 0, err
     assert "effector_mean" in out and (fitted / "model.safetensors").exists()
     config = ROOT / "configs" / "agents" / "finger_reach.yaml"
@@ -74,7 +61,7 @@ def test_dataset_fit_and_train(monkeypatch, capsys, tmp_path):
         "sac.learning_starts=16",
     ]
     arguments = ["train", "--config", config, "--folder", tmp_path / "sac", "--quiet", *small]
-    status, out, err = run(monkeypatch, capsys, *arguments)
+    status, out, err = softgym(*arguments)
     assert status == 0, err
     assert (tmp_path / "sac" / "policy.safetensors").exists()
 
@@ -126,23 +113,17 @@ STRENGTH = "configs/design/finger_strength.yaml"
         (["bench", "nothing"], ["nothing"]),
     ],
 )
-def test_bad_input_is_one_line_and_status_two(monkeypatch, capsys, tmp_path, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    arguments = [str(ROOT / a) if a == CONFIG else a for a in arguments]
-    status, _, err = run(monkeypatch, capsys, *arguments)
-    assert status == 2
-    lines = [line for line in err.splitlines() if line.strip()]
-    assert len(lines) == 1 and lines[0].startswith("softgym: error: ")
+def test_bad_input_is_one_line_and_status_two(refused, arguments, words):
+    line = refused(*(str(ROOT / argument) if argument == CONFIG else argument for argument in arguments))
     for word in words:
-        assert word in lines[0]
-    assert list(tmp_path.iterdir()) == []  # nothing half-made is left
+        assert word in line
 
 
 @pytest.mark.parametrize("text", ["steps: [1, 2", "- a\n- b\n", "steps: {a: 1}", "\x00\x01"])
-def test_malformed_files(monkeypatch, capsys, tmp_path, text):
+def test_malformed_files(softgym, tmp_path, text):
     path = tmp_path / "config.yaml"
     path.write_text(text)
-    status, _, err = run(monkeypatch, capsys, "train", "--config", path, "--folder", tmp_path / "x")
+    status, _, err = softgym("train", "--config", path, "--folder", tmp_path / "x")
     assert status == 2 and len(err.strip().splitlines()) == 1 and "config.yaml" in err
 
 
@@ -156,7 +137,7 @@ def test_malformed_files(monkeypatch, capsys, tmp_path, text):
     ],
 )
 def test_a_stopped_verb_says_so_and_goes_on_only_where_it_can(
-    module, name, arguments, resumes, monkeypatch, capsys, tmp_path
+    module, name, arguments, resumes, softgym, monkeypatch, tmp_path
 ):
     def stop(*_, **__):
         raise KeyboardInterrupt
@@ -164,22 +145,22 @@ def test_a_stopped_verb_says_so_and_goes_on_only_where_it_can(
     monkeypatch.setattr(f"{module}.{name}", stop)
     monkeypatch.chdir(tmp_path)
     arguments = [str(ROOT / a) if a.startswith("configs/") else a for a in arguments]
-    status, _, err = run(monkeypatch, capsys, *arguments)
+    status, _, err = softgym(*arguments)
     assert status == 130 and "stopped" in err
     assert ("again to continue" in err) == resumes
 
 
-def test_help_without_a_verb(monkeypatch, capsys):
-    status, out, err = run(monkeypatch, capsys)
+def test_help_without_a_verb(softgym):
+    status, out, err = softgym()
     assert status == 0 and not err
     for words in ("Usage: softgym", "Environments:", "Design and control:", "rollout", "calibrate"):
         assert words in out
 
 
 @pytest.mark.parametrize("verb", app.cli.commands)
-def test_every_verb_has_help_in_a_section(verb, monkeypatch, capsys):
-    _, listed, _ = run(monkeypatch, capsys)
-    status, out, _ = run(monkeypatch, capsys, verb, "--help")
+def test_every_verb_has_help_in_a_section(verb, softgym):
+    _, listed, _ = softgym()
+    status, out, _ = softgym(verb, "--help")
     assert status == 0 and f"softgym {verb}" in out
     assert re.search(rf"^  {verb} +[A-Z]", listed, re.MULTILINE)
 

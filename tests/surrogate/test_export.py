@@ -12,7 +12,6 @@ import sys
 import numpy as np
 import pytest
 
-from softgym_envs import cli
 from softgym_envs.errors import DesignError
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.export import export_c, export_onnx
@@ -238,22 +237,16 @@ def test_bad_input_is_named_and_nothing_is_written(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_line_writes_both(tmp_path, monkeypatch, capsys):
+def test_the_command_line_writes_both(tmp_path, monkeypatch, softgym):
     pytest.importorskip("onnx")
     model = random_model("two")
     monkeypatch.setattr("softgym_envs.surrogate.pretrained.load_model", lambda *_: model)
 
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["softgym", "deploy", "finger", *map(str, arguments)])
-        try:
-            cli.main()
-        except SystemExit as leave:
-            return leave.code or 0, *capsys.readouterr()
-        return 0, *capsys.readouterr()
-
     header, graph = tmp_path / "model.h", tmp_path / "model.onnx"
     weights = ("--weights", tmp_path)
-    status, out, _ = run(header, graph, *weights, "--design", "length=0.041", "--members", 1, "--name", "tip")
+    status, out, _ = softgym(
+        "deploy", "finger", header, graph, *weights, "--design", "length=0.041", "--members", 1, "--name", "tip"
+    )
     assert status == 0 and f"wrote {header}" in out and f"wrote {graph}" in out
     assert "tip_state" in header.read_text() and "length = 0.041 m" in header.read_text()
     for arguments, message in (
@@ -263,6 +256,6 @@ def test_the_command_line_writes_both(tmp_path, monkeypatch, capsys):
         ((tmp_path / "a.h", "--design", "size=1"), "unknown design variable 'size'"),
         ((), "FILES"),
     ):
-        status, _, err = run(*arguments, *weights)
+        status, _, err = softgym("deploy", "finger", *arguments, *weights)
         assert status == 2 and message in err
     assert sorted(tmp_path.iterdir()) == [header, graph]
