@@ -223,9 +223,8 @@ def _track(path: Path, case: str, data: dict[str, dict[str, np.ndarray]], size: 
     from softgym_envs.surrogate.data.sampling import select_states
     from softgym_envs.surrogate.data.states import stable_rows, training_states
     from softgym_envs.surrogate.features import Features
-    from softgym_envs.surrogate.model import card_of
-    from softgym_envs.surrogate.online import save_model
     from softgym_envs.surrogate.trainer import Trainer
+    from softgym_envs.surrogate.weight_files import card_of, save_model
 
     torch.set_num_threads(1)
     robot = make_robot(CASES[case]["robot"], **CASES[case]["robot_options"])

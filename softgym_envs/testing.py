@@ -282,10 +282,9 @@ def train_small_surrogate(
     from softgym_envs.surrogate import potential
     from softgym_envs.surrogate.data.states import training_states
     from softgym_envs.surrogate.features import Features
-    from softgym_envs.surrogate.model import card_of
-    from softgym_envs.surrogate.online import save_model
     from softgym_envs.surrogate.trainer import Trainer
     from softgym_envs.surrogate.training import domain_of
+    from softgym_envs.surrogate.weight_files import card_of, save_model
 
     training = sample_states(robot, states, 0, limit=limit, sequence="halton")
     validation = sample_states(robot, max(states // 3, 20), 1, limit=limit)

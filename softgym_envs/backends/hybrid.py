@@ -18,10 +18,10 @@ from softgym_envs.backends.surrogate import SurrogateBody
 from softgym_envs.errors import ConvergenceError, DataError
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.model import load_model
-from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of, save_model
+from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_model
+from softgym_envs.surrogate.weight_files import load_model, save_model
 
 #: Within this distance of an FEM state [fraction of the actuator range] its condensed model, the tangent, replaces a
 #: new solution. The error is of second order: 0.3 um at the tip of the finger.

@@ -1,36 +1,30 @@
-"""Trained condensed models, evaluated by a compiled kernel or NumPy: no torch in the hot path.
+"""The interface of trained condensed models; they are evaluated by compiled kernels or NumPy, without torch.
 
-Every model maps the reached actuator displacement and the design to efforts, effector positions and the compliance.
-What depends on the design alone is computed once per body (`context`). All arrays carry a leading batch dimension.
-The kinds of networks are in `softgym_envs.surrogate.networks`.
+Every model maps the reached actuator displacements and the design to efforts, effector positions and the compliance.
+Everything that depends on the design alone is computed once per body (`SurrogateModel.context`). All arrays have a
+leading batch dimension. The kinds of networks are listed in `softgym_envs.surrogate.networks`.
 """
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numba
 import numpy as np
 
-from softgym_envs.errors import WeightsError
 from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row, effort_unit, point_rows
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.domain import Domain
 from softgym_envs.surrogate.features import Features
-from softgym_envs.surrogate.networks import network_module
-
-FORMAT = 2
 
 
 @numba.njit(cache=True, error_model="numpy")
 def definite(matrices):
-    """Whether symmetric matrices (B, n, n) are positive definite, (B,): all pivots of the elimination are positive."""
+    """Return whether symmetric matrices (B, n, n) are positive definite, (B,): if all pivots are positive."""
     found = np.ones(len(matrices), dtype=np.bool_)
     n = matrices.shape[1]
     for row in range(len(matrices)):
@@ -48,12 +42,12 @@ def definite(matrices):
 
 @dataclass
 class Context:
-    """What a model knows of bodies before they are actuated.
+    """Bodies, prepared for a model: everything that does not depend on the actuation.
 
     Attributes:
-        stiffness: factor of all efforts relative to the baseline stiffness, shape (S, 1).
+        stiffness: stiffness relative to the baseline, which scales all efforts, shape (S, 1).
         arrays: arrays of the model with leading dimension S, the number of different bodies.
-        slot: which of them each of B rows is, shape (B,).
+        slot: index of the body of each of B rows, shape (B,).
     """
 
     stiffness: np.ndarray
@@ -62,15 +56,15 @@ class Context:
 
     @classmethod
     def shared(cls, one: Context, count: int) -> Context:
-        """``count`` rows of one body, which is kept once."""
+        """Return ``count`` rows of one body, which is stored once."""
         return cls(one.stiffness, one.arrays, np.zeros(count, dtype=np.int64))
 
     def rows(self, index: np.ndarray) -> Context:
-        """The context of some of the rows; nothing is copied."""
+        """Return the context of some of the rows, without copying arrays."""
         return Context(self.stiffness, self.arrays, self.slot[index])
 
     def put(self, index: np.ndarray, other: Context) -> None:
-        """Overwrite the bodies of some of the rows. Afterwards no two rows share one."""
+        """Overwrite the bodies of some rows. Afterwards every row has a body of its own."""
         if not self._own:
             self.stiffness = self.stiffness[self.slot]
             self.arrays = {name: array[self.slot] for name, array in self.arrays.items()}
@@ -82,11 +76,11 @@ class Context:
 
     @property
     def _own(self) -> bool:
-        """Every row has a body of its own, in order."""
+        """Whether every row has a body of its own, in order."""
         return len(self.stiffness) == len(self.slot) and bool((self.slot == np.arange(len(self.slot))).all())
 
     def gather(self) -> dict[str, np.ndarray]:
-        """The arrays of every row, with leading dimension B."""
+        """Return the arrays of every row, with leading dimension B."""
         if self._own:
             return self.arrays
         return {name: array[self.slot] for name, array in self.arrays.items()}
@@ -98,8 +92,19 @@ class SurrogateModel(ABC):
     Args:
         robot: the robot the weights are for.
         tensors: weights by name.
-        card: the JSON beside the weights.
+        card: the JSON file that describes the weights, see `weight_files.card_of`.
         members: how many members of an ensemble are used; default all.
+
+    Attributes:
+        features: scaling of inputs.
+        count: number of actuators n_a.
+        effectors: number of effector coordinates n_e.
+        size: order of W, n_a + n_e.
+        span: a quarter of the actuators' ranges, the unit of steps and tolerances of searches, shape (n_a,).
+        domain: where the model may be trusted.
+
+    Raises:
+        ValueError: if the card or ``members`` does not fit.
     """
 
     network: ClassVar[str]
@@ -120,13 +125,11 @@ class SurrogateModel(ABC):
         self.roles: Roles = (("a", self.count), ("e", self.effectors))
         commanded = [Row(a.name, a.unit, effort_unit(a.unit)) for a in robot.actuators]
         self.rows = (*commanded, *(row for name in robot.effectors for row in point_rows(name)))
-        #: A quarter of the actuators' ranges, the unit of steps and tolerances of searches.
         self.span = 0.25 * (robot.upper - robot.lower)
-
         self.domain = Domain.of_card(self.card, robot)
 
     def context(self, designs: np.ndarray) -> Context:
-        """Prepare bodies: designs (B, len(space)) in the order of the space."""
+        """Prepare bodies, given as designs (B, len(space)) in the order of the design space."""
         arrays = self._prepare(self.features.design(designs))
         low, high = self.domain.design_low, self.domain.design_high
         arrays["known"] = np.all((designs >= low) & (designs <= high), axis=1)
@@ -137,21 +140,21 @@ class SurrogateModel(ABC):
         return context
 
     def state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what is predicted at displacements (B, n_a).
+        """Return the predicted states at displacements (B, n_a).
 
         Returns:
-            Efforts [N, ...] (B, n_a), effector positions [m] (B, n_e), and the spread of the ensemble about the
-            effector [m] (B,), infinite for a model that has none.
+            Efforts [N, ...] (B, n_a), effector positions [m] (B, n_e), and the spread of the ensemble's effectors [m]
+            (B,), infinite for a model without an ensemble.
         """
         effort, effector, spread = self._state(context, displacement)
         return effort * context.stiffness[context.slot], effector, spread
 
     def effort(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        """Return the efforts alone, (B, n_a), at displacements (B, n_a)."""
+        """Return only the efforts (B, n_a) at displacements (B, n_a)."""
         return self._effort(context, displacement) * context.stiffness[context.slot]
 
     def effector(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the effectors [m] (B, n_e) and their spread [m] (B,) alone."""
+        """Return only the effectors [m] (B, n_e) and their spread [m] (B,), at displacements (B, n_a)."""
         return self._state(context, displacement)[1:]
 
     def search(
@@ -170,12 +173,15 @@ class SurrogateModel(ABC):
             target: commanded displacements, shape (B, n_a).
             guess: where the search begins, shape (B, n_a).
             unilateral: actuators that cannot push, shape (n_a,).
-            tolerance: largest step left [quarter of the actuator range].
-            iterations: bound on the steps; it ends after two or three.
+            tolerance: the search ends when its next step is below this [`span`].
+            iterations: limit of the steps; two or three are usually enough.
 
         Returns:
             Displacements (B, n_a), efforts (B, n_a), and whether they were found (B,).
         """
+        return self._search(context, target, guess, unilateral, tolerance, iterations)
+
+    def _search(self, context, target, guess, unilateral, tolerance, iterations):
         displacement, effort = guess.copy(), self.effort(context, guess)
         converged = np.isfinite(effort).all(axis=1)
         rows = np.flatnonzero((unilateral & ((effort < 0.0) | (guess > target))).any(axis=1))
@@ -189,15 +195,15 @@ class SurrogateModel(ABC):
                 K[np.linalg.det(K) == 0.0] = np.nan
                 W = np.linalg.inv(K)
             taut, solved = solve_rows(W, d - np.matmul(W, e[:, :, None])[:, :, 0] - wanted, unilateral)
-            if not solved.all():  # a network that does not keep W positive definite: these rows are lost
+            if not solved.all():  # W is not positive definite in these rows
                 converged[rows[~solved]] = False
                 rows, d, e, wanted, W, taut = (x[solved] for x in (rows, d, e, wanted, W, taut))
                 part = part.rows(solved)
-            # Far steps are cut: the network is only asked where its neighbourhood of known states reaches.
+            # Long steps are cut, so that the network is evaluated near known states only.
             step = np.clip(np.matmul(W, (taut - e)[:, :, None])[:, :, 0], -self.span, self.span)
             d = d + step
             moving = (np.abs(step) > tolerance * self.span).any(axis=1)
-            # A last step below the tolerance is taken without asking the model again.
+            # A last step below the tolerance is taken without evaluating the model again.
             displacement[rows[~moving]], effort[rows[~moving]] = d[~moving], taut[~moving]
             rows, d, wanted, W, part = rows[moving], d[moving], wanted[moving], W[moving], part.rows(moving)
             e = self.effort(part, d)
@@ -212,11 +218,12 @@ class SurrogateModel(ABC):
         """Judge predictions at displacements (B, n_a) by their spread (B,).
 
         Returns:
-            The uncertainty of the effector [m] (B,): the spread, inflated so that 95 % of the validation states err
-            by less; and whether the prediction is trusted (B,): body and displacement lie where the model was
+            The uncertainty of the effector [m] (B,): the spread, inflated to a bound that 95 % of the validation
+            errors keep; and whether the prediction is trusted (B,): body and displacement lie where the model was
             trained, and the uncertainty is not larger than in 98 % of the validation states. A model without an
-            ensemble is judged by its domain alone. Where a robot can buckle (the card has a limit of the growth), the
-            predicted `growth` must not be larger than in 98 % of them either: states about to buckle were no data.
+            ensemble is judged by its domain alone. For a robot that can buckle (its card limits the growth), the
+            predicted `growth` must not exceed that of 98 % of the validation states either, because states that are
+            about to buckle were left out of the training.
         """
         domain = self.domain
         uncertainty = domain.inflation * spread
@@ -228,10 +235,10 @@ class SurrogateModel(ABC):
         return uncertainty, trusted
 
     def growth(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        """Return how many times softer the held actuators are at displacements (B, n_a) than at zero, shape (B,).
+        """Return how many times softer the actuators are at displacements (B, n_a) than at zero, shape (B,).
 
-        It is the largest ratio of the two compliances between actuators in any direction, as predicted: next to a
-        buckling it becomes large. Infinite where one of the two is not positive definite.
+        This is the largest ratio, over all directions, of the two predicted compliances between actuators; near
+        buckling it becomes large. It is infinite if one of the two is not positive definite.
         """
         unmoved, stiffness = (self._curvature(context, d) for d in (np.zeros_like(displacement), displacement))
         found = np.full(len(displacement), np.inf)
@@ -255,11 +262,11 @@ class SurrogateModel(ABC):
 
     @abstractmethod
     def _prepare(self, design: np.ndarray) -> dict[str, np.ndarray]:
-        """Arrays of the context from design features (B, design_size)."""
+        """Return the arrays of the context, from design features (B, design_size)."""
 
     @abstractmethod
     def _state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Efforts at baseline stiffness, effector positions and their spread."""
+        """Return efforts at the baseline stiffness, effector positions and their spread."""
 
     def _effort(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         return self._state(context, displacement)[0]
@@ -268,78 +275,9 @@ class SurrogateModel(ABC):
         return np.linalg.inv(self._compliance(context, displacement)[:, : self.count, : self.count])
 
     def _curvature(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        """The stiffness that growth is judged by: every step asks for it, so a cheaper one will do."""
+        """Return the stiffness for judging growth; it is needed in every step and may be a cheaper estimate."""
         return self._stiffness(context, displacement)
 
     @abstractmethod
     def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        """W at baseline stiffness."""
-
-
-def card_of(robot: Robot, network: str) -> dict[str, Any]:
-    """What every card says: by it `load_model` knows whether weights are for a robot."""
-    return {
-        "format": FORMAT,
-        "network": network,
-        "robot": robot.name,
-        "mechanics_key": robot.mechanics_key,
-        "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
-        "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
-    }
-
-
-def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> SurrogateModel:
-    """Load weights (``model.safetensors``) and their card (``model.json``) for a robot.
-
-    Args:
-        folder: where they are.
-        robot: what they must be for.
-        members: how many members of an ensemble to use; default all.
-
-    Raises:
-        WeightsError: if a file is missing, truncated, of another version or for another robot; the message names the
-            file and what was expected.
-    """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load_file
-
-    folder = Path(folder)
-    card_path, weights_path = folder / "model.json", folder / "model.safetensors"
-    for path in (card_path, weights_path):
-        if not path.is_file():
-            raise WeightsError(f"weights file '{path}' does not exist; train it with 'softgym fit'")
-    try:
-        card = json.loads(card_path.read_text())
-    except ValueError as error:
-        raise WeightsError(f"weights card '{card_path}' is not valid JSON: {error}") from None
-    if not isinstance(card, dict) or card.get("format") != FORMAT:
-        raise WeightsError(f"weights card '{card_path}' is not of format {FORMAT}")
-    try:
-        module = network_module(str(card.get("network")))
-    except ValueError as error:
-        raise WeightsError(f"'{card_path}': {error}") from None
-    if card.get("robot") != robot.name or card.get("mechanics_key") != robot.mechanics_key:
-        wanted = {"robot": robot.name, **robot.mechanics_key}
-        found = {"robot": card.get("robot"), **card.get("mechanics_key", {})}
-        different = sorted(k for k in wanted if wanted[k] != found.get(k))
-        raise WeightsError(
-            f"weights '{folder.name}' were trained for another robot: "
-            + ", ".join(f"{k} = {found.get(k)!r}, asked {wanted[k]!r}" for k in different)
-            + "; use backend='fem' or train weights with 'softgym fit'"
-        )
-    expected = card_of(robot, card["network"])
-    for name in ("design_variables", "actuators"):
-        if card.get(name) != expected[name]:
-            raise WeightsError(
-                f"weights '{folder.name}' are for other {name}: {card.get(name)}, asked {expected[name]}"
-            )
-    try:
-        tensors = load_file(weights_path)
-    except (SafetensorError, OSError, ValueError) as error:
-        raise WeightsError(f"weights '{weights_path}' are damaged or truncated: {error}") from None
-    if wrong := sorted(name for name, tensor in tensors.items() if not np.isfinite(tensor).all()):
-        raise WeightsError(f"weights '{weights_path}' are not finite in {', '.join(wrong)}")
-    try:
-        return module.Model(robot, tensors, card, members)
-    except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise WeightsError(f"weights '{weights_path}' do not fit network '{card['network']}': {error}") from error
+        """Return W at the baseline stiffness."""

@@ -35,7 +35,6 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.config import provenance
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write, read_npz, write_json
@@ -362,18 +361,3 @@ def _widened(before: Model, after: Model, data: Mapping[str, np.ndarray], kept: 
 
 def _grown(box: list[float], values: np.ndarray) -> list[float]:
     return [min(box[0], float(values.min())), max(box[1], float(values.max()))]
-
-
-# -- weights on disk -----------------------------------------------------------------------------------------------
-
-
-def save_model(model: SurrogateModel, folder: str | Path) -> None:
-    """Write a model as ``model.safetensors`` and ``model.json``, to be read by `load_model`."""
-    from safetensors.numpy import save
-
-    folder = Path(folder)
-    # Not np.ascontiguousarray, which makes a vector of a scalar.
-    weights = {name: np.array(value, dtype=np.float32, order="C") for name, value in model.tensors.items()}
-    with atomic_write(folder / "model.safetensors") as stream:
-        stream.write(save(weights))
-    write_json(folder / "model.json", {**model.card, "provenance": provenance()})

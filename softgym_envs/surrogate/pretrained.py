@@ -8,7 +8,8 @@ from typing import Any
 
 from softgym_envs.errors import WeightsError
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.model import SurrogateModel, load_model
+from softgym_envs.surrogate.model import SurrogateModel
+from softgym_envs.surrogate.weight_files import load_model
 
 _ROOT = Path(__file__).parent / "weights"
 

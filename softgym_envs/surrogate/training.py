@@ -14,16 +14,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from softgym_envs.config import Config, provenance, save_resolved
+from softgym_envs.config import Config, save_resolved
 from softgym_envs.robots import make_robot
-from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.data.dataset import generate_dataset
 from softgym_envs.surrogate.data.sampling import SamplingPlan
 from softgym_envs.surrogate.data.states import full_compliance, stable_rows, training_states
 from softgym_envs.surrogate.features import Features
-from softgym_envs.surrogate.model import SurrogateModel, card_of, load_model
+from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.networks import NETWORKS, network_module
 from softgym_envs.surrogate.trainer import Trainer
+from softgym_envs.surrogate.weight_files import card_of, load_model, save_model
 
 SPLITS = ("train", "validation", "test")
 
@@ -202,7 +203,6 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         The errors on the test set.
     """
     import torch
-    from safetensors.numpy import save
 
     folder, data_folder = Path(folder), Path(data_folder)
     robot = make_robot(config.robot, **config.robot_options)
@@ -243,13 +243,8 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         "training_seconds": round(seconds, 1),
         "best_validation": {part: min(row["validation"] for row in rows) for part, rows in histories.items()},
         "test": errors,
-        "provenance": provenance(),
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    weights = {name: np.array(value, dtype=np.float32, order="C") for name, value in tensors.items()}
-    with atomic_write(folder / "model.safetensors") as stream:
-        stream.write(save(weights))
-    write_json(folder / "model.json", card)
+    save_model(module.Model(robot, tensors, card), folder)
     history = {f"{p}_{k}": np.array([row[k] for row in rows]) for p, rows in histories.items() for k in rows[0]}
     with atomic_write(folder / "history.npz") as stream:
         np.savez_compressed(stream, allow_pickle=False, **history)

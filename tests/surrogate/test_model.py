@@ -17,13 +17,14 @@ from softgym_envs.mechanics.solvers import complementarity
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate import online
 from softgym_envs.surrogate.baselines import residual
-from softgym_envs.surrogate.model import Context, SurrogateModel, load_model
+from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.networks import NETWORKS
 from softgym_envs.surrogate.potential import kernels
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
 from softgym_envs.surrogate.trainer import Trainer
 from softgym_envs.surrogate.training import FitConfig, fit, generate_datasets
+from softgym_envs.surrogate.weight_files import load_model
 from softgym_envs.testing import random_states, untrained_potential
 
 CABLES = (1, 2)
@@ -156,7 +157,7 @@ def test_search_of_a_batch_is_that_of_its_rows(name):
     well = np.setdiff1d(np.arange(count), lost)
     assert found[2][well].all()
     # the same search in plain numpy
-    expected = SurrogateModel.search(model, context.rows(well), target[well], guess[well], unilateral, 2e-4, 12)
+    expected = SurrogateModel._search(model, context.rows(well), target[well], guess[well], unilateral, 2e-4, 12)
     assert expected[2].all()
     assert np.abs(found[0][well] - expected[0]).max() < 1e-4 * model.span.max()
     assert np.abs(found[1][well] - expected[1]).max() < 1e-3 * np.abs(expected[1]).max()
@@ -403,7 +404,7 @@ def test_damaged_domains(copied, change, message):
 
 def test_missing_and_foreign_weights(copied):
     robot, folder = copied
-    with pytest.raises(WeightsError, match=r"cables = 2, asked 1"):
+    with pytest.raises(WeightsError, match=r"cables = 2, needed 1"):
         load_model(folder, make_robot("finger", cables=1))
     with pytest.raises(WeightsError, match="mesh_size"):
         load_model(folder, make_robot("finger", mesh_size=0.005))

@@ -10,10 +10,10 @@ import pytest
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.data.dataset import COLUMNS
-from softgym_envs.surrogate.model import load_model
-from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of, rehearsal_states, save_model
+from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of, rehearsal_states
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.training import stack_members, unstack_members
+from softgym_envs.surrogate.weight_files import load_model, save_model
 from softgym_envs.testing import sample_states
 
 LIMIT = 8e-3  # that of `weights`

@@ -160,15 +160,7 @@ class Model(SurrogateModel):
             spread = np.full(len(u), np.inf)
         return effector * self.effector_scale + self.effector_mean, spread * self.effector_scale
 
-    def search(
-        self,
-        context: Context,
-        target: np.ndarray,
-        guess: np.ndarray,
-        unilateral: np.ndarray,
-        tolerance: float,
-        iterations: int,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _search(self, context, target, guess, unilateral, tolerance, iterations):
         body = context.arrays
         displacement, effort = np.empty(guess.shape), np.empty(guess.shape)
         converged = np.empty(len(guess), dtype=bool)

@@ -1,0 +1,99 @@
+"""Trained models on disk: weights (``model.safetensors``) and the card that describes them (``model.json``)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.config import provenance
+from softgym_envs.errors import WeightsError
+from softgym_envs.robots.base import Robot
+from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.surrogate.model import SurrogateModel
+from softgym_envs.surrogate.networks import network_module
+
+FORMAT = 2
+
+
+def card_of(robot: Robot, network: str) -> dict[str, Any]:
+    """Return the entries of every card, by which `load_model` checks that weights fit a robot."""
+    return {
+        "format": FORMAT,
+        "network": network,
+        "robot": robot.name,
+        "mechanics_key": robot.mechanics_key,
+        "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
+        "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
+    }
+
+
+def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> SurrogateModel:
+    """Load weights (``model.safetensors``) and their card (``model.json``) for a robot.
+
+    Args:
+        folder: the folder with both files.
+        robot: the robot they must be for.
+        members: how many members of an ensemble to use; default all.
+
+    Raises:
+        WeightsError: if a file is missing, truncated, of another format or for another robot; the message names the
+            file and what is expected.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    folder = Path(folder)
+    card_path, weights_path = folder / "model.json", folder / "model.safetensors"
+    for path in (card_path, weights_path):
+        if not path.is_file():
+            raise WeightsError(f"weights file '{path}' does not exist; train it with 'softgym fit'")
+    try:
+        card = json.loads(card_path.read_text())
+    except ValueError as error:
+        raise WeightsError(f"weights card '{card_path}' is not valid JSON: {error}") from None
+    if not isinstance(card, dict) or card.get("format") != FORMAT:
+        raise WeightsError(f"weights card '{card_path}' does not have format {FORMAT}")
+    try:
+        module = network_module(str(card.get("network")))
+    except ValueError as error:
+        raise WeightsError(f"'{card_path}': {error}") from None
+    if card.get("robot") != robot.name or card.get("mechanics_key") != robot.mechanics_key:
+        wanted = {"robot": robot.name, **robot.mechanics_key}
+        found = {"robot": card.get("robot"), **card.get("mechanics_key", {})}
+        different = sorted(k for k in wanted if wanted[k] != found.get(k))
+        raise WeightsError(
+            f"weights '{folder.name}' were trained for another robot: "
+            + ", ".join(f"{k} = {found.get(k)!r}, needed {wanted[k]!r}" for k in different)
+            + "; use backend='fem' or train weights with 'softgym fit'"
+        )
+    expected = card_of(robot, card["network"])
+    for name in ("design_variables", "actuators"):
+        if card.get(name) != expected[name]:
+            raise WeightsError(
+                f"weights '{folder.name}' are for other {name}: {card.get(name)}, needed {expected[name]}"
+            )
+    try:
+        tensors = load_file(weights_path)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise WeightsError(f"weights '{weights_path}' are damaged or truncated: {error}") from None
+    if wrong := sorted(name for name, tensor in tensors.items() if not np.isfinite(tensor).all()):
+        raise WeightsError(f"weights '{weights_path}' have values that are not finite in {', '.join(wrong)}")
+    try:
+        return module.Model(robot, tensors, card, members)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise WeightsError(f"weights '{weights_path}' do not fit network '{card['network']}': {error}") from error
+
+
+def save_model(model: SurrogateModel, folder: str | Path) -> None:
+    """Write a model's weights and its card, with the provenance of this run, for `load_model`."""
+    from safetensors.numpy import save
+
+    folder = Path(folder)
+    # Not np.ascontiguousarray, which turns a scalar into a vector.
+    weights = {name: np.array(value, dtype=np.float32, order="C") for name, value in model.tensors.items()}
+    with atomic_write(folder / "model.safetensors") as stream:
+        stream.write(save(weights))
+    write_json(folder / "model.json", {**model.card, "provenance": provenance()})
