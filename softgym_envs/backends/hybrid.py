@@ -18,7 +18,7 @@ from softgym_envs.backends.surrogate import SurrogateBody
 from softgym_envs.errors import ConvergenceError, DataError
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of
+from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_tuned_from
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_model
 from softgym_envs.surrogate.weight_files import load_model, save_model
@@ -284,7 +284,7 @@ class HybridBackend(Backend):
             model = load_model(self._store.folder / "weights", self.robot)
         except DataError:  # there are none yet, or writing them was interrupted
             model = None
-        if isinstance(model, Model) and is_of(model, self.original, data, self._steps, self._seed):
+        if isinstance(model, Model) and is_tuned_from(model, self.original, data, self._steps, self._seed):
             self._use(model)
             self._learned = int(model.card["online"]["states"])
         elif self._retrain_after and self._store.count >= self._retrain_after:

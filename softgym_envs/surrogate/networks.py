@@ -1,4 +1,4 @@
-"""Registry of network kinds, each in a file of its own: the model as it is used, and how it is trained."""
+"""Registry of network kinds; each module holds the model, its hyper-parameters and its training."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ NETWORKS: dict[str, str] = {
     "thesis": "softgym_envs.surrogate.baselines.thesis",
     "rbf": "softgym_envs.surrogate.baselines.rbf",
 }
-"""Kind to module. A module has ``Model`` (a `SurrogateModel`), ``Options`` (its hyper-parameters, a `Config` whose
+"""Kind to module. Each module has ``Model`` (a `SurrogateModel`), ``Options`` (its hyper-parameters, a `Config` whose
 ``kind`` is its key) and ``train(robot, training, validation, trainer) -> (tensors, histories)``."""
 
 

@@ -1,25 +1,25 @@
-"""Online learning: a trained ensemble learns equilibria that the finite elements found where it could not be trusted.
+"""Online learning: a trained ensemble learns equilibria that finite elements found where it could not be trusted.
 
-Every member is trained a little more on the new states together with *rehearsal*: states that the member itself
-predicts where the ensemble is trusted. It does not forget, and the data it was made from need not be at hand. Members
-rehearse their own predictions, not those of the ensemble, and none sees all new states, so that they go on differing
-where nothing is known.
+Every member is trained a little more, on the new states and on *rehearsal* states: predictions of the member itself
+where the ensemble is trusted. The member therefore does not forget, and its original data are not needed. Members
+rehearse their own predictions, not those of the ensemble, and no member sees all new states, so that members still
+differ where nothing is known.
 
-When is a prediction trusted afterwards? Four things decide, and each errs to the safe side:
+Four rules decide which predictions are trusted afterwards; each errs on the safe side:
 
-* The box of known displacements and designs grows to include the new states. A box has corners where no state is, so
-  it only says that the model may be asked there at all.
-* Where a robot can buckle, its actuators may become as soft as in the softest of the new states, but not as soft as in
-  one that was no data because it is about to buckle.
-* The spread of the ensemble decides inside the box, with the limit of the original weights: new states never make the
+* The box of known displacements and designs grows to include the new states. A box has corners without states, so this
+  alone does not make a prediction trusted.
+* If a robot can buckle, its actuators may become as soft as in the softest new state, but not as soft as in a state
+  that was left out because it is about to buckle.
+* Inside the box the spread of the ensemble decides, with the limit of the original weights: new states never make the
   model less demanding.
-* Some of the new states are kept from all members. Where the ensemble errs there by more than its spread says, the
-  factor from spread to uncertainty is raised until 95 % of these errors lie below; it is never lowered. Members that
-  have come to agree on something wrong are found out so. Errors below a quarter of the limit need no excuse: few
-  states are kept, and one with a tiny spread would otherwise raise the alarm everywhere.
+* Some new states are withheld from all members. If the errors there exceed what the spread predicts, the factor from
+  spread to uncertainty is raised until 95 % of these errors lie below the uncertainty; it is never lowered. This
+  detects members that agree on something wrong. Errors below a quarter of the limit are ignored: only a few states are
+  withheld, and one with a tiny spread would otherwise raise the factor everywhere.
 
-Kept states come from the same episodes as the learned ones, so they vouch for what lies between them, not for what lies
-far away; there it is the disagreement of the members that counts.
+Withheld states come from the same episodes as the learned ones. They check predictions between those states, not far
+away from them; there the disagreement of the members decides.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.training import make_targets, potential_loss, stack_members, unstack_members
 
-#: Of the new states one in so many is kept from all members, to check them.
-KEPT = 8
+#: One in this many new states is withheld from all members, to check them.
+WITHHELD_EVERY = 8
 
-#: Entries of a card that are about the training of the original weights and no longer hold.
+#: Entries of a card about the training of the original weights, which no longer apply.
 _OF_TRAINING = ("test", "best_validation", "training_seconds", "provenance")
 
 _FORMAT = 1
 
 
 def check_ensemble(model: SurrogateModel) -> Model:
-    """Return the model if its ensemble can tell where it may be trusted.
+    """Return the model if it is an ensemble that can decide where it may be trusted.
 
     Raises:
-        WeightsError: if it cannot: another kind of network, a single member, or no limit in its card.
+        WeightsError: for another kind of network, a single member, or a card without a limit.
     """
     if not isinstance(model, Model):
         raise WeightsError(f"online learning needs a network of kind 'potential'; these weights are '{model.network}'")
@@ -65,30 +65,30 @@ def check_ensemble(model: SurrogateModel) -> Model:
         raise WeightsError(f"online learning needs a convex energy; that of robot '{model.robot.name}' is not")
     if model.members < model.trained:
         raise WeightsError(
-            "online learning needs all members of an ensemble of 2 or more: their spread decides what is trusted, and "
-            f"is calibrated for all; got {model.members}"
+            "online learning needs all members of an ensemble of 2 or more, because their spread decides what is "
+            f"trusted; got {model.members}"
         )
     if not {"displacement", "design", "limit", "inflation"} <= model.card.get("domain", {}).keys():
         raise WeightsError("the card of the weights does not say where they are trusted; train them with 'softgym fit'")
     return model
 
 
-# -- states that are kept ------------------------------------------------------------------------------------------
+# -- stored states -----------------------------------------------------------------------------------------------
 
 
 class StateStore:
-    """Equilibria collected over episodes, in memory and, where a folder is given, in atomic npz shards.
+    """Equilibria collected over episodes, in memory and, if a folder is given, in npz shards written atomically.
 
-    Shards have the columns of a dataset and each begins with the rest state of its body, so that each can be read
-    alone. Several processes may collect into one folder; each sees what the others wrote when it is started.
+    Shards have the columns of a dataset. Each begins with the state at rest of its body and can be read on its own.
+    Several processes may collect into one folder; each reads at its start what the others have written.
 
     Args:
-        robot: whose states they are.
-        folder: where they are kept, or None for memory alone. What it holds is read.
+        robot: the robot of all states.
+        folder: folder of the shards; existing ones are read. None keeps states in memory only.
 
     Attributes:
-        data: all states, columns of `softgym_envs.surrogate.data.dataset.COLUMNS`; shards one after the other.
-        count: states in it, without rest states.
+        data: all states, as columns of `softgym_envs.surrogate.data.dataset.COLUMNS`, in the order of the shards.
+        count: number of states, without those at rest.
 
     Raises:
         DataError: if the folder holds states of another robot or its manifest cannot be read. A damaged shard is
@@ -104,24 +104,26 @@ class StateStore:
         self._parts: list[dict[str, np.ndarray]] = []
         if self.folder is None:
             return
-        asked = json.loads(json.dumps({"format": _FORMAT, "robot": robot.name, "mechanics_key": robot.mechanics_key}))
+        manifest = json.loads(
+            json.dumps({"format": _FORMAT, "robot": robot.name, "mechanics_key": robot.mechanics_key})
+        )
         path = self.folder / "manifest.json"
         if path.exists():
             try:
                 found = json.loads(path.read_text())
             except (OSError, ValueError) as error:
                 raise DataError(f"manifest '{path}' cannot be read: {error}") from error
-            if found != asked:
-                raise DataError(f"'{self.folder}' holds states of another robot: {found}, asked {asked}")
+            if found != manifest:
+                raise DataError(f"'{self.folder}' holds states of another robot: {found}, needed {manifest}")
         else:
-            write_json(path, asked)
+            write_json(path, manifest)
         for shard in sorted(self.folder.glob("states_*.npz")):
             try:
                 self._parts.append(self._checked(read_npz(shard, COLUMNS), f"shard '{shard}'"))
             except DataError as error:
                 aside = shard.with_suffix(".corrupt")
                 shard.rename(aside)
-                print(f"{error}; set aside as '{aside.name}'")
+                print(f"{error}; renamed to '{aside.name}'")
 
     def _checked(self, part: Mapping[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
         rows = len(part["rest"])
@@ -141,14 +143,14 @@ class StateStore:
         return sum(len(part["rest"]) - int(part["rest"].sum()) for part in self._parts)
 
     def add(self, part: Mapping[str, np.ndarray]) -> None:
-        """Add states, beginning with the rest state of their body, and write their shard.
+        """Add states, of which the first is that of their body at rest, and write their shard.
 
         Raises:
-            DataError: if columns have a wrong shape, are not finite, or lack the rest state.
+            DataError: if a column has a wrong shape or values that are not finite, or the state at rest is missing.
         """
         checked = self._checked(part, "new states")
         if self.folder is not None:
-            # In the order of time, and unique: several stores and processes may collect into one folder.
+            # Names are unique and in order of time: several stores and processes may collect into one folder.
             with atomic_write(self.folder / f"states_{time.time_ns():020d}_{uuid.uuid4().hex}.npz") as stream:
                 np.savez(stream, allow_pickle=False, **checked)
         self._parts.append(checked)
@@ -158,12 +160,11 @@ class StateStore:
 
 
 def rehearsal_states(model: Model, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Draw bodies and displacements where a model is trusted: its domain, less what its ensemble disagrees about.
+    """Return random bodies and displacements where a model is trusted: in its domain, where its ensemble agrees.
 
     Returns:
-        Designs (count, len(space)) in the order of the space, the variable that only scales efforts at its baseline;
-        and displacements (count, n_a). Where the ensemble trusts too little of its own domain to find so many, those
-        of the smallest spread are taken.
+        Designs (count, len(space)) in the order of the space, with the stiffness variable at its baseline; and
+        displacements (count, n_a). If too few of the candidates are trusted, those with the smallest spread are added.
     """
     rng = np.random.default_rng([seed, 0])
     space, domain = model.robot.design_space, model.card["domain"]
@@ -176,13 +177,13 @@ def rehearsal_states(model: Model, count: int, seed: int = 0) -> tuple[np.ndarra
     context = model.context(designs)
     spread = model.state(context, displacement)[2]
     _, trusted = model.trust(context, displacement, spread)
-    # Trusted ones first, as they were drawn.
+    # Trusted ones first, in the order in which they were drawn.
     chosen = np.argsort(np.where(trusted, 0.0, spread), kind="stable")[:count]
     return designs[chosen], displacement[chosen]
 
 
 def _predicted(model: Model, designs: np.ndarray, displacement: np.ndarray) -> States:
-    """What a model says, as states that it can be trained on."""
+    """Return predictions of a model as states to train on."""
     context = model.context(designs)
     effort, effector, _ = model.state(context, displacement)
     return States(
@@ -197,7 +198,7 @@ def _predicted(model: Model, designs: np.ndarray, displacement: np.ndarray) -> S
 
 
 def _joined(a: States, b: States) -> States:
-    """Two sets of states, one after the other."""
+    """Concatenate two sets of states."""
     parts = {f.name: np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(States)}
     parts["rest_of"] = np.arange(len(a) + len(b))
     return States(**parts)
@@ -213,23 +214,22 @@ def fine_tune(
     rehearsal: int = 1024,
     seed: int = 0,
 ) -> Model:
-    """Return a model that also knows new states; the given one is not changed.
+    """Return a model that has also learned new states; the given one is not changed.
 
-    Half of every batch is new, half rehearsed. The result depends on the model, the states and the seed alone.
+    Half of every batch are new states, half rehearsal. The result depends only on the arguments.
 
     Args:
         model: an ensemble of potential networks whose card holds its domain.
-        data: columns of equilibria, as `softgym_envs.surrogate.data.dataset.load_dataset` gives them; unstable ones are
-            left out.
+        data: columns of equilibria, as `load_dataset` returns them; unstable ones are left out.
         steps: steps of Adam for each member.
-        learning_rate: the largest, of a one-cycle schedule.
+        learning_rate: largest rate of the one-cycle schedule.
         batch_size: rows of a batch.
-        rehearsal: states that each member rehearses.
-        seed: of the rehearsed states and the batches.
+        rehearsal: number of rehearsal states of each member.
+        seed: seed of the rehearsal states and the batches.
 
     Raises:
-        DataError: if no state can be learned, or the training diverges.
-        WeightsError: if the model is no ensemble with a known domain.
+        DataError: if no new state is stable, or the training diverges.
+        WeightsError: if the model is not an ensemble with a known domain.
     """
     import torch
 
@@ -242,14 +242,14 @@ def fine_tune(
     if len(new) == 0:
         raise DataError("none of the new states is stable: there is nothing to learn")
     states, scales = unstack_members(model.tensors)
-    # Batches of states come in the order of episodes; neighbours go to different members.
+    # States are in the order of episodes; a permutation gives neighbours to different members.
     turn = np.random.default_rng([seed, 1]).permutation(len(new))
-    kept = turn < (len(new) // KEPT if len(new) >= 2 * KEPT else 0)
+    withheld = turn < (len(new) // WITHHELD_EVERY if len(new) >= 2 * WITHHELD_EVERY else 0)
     designs, displacement = rehearsal_states(model, rehearsal, seed)
     tuned = []
     for member in range(M):
         own = Model(robot, _member(model.tensors, member), {})
-        seen = np.flatnonzero(~kept & ((turn % M != member) | (len(new) < 2 * M)))
+        seen = np.flatnonzero(~withheld & ((turn % M != member) | (len(new) < 2 * M)))
         old = _predicted(own, designs, displacement)
         targets = make_targets(robot, _joined(new.rows(seen), old), scales)
         effort_spread = targets.effort_spread
@@ -285,7 +285,7 @@ def fine_tune(
             raise DataError(f"online training of member {member} diverged: its loss is {value.item()}")
         tuned.append({k: v.detach().numpy().copy() for k, v in net.state_dict().items()})
     tensors = stack_members(tuned, scales)
-    card = _widened(model, Model(robot, tensors, model.card), data, kept)
+    card = _widened(model, Model(robot, tensors, model.card), data, withheld)
     digest = _digest(data, COLUMNS)
     card["data_sha256"] = hashlib.sha256(f"{model.card.get('data_sha256')}{digest}".encode()).hexdigest()
     card["online"] = {
@@ -296,7 +296,7 @@ def fine_tune(
         "rows": len(data["rest"]),
         "states": len(data["rest"]) - int(np.sum(data["rest"])),
         "unstable_states_left_out": len(data["rest"]) - len(new),
-        "kept_states": int(kept.sum()),
+        "withheld_states": int(withheld.sum()),
         "steps": steps,
         "learning_rate": learning_rate,
         "batch_size": batch_size,
@@ -307,8 +307,8 @@ def fine_tune(
     return Model(robot, tensors, card)
 
 
-def is_of(model: Model, parent: Model, data: Mapping[str, np.ndarray], steps: int, seed: int) -> bool:
-    """Whether a model is `fine_tune` of ``parent`` on the first rows of some states, with these options."""
+def is_tuned_from(model: Model, parent: Model, data: Mapping[str, np.ndarray], steps: int, seed: int) -> bool:
+    """Return whether `fine_tune` of ``parent`` with these options, on the first rows of some states, made a model."""
     online = model.card.get("online", {})
     rows = online.get("rows", 0)
     return bool(
@@ -321,7 +321,7 @@ def is_of(model: Model, parent: Model, data: Mapping[str, np.ndarray], steps: in
 
 
 def _digest(arrays: Mapping[str, np.ndarray], names: Iterable[str]) -> str:
-    """SHA-256 of arrays, in the order of their names."""
+    """Return the SHA-256 digest of arrays, in the order of their names."""
     digest = hashlib.sha256()
     for name in names:
         digest.update(np.ascontiguousarray(arrays[name]).tobytes())
@@ -329,12 +329,12 @@ def _digest(arrays: Mapping[str, np.ndarray], names: Iterable[str]) -> str:
 
 
 def _member(tensors: Mapping[str, np.ndarray], member: int) -> dict[str, np.ndarray]:
-    """The weights of one member, as an ensemble of one."""
+    """Return the weights of one member, as an ensemble of one."""
     return {k: v if k.startswith("scale.") or k == "rest" else v[member : member + 1] for k, v in tensors.items()}
 
 
-def _widened(before: Model, after: Model, data: Mapping[str, np.ndarray], kept: np.ndarray) -> dict[str, Any]:
-    """The card of a model after it learned states, of which ``kept`` (of the stable ones) no member saw."""
+def _widened(before: Model, after: Model, data: Mapping[str, np.ndarray], withheld: np.ndarray) -> dict[str, Any]:
+    """Return the card of a model after it learned states; ``withheld`` marks the stable ones that no member saw."""
     robot, names = before.robot, before.robot.design_space.names
     stable = stable_rows(robot, data)
     left_out = {name: data[name][~stable] for name in ("design", "displacement")}
@@ -349,8 +349,8 @@ def _widened(before: Model, after: Model, data: Mapping[str, np.ndarray], kept: 
         learned, beyond = (after.growth(after.context(d["design"]), d["displacement"]) for d in (data, left_out))
         bound = min(GROWTH, float(beyond.min(initial=np.inf)))
         domain["growth"] = max(domain["growth"], min(float(learned.max()), bound))
-    if kept.any():
-        designs, displacement, truth = (data[k][kept] for k in ("design", "displacement", "effector"))
+    if withheld.any():
+        designs, displacement, truth = (data[k][withheld] for k in ("design", "displacement", "effector"))
         _, effector, spread = after.state(after.context(designs), displacement)
         error = np.linalg.norm((effector - truth).reshape(len(truth), -1, 3), axis=2).max(axis=1)
         least = 0.25 * domain["limit"] / domain["inflation"]

@@ -1,4 +1,4 @@
-"""Weights that ship with the package, each made by ``softgym fit --config configs/surrogate/<variant>.yaml``."""
+"""Weights shipped with the package, each made by ``softgym fit --config configs/surrogate/<weights name>.yaml``."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _ROOT = Path(__file__).parent / "weights"
 
 
 def pretrained_folder(robot: Robot) -> Path:
-    """Folder of the shipped weights of a robot."""
+    """Return the folder of the shipped weights of a robot."""
     return _ROOT / robot.weights_name
 
 
 def pretrained_model(robot: Robot, weights: str | Path | None = None, members: int | None = None) -> SurrogateModel:
-    """Return the model of a robot, from a folder or from the shipped weights.
+    """Return the learned model of a robot, from a folder or from the shipped weights.
 
     Args:
         robot: the robot.
@@ -28,7 +28,7 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
         members: how many members of the ensemble to use, fewer for speed; default all.
 
     Raises:
-        WeightsError: if there are none, or they are damaged or for another robot.
+        WeightsError: if there are no weights, or they are damaged or for another robot.
     """
     folder = Path(weights) if weights is not None else pretrained_folder(robot)
     if weights is None and not folder.is_dir():
@@ -38,7 +38,7 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
 
 
 def shipped_robots() -> dict[str, tuple[str, dict[str, Any]]]:
-    """Variants with shipped weights: the robot and the options they were trained for."""
+    """Return the names of all shipped weights, with the robot and the options they were trained for."""
     found = {}
     for card in sorted(_ROOT.glob("*/model.json")):
         config = json.loads(card.read_text())["config"]

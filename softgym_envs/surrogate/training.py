@@ -29,7 +29,7 @@ from softgym_envs.surrogate.weight_files import card_of, load_model, save_model
 SPLITS = ("train", "validation", "test")
 
 BUCKLING = 0.01
-"""Share of unstable training states from which on a model must tell them: less often it is not worth the time."""
+"""If more than this share of the training states is unstable, the model must detect them; below, it is not worth it."""
 
 
 class SplitConfig(Config):
@@ -42,7 +42,7 @@ class SplitConfig(Config):
 
 
 class DataConfig(Config):
-    """Three separate datasets: the best epoch is chosen on validation, and the test set is used once.
+    """Three separate datasets. Validation chooses the best step of a training; the test set is used once.
 
     Seeds default to 0, 1 and 2.
     """
@@ -57,7 +57,7 @@ class DataConfig(Config):
 
     @model_validator(mode="before")
     @classmethod
-    def _seeds_of_their_own(cls, data: Any) -> Any:
+    def _default_seeds(cls, data: Any) -> Any:
         if not isinstance(data, dict):
             return data
         given = {name: data[name] for name in SPLITS if isinstance(data.get(name), dict)}
@@ -69,20 +69,20 @@ class DataConfig(Config):
         for k, split in enumerate(SPLITS):
             if drawn[k] in drawn[:k]:
                 raise ValueError(
-                    f"{split} would draw the points of {SPLITS[drawn.index(drawn[k])]} again (sequence "
-                    f"'{drawn[k][0]}', seed {drawn[k][1]}); give it another seed"
+                    f"{split} would have the same points as {SPLITS[drawn.index(drawn[k])]} (sequence "
+                    f"'{drawn[k][0]}', seed {drawn[k][1]}); choose another seed"
                 )
         return self
 
     def plan(self, split: str) -> SamplingPlan:
-        """What the dataset ``split`` ("train", "validation" or "test") is drawn by."""
+        """Return the plan of the dataset ``split``: "train", "validation" or "test"."""
         return SamplingPlan(**getattr(self, split).model_dump(), **self.model_dump(exclude=set(SPLITS)))
 
 
 if TYPE_CHECKING:
     NetworkOptions = Any
 else:
-    #: Hyper-parameters of a network, told apart by ``kind``.
+    #: Hyper-parameters of a network; ``kind`` says of which.
     NetworkOptions = Annotated[
         functools.reduce(operator.or_, (network_module(kind).Options for kind in NETWORKS)),
         Field(discriminator="kind"),
@@ -90,7 +90,7 @@ else:
 
 
 class FitConfig(Config):
-    """A surrogate to be made: robot, data, network."""
+    """Configuration of a surrogate: robot, data and network."""
 
     robot: str
     robot_options: dict[str, Any] = {}
@@ -102,10 +102,10 @@ class FitConfig(Config):
 
 
 def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[str, float]:
-    """Errors of a model on a dataset, in metres and relative.
+    """Return errors of a model on a dataset.
 
-    ``effector`` is the distance between predicted and FEM effector at the same reached displacement; ``compliance``
-    is the relative Frobenius error of W; ``effort`` is relative to the largest effort in the data.
+    ``effector``: distance between predicted and FEM effector at the same reached displacement [m]; ``compliance``:
+    relative Frobenius error of W; ``effort``: relative to the largest effort in the data.
     """
     stable = stable_rows(model.robot, data)
     data = {name: column[stable] for name, column in data.items()}
@@ -136,13 +136,13 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
 def domain_of(
     model: SurrogateModel, training: dict[str, np.ndarray], validation: dict[str, np.ndarray]
 ) -> dict[str, Any]:
-    """Where a model may be trusted: the box of its training states, and its uncertainty on the validation states.
+    """Return where a model may be trusted: the box of its training states, and its uncertainty on validation states.
 
     Returns:
         ``displacement`` and ``design`` ranges; ``inflation``: factor from the spread of the ensemble to a bound that
         95 % of the validation errors keep; ``limit``: uncertainty that 98 % of the validation states stay below [m];
-        where more than `BUCKLING` of the training states were left out, ``growth``: how many times softer than
-        unmoved 98 % of the validation states are not.
+        and, if more than `BUCKLING` of the training states were left out, ``growth``: how many times softer than
+        at zero displacement the actuators of 98 % of the validation states are at most.
     """
     stable = stable_rows(model.robot, training)
     training = {name: column[stable] for name, column in training.items()}
@@ -170,8 +170,8 @@ def domain_of(
 def generate_datasets(
     config: FitConfig, data_folder: str | Path, *, progress: bool = True
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Generate the datasets ``train``, ``validation`` and ``test`` of a surrogate, or take up what is there."""
-    if not (Path(data_folder) / "config.yaml").exists():  # what is there stands until the data are accepted
+    """Return the datasets ``train``, ``validation`` and ``test`` of a surrogate; whatever is missing is generated."""
+    if not (Path(data_folder) / "config.yaml").exists():  # an existing file is kept until the data are accepted
         save_resolved(data_folder, config)
     data = {
         split: generate_dataset(
@@ -191,12 +191,13 @@ def generate_datasets(
 
 
 def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progress: bool = True) -> dict[str, float]:
-    """Generate the data (or take up what is there), train, test once, and write the weights with their card.
+    """Generate missing data, train, test once, and write the weights with their card.
 
     Args:
-        config: what to make.
-        folder: where ``model.safetensors``, ``model.json`` and ``history.npz`` go.
-        data_folder: where the datasets ``train``, ``validation`` and ``test`` live.
+        config: robot, data and network.
+        folder: folder for ``model.safetensors``, ``model.json`` and ``history.npz``. Weights of the same configuration
+            and data are not trained again.
+        data_folder: folder of the datasets ``train``, ``validation`` and ``test``.
         progress: show progress bars.
 
     Returns:
@@ -211,20 +212,20 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     for split in data.values():
         for column in split.values():
             digest.update(np.ascontiguousarray(column).tobytes())
-    asked: dict[str, Any] = {
+    inputs: dict[str, Any] = {
         "config": config.model_dump(mode="json", exclude={"workers", "executor"}),
         "data_sha256": digest.hexdigest(),
     }
     card_path = folder / "model.json"
     if card_path.exists():
         model = load_model(folder, robot)
-        same = all(model.card["config"].get(k) == v for k, v in asked["config"].items())
-        if same and model.card["data_sha256"] == asked["data_sha256"]:
+        same = all(model.card["config"].get(k) == v for k, v in inputs["config"].items())
+        if same and model.card["data_sha256"] == inputs["data_sha256"]:
             return model.card["test"]
     torch.set_num_threads(1)
     features = Features(robot)
     states = {split: training_states(robot, data[split], features) for split in SPLITS}
-    key = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:12]
+    key = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:12]
     trainer = Trainer(config.network, config.seed, folder / "parts", key, progress, config.workers)
     start = time.perf_counter()
     module = network_module(config.network.kind)
@@ -239,7 +240,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         "loaded": bool(robot.build().loads.any()),
         "states": {split: len(rows) for split, rows in states.items()},
         "unstable_states_left_out": {split: len(data[split]["rest"]) - len(rows) for split, rows in states.items()},
-        "data_sha256": asked["data_sha256"],
+        "data_sha256": inputs["data_sha256"],
         "training_seconds": round(seconds, 1),
         "best_validation": {part: min(row["validation"] for row in rows) for part, rows in histories.items()},
         "test": errors,

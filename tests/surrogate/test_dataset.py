@@ -50,10 +50,10 @@ def test_malformed_plans():
     with pytest.raises(ValueError, match=r"'grid' is unknown; allowed: 'halton', 'sobol', 'latin', 'random'"):
         SamplingPlan(1, 1, "grid")
     for groups, states, seed, message in (
-        (0, 1, 0, "groups = 0 must be a whole number of 1 or more"),
-        (2.5, 1, 0, "groups = 2.5 must be a whole number"),
+        (0, 1, 0, "groups = 0 must be an integer of at least 1"),
+        (2.5, 1, 0, "groups = 2.5 must be an integer"),
         (1, 0, 0, "states = 0"),
-        (1, 1, -1, "seed = -1 must be a whole number of 0 or more"),
+        (1, 1, -1, "seed = -1 must be an integer of at least 0"),
     ):
         with pytest.raises(ValueError, match=message):
             SamplingPlan(groups, states, seed=seed)
@@ -135,13 +135,13 @@ def test_designs():
         ({"design": {"young_modulus": 1.0}}, "young_modulus"),
         (
             {"bounds": {"length": (0.030, 0.040)}},
-            r"bounds of 'length' = \[0.03, 0.04\] leave its own, \[0.038, 0.042\]",
+            r"bounds of 'length' = \[0.03, 0.04\] must be inside \[0.038, 0.042\]",
         ),
         ({"bounds": {"length": (0.041, 0.040)}}, "bounds of 'length'"),
         ({"bounds": {"length": (0.039, float("nan"))}}, "bounds of 'length'"),
-        ({"bounds": {"young_modulus": (1e6, 2e6)}}, "bounds of 'young_modulus', which is not drawn; drawn: length"),
-        ({"vary": (), "bounds": {"length": (0.039, 0.040)}}, "bounds of 'length', which is not drawn; drawn: none"),
-        ({"design": {"length": 0.039}}, "a value of 'length', which is drawn"),
+        ({"bounds": {"young_modulus": (1e6, 2e6)}}, "'young_modulus' has bounds but is not drawn; drawn: length"),
+        ({"vary": (), "bounds": {"length": (0.039, 0.040)}}, "'length' has bounds but is not drawn; drawn: none"),
+        ({"design": {"length": 0.039}}, "'length' is drawn and has a fixed value"),
     ],
 )
 def test_plans_that_do_not_fit_the_robot(tmp_path, options, message):
@@ -421,7 +421,7 @@ def test_damaged_shards_are_named_set_aside_and_made_again(copied, trunk, damage
         load_dataset(copied)
     again = generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
     said = capsys.readouterr().out
-    assert "shard_00001.npz" in said and "set aside as 'shard_00001.corrupt' and made again" in said
+    assert "shard_00001.npz" in said and "renamed to 'shard_00001.corrupt', generating it again" in said
     assert (copied / "shard_00001.corrupt").exists()
     assert first.stat().st_mtime_ns == stamp
     assert second.read_bytes() == content  # a shard has the same bytes whenever it is made

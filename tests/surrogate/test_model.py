@@ -434,7 +434,7 @@ def test_splits_are_of_different_states():
     robot = make_robot("finger")
     designs = [tuple(data.plan(name).designs(robot, 0, 1)[0].values()) for name in splits()]
     assert len(set(designs)) == 3
-    with pytest.raises(ValueError, match=r"test would draw the points of train again \(sequence 'random', seed 0\)"):
+    with pytest.raises(ValueError, match=r"test would have the same points as train \(sequence 'random', seed 0\)"):
         FitConfig.model_validate({"robot": "finger", "data": splits(test={"seed": 0})})
 
 

@@ -10,7 +10,7 @@ import pytest
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.data.dataset import COLUMNS
-from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_of, rehearsal_states
+from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_tuned_from, rehearsal_states
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.training import stack_members, unstack_members
 from softgym_envs.surrogate.weight_files import load_model, save_model
@@ -137,7 +137,7 @@ def test_the_growth_rises_to_what_was_learned_and_not_to_what_was_left_out(model
     compliance[rows[5], 0] *= 100.0 * compliance[0, 0] / compliance[rows[5], 0]
     found, states = growth({**middle, "compliance": compliance})
     assert found == pytest.approx(max(0.1, min(states[rows[5]], states.max())))
-    assert not is_of(fine_tune(strict, middle, steps=3), model, middle, 3, 0)  # a parent of another domain
+    assert not is_tuned_from(fine_tune(strict, middle, steps=3), model, middle, 3, 0)  # a parent of another domain
 
 
 def test_learning_depends_on_states_and_seed_alone(model, middle):
@@ -160,9 +160,9 @@ def test_weights_are_written_and_read_as_ordinary_ones(model, learned, middle, r
     for a, b in zip(*(m.state(context, middle["displacement"]) for m in (read, learned)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6)
     assert read.card["domain"] == learned.card["domain"]
-    assert is_of(read, model, middle, 250, 0)
-    assert not is_of(read, model, middle, 250, 1) and not is_of(read, learned, middle, 250, 0)
-    assert not is_of(model, model, middle, 250, 0)
+    assert is_tuned_from(read, model, middle, 250, 0)
+    assert not is_tuned_from(read, model, middle, 250, 1) and not is_tuned_from(read, learned, middle, 250, 0)
+    assert not is_tuned_from(model, model, middle, 250, 0)
 
 
 def test_models_that_cannot_decide_are_refused(robot, weights, middle, model):
@@ -204,7 +204,7 @@ def test_states_of_another_robot_and_damaged_ones(robot, middle, tmp_path, capsy
     first = min(tmp_path.glob("*.npz"))
     first.write_bytes(first.read_bytes()[:100])
     assert StateStore(robot, tmp_path).count == 2
-    assert first.with_suffix(".corrupt").exists() and "set aside" in capsys.readouterr().out
+    assert first.with_suffix(".corrupt").exists() and "renamed to" in capsys.readouterr().out
     (tmp_path / "manifest.json").write_text("{")
     with pytest.raises(DataError, match=r"manifest\.json.*cannot be read"):
         StateStore(robot, tmp_path)

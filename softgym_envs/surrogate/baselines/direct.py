@@ -1,4 +1,4 @@
-"""Networks that predict the entries of W and delta_free themselves, as the thesis' does."""
+"""Base of networks that predict the entries of W and delta_free, as the thesis' networks do."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class DirectModel(SurrogateModel):
 
     @abstractmethod
     def _entries(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        """Upper triangles of W, then delta_free, shape (B, k)."""
+        """Return upper triangles of W, then delta_free, shape (B, k)."""
 
     def _outputs(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         y = self._entries(context, displacement)

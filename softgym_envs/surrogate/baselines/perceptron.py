@@ -1,4 +1,4 @@
-"""Plain perceptrons: the parts that the residual network and the thesis' network are made of."""
+"""Plain perceptrons, the parts of the residual network and of the thesis' network."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from softgym_envs.errors import WeightsError
 
 
 def layers(tensors: Mapping[str, np.ndarray], prefix: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Weights (in, out) and biases of a perceptron by its prefix, in single precision."""
+    """Return weights (in, out) and biases of the perceptron with a prefix, in single precision."""
     found: list[tuple[np.ndarray, np.ndarray]] = []
     while f"{prefix}.{len(found)}.weight" in tensors:
         k = len(found)
@@ -19,12 +19,12 @@ def layers(tensors: Mapping[str, np.ndarray], prefix: str) -> list[tuple[np.ndar
         weight = np.ascontiguousarray(tensors[f"{prefix}.{k}.weight"].T, dtype=np.float32)
         found.append((weight, tensors[f"{prefix}.{k}.bias"].astype(np.float32)))
     if not found:
-        raise WeightsError(f"the weights hold no layers named '{prefix}.*'")
+        raise WeightsError(f"the weights have no layers named '{prefix}.*'")
     return found
 
 
 def perceptron(inputs: int, outputs: int, width: int, depth: int, activation: str, seed: int) -> Any:
-    """A torch perceptron with seeded weights; ``activation`` is "algebraic" or "relu"."""
+    """Return a torch perceptron with seeded weights; ``activation`` is "algebraic" or "relu"."""
     import torch
     from torch import nn
 
@@ -42,7 +42,7 @@ def perceptron(inputs: int, outputs: int, width: int, depth: int, activation: st
 
 
 def weights(net, prefix: str) -> dict[str, np.ndarray]:
-    """Its tensors, named as `layers` reads them."""
+    """Return the tensors of a perceptron, named as `layers` reads them."""
     from torch import nn
 
     linear = [layer for layer in net if isinstance(layer, nn.Linear)]
@@ -54,11 +54,11 @@ def weights(net, prefix: str) -> dict[str, np.ndarray]:
 
 
 def mean_scale(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of columns; a constant column has scale 0, so its mean is its prediction."""
+    """Return mean and scale of columns. A constant column has scale 0, so that its prediction is its mean."""
     scale = values.std(axis=0)
     return values.mean(axis=0), np.where(scale > 1e-12 * np.abs(values).max(), scale, 0.0)
 
 
 def standardise(values: np.ndarray, mean: np.ndarray | float, scale: np.ndarray) -> np.ndarray:
-    """Values in units of their spread; constant columns become 0."""
+    """Return values in units of their scale; constant columns become 0."""
     return np.where(scale > 0.0, (values - mean) / np.where(scale > 0.0, scale, 1.0), 0.0)

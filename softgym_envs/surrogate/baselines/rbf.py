@@ -1,7 +1,7 @@
-"""Radial basis functions, as a strong baseline without a network: W and delta_free interpolated between the states.
+"""Radial basis functions, a strong baseline without a network: W and delta_free are interpolated between the states.
 
-Thin-plate splines in the scaled actuation and design (`scipy.interpolate.RBFInterpolator`), over the nearest states
-where there are many. Exact at the samples and without training; W is symmetric but not kept positive definite.
+`scipy.interpolate.RBFInterpolator` interpolates in the scaled actuation and design, over the nearest states if there
+are many. It is exact at the samples and needs no training. W is symmetric but not always positive definite.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from softgym_envs.surrogate.baselines.direct import DirectModel
 from softgym_envs.surrogate.baselines.perceptron import mean_scale, standardise
 from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.model import Context
+from softgym_envs.surrogate.trainer import History, Trainer
 
 
 class Options(Config):
-    """Hyper-parameters."""
+    """Hyper-parameters of the interpolation."""
 
     kind: Literal["rbf"] = "rbf"
     kernel: Literal["thin_plate_spline", "cubic", "quintic", "linear"] = "cubic"
@@ -59,9 +60,9 @@ class Model(DirectModel):
 
 
 def train(
-    robot: Robot, training: States, validation: States, trainer: Any
-) -> tuple[dict[str, np.ndarray], dict[str, list[dict[str, float]]]]:
-    """Keep the states themselves; repeated ones once."""
+    robot: Robot, training: States, validation: States, trainer: Trainer
+) -> tuple[dict[str, np.ndarray], dict[str, History]]:
+    """Return the states themselves, without duplicates."""
     y = training.entries
     x = np.concatenate([training.actuation, training.design], axis=1)
     x, first = np.unique(np.round(x, 9), axis=0, return_index=True)
@@ -72,7 +73,7 @@ def train(
         "values": standardise(y[first], mean, scale),
         "mean": mean,
         "scale": scale,
-        # Inputs that never change, as of a single body, would make the problem singular.
+        # Inputs that never change, such as those of a single body, would make the problem singular.
         "used": np.ptp(x, axis=0) > 1e-9,
         "kernel": np.array(KERNELS.index(options.kernel)),
         "neighbors": np.array(options.neighbors),

@@ -1,4 +1,4 @@
-"""A structured network: equal to its rest pair at rest, W always symmetric positive definite."""
+"""A structured network: exact at rest, with a symmetric positive definite W by construction."""
 
 from __future__ import annotations
 
@@ -9,28 +9,25 @@ import numpy as np
 from numba import njit
 from pydantic import Field
 
-from softgym_envs.config import Config
 from softgym_envs.errors import DataError
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.baselines.perceptron import layers, mean_scale, perceptron, standardise, weights
 from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.model import Context, SurrogateModel
+from softgym_envs.surrogate.trainer import History, Trainer, TrainingOptions
 
 
-class Options(Config):
-    """Hyper-parameters."""
+class Options(TrainingOptions):
+    """Hyper-parameters of the residual network."""
 
     kind: Literal["residual"] = "residual"
     width: int = Field(default=128, gt=0)
     depth: int = Field(default=3, gt=0)
-    optimiser: Literal["soap", "adam"] = "soap"
-    steps: int = Field(default=4000, gt=0)
-    batch_size: int = Field(default=128, gt=0)
     learning_rate: float = Field(default=3e-3, gt=0)
 
 
 def _activate(x: np.ndarray) -> np.ndarray:
-    """The algebraic sigmoid ``x / sqrt(1 + x^2)``: smooth like tanh, and a few instructions on any machine."""
+    """Return the algebraic sigmoid ``x / sqrt(1 + x^2)``, which is smooth like tanh but cheaper."""
     return x / np.sqrt(1.0 + x * x)
 
 
@@ -43,7 +40,7 @@ def _forward(x: np.ndarray, parts: list[tuple[np.ndarray, np.ndarray]]) -> np.nd
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _rows_forward(x, first, prepared, hidden, hidden_bias, last, last_bias, out):
-    """Perceptron of every row: ``prepared`` (B, w) holds the design's share of the first layer."""
+    """Evaluate a perceptron row by row; ``prepared`` (B, w) is the contribution of the design to the first layer."""
     width = first.shape[1]
     h = np.empty(width, dtype=np.float32)
     g = np.empty(width, dtype=np.float32)
@@ -74,12 +71,12 @@ def _rows_forward(x, first, prepared, hidden, hidden_bias, last, last_bias, out)
                 out[b, k] += value * last[i, k]
 
 
-#: From this many rows on, matrix products of NumPy beat the compiled loop over rows (``softgym bench inference``).
+#: For this many rows or more, NumPy's matrix products are faster than the compiled loop over rows.
 _BATCH = 32
 
 
 class _ActuatedNet:
-    """A perceptron of (actuation, design) whose design part is prepared once per body."""
+    """A perceptron of (actuation, design); the contribution of the design is computed once per body."""
 
     def __init__(self, parts: list[tuple[np.ndarray, np.ndarray]], count: int) -> None:
         (first, self._bias), *hidden, (self._last, self._last_bias) = parts
@@ -90,11 +87,11 @@ class _ActuatedNet:
         self._hidden_bias = np.stack([b for _, b in hidden]) if hidden else np.zeros((0, width), dtype=np.float32)
 
     def prepare(self, design: np.ndarray) -> np.ndarray:
-        """Share of the design features (B, d) in the first layer, shape (B, width)."""
+        """Return the contribution of design features (B, d) to the first layer, shape (B, width)."""
         return design @ self._design + self._bias
 
     def __call__(self, actuation: np.ndarray, prepared: np.ndarray) -> np.ndarray:
-        """Outputs (B, k) at scaled actuation (B, n_a) of bodies prepared as (B, width)."""
+        """Return outputs (B, k) at scaled actuation (B, n_a) for prepared bodies (B, width)."""
         x = actuation.astype(np.float32)
         if len(x) >= _BATCH:
             h = _activate(x @ self._first + prepared)
@@ -116,16 +113,16 @@ class _ActuatedNet:
 
 
 class Model(SurrogateModel):
-    """Structured network: equal to its rest pair at rest, W always symmetric positive definite.
+    """A structured network: exact at rest, with a symmetric positive definite W by construction.
 
-    A rest network G gives, for a design, the Cholesky factor ``C0`` of the rest compliance and the effector at rest.
-    A state network N and a compliance network M act as residuals that vanish at rest by construction:
+    A network G maps the design to the effector at rest and the Cholesky factor ``C0`` of the compliance at rest.
+    A state network N and a compliance network M are residuals that vanish at rest by construction:
 
         effort = (K0 + N_K(delta, p) - N_K(0, p)) delta,            K0 = W0_aa^-1
         effector = effector_0 + (W0_ea K0 + N_J(delta, p) - N_J(0, p)) delta
         W = C C^T,  C = C0 T,  T = lower triangular with diagonal exp(d) from  d = M(delta, p) - M(0, p)
 
-    (Thesis eq. 4.2 and 4.12 give the inputs and outputs; the structure is ours.)
+    Inputs and outputs are those of the thesis (eq. 4.2, 4.12); the structure is not from there.
     """
 
     network = "residual"
@@ -137,7 +134,7 @@ class Model(SurrogateModel):
         self._rest = layers(tensors, "rest")
         self._rest_scale = tensors["rest_scale"].astype(float)
         self._rest_mean = tensors["rest_mean"].astype(float)
-        # Each first layer splits into an actuation part and a design part that is known in advance.
+        # The first layer of each is split into a part of the actuation and a part of the design.
         self._nets = {name: _ActuatedNet(layers(tensors, name), self.count) for name in ("state", "compliance")}
         self._state_scale = tensors["state_scale"].astype(np.float32)
         self._compliance_scale = tensors["compliance_scale"].astype(np.float32)
@@ -163,7 +160,7 @@ class Model(SurrogateModel):
         return arrays
 
     def _triangular(self, entries: np.ndarray) -> np.ndarray:
-        """Lower triangular matrices (B, n, n) with the exponential of the given diagonal."""
+        """Return lower triangular matrices (B, n, n) from entries whose diagonal is logarithmic."""
         result = np.zeros((len(entries), self.size, self.size))
         entries = entries.copy()
         entries[:, self._diagonal] = np.exp(entries[:, self._diagonal])
@@ -186,7 +183,7 @@ class Model(SurrogateModel):
 
 
 def _log_cholesky(C: np.ndarray) -> np.ndarray:
-    """Entries (B, n (n + 1) / 2) of lower triangular C (B, n, n), the diagonal as logarithms."""
+    """Return the entries (B, n (n + 1) / 2) of lower triangular C (B, n, n), with the logarithm of the diagonal."""
     C = C.copy()
     diagonal = np.arange(C.shape[1])
     C[:, diagonal, diagonal] = np.log(C[:, diagonal, diagonal])
@@ -195,13 +192,13 @@ def _log_cholesky(C: np.ndarray) -> np.ndarray:
 
 
 def train(
-    robot: Robot, training: States, validation: States, trainer: Any
-) -> tuple[dict[str, np.ndarray], dict[str, list[dict[str, float]]]]:
-    """Train the three parts of `ResidualModel`."""
+    robot: Robot, training: States, validation: States, trainer: Trainer
+) -> tuple[dict[str, np.ndarray], dict[str, History]]:
+    """Train the three networks of the model."""
     import torch
 
     if not training.unloaded:
-        raise DataError("bodies at rest have efforts or displaced actuators; use network.kind = 'potential'")
+        raise DataError("bodies have efforts or displacements at rest; use network.kind = 'potential'")
     options = trainer.options
     count = len(robot.actuators)
     a, e = slice(0, count), slice(count, None)
@@ -210,7 +207,7 @@ def train(
         return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
 
     tensors: dict[str, np.ndarray] = {}
-    histories: dict[str, list[dict[str, float]]] = {}
+    histories: dict[str, History] = {}
     # 1. The rest pair of a design.
     rest = {}
     for key, arrays in (("train", training), ("validation", validation)):

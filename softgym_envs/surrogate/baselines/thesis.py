@@ -1,4 +1,4 @@
-"""The network of the thesis (eq. 4.2, 4.11, 4.12), for comparison."""
+"""The network of the thesis, for comparison (thesis, eq. 4.2, 4.11, 4.12)."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from softgym_envs.config import Config
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.baselines.direct import DirectModel
 from softgym_envs.surrogate.baselines.perceptron import layers, mean_scale, perceptron, standardise, weights
 from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.model import Context
+from softgym_envs.surrogate.trainer import History, Trainer, TrainingOptions
 
 
-class Options(Config):
-    """Hyper-parameters."""
+class Options(TrainingOptions):
+    """Hyper-parameters of the thesis' network."""
 
     kind: Literal["thesis"] = "thesis"
     width: int = Field(default=450, gt=0)
@@ -29,12 +29,12 @@ class Options(Config):
 
 
 class Model(DirectModel):
-    """The thesis' network (eq. 4.2, 4.11, 4.12): two ReLU perceptrons.
+    """The thesis' network: two ReLU perceptrons (thesis, eq. 4.2, 4.11, 4.12).
 
     G maps the design to (W0, free0), F maps (delta, W0, free0) to (W, free).
 
-    Effector rows of free0 and free are absolute positions, which standardisation makes equivalent to the thesis'
-    displacements from a goal. W is symmetric but not kept positive definite.
+    Effector rows of free0 and free are absolute positions; standardisation makes them equivalent to the displacements
+    from a goal in the thesis. W is symmetric but not always positive definite.
     """
 
     network = "thesis"
@@ -63,8 +63,8 @@ class Model(DirectModel):
 
 
 def train(
-    robot: Robot, training: States, validation: States, trainer: Any
-) -> tuple[dict[str, np.ndarray], dict[str, list[dict[str, float]]]]:
+    robot: Robot, training: States, validation: States, trainer: Trainer
+) -> tuple[dict[str, np.ndarray], dict[str, History]]:
     """Train the thesis' G and F on standardised (W upper triangle, delta_free)."""
     import torch
 

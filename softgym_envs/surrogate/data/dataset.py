@@ -1,4 +1,4 @@
-"""Datasets of condensed models: atomic npz shards and a manifest; generation is parallel and resumable."""
+"""Datasets of condensed models: npz shards and a manifest. Generation is parallel and can be resumed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FORMAT = 2
 
 
 def _read_shard(path: Path, manifest: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Read and check a shard. One without a feasible design has no rows, and no widths either."""
+    """Return a checked shard; without a feasible design it has no rows and its columns have no width."""
     shard = read_npz(path, COLUMNS)
     if not all(column.dtype.kind in "fiub" and np.isfinite(column).all() for column in shard.values()):
         raise DataError(f"shard '{path}' holds values that are not finite")
@@ -52,7 +52,7 @@ def _make_shard(robot: str, options: dict, plan: SamplingPlan, first: int, last:
     from threadpoolctl import threadpool_limits
 
     global _robot
-    if Path(path).exists():  # by a worker that outlived its killed run for a moment
+    if Path(path).exists():  # written by a worker that survived its killed run for a moment
         return
     with threadpool_limits(1):
         key = (robot, json.dumps(options))
@@ -69,8 +69,8 @@ def _make_shard(robot: str, options: dict, plan: SamplingPlan, first: int, last:
         np.savez_compressed(stream, allow_pickle=False, failed=failed, infeasible=last - first - len(parts), **shard)
 
 
-def _hold(folder: Path) -> AcquireReturnProxy:
-    """Hold the folder against other runs, as a context. The operating system lets go of it when this process dies."""
+def _lock(folder: Path) -> AcquireReturnProxy:
+    """Lock the folder against other runs, as a context. The operating system unlocks it when this process ends."""
     from filelock import FileLock, Timeout
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -93,24 +93,24 @@ def generate_dataset(
 ) -> dict[str, np.ndarray]:
     """Generate a dataset, or finish an interrupted one, and return it.
 
-    Finished shards are kept, however the process that made them ended; a shard that cannot be read is renamed to
-    ``*.corrupt`` and made again. A finished dataset is only read. One of fewer groups of the same plan grows: a
-    sequence goes on where it was (but not a Latin hypercube, which is laid out for its number of points).
+    Finished shards are kept even if their process was killed; a shard that cannot be read is renamed to ``*.corrupt``
+    and generated again. A finished dataset is only read. If the folder holds fewer groups of the same plan, the rest is
+    added, because sequences can be continued (except a Latin hypercube, whose points depend on their number).
 
     Args:
-        folder: where shards, ``manifest.json`` and the card ``README.md`` live.
-        robot: registry name.
+        folder: folder of the shards, ``manifest.json`` and the card ``README.md``.
+        robot: name of the robot.
         plan: what to sample.
         robot_options: options of the robot.
         groups_per_shard: designs per shard.
-        workers: processes, one thread each.
+        workers: number of processes, each with one thread.
         executor: ``"loky"``: processes on this machine; ``"ray"``: a Ray cluster (the one of ``RAY_ADDRESS``, or one
             that is started here), whose machines share the folder. It needs the extra ``ray``.
         progress: show a progress bar.
 
     Raises:
-        DataError: if the folder holds a dataset of another plan, or another process is at it, or no design of the plan
-            is feasible.
+        DataError: if the folder holds a dataset of another plan, another process is writing to it, or no design of the
+            plan is feasible.
         DesignError: if the plan does not fit the robot.
         ValueError: for an unknown executor.
     """
@@ -132,8 +132,8 @@ def generate_dataset(
             "compliance": "upper triangle of W over actuators then effectors, row by row",
         },
     }
-    manifest = json.loads(json.dumps(manifest))  # as it will be read again: tuples are lists there
-    plan.designs(body, 0, 1)  # a plan that cannot be is refused before anything is written
+    manifest = json.loads(json.dumps(manifest))  # as it will be read: with lists instead of tuples
+    plan.designs(body, 0, 1)  # refuse an impossible plan before anything is written
     path = folder / "manifest.json"
     card = folder / "README.md"
     if path.exists():
@@ -143,14 +143,14 @@ def generate_dataset(
                 return load_dataset(folder)
             except DataError:
                 pass  # unfinished or damaged
-    with _hold(folder):
+    with _lock(folder):
         if path.exists() and _check_manifest(folder, manifest):
             card.unlink(missing_ok=True)
         write_json(path, manifest)
-        for name in (path.name, card.name, "shard_"):  # what writers left that were killed
+        for name in (path.name, card.name, "shard_"):  # temporary files of killed writers
             for left in folder.glob(f".{name}*"):
                 left.unlink(missing_ok=True)
-        # The baseline mesh is made once, before the workers ask for it.
+        # Cache the baseline mesh before the workers need it.
         body.build()
         _make_missing(folder, manifest, plan, workers, executor, progress)
         data = load_dataset(folder)
@@ -161,7 +161,7 @@ def generate_dataset(
 def _make_missing(
     folder: Path, manifest: dict[str, Any], plan: SamplingPlan, workers: int, executor: str, progress: bool
 ) -> None:
-    """Make the shards that are missing, and those that cannot be read."""
+    """Generate the shards that are missing or cannot be read."""
     from tqdm import tqdm
 
     shards = _shards(folder, manifest)
@@ -174,7 +174,7 @@ def _make_missing(
             except DataError as error:
                 aside = shard.with_suffix(".corrupt")
                 shard.rename(aside)
-                print(f"{error}; set aside as '{aside.name}' and made again")
+                print(f"{error}; renamed to '{aside.name}', generating it again")
         first = number * manifest["groups_per_shard"]
         missing.append((first, min(first + manifest["groups_per_shard"], plan.groups), str(shard)))
     arguments = [(manifest["robot"], manifest["robot_options"], plan, *shard_range) for shard_range in missing]
@@ -186,7 +186,7 @@ def _make_missing(
 
 
 def _write_card(path: Path, manifest: dict[str, Any], data: dict[str, np.ndarray]) -> None:
-    """Write what the dataset holds, for people."""
+    """Write a description of the dataset, for readers."""
     failed = infeasible = 0
     for shard in _shards(path.parent, manifest):
         with np.load(shard, allow_pickle=False) as content:
@@ -196,8 +196,8 @@ def _write_card(path: Path, manifest: dict[str, Any], data: dict[str, np.ndarray
         f"# States of robot `{manifest['robot']}`",
         "",
         f"{len(data['rest'])} equilibria of {int(data['rest'].sum())} bodies, by `softgym dataset` "
-        f"(softgym-envs {__version__}). {infeasible} bodies could not be built or have no rest, {failed} commands have "
-        "no equilibrium; both are left out.",
+        f"(softgym-envs {__version__}). {infeasible} bodies are infeasible or have no equilibrium at rest, {failed} "
+        "commands have no equilibrium; both are left out.",
         "",
         f"Robot options: `{json.dumps(manifest['robot_options'])}`. Plan: `{json.dumps(manifest['plan'])}`.",
         "",
@@ -215,13 +215,13 @@ def _write_card(path: Path, manifest: dict[str, Any], data: dict[str, np.ndarray
 
 
 def _shards(folder: Path, manifest: dict[str, Any]) -> list[Path]:
-    """Paths of all shards a dataset has when it is finished."""
+    """Return the paths of all shards of the finished dataset."""
     count = -(-manifest["plan"]["groups"] // manifest["groups_per_shard"])
     return [folder / f"shard_{number:05d}.npz" for number in range(count)]
 
 
 def _check_manifest(folder: Path, manifest: dict[str, Any]) -> bool:
-    """Tell whether a folder holds the first groups only; raise `DataError` if it holds another dataset."""
+    """Return whether a folder holds only the first groups; raise `DataError` if it holds another dataset."""
     kept = _read_manifest(folder / "manifest.json")
     if kept == manifest:
         return False
@@ -240,7 +240,7 @@ def _read_manifest(path: Path) -> dict:
     except (OSError, ValueError) as error:
         raise DataError(f"manifest '{path}' cannot be read: {error}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != _FORMAT:
-        raise DataError(f"manifest '{path}' is not of format {_FORMAT}")
+        raise DataError(f"manifest '{path}' does not have format {_FORMAT}")
     missing = sorted({"plan", "groups_per_shard", "columns"} - manifest.keys())
     if missing:
         raise DataError(f"manifest '{path}' lacks {', '.join(missing)}")

@@ -1,9 +1,9 @@
-"""Where to evaluate the FEM: designs and actuation drawn together, states of one design solved as a path.
+"""Sampling of FEM states: designs and commands are drawn together, and the states of one design are solved as a path.
 
-The condensed model is smooth in the *reached* actuator displacement, taut or pushed. Cables that hang slack reach
-more than they are told; so commands are first solved as real cables, and part of the slack states are then solved
-again with the slack cables pulled back towards their commands by up to ``margin``, as if they could push. The network
-thus knows the states on the slack boundary and a little beyond, where a solver that looks for the boundary has to go.
+The condensed model is a smooth function of the *reached* actuator displacements, whether cables pull or push. A slack
+cable reaches more than its command. So commands are first solved with real cables; then part of the slack states are
+solved again with the slack cables moved towards their commands by up to ``margin``, as if they could push. The network
+thus learns states on the boundary of slackness and a little beyond it, where a search for the boundary also goes.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.features import learned_variables
 
 SEQUENCES = ("halton", "sobol", "latin", "random")
-"""How points are spread: scrambled Halton and Sobol sequences, a Latin hypercube, independent draws."""
+"""Kinds of points: scrambled Halton and Sobol sequences, a Latin hypercube, independent draws."""
 
 
 @dataclass(frozen=True)
 class SamplingPlan:
-    """A reproducible set of states, made of groups that share a design.
+    """A reproducible set of states, in groups that share a design.
 
     Args:
         groups: number of designs.
-        states: commanded states per design, beside the rest state.
+        states: commanded states per design, in addition to the state at rest.
         sequence: one of `SEQUENCES`. Use ``"random"`` for validation and test.
         seed: seed of the sequence.
-        margin: how far slack cables are pulled back [fraction of the actuator range]; 1 samples cables that push.
-        vary: design variables that are drawn; default all that the surrogate learns. None of them: an empty tuple.
-        design: values of the others, where they are not at their baseline.
+        margin: how far slack cables are moved back [fraction of the actuator range]; 1 samples cables that push.
+        vary: design variables that are drawn; default all that the surrogate learns, an empty tuple for none.
+        design: values of other variables; default their baseline.
         bounds: narrower bounds of drawn variables.
     """
 
@@ -54,7 +54,7 @@ class SamplingPlan:
         for name, least in (("groups", 1), ("states", 1), ("seed", 0)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-                raise ValueError(f"{name} = {value!r} must be a whole number of {least} or more")
+                raise ValueError(f"{name} = {value!r} must be an integer of at least {least}")
         if self.vary is not None and len(set(self.vary)) < len(self.vary):
             raise ValueError(f"vary = {list(self.vary)} names a variable twice")
         if not 0.0 <= self.margin <= 1.0:
@@ -76,16 +76,16 @@ class SamplingPlan:
             return halton.random(count)
         if self.sequence == "sobol":
             sobol = qmc.Sobol(dimension, scramble=True, rng=rng)
-            # Its points come in powers of two; of a part of them no balance is asked.
+            # The number of points of a Sobol sequence is a power of two; some of them are used here.
             return sobol.random_base2(int(np.ceil(np.log2(max(total, 2)))))[first : first + count]
         return qmc.LatinHypercube(dimension, rng=rng).random(total)[first : first + count]
 
     def designs(self, robot: Robot, first: int, count: int) -> list[Design]:
-        """Complete designs of groups ``first .. first + count``.
+        """Return the complete designs of groups ``first .. first + count``.
 
         Raises:
-            DesignError: for variables the robot does not have, bounds outside its own or of a variable that is not
-                drawn, and a value for one that is.
+            DesignError: for variables that the robot does not have, bounds outside the robot's, bounds of a variable
+                that is not drawn, and a fixed value of one that is.
         """
         space = robot.design_space
         names = learned_variables(robot) if self.vary is None else self.vary
@@ -93,15 +93,15 @@ class SamplingPlan:
             if name not in space.names:
                 raise DesignError(unknown_name("design variable", name, space.names))
         for name in self.bounds.keys() - set(names):
-            raise DesignError(f"bounds of '{name}', which is not drawn; drawn: {', '.join(names) or 'none'}")
+            raise DesignError(f"'{name}' has bounds but is not drawn; drawn: {', '.join(names) or 'none'}")
         for name in self.design.keys() & set(names):
-            raise DesignError(f"a value of '{name}', which is drawn; leave it out of `design` or of `vary`")
+            raise DesignError(f"'{name}' is drawn and has a fixed value; remove it from `design` or from `vary`")
         box = []
         for name in names:
             low, high = self.bounds.get(name, (space[name].low, space[name].high))
             if not space[name].low <= low <= high <= space[name].high:
                 own = f"[{space[name].low:g}, {space[name].high:g}]"
-                raise DesignError(f"bounds of '{name}' = [{low:g}, {high:g}] leave its own, {own}")
+                raise DesignError(f"bounds of '{name}' = [{low:g}, {high:g}] must be inside {own}")
             box.append((low, high))
         ends = np.array(box).reshape(-1, 2)
         points = self.unit_points(len(names), first, count, self.groups, 0)
@@ -110,7 +110,7 @@ class SamplingPlan:
 
 
 def path_order(points: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Order points (n, d) so that each lies near the one before, beginning near ``start`` (d,): nearest first."""
+    """Return an order of points (n, d) in which each is the nearest remaining one, beginning near ``start`` (d,)."""
     left = np.ones(len(points), dtype=bool)
     order = np.empty(len(points), dtype=np.int64)
     present = start
@@ -123,12 +123,13 @@ def path_order(points: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 
 def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str, np.ndarray] | None, int]:
-    """Solve all states of one design, each from its neighbour.
+    """Solve all states of one design, each starting from the previous one.
 
     Returns:
         Arrays with one row per solved state: ``design`` (all variables), ``displacement``, ``effort``, ``effector``,
-        ``compliance`` (upper triangle of W, row by row), ``rest`` (1 for the rest state), and the number of states
-        without an equilibrium, which are left out. None for a design that is infeasible or has no rest.
+        ``compliance`` (upper triangle of W, row by row) and ``rest`` (1 for the state at rest), or None for a design
+        that is infeasible or has no equilibrium at rest; and the number of commands without an equilibrium, which are
+        left out.
     """
     space = robot.design_space
     count = len(robot.actuators)
@@ -153,7 +154,7 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str
         try:
             equilibrium = statics.solve(command)
         except ConvergenceError:
-            try:  # another way to it, from rest
+            try:  # try again from rest
                 statics.restore(rest.x, rest.effort)
                 equilibrium = statics.solve(command)
             except ConvergenceError:
@@ -184,16 +185,16 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str
 
 
 def select_states(data: Mapping[str, np.ndarray], count: int, seed: int = 0) -> np.ndarray:
-    """Choose the states that stand for a dataset: those nearest to k-means centres (thesis 5.3).
+    """Choose states that represent a dataset: those nearest to k-means centres (thesis, sec. 5.3).
 
-    Clusters are of the normalised entries of ``W`` and ``delta_free``, so that states lie close where the condensed
-    model changes and far apart where it does not.
+    Clusters are formed from the normalised entries of ``W`` and ``delta_free``: chosen states are close together where
+    the condensed model changes, and far apart where it does not.
 
     Returns:
         Row numbers, ascending, shape (count,).
 
     Raises:
-        ValueError: if ``count`` is no number of rows the data can give.
+        ValueError: if ``count`` is not between 1 and the number of rows.
     """
     from scipy.cluster.vq import kmeans2
 
@@ -201,7 +202,7 @@ def select_states(data: Mapping[str, np.ndarray], count: int, seed: int = 0) -> 
     if not isinstance(count, int | np.integer) or not 1 <= count <= rows:
         raise ValueError(f"count = {count} states cannot be chosen from {rows}; allowed: 1 to {rows}")
     actuators, effectors = data["effort"].shape[1], data["effector"].shape[1]
-    n = int(np.sqrt(2 * data["compliance"].shape[1]))  # more than these where there are contacts
+    n = int(np.sqrt(2 * data["compliance"].shape[1]))  # larger than the sum of both if there are contacts
     W = np.zeros((rows, n, n))
     W[:, *np.triu_indices(n)] = data["compliance"]
     W += np.triu(W, 1).swapaxes(1, 2)
@@ -212,14 +213,14 @@ def select_states(data: Mapping[str, np.ndarray], count: int, seed: int = 0) -> 
     spread[spread <= 1e-12 * np.abs(entries).max(axis=0)] = np.inf
     entries = (entries - entries.mean(axis=0)) / spread
     distinct, first = np.unique(entries, axis=0, return_index=True)
-    if len(distinct) <= count:  # all of them, and copies; more centres than points cannot be drawn
+    if len(distinct) <= count:  # k-means needs at least as many points as centres: take all, and copies
         chosen, distance = first.tolist(), np.zeros(rows)
     else:
-        with warnings.catch_warnings(action="ignore", category=UserWarning):  # empty clusters are seen to below
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # empty clusters are handled below
             centres, labels = kmeans2(entries, count, minit="++", rng=np.random.default_rng(seed))
         distance = np.linalg.norm(entries - centres[labels], axis=1)
         chosen = [g[distance[g].argmin()] for k in range(count) if len(g := np.flatnonzero(labels == k))]
-    if len(chosen) < count:  # clusters that came out empty: the states farthest from what is chosen
+    if len(chosen) < count:  # replace empty clusters by the states farthest from their centres
         left = np.setdiff1d(np.argsort(-distance, kind="stable"), chosen, assume_unique=True)
         chosen += left[np.argsort(-distance[left], kind="stable")][: count - len(chosen)].tolist()
     return np.sort(np.array(chosen))

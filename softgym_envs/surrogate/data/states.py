@@ -1,4 +1,4 @@
-"""A dataset as the matrices that networks are trained on."""
+"""Datasets as the matrices that networks are trained on."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from softgym_envs.errors import DataError
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.features import Features
 
-#: Largest growth of the actuators' compliance over that at rest of states that are learned.
+#: States whose actuators are more than this many times softer than at rest are not learned.
 GROWTH = 10.0
 
 
 @dataclass(frozen=True)
 class States:
-    """Condensed models of N equilibria, at the baseline stiffness where one variable only scales efforts.
+    """Condensed models of N equilibria; efforts and compliances are those at the baseline stiffness.
 
     Attributes:
         design: features of the design, shape (N, d).
@@ -26,7 +26,7 @@ class States:
         effort: shape (N, n_a).
         effector: shape (N, n_e).
         W: compliance, shape (N, n, n).
-        rest_of: row of the rest state of the same body, shape (N,).
+        rest_of: row of the state at rest of the same body, shape (N,).
     """
 
     design: np.ndarray
@@ -42,32 +42,32 @@ class States:
 
     @property
     def rest_rows(self) -> np.ndarray:
-        """Rows of the rest states, one per body."""
+        """Rows of the states at rest, one per body."""
         return np.unique(self.rest_of)
 
     @property
     def unloaded(self) -> bool:
-        """Every body is at rest without effort and at zero displacement."""
+        """Whether every body is at rest without effort and at zero displacement."""
         rows = self.rest_rows
         return bool(np.abs(self.displacement[rows]).max() < 1e-9 and np.abs(self.effort[rows]).max() < 1e-9)
 
     @property
     def entries(self) -> np.ndarray:
-        """What the thesis learns: the upper triangle of W, row by row, then delta_free, shape (N, k)."""
+        """Outputs of the thesis' networks: the upper triangle of W, row by row, then delta_free, shape (N, k)."""
         effort = np.concatenate([self.effort, np.zeros_like(self.effector)], axis=1)
         delta = np.concatenate([self.displacement, self.effector], axis=1)
         free = delta - np.einsum("bij,bj->bi", self.W, effort)
         return np.concatenate([self.W[:, *np.triu_indices(self.W.shape[1])], free], axis=1)
 
     def rows(self, index: np.ndarray) -> States:
-        """Some of the states. Rest states they refer to are not brought along: only for networks without rest."""
+        """Return some of the states. Each refers to itself as its state at rest: for networks that do not use those."""
         parts = {f.name: getattr(self, f.name)[index] for f in fields(self)}
         parts["rest_of"] = np.arange(len(parts["effort"]))
         return States(**parts)
 
 
 def full_compliance(upper: np.ndarray, size: int) -> np.ndarray:
-    """Symmetric matrices (N, size, size) from upper triangles, row by row (N, size (size + 1) / 2)."""
+    """Return symmetric matrices (N, size, size) from upper triangles, row by row (N, size (size + 1) / 2)."""
     W = np.empty((len(upper), size, size))
     rows, columns = np.triu_indices(size)
     W[:, rows, columns] = upper
@@ -76,19 +76,20 @@ def full_compliance(upper: np.ndarray, size: int) -> np.ndarray:
 
 
 def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Which equilibria of a dataset a robot can be kept in, shape (N,).
+    """Return which equilibria of a dataset are stable enough to be learned, shape (N,).
 
-    Those whose W is not positive definite are unstable even with their actuators held (volume-driven chambers can
-    buckle). Those whose actuators' compliance has grown `GROWTH` times over that at rest, in any direction, are about
-    to buckle: W is singular there, which no smooth model follows. Bodies that are unstable at rest teach nothing.
-    Where the energy is not convex (`Robot.convex`) states are kept whose actuators must be held.
+    States whose W is not positive definite are unstable even with their actuators held (volume-driven chambers can
+    buckle). States whose compliance between actuators is more than `GROWTH` times that at rest, in any direction, are
+    about to buckle: W is nearly singular there, and a smooth model cannot represent that. All states of a body that is
+    unstable at rest are left out. For robots whose energy is not convex (`Robot.convex`), states that are stable only
+    while their actuators are held are included.
 
     Raises:
-        DataError: if the dataset does not begin with a rest state.
+        DataError: if the dataset does not begin with a state at rest.
     """
     rest = data["rest"].astype(bool)
     if len(rest) == 0 or not rest[0]:
-        raise DataError("the dataset has no rest state at its beginning")
+        raise DataError("the dataset does not begin with a rest state")
     count = data["effort"].shape[1]
     W = (
         full_compliance(data["compliance"], count + data["effector"].shape[1])
@@ -99,7 +100,7 @@ def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
     rest_of = np.flatnonzero(rest)[np.cumsum(rest) - 1]
     convex = np.linalg.eigvalsh((W / scale[:, None] / scale)[:, a, a])[:, 0] > 1e-9
     stable = convex if robot.convex else convex[rest_of]
-    # What is left once the actuators are held may vanish (a chain of rigid directions) but not be negative.
+    # The compliance with held actuators may be zero (in rigid directions) but not negative.
     held = W[:, e, e] - W[:, e, a] @ np.linalg.solve(W[:, a, a], W[:, a, e])
     least = np.linalg.eigvalsh(0.5 * (held + held.swapaxes(1, 2)))[:, 0]
     stable &= least > -1e-6 * np.einsum("bii->b", W[:, e, e])
