@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from agents.config import EnvironmentConfig
 from agents.statistics import Estimate, crossed_estimate, stratified_estimate
 from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json
+
+if TYPE_CHECKING:
+    from agents.training import CurvePoint
 
 RESULTS = Path(__file__).parent / "results"
 """Stored runs of the configurations in ``configs/agents``."""
@@ -27,21 +30,63 @@ AGENTS = {
 }
 
 
+class StoredEvaluation(TypedDict):
+    """An evaluation in a file of results: values for each goal, rounded, and the cost."""
+
+    distances: list[float]
+    mean_distances: list[float]
+    returns: list[float]
+    successes: list[int]
+    steps: int
+    seconds: float
+
+
+Evaluations = dict[str, dict[str, StoredEvaluation]]
+"""Evaluations by backend and agent."""
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A training with one seed and the evaluations of its policy."""
+
+    seed: int
+    environment: EnvironmentConfig
+    curve: list[CurvePoint]
+    evaluations: Evaluations
+
+    @classmethod
+    def read(cls, path: Path) -> StoredRun:
+        """Read ``seed<k>.json``.
+
+        Raises:
+            DataError: if it is not the result of a training.
+        """
+        run = read_json(path)
+        expected = {"seed", "config", "curve", "evaluations", "horizon"}
+        if not isinstance(run, dict) or not expected <= run.keys():
+            raise DataError(f"'{path}' is not the result of a training: it must contain {', '.join(sorted(expected))}")
+        environment = EnvironmentConfig.model_validate(run["config"]["environment"])
+        return cls(run["seed"], environment, run["curve"], run["evaluations"])
+
+
 @dataclass(frozen=True)
 class StoredRuns:
     """All seeds of one configuration, and the baselines on the same goals.
 
     Attributes:
         name: name of the configuration.
-        environment: environment of the training.
         runs: the trainings, by seed.
         baselines: evaluations of the baselines, empty if they were not run.
     """
 
     name: str
-    environment: EnvironmentConfig
-    runs: list[dict[str, Any]]
-    baselines: dict[str, Any]
+    runs: list[StoredRun]
+    baselines: Evaluations
+
+    @property
+    def environment(self) -> EnvironmentConfig:
+        """Environment of the trainings."""
+        return self.runs[0].environment
 
     def scores(self, agent: str, backend: str, column: str) -> np.ndarray | None:
         """Return one column of the final evaluation, shape (seeds, goals), or None if there is no such evaluation.
@@ -52,9 +97,9 @@ class StoredRuns:
             column: ``"distances"``, ``"mean_distances"``, ``"returns"`` or ``"successes"``.
         """
         backend = self.environment.backend if backend == "own" else backend
-        sources = self.runs if agent == "sac" else [self.baselines]
-        rows = [source.get("evaluations", {}).get(backend, {}).get(agent) for source in sources]
-        found = [row[column] for row in rows if row is not None]
+        sources = [run.evaluations for run in self.runs] if agent == "sac" else [self.baselines]
+        rows = [source.get(backend, {}).get(agent) for source in sources]
+        found = [row[column] for row in rows if row is not None]  # type: ignore[literal-required]
         return np.array(found, dtype=float) if found else None
 
     @property
@@ -77,24 +122,15 @@ def load_runs(folder: str | Path = RESULTS) -> list[StoredRuns]:
     folder = Path(folder)
     found = []
     for place in sorted(path for path in folder.glob("*") if path.is_dir()):
-        runs = sorted((_read_run(path) for path in place.glob("seed*.json")), key=lambda run: run["seed"])
+        runs = sorted(map(StoredRun.read, place.glob("seed*.json")), key=lambda run: run.seed)
         if runs:
             path = place / "baselines.json"
-            environment = EnvironmentConfig.model_validate(runs[0]["config"]["environment"])
-            found.append(StoredRuns(place.name, environment, runs, read_json(path) if path.exists() else {}))
+            found.append(StoredRuns(place.name, runs, read_json(path)["evaluations"] if path.exists() else {}))
     if not found:
         raise DataError(
             f"'{folder}' contains no results (<config>/seed<k>.json); create them with python -m agents.sweep"
         )
     return found
-
-
-def _read_run(path: Path) -> dict[str, Any]:
-    run = read_json(path)
-    wanted = {"seed", "config", "curve", "evaluations", "horizon"}
-    if not isinstance(run, dict) or not wanted <= run.keys():
-        raise DataError(f"'{path}' is not the result of a training: it must contain {', '.join(sorted(wanted))}")
-    return run
 
 
 def table(runs: list[StoredRuns]) -> str:
@@ -192,7 +228,7 @@ def draw_curves(runs: list[StoredRuns], path: str | Path, columns: int = 4) -> P
         panel.remove()
     for panel, entry in zip(panels, runs, strict=False):
         curves = [
-            ([row["step"] for row in run["curve"]], [row["mean_return"] / entry.horizon for row in run["curve"]])
+            ([row["step"] for row in run.curve], [row["mean_return"] / entry.horizon for row in run.curve])
             for run in entry.runs
         ]
         for steps, returns in curves:

@@ -18,7 +18,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from softgym_envs.config import check_config, difference, load_config, provenanc
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.executors import parallel_map
 from softgym_envs.storage import read_json, write_json
+
+if TYPE_CHECKING:
+    from agents.results import Evaluations
 
 TEST_SEED = 2_000_003
 """Seed of the goals that are used neither in trainings nor to choose policies."""
@@ -44,17 +47,16 @@ def unseen_goals(environment: EnvironmentConfig, count: int) -> tuple[list[dict[
 
 def _evaluations(
     environment: EnvironmentConfig, agents: dict[str, str | Path], goals: int, fem_goals: int
-) -> dict[str, dict[str, Any]]:
+) -> Evaluations:
     """Evaluate agents on the environment's backend and on FEM: ``{backend: {agent: evaluation}}``, SI."""
     from agents.evaluation import evaluate
 
     counts = _counts(environment, goals, fem_goals)
     designs, paths = unseen_goals(environment, max(counts.values()))
-    found: dict[str, dict[str, Any]] = {}
+    found: Evaluations = {}
     for backend, count in counts.items():
         found[backend] = {}
         for name, agent in agents.items():
-            begun = time.perf_counter()
             outcome = evaluate(
                 agent,
                 environment.on(backend),
@@ -68,7 +70,7 @@ def _evaluations(
                 "returns": _short(outcome.returns),
                 "successes": outcome.successes.astype(int).tolist(),
                 "steps": outcome.steps,
-                "seconds": round(time.perf_counter() - begun, 2),
+                "seconds": round(outcome.seconds, 2),
             }
     return found
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -27,7 +27,17 @@ if TYPE_CHECKING:
 
 EVALUATION_SEED = 1_000_003
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "ends")
-_CURVE = ("step", "seconds", "success_rate", "mean_distance", "worst_distance", "mean_return")
+
+
+class CurvePoint(TypedDict):
+    """A point of a learning curve: an evaluation during the training."""
+
+    step: int
+    seconds: float
+    success_rate: float
+    mean_distance: float
+    worst_distance: float
+    mean_return: float
 
 
 def train(
@@ -85,7 +95,7 @@ def train(
 
     began = time.process_time()
     checkpoint = folder / "checkpoint.safetensors"
-    curve: list[dict[str, float]] = []
+    curve: list[CurvePoint] = []
     best: dict[str, np.ndarray] = {}
     outcome: Evaluation | None = None
     model = _make_model(config)
@@ -130,7 +140,7 @@ def train(
                 best = _weights(model)
             bar.set_postfix_str(f"success {outcome.success_rate:.0%}, distance {1e3 * outcome.mean_distance:.2f} mm")
             for name in ("success_rate", "mean_distance", "mean_return"):
-                model.logger.record(f"evaluation/{name}", curve[-1][name])
+                model.logger.record(f"evaluation/{name}", getattr(outcome, name))
             model.logger.dump(model.num_timesteps)
             _write_curve(folder / "curve.csv", curve)
             if proposer is not None:
@@ -166,7 +176,7 @@ def cpu_before(policy: Path, began: float) -> float:
     return max(0.0, card.get("cpu_seconds", 0.0) - (time.process_time() - began))
 
 
-def _best_step(curve: list[dict[str, float]]) -> int:
+def _best_step(curve: list[CurvePoint]) -> int:
     """Return the step of the evaluation with the largest mean return, the last one among equals."""
     return int(max(curve, key=lambda row: (row["mean_return"], row["step"]))["step"])
 
@@ -275,7 +285,7 @@ def _optimisers(model: SAC) -> dict[str, Any]:
 def _save_checkpoint(
     model: SAC,
     path: Path,
-    curve: list[dict[str, float]],
+    curve: list[CurvePoint],
     best: dict[str, np.ndarray],
     outcome: Evaluation,
     cpu_seconds: float,
@@ -313,7 +323,7 @@ def _save_checkpoint(
         stream.write(save(arrays, metadata={"state": json.dumps(meta)}))
 
 
-def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, np.ndarray], Evaluation, float]:
+def _restore(model: SAC, path: Path) -> tuple[list[CurvePoint], dict[str, np.ndarray], Evaluation, float]:
     """Restore a model from a checkpoint.
 
     Returns:
@@ -350,8 +360,8 @@ def _restore(model: SAC, path: Path) -> tuple[list[dict[str, float]], dict[str, 
     return meta["curve"], best, Evaluation.from_json(meta["outcome"]), float(meta.get("cpu_seconds", 0.0))
 
 
-def _write_curve(path: Path, curve: list[dict[str, float]]) -> None:
+def _write_curve(path: Path, curve: list[CurvePoint]) -> None:
     with atomic_write(path, "w") as stream:
-        writer = csv.DictWriter(stream, _CURVE)
+        writer = csv.DictWriter(stream, CurvePoint.__annotations__)
         writer.writeheader()
         writer.writerows(curve)
