@@ -78,8 +78,8 @@ def _evaluations(
 def _counts(environment: EnvironmentConfig, goals: int, fem_goals: int) -> dict[str, int]:
     """Return the number of goals for each backend that agents are evaluated on."""
     own = environment.backend
-    asked = {"fem": fem_goals} if own == "fem" else {own: goals, "fem": fem_goals}
-    return {backend: count for backend, count in asked.items() if count > 0}
+    expected = {"fem": fem_goals} if own == "fem" else {own: goals, "fem": fem_goals}
+    return {backend: count for backend, count in expected.items() if count > 0}
 
 
 def _short(values: np.ndarray) -> list[float]:
@@ -91,7 +91,7 @@ def _finished(result: Path, config: TrainConfig, goals: int, fem_goals: int) -> 
 
     Args:
         result: ``seed<k>.json``, or ``baselines.json``, for which only the environment of ``config`` counts.
-        config: what is asked for, with its seed.
+        config: the requested configuration, with its seed.
         goals: unseen goals on the environment's backend.
         fem_goals: unseen goals on FEM.
 
@@ -112,13 +112,13 @@ def _finished(result: Path, config: TrainConfig, goals: int, fem_goals: int) -> 
     except (KeyError, TypeError, AttributeError, StopIteration) as error:
         raise DataError(f"{where} is not the result of a sweep: {type(error).__name__} {error}") from None
     other = difference(old, config)
-    asked = _counts(config.environment, goals, fem_goals)
-    if other is None and found != asked:
+    expected = _counts(config.environment, goals, fem_goals)
+    if other is None and found != expected:
         # A task whose goals are all equal is evaluated on one of them.
         if set(found.values()) == {1} and len(unseen_goals(config.environment, 2)[1]) == 1:
-            asked = dict.fromkeys(asked, 1)
-        if found != asked:
-            other = f"goals = {found}, got {asked}"
+            expected = dict.fromkeys(expected, 1)
+        if found != expected:
+            other = f"goals = {found}, got {expected}"
     if other is not None:
         raise DataError(f"{where} belongs to another sweep: {other}; choose another folder")
     return True

@@ -1,4 +1,4 @@
-"""What tasks and spaces need to compute with NumPy arrays and torch tensors alike."""
+"""Helpers for code that computes with NumPy arrays as well as torch tensors."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The same environments as `SoftRobotVectorEnv`, with tensors in place of arrays. A step runs the same few Newton
 iterations for every row, needed or not, and never waits for the host, so that it can be captured as a CUDA graph or
-compiled. After the step the host asks once whether an episode ended or a search is unfinished; the few rows whose
+compiled. After the step the host checks once whether an episode ended or a search is unfinished; the few rows whose
 search takes longer are then finished on their own.
 
 Internally, reached displacements ``u`` are scaled to [-1, 1] over the actuators' ranges, as the networks take them.

@@ -1,4 +1,4 @@
-"""Environments of configurations: by ID, or a robot and a task of one's own, which are trained and evaluated."""
+"""Environments of configurations: by ID, or your own robot and task, trained and evaluated."""
 
 import json
 import sys
@@ -56,7 +56,7 @@ def module(tmp_path, monkeypatch):
     sys.modules.pop("spiky", None)
 
 
-def test_a_robot_of_ones_own_is_trained_and_evaluated(module, tmp_path):
+def test_your_own_robot_is_trained_and_evaluated(module, tmp_path):
     config_file = tmp_path / "train.yaml"
     config_file.write_text(
         yaml.safe_dump(

@@ -55,7 +55,7 @@ def test_pushes(robot):
     assert (np.abs(np.mean(forces, axis=0)) < 0.06).all()  # from all sides
 
 
-def test_no_push_unless_asked(robot):
+def test_no_push_by_default(robot):
     task = make_task("carry", robot)
     task.begin(np.random.default_rng(0))
     assert all(task.push(k) is None for k in range(100))

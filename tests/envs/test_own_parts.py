@@ -1,4 +1,4 @@
-"""Robots and tasks of one's own in environments: as objects, classes and paths, registered or not."""
+"""Your own robots and tasks in environments: as objects, classes and paths, registered or not."""
 
 import copy
 import pickle
@@ -62,7 +62,7 @@ def walk(env, steps=4):
 
 
 @pytest.mark.parametrize("robot", [Spike, ROBOT, "object"])
-def test_a_robot_of_ones_own(robot):
+def test_your_own_robot(robot):
     robot = Spike() if robot == "object" else robot
     env = gymnasium.make("SoftGym/Reach-v0", robot=robot)
     assert type(env.unwrapped.robot) is Spike
@@ -95,7 +95,7 @@ def test_a_robot_object_is_used_as_it_is():
         SoftRobotEnv(robot, Reach(robot), task_options={"spread": 0.01})
 
 
-def test_a_task_of_ones_own_in_every_environment():
+def test_your_own_task_in_every_environment():
     from softgym_envs.envs.torch_env import TorchVectorEnv
 
     single = gymnasium.make("SoftGym/FingerReach-v0", task=Approach)

@@ -18,7 +18,7 @@ Kinematics = Callable[[Array], Array]
 
 
 class Random(Protocol):
-    """What tasks draw with: a `numpy.random.Generator`, or its counterpart for tensors."""
+    """Random numbers for tasks: a `numpy.random.Generator`, or its counterpart for tensors."""
 
     def uniform(self, low: Any, high: Any, size: Any, /) -> Array:
         """Draw uniformly between ``low`` and ``high``."""
