@@ -107,11 +107,11 @@ class StudyFolder:
             where = f"storage '{config.storage}'"
             if "config" not in shared:
                 raise ConfigError(
-                    f"{where} has a study '{config.name}' that is not a co-design study; use another name"
+                    f"{where} holds a study '{config.name}' that is not a co-design study; use another name"
                 )
             if mine not in (None, shared["id"]):
                 raise ConfigError(
-                    f"{where} has another study '{config.name}' than folder '{shown}'; use another folder"
+                    f"{where} holds another study '{config.name}' than folder '{shown}'; use another folder"
                 )
             old = check_config(StudyConfig, shared["config"], f"study '{config.name}' of {where}")
             fixed = TEST_SETTINGS if storage.has_files("finalists") else self._tested_with()
