@@ -6,17 +6,6 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from os.path import commonprefix
 
-__all__ = [
-    "ConfigError",
-    "ConvergenceError",
-    "DataError",
-    "DesignError",
-    "InfeasibleDesign",
-    "MeshingError",
-    "SoftGymError",
-    "WeightsError",
-]
-
 
 class SoftGymError(Exception):
     """Base of all errors that softgym-envs raises for its users."""

@@ -89,6 +89,11 @@ MISTAKES = {
         "goal = [0.0, 50.0, -90.0] m is 102.8 m away from the effector of robot 'finger', whose size is * m; "
         "did you mean metres?",
     ),
+    "goal zone in millimetres": (
+        lambda f: config(f, StudyConfig, FINGER, "goals.zone.center=[0,66,-72]"),
+        "config '*': *center = [0.0, 66.0, -72.0] m is * m away from the effector of robot 'finger', *; did you "
+        "mean metres?",
+    ),
     "design in millimetres": (
         lambda _: reset(design={"length": 40.0}),
         "design variable 'length' = 40 m is out of bounds; allowed: 0.038 to 0.042 m",

@@ -24,6 +24,7 @@ from codesign.scheduling.postgres import HEARTBEAT, PostgresStorage
 from codesign.scheduling.queue import TrialQueue
 from codesign.study import run_study
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
+from softgym_envs.testing import wait_until
 
 GRACE = 2.0
 
@@ -69,13 +70,6 @@ def states(queue):
     return [trial.state.name for trial in queue.study.get_trials(deepcopy=False)]
 
 
-def wait_for(condition, seconds=20.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it takes too long"
-        time.sleep(0.05)
-
-
 def test_machines_share_the_budget_and_the_goals(machine):
     a, b = machine("a", trials=3), machine("b", trials=3)
     assert (a.path / "goals.json").read_bytes() == (b.path / "goals.json").read_bytes()
@@ -115,7 +109,7 @@ def test_worker_killed_with_its_call_does_not_blame_the_body(machine, call_lives
                 survivor.storage.execute(HEARTBEAT, worker=call.worker)
             return survivor.claimable()
 
-        wait_for(claimable)
+        wait_until(claimable)
         again = survivor.claim()
     assert (again.number, again.params) == (1, lost.params)
     assert again.user_attrs["attempt"] == 1 + call_lives
@@ -128,7 +122,7 @@ def test_body_of_a_dead_worker_runs_again_on_another_machine(machine):
             lost = victim.claim()
             lost.report(0.25, 10)
             assert survivor.claim() is None  # its last heartbeat is recent
-        wait_for(lambda: survivor.claimable())
+        wait_until(lambda: survivor.claimable())
         again = survivor.claim()
         assert (again.number, again.params) == (1, lost.params)
         assert again.user_attrs["origin"] == lost.user_attrs["origin"]
@@ -203,10 +197,10 @@ def test_body_that_kills_its_workers_is_given_up(machine):
     folder = machine(trials=1, attempts=2)
     with TrialQueue(folder) as watcher:
         for number in range(2):
-            wait_for(watcher.claimable)
+            wait_until(watcher.claimable)
             with doomed(folder) as victim:
                 assert victim.claim().number == number
-        wait_for(watcher.claimable)
+        wait_until(watcher.claimable)
         worker.run_trials(folder)
         watcher.mirror()
         (found,) = folder.results()
@@ -226,7 +220,7 @@ def test_jobs_are_shared(machine):
         assert mine
         thread = threading.Thread(target=run_pending, args=(b, [job(b, "1"), job(b, "2")]))
         thread.start()
-        wait_for(lambda: (b.path / "screen" / "2.json").exists())
+        wait_until(lambda: (b.path / "screen" / "2.json").exists())
         assert not (b.path / "screen" / "1.json").exists()
     thread.join()
     assert made == ["0", "2", "1"]

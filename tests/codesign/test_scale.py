@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import sys
-import time
 from dataclasses import replace
 from wsgiref.util import setup_testing_defaults
 
@@ -27,6 +26,7 @@ from codesign.scheduling.worker import run_trials
 from codesign.snapshot import load_study
 from codesign.study import run_study
 from softgym_envs.errors import ConfigError, DataError, MeshingError, SoftGymError
+from softgym_envs.testing import wait_until
 
 SMALL = {"count": 2, "unseen_count": 2, "training_count": 2}
 
@@ -189,12 +189,13 @@ def test_interrupted_baseline_is_not_given_up(tmp_path, tiny, start_study):
 
     for number, how in enumerate((signal.SIGINT, signal.SIGINT, signal.SIGKILL)):
         process = start_study(folder, data)
-        end = time.monotonic() + 120.0
-        while not running(number):
-            assert process.poll() is None and time.monotonic() < end
-            time.sleep(0.05)
+        wait_until(
+            lambda number=number: running(number),
+            interval=0.05,
+            failed=lambda process=process: None if process.poll() is None else process.stdout.read(),
+        )
         process.send_signal(how)
-        process.communicate(timeout=120)
+        process.communicate()
     with TrialQueue(StudyFolder(folder)), TrialQueue(StudyFolder(folder)) as queue:
         again = queue.claim()
         assert (again.number, again.user_attrs["origin"], again.user_attrs["attempt"]) == (3, "baseline", 1)

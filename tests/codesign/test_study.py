@@ -6,7 +6,6 @@ import csv
 import json
 import re
 import signal
-import time
 from collections import Counter
 from html.parser import HTMLParser
 from types import SimpleNamespace
@@ -24,6 +23,7 @@ from codesign.scheduling.optuna_study import open_study
 from codesign.snapshot import load_study
 from codesign.study import run_study
 from softgym_envs.errors import WeightsError
+from softgym_envs.testing import wait_until
 
 TRIALS = 7
 
@@ -32,12 +32,8 @@ def results_in(folder):
     return {path.parent.name: path.read_bytes() for path in folder.glob("trials/[0-9]*/result.json")}
 
 
-def wait_for(condition, process, seconds=120.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, process.stdout.read()
-        assert time.monotonic() < end, "it takes too long"
-        time.sleep(0.02)
+def wait_for(condition, process):
+    wait_until(condition, interval=0.02, failed=lambda: None if process.poll() is None else process.stdout.read())
 
 
 @pytest.fixture(scope="module")
@@ -54,15 +50,15 @@ def finished(tmp_path_factory, tiny, start_study):
     first = start_study(folder, data)
     wait_for(lambda: results_in(folder), first)
     first.send_signal(signal.SIGINT)
-    output, _ = first.communicate(timeout=120)
+    output, _ = first.communicate()
     interrupted = results_in(folder)
 
     second, third = start_study(folder, data), start_study(folder, {**data, "workers": 1})
     wait_for(lambda: len(results_in(folder)) >= len(interrupted) + 2, second)
     second.kill()
-    second.communicate(timeout=120)
+    second.communicate()
     killed = results_in(folder)
-    third.communicate(timeout=120)
+    third.communicate()
     returned = run_study(StudyConfig.model_validate(data), folder, progress=False)
     return SimpleNamespace(
         folder=StudyFolder(folder), output=output, interrupted=interrupted, killed=killed, third=third, results=returned
