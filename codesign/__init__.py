@@ -1,6 +1,7 @@
 """Co-design: Optuna proposes bodies, each is scored with its controller, and the best are checked on FEM.
 
-`run_study` runs a study, `write_report` writes its report, and `load_study` reads what it has found so far.
+`run_study` runs a study, `write_report` writes its report, and `load_study` reads what it has found so far. `search`,
+`optimise`, `analyse_sensitivity` and `calibrate` work on bodies without a controller.
 """
 
 from typing import TYPE_CHECKING
@@ -17,7 +18,14 @@ if TYPE_CHECKING:
     from codesign.snapshot import load_study as load_study
     from codesign.study import run_study as run_study
     from codesign.tools.calibration import calibrate as calibrate
+    from codesign.tools.config import CalibrationConfig as CalibrationConfig
+    from codesign.tools.config import OptimiseConfig as OptimiseConfig
+    from codesign.tools.config import SensitivityConfig as SensitivityConfig
     from codesign.tools.gradient import optimise as optimise
+    from codesign.tools.measurements import measure as measure
+    from codesign.tools.measurements import read_measurements as read_measurements
+    from codesign.tools.metrics import Metric as Metric
+    from codesign.tools.metrics import design_metric as design_metric
     from codesign.tools.search import search as search
     from codesign.tools.sensitivity import analyse_sensitivity as analyse_sensitivity
 
@@ -31,7 +39,10 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "snapshot": ["StudySnapshot", "load_study"],
         "study": ["run_study"],
         "tools.calibration": ["calibrate"],
+        "tools.config": ["CalibrationConfig", "OptimiseConfig", "SensitivityConfig"],
         "tools.gradient": ["optimise"],
+        "tools.measurements": ["measure", "read_measurements"],
+        "tools.metrics": ["Metric", "design_metric"],
         "tools.search": ["search"],
         "tools.sensitivity": ["analyse_sensitivity"],
     },
