@@ -592,7 +592,11 @@ def test_ten_kills_lose_no_finished_shard_and_repeat_none(tmp_path, rng):
                     time.sleep(rng.uniform(0.0, 1.0))
                 else:
                     goal = before + int(rng.integers(1, 4))
-                    wait_until(lambda goal=goal: sum(1 for _ in folder.glob("shard_*")) >= goal, interval=0.002)
+                    wait_until(
+                        lambda goal=goal: sum(1 for _ in folder.glob("shard_*")) >= goal,
+                        interval=0.002,
+                        failed=lambda s=session: None if live_processes(s) else "the run ended before its next shard",
+                    )
                     time.sleep(rng.uniform(0.0, 0.03))
                 if number % 2:
                     os.killpg(session, signal.SIGKILL)
