@@ -12,7 +12,7 @@ from typing import TextIO
 LIMIT = 900.0
 """Time that a test may take on a machine with a free core [s]; the slowest tests take a minute.
 
-The load average follows the true load only slowly, hence the wide margin: this guard ends tests that hang, not slow ones.
+The load average follows the true load only slowly, hence the wide margin: it ends tests that hang, not slow ones.
 """
 
 INTERVAL = 5.0
