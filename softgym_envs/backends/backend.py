@@ -46,7 +46,7 @@ class State:
         motion: time, velocities and energies of the body; None without dynamics.
         stable: the equilibrium is stable whether displacements or efforts are commanded (always True on the
             surrogate). In dynamics: the tangent of the time step, including inertia, is positive definite.
-        uncertainty: bound on the error of the effector [m] that 95 % of a learned model's errors keep; 0 for FEM.
+        uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM.
         trusted: the state lies where the learned model may be trusted; always True for FEM.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
     """
@@ -66,7 +66,7 @@ class State:
     trusted: bool = True
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy holds the condensed model itself, not the learned model it is evaluated by.
+        # A copy holds the condensed model itself, not the learned model that evaluates it.
         return {**self.__dict__, "condensed": self.condensed}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -92,7 +92,7 @@ class Backend(ABC):
 
     @abstractmethod
     def reset(self, design: Mapping[str, float] | None = None) -> State:
-        """Go to the equilibrium at rest of a design (default: the current one). The same design is not rebuilt.
+        """Go to the rest equilibrium of a design (default: the current one). An unchanged design is not rebuilt.
 
         Raises:
             DesignError: for a malformed design.

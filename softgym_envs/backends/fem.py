@@ -114,7 +114,7 @@ class FEMBackend(Backend):
                 self.state = self._advance(command, mode, load)
             self._mode = mode
         except BaseException:
-            # Whatever stopped it, the current state is kept.
+            # Keep the current state, whatever stopped the step.
             self._go_back(kept)
             raise
         return self.state

@@ -51,22 +51,22 @@ class HybridBackend(Backend):
         design: first design; missing variables take their baseline.
         weights: folder of weights of kind ``potential``; default the shipped ones.
         members: how many members of the ensemble to use, 2 or more; default all.
-        folder: where FEM states (npz shards) and the weights that learned them (``weights``) are kept, and read if they
-            exist; default in memory only.
-        retrain_after: number of new FEM states after which the ensemble learns; 0: never.
-        steps: steps of Adam for each member, each time.
+        folder: folder of FEM states (npz shards) and of the weights that learned them (``weights``); existing ones are
+            read. By default both stay in memory.
+        retrain_after: number of new FEM states after which the ensemble learns; 0 for never.
+        steps: steps of Adam for each member in each retraining.
         tolerance: largest accepted uncertainty of the effector [m]; default a tenth of the robot's ``goal_tolerance``.
-            The limit of the weights is always accepted.
+            Uncertainties up to the limit of the weights are always accepted.
         seed: seed of the learning.
 
     Attributes:
         calls: states requested by `step` and `probe`.
         fem_calls: FEM solutions, including those of bodies at rest.
         tangent_calls: states extrapolated from a nearby FEM state.
-        retrainings: how often the ensemble learned.
-        retraining_seconds: time spent on it [s].
+        retrainings: how many times the ensemble learned.
+        retraining_seconds: time spent on retraining [s].
         original: the model of the given weights, with the accepted uncertainty.
-        model: the current model, which learned states.
+        model: the current model, after learning.
 
     Raises:
         WeightsError: if the weights have no ensemble to decide where they are trusted.
@@ -89,7 +89,7 @@ class HybridBackend(Backend):
     ) -> None:
         for name, value, least in (("retrain_after", retrain_after, 0), ("steps", steps, 1)):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise ValueError(f"{name} = {value!r} must be a whole number of {least} or more")
+                raise ValueError(f"{name} = {value!r} must be an integer of at least {least}")
         if tolerance is None:
             tolerance = 0.1 * robot.goal_tolerance
         elif not (np.isfinite(tolerance) and tolerance > 0.0):
@@ -107,11 +107,11 @@ class HybridBackend(Backend):
         self.retraining_seconds = 0.0
         self._fem: FEMBackend | None = None
         self._known: list[State] = []  # FEM states of this episode, rest first
-        self._waiting: list[State] = []  # to be written
+        self._waiting: list[State] = []  # waiting to be written
         # Displacements of kept states [fraction of the actuator range], by body.
         self._kept: dict[tuple[float, ...], list[np.ndarray]] = {}
         self._store = StateStore(robot, folder)
-        self._learned = 0  # number of states in the store that the model learned
+        self._learned = 0  # number of states in the store that the model has learned
         self._body: SurrogateBody | None = None
         self.design = None  # type: ignore[assignment]  # until the first reset
         if self._store.count:
@@ -163,7 +163,7 @@ class HybridBackend(Backend):
     # -- finite elements --------------------------------------------------------------------------------------------
 
     def _build_fem(self, design: Mapping[str, float]) -> State:
-        """Build the finite elements of a body if necessary, and return its state at rest."""
+        """Build the finite-element model of a body if necessary, and return its state at rest."""
         if self._fem is None:
             self._fem = FEMBackend(self.robot, design)
             self.fem_calls += 1
@@ -277,12 +277,12 @@ class HybridBackend(Backend):
             self._body = SurrogateBody(model, self.design)
 
     def _resume(self) -> None:
-        """Continue from the states of an earlier run: load the weights that learned them, or learn them now."""
+        """Continue from the states of an earlier run: load the weights that learned them, or train on them now."""
         assert self._store.folder is not None
         data = self._store.data
         try:
             model = load_model(self._store.folder / "weights", self.robot)
-        except DataError:  # there are none yet, or writing them was interrupted
+        except DataError:  # no weights yet, or writing them was interrupted
             model = None
         if isinstance(model, Model) and is_tuned_from(model, self.original, data, self._steps, self._seed):
             self._use(model)

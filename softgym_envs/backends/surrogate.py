@@ -24,14 +24,14 @@ TOLERANCE = 5e-5
 
 @dataclass(frozen=True)
 class BatchState:
-    """States of B rows.
+    """States of a batch of B bodies.
 
     Attributes:
         displacement: reached actuator displacements, shape (B, n_a).
         effort: actuator efforts, shape (B, n_a).
         effector: effector coordinates [m], shape (B, n_e).
         slack: which actuators are slack, shape (B, n_a).
-        converged: whether the state was found, shape (B,); other rows must not be used.
+        converged: whether the state was found, shape (B,); rows without a state must not be used.
         uncertainty: uncertainty of the effector [m], shape (B,).
         trusted: whether the model may be trusted, shape (B,).
     """
@@ -62,7 +62,7 @@ def solve_efforts(model: SurrogateModel, context: Context, effort: np.ndarray, s
 
 
 def rest_state(model: SurrogateModel, context: Context, unilateral: np.ndarray) -> BatchState:
-    """Return the states of bodies without effort, or with actuators held at zero if loads would move them."""
+    """Return the states at rest: without effort, or with actuators held at zero if loads would move them."""
     zero = np.zeros((len(context.slot), model.count))
     if model.card.get("loaded", False):
         return solve_displacements(model, context, zero, zero, unilateral)
@@ -91,7 +91,7 @@ def solve_displacements(
         start: displacements reached before, shape (B, n_a); the search for slack cables starts there.
         unilateral: actuators that cannot push, shape (n_a,).
         slack: which actuators were slack before, shape (B, n_a).
-        max_iterations: limit of the search, which usually takes two or three.
+        max_iterations: largest number of steps of the search, which usually takes two or three.
     """
     guess = target if slack is None else np.where(slack, np.maximum(start, target), target)
     displacement, effort, converged = model.search(context, target, guess, unilateral, TOLERANCE, max_iterations)
@@ -122,7 +122,7 @@ class SurrogateBody:
         """
         found = rest_state(self.model, self._context, self._unilateral)
         if not found.converged[0]:
-            raise ConvergenceError(f"the surrogate does not find the rest of {self.design}")
+            raise ConvergenceError(f"the surrogate finds no equilibrium at rest of design {self.design}")
         return self._state(np.zeros(self.model.count), found)
 
     def solve(self, command: np.ndarray, mode: str, start: State) -> State:
@@ -147,7 +147,7 @@ class SurrogateBody:
         else:
             raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
         if not found.converged[0]:
-            raise ConvergenceError(f"the surrogate does not find a state under {mode}s {command.tolist()}")
+            raise ConvergenceError(f"the surrogate finds no equilibrium under {mode}s {command.tolist()}")
         return self._state(command, found)
 
     def _state(self, command: np.ndarray, found: BatchState) -> State:
@@ -158,7 +158,7 @@ class SurrogateBody:
             effort=effort,
             effector=effector.reshape(-1, 3),
             slack=found.slack[0],
-            # Agents that do not read W do not pay for it.
+            # W is evaluated on demand, because many agents never read it.
             condensed=partial(_condensed, self.model, self._context, displacement, effort, effector),
             velocity=np.zeros((len(effector) // 3, 3)),
             uncertainty=float(found.uncertainty[0]),

@@ -1,7 +1,7 @@
-"""The potential model over a hundred thousand bodies at once, wholly in torch: nothing leaves the device.
+"""The potential model for a hundred thousand bodies at once, entirely in torch: nothing leaves the device.
 
 A search takes a fixed sequence of batched matrix products over all rows and all members of the ensemble: every row
-takes the same few Newton steps, whether it needs them or not, and none of them waits for the host. It can therefore be
+takes the same few Newton steps, whether it needs them or not, without waiting for the host. It can therefore be
 captured as a CUDA graph or compiled.
 
 Displacements are scaled to [-1, 1] over the actuators' ranges.
@@ -24,13 +24,13 @@ from softgym_envs.surrogate.potential.torch import PotentialEnsemble
 SPAN = 0.5
 #: Bound on the Newton steps of a row that takes more than the fixed few.
 MAX_NEWTON_STEPS = 25
-#: Passes of pivots in a complementarity problem: the first to the last known slack set, the others to the right one.
+#: Pivoting passes of a complementarity problem: the first restores the last known slack set, the others correct it.
 PIVOT_PASSES = 3
 
 Bodies = dict[str, Tensor]
 """Arrays of S bodies by name, or of one body for all rows."""
 
-#: Arrays of which every member of the ensemble has its own, (M, S, ...); the others are (S, ...).
+#: Arrays that differ between the members of the ensemble, (M, S, ...); the others are (S, ...).
 _PER_MEMBER = frozenset({"c", "a", "b", "d1", "d2", "x0", "slope", "held"})
 
 
@@ -39,11 +39,11 @@ class TorchBatch:
 
     Args:
         model: a trained ensemble of potential networks.
-        device: where everything is.
-        dtype: of the networks and all results.
+        device: device of all tensors.
+        dtype: type of the networks and all results.
 
     Raises:
-        ValueError: for a model of another network.
+        ValueError: for a model of an unsupported network.
     """
 
     def __init__(self, model: SurrogateModel, device: torch.device, dtype: torch.dtype) -> None:
@@ -69,7 +69,7 @@ class TorchBatch:
         self._design_low, self._design_high = (put(b, torch.float64) for b in (domain.design_low, domain.design_high))
 
     def prepare(self, designs: Tensor) -> Bodies:
-        """Return what is known of bodies before they are actuated, and their states at rest; asks the host.
+        """Return what does not depend on the actuation, and the states at rest; waits for the device.
 
         Args:
             designs: values in the order of the design space, in double precision (near 0.5 a Poisson's ratio needs its
@@ -126,8 +126,8 @@ class TorchBatch:
             bodies: from `prepare`.
             target: commanded displacements.
             guess: where the search begins.
-            iterations: Newton steps of every row.
-            stop: ask the host before every step whether a row still moves, and stop when none does.
+            iterations: number of Newton steps of every row.
+            stop: stop when no row moves any more; the host checks this before every step.
 
         Returns:
             Displacements (B, n), gradients (B, n), and whether they were found (B,).
@@ -154,14 +154,14 @@ class TorchBatch:
             z, taut, slack, solved = complementarity(hessian, q, slack, self.unilateral)
             step = torch.clamp(ahead + z, -SPAN, SPAN)
             still = (step.abs() <= TOLERANCE * SPAN).all(dim=1)
-            # A last step below the tolerance is taken without asking the model again.
+            # A last step below the tolerance is taken without evaluating the model again.
             u = torch.where(found[:, None], u, u + step)
             effort = torch.where(found[:, None], effort, taut)
             found = found | (still & solved)
         return u, effort, found
 
     def _without_effort(self, bodies: Bodies, start: Tensor) -> Tensor:
-        """Find displacements (B, n) without effort by Newton's method; asks the host."""
+        """Find displacements (B, n) without effort by Newton's method; waits for the device."""
         u = start
         for _ in range(50):
             gradient, hessian = self._ensemble.derivatives(bodies, u)
@@ -179,7 +179,8 @@ def complementarity(
     """Solve ``0 <= z _|_ K z + q >= 0`` (z = 0 in bilateral rows) by principal pivots, in a fixed number of passes.
 
     A pivot exchanges an actuator's z with its effort: a rank-one update of the tableau, masked by row of the batch.
-    The first pass exchanges those that were slack before, the others every one of a wrong sign, in turn.
+    The first pass exchanges the actuators that were slack before. In the others, each actuator in turn is exchanged if
+    its sign is wrong.
 
     Args:
         K: symmetric positive definite, shape (B, n, n).
@@ -191,7 +192,7 @@ def complementarity(
         z (B, n), K z + q (B, n), the slack set (B, n), and whether its signs are right (B,).
     """
     n = q.shape[1]
-    # With a unit diagonal the pivots are of order one: the sum that makes a rank-one update exact loses no digits.
+    # With a unit diagonal the pivots are of order one, so the sums of the rank-one updates lose no digits.
     scale = torch.rsqrt(torch.diagonal(K, dim1=1, dim2=2))
     q = scale * q
     tableau = torch.cat([K * scale[:, :, None] * scale[:, None, :], q[:, :, None]], dim=2).permute(1, 2, 0).contiguous()
@@ -215,7 +216,7 @@ def complementarity(
 
 
 def _definite(a: Tensor) -> Tensor:
-    """Whether symmetric matrices (B, n, n) are positive definite, (B,): all pivots of the elimination are positive."""
+    """Whether symmetric matrices (B, n, n) are positive definite, shape (B,): all pivots are positive."""
     found = torch.ones(len(a), dtype=torch.bool, device=a.device)
     while a.shape[1]:
         pivot = a[:, :1, :1]

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 class SoftRobotEnv(gymnasium.Env, EzPickle):
     """A soft robot with a task. The page of each environment ID has the tables of its spaces.
 
-    A copy or pickle of the environment holds what it was made with, and starts before its first `reset`. Robot and task
-    objects are copied with it; classes and names stay references, so their modules must be importable where it is
+    A copy or pickle of the environment holds the arguments it was made with and has to be reset before use. Robot and
+    task objects are copied with it; classes and names stay references, so their modules must be importable where it is
     unpickled. ``spec.to_json`` needs names or paths ``"module:class"``.
 
     Args:
@@ -108,7 +108,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         """Start an episode.
 
         Args:
-            seed: seed of everything random in this environment.
+            seed: seed of all random numbers of this environment.
             options: ``"design"``: body of the episode; ``"goal"``: a goal (3,) or a path of goals (p, 3) [m].
 
         Raises:
@@ -142,7 +142,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         A step whose equilibrium is not found ends the episode (truncated) with ``info["converged"] = False``.
 
         Raises:
-            ValueError: for an action of a wrong shape or one that is not finite.
+            ValueError: for an action with a wrong shape or a value that is not finite.
         """
         action = self.spaces.check_action(action)
         if action.ndim != 1:
@@ -182,14 +182,14 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         return observation, info
 
     def _kinematics(self, commands: np.ndarray) -> np.ndarray:
-        """Effectors [m] (1, 3) that commands (1, n_a) lead to; NaN where no equilibrium is found."""
+        """Return the effectors [m] (1, 3) that commands (1, n_a) lead to; NaN without an equilibrium."""
         try:
             return self.backend.probe(commands[0]).effector[:1]
         except ConvergenceError:
             return np.full((1, 3), np.nan)
 
     def render(self) -> np.ndarray | None:
-        """Return an image (height, width, 3) of the body, its cables, effector and goal, or None without a mode."""
+        """Return an image (height, width, 3) of the body, its cables, effector and goal; None without a render mode."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() needs render_mode='rgb_array' in gymnasium.make")
             return None

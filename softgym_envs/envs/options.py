@@ -23,15 +23,15 @@ class EnvironmentOptions:
     """Keyword options of `SoftRobotEnv`, `SoftRobotVectorEnv` and `TorchVectorEnv`.
 
     Attributes:
-        design: body of every episode unless given in `reset`; missing variables take their baseline.
+        design: body of every episode unless `reset` gets another one; missing variables take their baseline.
         sample_design: draw the body at each reset: True for all variables, or their names.
-        design_in_observation: show the body to the agent: True for all variables, or their names.
+        design_in_observation: include the body in the observation: True for all variables, or their names.
         action_mode: ``"increment"`` or ``"absolute"``, see `AgentSpaces`.
         robot_options: options of the robot.
         task_options: options of the task.
         backend_options: options of the backend; in batched environments ``weights`` and ``members``.
-        defaults: options of the environment's ID, which those above override one by one; its ``backend_options`` hold
-            for its ``backend`` only.
+        defaults: options of the environment's ID, which those above override one by one; its ``backend_options`` apply
+            to its ``backend`` only.
     """
 
     design: Mapping[str, float] | None = None
@@ -59,7 +59,7 @@ class EnvironmentOptions:
 
 @dataclass(frozen=True)
 class Setup:
-    """What an environment is made of, from its options.
+    """The parts of an environment, resolved from its options.
 
     Attributes:
         robot: the robot.
@@ -82,7 +82,7 @@ class Setup:
     action_mode: str
 
     def spaces(self, *, moving: bool = False) -> AgentSpaces:
-        """Return the agent's spaces; ``moving``: with the effector's velocity."""
+        """Return the agent's spaces; with ``moving``, observations include the effector's velocity."""
         return AgentSpaces(
             self.robot, action_mode=self.action_mode, design_names=self.shown, axes=self.task.axes, moving=moving
         )
@@ -142,10 +142,10 @@ def design_names(space: DesignSpace, choice: bool | Sequence[str]) -> tuple[str,
 
 
 def check_reset_options(options: Mapping[str, Any] | None) -> tuple[Any, Any]:
-    """Return ``design`` and ``goal`` of the options of `reset`, None where missing.
+    """Return ``design`` and ``goal`` from the options of `reset`; None where missing.
 
     Raises:
-        ValueError: for another option.
+        ValueError: for an unknown option.
     """
     options = options or {}
     for name in options:

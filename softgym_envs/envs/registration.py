@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EnvironmentRow:
-    """What an environment ID stands for: a robot, a task, a time limit and their default options.
+    """What an environment ID stands for: a robot, a task, a time limit and default options.
 
     Attributes:
-        robot: registry name, ``"module:class"``, class or object; None where ``gymnasium.make`` must be given one.
+        robot: registry name, ``"module:class"``, class or object; None if it must be passed to ``gymnasium.make``.
         task: registry name, ``"module:class"``, class or object.
         max_episode_steps: time limit.
         backend: name of the backend; None for the surrogate where weights ship for the robot, else FEM.
@@ -42,10 +42,10 @@ class EnvironmentRow:
 
     @property
     def defaults(self) -> dict[str, Any]:
-        """Default options in the form that environments take them.
+        """Default options in the form in which environments take them.
 
-        They are one option because ``gymnasium.make`` replaces whole mappings: the user's ``robot_options`` would
-        otherwise remove all of these.
+        They are passed as one option because ``gymnasium.make`` replaces whole mappings: the user's ``robot_options``
+        would otherwise replace all of these.
         """
         options = ("robot_options", "task_options", "backend_options")
         return {"defaults": {"backend": self.backend, **{name: dict(getattr(self, name)) for name in options}}}
@@ -76,7 +76,7 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/FingerReach-v0": _row("finger", "reach", 50),
     "SoftGym/FingerTrack-v0": _row("finger", "track", 100),
     "SoftGym/DiamondReach-v0": _row("diamond", "reach", 50),
-    # On its way out the published circle needs cables that push.
+    # Without cables that push, part of the published circle is out of reach.
     "SoftGym/DiamondTrack-v0": _row("diamond", "track", 100, robot_options={"unilateral": False}),
     "SoftGym/CableTrunkReach-v0": _row("cable_trunk", "reach", 50),
     "SoftGym/CableTrunkTrack-v0": _row("cable_trunk", "track", 100),
@@ -124,7 +124,7 @@ def register_environment(
 ) -> None:
     """Register an environment ID of your own with Gymnasium, the command line and studies.
 
-    Other processes know the ID only if they import the module that registers it.
+    In other processes the ID exists only if they import the module that registers it.
 
     Args:
         id: such as ``"MyLab/ArmReach-v0"``.

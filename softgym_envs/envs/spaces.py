@@ -26,8 +26,8 @@ class AgentSpaces:
     Attributes:
         action_space: of one environment, shape (n_a,).
         observation_space: of one environment, shape (d,).
-        position_scale: positions are divided by it [m].
-        error_scale: distance to the goal that appears as one half [m].
+        position_scale: unit of observed positions [m].
+        error_scale: distance to the goal that is observed as one half [m].
         slices: where to find the parts of an observation: command, displacement, effort, effector, goal, error,
             velocity, design.
     """
@@ -116,7 +116,7 @@ class AgentSpaces:
         unit_design: Array,
         velocity: Array | None = None,
     ) -> Array:
-        """Return the observation of a state, shape (..., d), float32 or of the tensors' type.
+        """Return the observation of a state, shape (..., d), float32 or the type of the tensors.
 
         The parts are command, displacement, effort, effector, goal, error, velocity and design. Efforts, errors and
         velocities are unbounded; x / (1 + abs(x)) maps them to (-1, 1) without loss.
@@ -147,7 +147,7 @@ class AgentSpaces:
         return goal / self.position_scale, _squash(self.axes * (goal - effector) / self.error_scale)
 
     def observed_effector(self, observation: np.ndarray) -> np.ndarray:
-        """Return the first effector [m] (..., 3) in observations (..., d), with the digits of float32."""
+        """Return the first effector [m] (..., 3) in observations (..., d), in float32 precision."""
         return observation[..., self.slices["effector"]].astype(float) * self.position_scale
 
     def effort_share(self, effort: Array) -> Array:

@@ -1,9 +1,9 @@
 """Environments on the surrogate in torch: a hundred thousand bodies at once on a GPU, without copies to the host.
 
 The same environments as `SoftRobotVectorEnv`, with tensors in place of arrays. A step runs the same few Newton
-iterations for every row, needed or not, and never waits for the host, so that it can be captured as a CUDA graph or
+iterations for every row, needed or not, and never waits for the host, so it can be captured as a CUDA graph or
 compiled. After the step the host checks once whether an episode ended or a search is unfinished; the few rows whose
-search takes longer are then finished on their own.
+search takes longer are then finished separately.
 
 Internally, reached displacements ``u`` are scaled to [-1, 1] over the actuators' ranges, as the networks take them.
 """
@@ -40,13 +40,13 @@ class TorchVectorEnv:
     Mirrors the API of `gymnasium.vector.VectorEnv` but returns tensors on ``device``, so it is not a subclass. Episodes
     that end are reset in the same step: the observation is the first of the next episode, and ``info["final_obs"]`` and
     ``info["final_info"]`` hold the end of the last one; ``info["_final_obs"]`` marks the rows that ended. Later steps
-    do not overwrite what a step returned.
+    do not overwrite returned tensors.
 
     Args:
         id: ID of an environment on the surrogate.
         num_envs: number of sub-environments.
         device: device of all tensors: ``"cuda"``, ``"cpu"``, ...
-        dtype: of the networks and all results; ``torch.float32`` or ``torch.float64``.
+        dtype: type of the networks and all results; ``torch.float32`` or ``torch.float64``.
         seed: seed of the first `reset`.
         compile: compile the step with ``torch.compile``; the first step then takes about a minute.
         cuda_graph: capture the step as a CUDA graph and replay it; for CUDA devices.
@@ -56,9 +56,9 @@ class TorchVectorEnv:
         **options: see `EnvironmentOptions`.
 
     Raises:
-        ValueError: for an ID, a task, a network, a device or an option that is not supported.
+        ValueError: for an unsupported ID, task, network, device or option.
         DesignError: for a malformed design.
-        WeightsError: if no weights ship for the robot, or fewer members than ``backend_options`` ask for.
+        WeightsError: if no weights ship for the robot, or they have fewer members than ``backend_options`` requests.
     """
 
     def __init__(
@@ -116,7 +116,8 @@ class TorchVectorEnv:
         self._random = _TorchRandom(self._generator, dtype)
         self._first_seed = seed
         self._compile, self._cuda_graph = compile, cuda_graph
-        #: The step, as it is called; None where bodies or state have moved in memory.
+        #: The prepared step (eager, compiled or captured); None if it must be prepared again, because tensors moved in
+        #: memory.
         self._advance_fast: Callable[[Tensor], Result] | None = None
         self.designs = self._fixed.expand(num_envs, -1).clone()
         self._changed = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
@@ -142,7 +143,7 @@ class TorchVectorEnv:
     # -- bodies -----------------------------------------------------------------------------------------------------
 
     def _prepare(self, designs: Tensor) -> Bodies:
-        """Return bodies, with what the observation shows of them, from designs (S, len(space)) in double precision."""
+        """Return bodies and their observed designs, from designs (S, len(space)) in double precision."""
         low, high = self._ends
         unit = 2.0 * (torch.where(self._log, torch.log(designs), designs) - low) / (high - low) - 1.0
         return self._model.prepare(designs) | {"unit": unit[:, self._shown].to(self.dtype)}
@@ -285,7 +286,7 @@ class TorchVectorEnv:
 
         Raises:
             RuntimeError: before the first `reset`.
-            ValueError: for actions of a wrong shape or that are not finite.
+            ValueError: for actions with a wrong shape or values that are not finite.
         """
         if not self._started:
             raise RuntimeError("step was called before reset")
@@ -296,7 +297,7 @@ class TorchVectorEnv:
         if self._advance_fast is None:
             self._advance_fast = self._prepare_step(actions)
         result = self._advance_fast(actions)
-        # The only time that a step waits for the device, unless an episode ends.
+        # The only point where a step waits for the device, unless an episode ends.
         finite, found, ended = result["flags"].tolist()
         if not finite:
             raise ValueError("actions must be finite; allowed: -1 to 1")
@@ -341,7 +342,7 @@ class TorchVectorEnv:
         return replay
 
     def _advance(self, bodies: Bodies, state: dict[str, Tensor], actions: Tensor) -> Result:
-        """Return the result of a step with `NEWTON_STEPS` Newton steps in every row; changes nothing."""
+        """Return the result of a step with `NEWTON_STEPS` Newton steps in every row; it changes nothing."""
         command = self._spaces.command(actions.clamp(-1.0, 1.0), state["command"])
         target = self._scaled(command)
         u, gradient, found = self._model.search(bodies, target, _guess(state, target), NEWTON_STEPS)
@@ -415,7 +416,7 @@ class TorchVectorEnv:
 
 
 class _TorchRandom:
-    """Random numbers for tasks, as of a `numpy.random.Generator`, as tensors on a device."""
+    """Random numbers for tasks: the methods of `numpy.random.Generator` that they use, with tensors on a device."""
 
     def __init__(self, generator: torch.Generator, dtype: torch.dtype) -> None:
         self._generator, self._dtype = generator, dtype

@@ -33,7 +33,7 @@ class SoftRobotVectorEnv(VectorEnv):
         num_envs: number of sub-environments.
         max_episode_steps: time limit; default none.
         backend: ``"surrogate"``; ``gymnasium.make_vec(..., vectorization_mode="sync")`` steps other backends.
-        render_mode: None; batches are not rendered.
+        render_mode: must be None; batches are not rendered.
         **options: see `EnvironmentOptions`; every sub-environment samples its own design.
 
     Raises:
@@ -77,8 +77,8 @@ class SoftRobotVectorEnv(VectorEnv):
         self.model = pretrained_model(self.robot, **setup.backend_options)
         self.max_episode_steps = max_episode_steps if max_episode_steps is not None else np.iinfo(np.int64).max
         self._fixed_design, self.sampled_variables = setup.design, setup.sampled
-        #: Draws the sampled variables of sub-environments ``index`` in unit coordinates [-1, 1], shape
-        #: (len(index), number of sampled variables). Replace it to draw bodies in another way.
+        #: Draws the sampled variables of sub-environments ``index`` in unit coordinates [-1, 1], shape (len(index),
+        #: number of sampled variables). Replace this function to draw bodies in another way.
         self.design_sampler: Callable[[np.random.Generator, np.ndarray], np.ndarray] = self._draw_uniformly
         self.spaces = setup.spaces()
         self.single_action_space = self.spaces.action_space
@@ -88,7 +88,7 @@ class SoftRobotVectorEnv(VectorEnv):
 
         self._unilateral = self.robot.unilateral
         self.designs = np.tile(self._fixed_design.array, (num_envs, 1))
-        # One body for all, until they differ.
+        # One body for all rows, until they differ.
         self._context = Context.shared(self.model.context(self.designs[:1]), num_envs)
         self._unit_design = np.zeros((num_envs, len(setup.shown)))
         self._command = np.zeros((num_envs, len(self.robot.actuators)))
@@ -226,7 +226,7 @@ class SoftRobotVectorEnv(VectorEnv):
         """Apply actions (num_envs, n_a) in [-1, 1].
 
         Raises:
-            ValueError: for actions of a wrong shape or that are not finite.
+            ValueError: for actions with a wrong shape or values that are not finite.
         """
         actions = self.spaces.check_action(actions)
         if actions.shape != self.action_space.shape:
@@ -284,7 +284,7 @@ class SoftRobotVectorEnv(VectorEnv):
         return info, reward
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Do nothing: there is nothing to free."""
+        """Do nothing, because there is nothing to free."""
 
 
 _FIELDS = tuple(field.name for field in fields(BatchState))

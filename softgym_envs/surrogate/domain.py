@@ -1,4 +1,4 @@
-"""Where a trained model may be trusted, as its card says."""
+"""The region in which a trained model may be trusted, read from its card."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from softgym_envs.robots.base import Robot
 
 @dataclass(frozen=True)
 class Domain:
-    """The states a model was trained on, and how far its uncertainty is believed.
+    """The box of states a model was trained on, and the limits below which its predictions are trusted.
 
     Attributes:
         low: smallest displacements, shape (n_a,); a margin of 1 % of the range is included.
@@ -21,10 +21,10 @@ class Domain:
         design_low: smallest values of all design variables in the order of the space, shape (d,), likewise; -inf for
             variables without bounds.
         design_high: largest values, shape (d,), likewise.
-        inflation: factor from the spread of the ensemble to a bound that 95 % of the validation errors keep.
+        inflation: factor that turns the spread of the ensemble into a bound on 95 % of the validation errors.
         limit: largest trusted uncertainty of the effector [m].
-        growth: how many times softer than unmoved the actuators of a trusted state may be; infinite for robots that do
-            not buckle.
+        growth: how many times softer than at zero displacement the actuators of a trusted state may be; infinite for
+            robots that do not buckle.
     """
 
     low: np.ndarray
@@ -42,7 +42,7 @@ class Domain:
 
     @classmethod
     def of_card(cls, card: Mapping[str, Any], robot: Robot) -> Domain:
-        """Read the domain from a model's card; what the card does not mention is not limited.
+        """Read the domain from a model's card; quantities that the card does not mention are unlimited.
 
         Raises:
             ValueError: if the domain is malformed or names design variables that the robot does not have.

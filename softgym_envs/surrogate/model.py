@@ -24,7 +24,7 @@ from softgym_envs.surrogate.features import Features
 
 @numba.njit(cache=True, error_model="numpy")
 def definite(matrices):
-    """Return whether symmetric matrices (B, n, n) are positive definite, (B,): if all pivots are positive."""
+    """Return whether symmetric matrices (B, n, n) are positive definite, shape (B,): all pivots are positive."""
     found = np.ones(len(matrices), dtype=np.bool_)
     n = matrices.shape[1]
     for row in range(len(matrices)):
@@ -93,7 +93,7 @@ class SurrogateModel(ABC):
         robot: the robot the weights are for.
         tensors: weights by name.
         card: the JSON file that describes the weights, see `weight_files.card_of`.
-        members: how many members of an ensemble are used; default all.
+        members: how many members of the ensemble to use; default all.
 
     Attributes:
         features: scaling of inputs.
@@ -174,7 +174,7 @@ class SurrogateModel(ABC):
             guess: where the search begins, shape (B, n_a).
             unilateral: actuators that cannot push, shape (n_a,).
             tolerance: the search ends when its next step is below this [`span`].
-            iterations: limit of the steps; two or three are usually enough.
+            iterations: largest number of steps; two or three are usually enough.
 
         Returns:
             Displacements (B, n_a), efforts (B, n_a), and whether they were found (B,).
@@ -218,12 +218,12 @@ class SurrogateModel(ABC):
         """Judge predictions at displacements (B, n_a) by their spread (B,).
 
         Returns:
-            The uncertainty of the effector [m] (B,): the spread, inflated to a bound that 95 % of the validation
-            errors keep; and whether the prediction is trusted (B,): body and displacement lie where the model was
-            trained, and the uncertainty is not larger than in 98 % of the validation states. A model without an
-            ensemble is judged by its domain alone. For a robot that can buckle (its card limits the growth), the
-            predicted `growth` must not exceed that of 98 % of the validation states either, because states that are
-            about to buckle were left out of the training.
+            The uncertainty of the effector [m] (B,): the spread, inflated to a bound on 95 % of the validation errors;
+            and whether the prediction is trusted (B,): body and displacement lie where the model was trained, and the
+            uncertainty is not larger than in 98 % of the validation states. A model without an ensemble is judged by
+            its domain alone. For a robot that can buckle (its card limits the growth), the predicted `growth` must not
+            exceed that of 98 % of the validation states either, because states that are about to buckle were left out
+            of the training.
         """
         domain = self.domain
         uncertainty = domain.inflation * spread
@@ -275,7 +275,7 @@ class SurrogateModel(ABC):
         return np.linalg.inv(self._compliance(context, displacement)[:, : self.count, : self.count])
 
     def _curvature(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        """Return the stiffness for judging growth; it is needed in every step and may be a cheaper estimate."""
+        """Return the stiffness that `growth` uses in every step; it may be a cheaper estimate."""
         return self._stiffness(context, displacement)
 
     @abstractmethod

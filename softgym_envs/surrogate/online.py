@@ -3,7 +3,7 @@
 Every member is trained a little more, on the new states and on *rehearsal* states: predictions of the member itself
 where the ensemble is trusted. The member therefore does not forget, and its original data are not needed. Members
 rehearse their own predictions, not those of the ensemble, and no member sees all new states, so that members still
-differ where nothing is known.
+differ where there are no data.
 
 Four rules decide which predictions are trusted afterwards; each errs on the safe side:
 
@@ -44,7 +44,7 @@ from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.training import make_targets, potential_loss, stack_members, unstack_members
 
-#: One in this many new states is withheld from all members, to check them.
+#: One in this many new states is withheld from all members and used to check them.
 WITHHELD_EVERY = 8
 
 #: Entries of a card about the training of the original weights, which no longer apply.
@@ -143,14 +143,14 @@ class StateStore:
         return sum(len(part["rest"]) - int(part["rest"].sum()) for part in self._parts)
 
     def add(self, part: Mapping[str, np.ndarray]) -> None:
-        """Add states, of which the first is that of their body at rest, and write their shard.
+        """Add states of one body, the first of them at rest, and write their shard.
 
         Raises:
             DataError: if a column has a wrong shape or values that are not finite, or the state at rest is missing.
         """
         checked = self._checked(part, "new states")
         if self.folder is not None:
-            # Names are unique and in order of time: several stores and processes may collect into one folder.
+            # Names are unique and sort by time: several stores and processes may collect into one folder.
             with atomic_write(self.folder / f"states_{time.time_ns():020d}_{uuid.uuid4().hex}.npz") as stream:
                 np.savez(stream, allow_pickle=False, **checked)
         self._parts.append(checked)
@@ -216,7 +216,8 @@ def fine_tune(
 ) -> Model:
     """Return a model that has also learned new states; the given one is not changed.
 
-    Half of every batch are new states, half rehearsal. The result depends only on the arguments.
+    Half of every batch consists of new states, the other half of rehearsal states. The result depends only on the
+    arguments.
 
     Args:
         model: an ensemble of potential networks whose card holds its domain.
@@ -242,7 +243,7 @@ def fine_tune(
     if len(new) == 0:
         raise DataError("none of the new states is stable: there is nothing to learn")
     states, scales = unstack_members(model.tensors)
-    # States are in the order of episodes; a permutation gives neighbours to different members.
+    # States are in the order of episodes; a permutation distributes neighbours over the members.
     turn = np.random.default_rng([seed, 1]).permutation(len(new))
     withheld = turn < (len(new) // WITHHELD_EVERY if len(new) >= 2 * WITHHELD_EVERY else 0)
     designs, displacement = rehearsal_states(model, rehearsal, seed)
@@ -308,7 +309,7 @@ def fine_tune(
 
 
 def is_tuned_from(model: Model, parent: Model, data: Mapping[str, np.ndarray], steps: int, seed: int) -> bool:
-    """Return whether `fine_tune` of ``parent`` with these options, on the first rows of some states, made a model."""
+    """Return whether a model is the result of `fine_tune(parent, ...)` on the first rows of ``data``."""
     online = model.card.get("online", {})
     rows = online.get("rows", 0)
     return bool(

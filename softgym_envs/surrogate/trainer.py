@@ -1,4 +1,4 @@
-"""Optimisation of the parts of a network with torch, each kept on disk when it is finished."""
+"""Optimisation of the parts of a network with torch; each finished part is kept on disk."""
 
 from __future__ import annotations
 

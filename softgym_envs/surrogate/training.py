@@ -29,7 +29,8 @@ from softgym_envs.surrogate.weight_files import card_of, load_model, save_model
 SPLITS = ("train", "validation", "test")
 
 BUCKLING = 0.01
-"""If more than this share of the training states is unstable, the model must detect them; below, it is not worth it."""
+"""If more than this share of the training states is unstable, the model must detect them; below, that is not worth its
+cost."""
 
 
 class SplitConfig(Config):
@@ -42,7 +43,7 @@ class SplitConfig(Config):
 
 
 class DataConfig(Config):
-    """Three separate datasets. Validation chooses the best step of a training; the test set is used once.
+    """Three separate datasets. The validation set chooses the best step of a training; the test set is used once.
 
     Seeds default to 0, 1 and 2.
     """
@@ -82,7 +83,7 @@ class DataConfig(Config):
 if TYPE_CHECKING:
     NetworkOptions = Any
 else:
-    #: Hyper-parameters of a network; ``kind`` says of which.
+    #: Hyper-parameters of the network that ``kind`` names.
     NetworkOptions = Annotated[
         functools.reduce(operator.or_, (network_module(kind).Options for kind in NETWORKS)),
         Field(discriminator="kind"),
@@ -139,10 +140,10 @@ def domain_of(
     """Return where a model may be trusted: the box of its training states, and its uncertainty on validation states.
 
     Returns:
-        ``displacement`` and ``design`` ranges; ``inflation``: factor from the spread of the ensemble to a bound that
-        95 % of the validation errors keep; ``limit``: uncertainty that 98 % of the validation states stay below [m];
-        and, if more than `BUCKLING` of the training states were left out, ``growth``: how many times softer than
-        at zero displacement the actuators of 98 % of the validation states are at most.
+        ``displacement`` and ``design`` ranges; ``inflation``: factor that turns the spread of the ensemble into a bound
+        on 95 % of the validation errors; ``limit``: uncertainty that 98 % of the validation states stay below [m]; and,
+        if more than `BUCKLING` of the training states were left out, ``growth``: how many times softer than at zero
+        displacement the actuators are, a bound on 98 % of the validation states.
     """
     stable = stable_rows(model.robot, training)
     training = {name: column[stable] for name, column in training.items()}
@@ -250,6 +251,6 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     with atomic_write(folder / "history.npz") as stream:
         np.savez_compressed(stream, allow_pickle=False, **history)
     save_resolved(folder, config)
-    load_model(folder, robot)  # what was written can be read
+    load_model(folder, robot)  # fail now if the written files cannot be read
     shutil.rmtree(folder / "parts", ignore_errors=True)
     return errors

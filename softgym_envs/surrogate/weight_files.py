@@ -19,7 +19,7 @@ FORMAT = 2
 
 
 def card_of(robot: Robot, network: str) -> dict[str, Any]:
-    """Return the entries of every card, by which `load_model` checks that weights fit a robot."""
+    """Return the entries that every card has and by which `load_model` checks that weights fit a robot."""
     return {
         "format": FORMAT,
         "network": network,
@@ -72,9 +72,7 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
     expected = card_of(robot, card["network"])
     for name in ("design_variables", "actuators"):
         if card.get(name) != expected[name]:
-            raise WeightsError(
-                f"weights '{folder.name}' are for other {name}: {card.get(name)}, needed {expected[name]}"
-            )
+            raise WeightsError(f"weights '{folder.name}' have {name} = {card.get(name)}, needed {expected[name]}")
     try:
         tensors = load_file(weights_path)
     except (SafetensorError, OSError, ValueError) as error:

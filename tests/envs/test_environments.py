@@ -282,7 +282,7 @@ def test_bad_actions_and_reset_options(backend):
         env.reset(options={"colour": "red"})
     with pytest.raises(ValueError, match="goal"):
         env.reset(options={"goal": [0.0, np.nan, 0.0]})
-    with pytest.raises(ValueError, match="one goal an episode, got a path of 5"):
+    with pytest.raises(ValueError, match="one goal per episode, got a path of 5"):
         env.reset(options={"goal": np.zeros((5, 3))})
     with pytest.raises(DesignError, match="length"):
         env.reset(options={"design": {"length": 1.0}})

@@ -1,1 +1,1 @@
-"""Tasks: one readable file each."""
+"""Tasks, one file each."""

@@ -38,8 +38,8 @@ def check_goals(goals: object, name: str, robot: Robot, leading: tuple[int, ...]
 
     Args:
         goals: points or paths of points.
-        name: of the option, for messages.
-        robot: whose goals they are.
+        name: name of the option, for messages.
+        robot: the robot that the goals are for.
         leading: expected leading shape.
 
     Raises:
@@ -77,7 +77,7 @@ def check_length(value: float, name: str, robot: Robot) -> float:
 
 
 class Task(ABC):
-    """What a robot has to do: draws goals, and rates how well a state fits the present goal.
+    """What a robot has to do: a task draws goals and rates how close a state is to the present goal.
 
     A task sees effectors, efforts and goals in SI units, always in batches, and never a backend. `TorchVectorEnv` calls
     a copy of the task whose arrays are tensors, so `sample`, `goals`, `distance` and `reward_terms` should compute with
@@ -85,14 +85,14 @@ class Task(ABC):
 
     Attributes:
         name: registry name; default the name of the class in lower case.
-        horizon: control steps that a path of goals covers; the last goal holds beyond it. 1 for a single goal.
-        max_episode_steps: time limit of an episode where none is given.
+        horizon: control steps that a path of goals covers; afterwards the last goal holds. 1 for a single goal.
+        max_episode_steps: time limit of an episode if none is given.
         robot: the robot.
         axes: coordinates of the effector that count, 1 or 0, shape (3,).
         success_distance: distance below which a goal counts as reached [m].
     """
 
-    #: Whether it applies forces to the effector, which not every backend can.
+    #: Whether the task applies forces to the effector, which not every backend supports.
     pushes = False
 
     name: str
@@ -131,7 +131,7 @@ class Task(ABC):
         """
         paths = check_goals(goals, "goal", self.robot, leading)
         if self.horizon == 1 and paths.shape[-2] > 1:
-            raise ValueError(f"task '{self.name}' has one goal an episode, got a path of {paths.shape[-2]}")
+            raise ValueError(f"task '{self.name}' has one goal per episode, got a path of {paths.shape[-2]}")
         return paths
 
     def begin(self, rng: np.random.Generator) -> None:  # noqa: B027 - optional

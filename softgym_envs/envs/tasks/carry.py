@@ -1,4 +1,4 @@
-"""Carry: move the effector as far to the right as it goes."""
+"""Carry: move the effector as far to the right as possible."""
 
 from __future__ import annotations
 

@@ -17,12 +17,12 @@ class Reach(Task):
 
     Args:
         robot: the robot.
-        goals: ``"reachable"`` draws goals within reach of the present body; an array of goals [m], shape (k, 3), is
-            drawn from whatever the body is, which makes bodies comparable.
+        goals: ``"reachable"`` draws goals within reach of the present body. Goals of an array [m], shape (k, 3), are
+            drawn whatever the body is, which makes bodies comparable.
         command_low: smallest command of a reachable goal, as a fraction of the actuator's range; 0.5 leads to goals
             deep in the workspace.
         spread: largest random shift of a reachable goal along each axis [m]; some goals then lie outside the workspace,
-            where an agent can only come near.
+            where an agent can only approach them.
     """
 
     name = "reach"
@@ -50,7 +50,7 @@ class Reach(Task):
         low = self.robot.lower + self.command_low * (high - self.robot.lower)
         goals = kinematics(rng.uniform(low, high, (count, len(low))))
         for _ in range(MAX_DRAWS):
-            lost = namespace(goals).isnan(goals[:, 0])  # commands without an equilibrium are drawn again
+            lost = namespace(goals).isnan(goals[:, 0])  # draw again for commands without an equilibrium
             if not lost.any():
                 return (goals + rng.uniform(-self.spread, self.spread, goals.shape))[:, None]
             goals[lost] = kinematics(rng.uniform(low, high, (count, len(low))))[lost]

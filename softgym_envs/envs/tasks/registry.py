@@ -27,8 +27,8 @@ def make_task(task: str | type[Task] | Task, robot: Robot, **options: object) ->
     """Return a task for a robot.
 
     Args:
-        task: registered name, path ``"module:class"``, class, or a task made for this robot, which is returned as it
-            is.
+        task: registered name, path ``"module:class"``, class, or a task made for this robot, which is returned
+            unchanged.
         robot: the robot.
         **options: options of the task, see its class.
 
@@ -45,7 +45,7 @@ def register_task(name_or_class: Any = None, task: str | type[Task] | None = Non
     """Make a task of your own available by name, to environments, studies and the command line.
 
     Used as a decorator (``@register_task`` or ``@register_task("press")``) or as a call (``register_task(Press)``,
-    ``register_task("press", "my_package.press:Press")``). As for `register_robot`, worker processes know the task by
+    ``register_task("press", "my_package.press:Press")``). As for `register_robot`, worker processes find the task by
     its path or by an entry point of the group ``softgym_envs.tasks``.
 
     Args:

@@ -11,7 +11,7 @@ from softgym_envs.surrogate.model import Context, SurrogateModel
 
 
 class DirectModel(SurrogateModel):
-    """A model whose outputs are those of `States.entries`. W is symmetric but not kept positive definite."""
+    """A model that predicts `States.entries`. W is symmetric but not always positive definite."""
 
     @abstractmethod
     def _entries(self, context: Context, displacement: np.ndarray) -> np.ndarray:

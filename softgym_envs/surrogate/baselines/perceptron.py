@@ -15,7 +15,7 @@ def layers(tensors: Mapping[str, np.ndarray], prefix: str) -> list[tuple[np.ndar
     found: list[tuple[np.ndarray, np.ndarray]] = []
     while f"{prefix}.{len(found)}.weight" in tensors:
         k = len(found)
-        # Stored as (out, in); used from the right, so transposed and contiguous.
+        # Stored as (out, in) but multiplied from the right, hence transposed and made contiguous.
         weight = np.ascontiguousarray(tensors[f"{prefix}.{k}.weight"].T, dtype=np.float32)
         found.append((weight, tensors[f"{prefix}.{k}.bias"].astype(np.float32)))
     if not found:
@@ -42,7 +42,7 @@ def perceptron(inputs: int, outputs: int, width: int, depth: int, activation: st
 
 
 def weights(net, prefix: str) -> dict[str, np.ndarray]:
-    """Return the tensors of a perceptron, named as `layers` reads them."""
+    """Return the tensors of a perceptron under the names that `layers` expects."""
     from torch import nn
 
     linear = [layer for layer in net if isinstance(layer, nn.Linear)]
@@ -54,7 +54,7 @@ def weights(net, prefix: str) -> dict[str, np.ndarray]:
 
 
 def mean_scale(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and scale of columns. A constant column has scale 0, so that its prediction is its mean."""
+    """Return mean and scale of columns. A constant column has scale 0, so its prediction is its mean."""
     scale = values.std(axis=0)
     return values.mean(axis=0), np.where(scale > 1e-12 * np.abs(values).max(), scale, 0.0)
 

@@ -122,7 +122,7 @@ class Model(SurrogateModel):
         effector = effector_0 + (W0_ea K0 + N_J(delta, p) - N_J(0, p)) delta
         W = C C^T,  C = C0 T,  T = lower triangular with diagonal exp(d) from  d = M(delta, p) - M(0, p)
 
-    Inputs and outputs are those of the thesis (eq. 4.2, 4.12); the structure is not from there.
+    Inputs and outputs are those of the thesis (eq. 4.2, 4.12); the structure is our own.
     """
 
     network = "residual"
@@ -134,7 +134,7 @@ class Model(SurrogateModel):
         self._rest = layers(tensors, "rest")
         self._rest_scale = tensors["rest_scale"].astype(float)
         self._rest_mean = tensors["rest_mean"].astype(float)
-        # The first layer of each is split into a part of the actuation and a part of the design.
+        # The first layer of each network is split into an actuation part and a design part.
         self._nets = {name: _ActuatedNet(layers(tensors, name), self.count) for name in ("state", "compliance")}
         self._state_scale = tensors["state_scale"].astype(np.float32)
         self._compliance_scale = tensors["compliance_scale"].astype(np.float32)
@@ -198,7 +198,7 @@ def train(
     import torch
 
     if not training.unloaded:
-        raise DataError("bodies have efforts or displacements at rest; use network.kind = 'potential'")
+        raise DataError("some bodies have efforts or displacements at rest; use network.kind = 'potential'")
     options = trainer.options
     count = len(robot.actuators)
     a, e = slice(0, count), slice(count, None)
@@ -208,7 +208,7 @@ def train(
 
     tensors: dict[str, np.ndarray] = {}
     histories: dict[str, History] = {}
-    # 1. The rest pair of a design.
+    # 1. Effector and compliance at rest, from the design.
     rest = {}
     for key, arrays in (("train", training), ("validation", validation)):
         rows = arrays.rest_rows

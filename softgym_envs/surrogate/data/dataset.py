@@ -26,7 +26,7 @@ _FORMAT = 2
 
 
 def _read_shard(path: Path, manifest: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Return a checked shard; without a feasible design it has no rows and its columns have no width."""
+    """Return a checked shard; if none of its designs is feasible, it has no rows and its columns have no width."""
     shard = read_npz(path, COLUMNS)
     if not all(column.dtype.kind in "fiub" and np.isfinite(column).all() for column in shard.values()):
         raise DataError(f"shard '{path}' holds values that are not finite")
@@ -40,7 +40,7 @@ def _read_shard(path: Path, manifest: dict[str, Any]) -> dict[str, np.ndarray]:
     size = widths["effort"] + widths["effector"]
     for name, width in (widths | {"compliance": size * (size + 1) // 2}).items():
         if shard[name].shape != (len(shard["rest"]), width):
-            raise DataError(f"shard '{path}': column '{name}' has shape {shard[name].shape}, not {width} wide")
+            raise DataError(f"shard '{path}': column '{name}' has shape {shard[name].shape}, expected width {width}")
     return shard
 
 
@@ -52,7 +52,7 @@ def _make_shard(robot: str, options: dict, plan: SamplingPlan, first: int, last:
     from threadpoolctl import threadpool_limits
 
     global _robot
-    if Path(path).exists():  # written by a worker that survived its killed run for a moment
+    if Path(path).exists():  # written by a worker that briefly outlived its killed run
         return
     with threadpool_limits(1):
         key = (robot, json.dumps(options))
@@ -132,7 +132,7 @@ def generate_dataset(
             "compliance": "upper triangle of W over actuators then effectors, row by row",
         },
     }
-    manifest = json.loads(json.dumps(manifest))  # as it will be read: with lists instead of tuples
+    manifest = json.loads(json.dumps(manifest))  # in the form in which it is read back: lists instead of tuples
     plan.designs(body, 0, 1)  # refuse an impossible plan before anything is written
     path = folder / "manifest.json"
     card = folder / "README.md"
@@ -186,7 +186,7 @@ def _make_missing(
 
 
 def _write_card(path: Path, manifest: dict[str, Any], data: dict[str, np.ndarray]) -> None:
-    """Write a description of the dataset, for readers."""
+    """Write the card that describes the dataset to people."""
     failed = infeasible = 0
     for shard in _shards(path.parent, manifest):
         with np.load(shard, allow_pickle=False) as content:

@@ -3,7 +3,8 @@
 The condensed model is a smooth function of the *reached* actuator displacements, whether cables pull or push. A slack
 cable reaches more than its command. So commands are first solved with real cables; then part of the slack states are
 solved again with the slack cables moved towards their commands by up to ``margin``, as if they could push. The network
-thus learns states on the boundary of slackness and a little beyond it, where a search for the boundary also goes.
+thus learns states on the boundary of slackness and a little beyond it, where the search for slack cables also evaluates
+it.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class SamplingPlan:
         sequence: one of `SEQUENCES`. Use ``"random"`` for validation and test.
         seed: seed of the sequence.
         margin: how far slack cables are moved back [fraction of the actuator range]; 1 samples cables that push.
-        vary: design variables that are drawn; default all that the surrogate learns, an empty tuple for none.
+        vary: design variables that are drawn, an empty tuple for none; default all that the surrogate learns.
         design: values of other variables; default their baseline.
         bounds: narrower bounds of drawn variables.
     """
@@ -202,7 +203,7 @@ def select_states(data: Mapping[str, np.ndarray], count: int, seed: int = 0) -> 
     if not isinstance(count, int | np.integer) or not 1 <= count <= rows:
         raise ValueError(f"count = {count} states cannot be chosen from {rows}; allowed: 1 to {rows}")
     actuators, effectors = data["effort"].shape[1], data["effector"].shape[1]
-    n = int(np.sqrt(2 * data["compliance"].shape[1]))  # larger than the sum of both if there are contacts
+    n = int(np.sqrt(2 * data["compliance"].shape[1]))  # more than actuators + effectors if there are contacts
     W = np.zeros((rows, n, n))
     W[:, *np.triu_indices(n)] = data["compliance"]
     W += np.triu(W, 1).swapaxes(1, 2)
@@ -213,7 +214,7 @@ def select_states(data: Mapping[str, np.ndarray], count: int, seed: int = 0) -> 
     spread[spread <= 1e-12 * np.abs(entries).max(axis=0)] = np.inf
     entries = (entries - entries.mean(axis=0)) / spread
     distinct, first = np.unique(entries, axis=0, return_index=True)
-    if len(distinct) <= count:  # k-means needs at least as many points as centres: take all, and copies
+    if len(distinct) <= count:  # k-means needs at least as many points as centres: take all points, and copies of some
         chosen, distance = first.tolist(), np.zeros(rows)
     else:
         with warnings.catch_warnings(action="ignore", category=UserWarning):  # empty clusters are handled below

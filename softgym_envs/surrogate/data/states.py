@@ -1,4 +1,4 @@
-"""Datasets as the matrices that networks are trained on."""
+"""Datasets as the matrices on which networks are trained."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class States:
         return np.concatenate([self.W[:, *np.triu_indices(self.W.shape[1])], free], axis=1)
 
     def rows(self, index: np.ndarray) -> States:
-        """Return some of the states. Each refers to itself as its state at rest: for networks that do not use those."""
+        """Return some of the states, for networks that ignore rest states: each is listed as its own state at rest."""
         parts = {f.name: getattr(self, f.name)[index] for f in fields(self)}
         parts["rest_of"] = np.arange(len(parts["effort"]))
         return States(**parts)

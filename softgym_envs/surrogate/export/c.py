@@ -18,8 +18,8 @@ from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.version import __version__
 
 #: Template of the functions, with ``${p}`` for the prefix and ``${P}`` for the same in capitals. The arithmetic is that
-#: of the compiled kernels; loops run over hidden units innermost, which compilers vectorise without permission to
-#: reorder sums.
+#: of the compiled kernels; the innermost loops run over hidden units, so compilers can vectorise them without being
+#: allowed to reorder sums.
 _FUNCTIONS = Path(__file__).with_name("functions.h.in")
 
 
@@ -47,8 +47,8 @@ def export_c(
 
     Raises:
         DesignError: for a malformed design.
-        ValueError: for another network, ending or number of members, a prefix that is not an identifier, or weights
-            that are not finite in single precision.
+        ValueError: for an unsupported network, file ending or number of members, a prefix that is not an identifier, or
+            weights that are not finite in single precision.
     """
     path = check_path(path, ".h")
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
@@ -93,8 +93,8 @@ def _comment(lines: Iterable[str]) -> str:
 def _constants(model: Model, design: Design) -> dict[str, tuple[str, np.ndarray]]:
     """Return the constants of the header: name to (shape in C, values).
 
-    Constant factors and terms are part of the weights: the share of each member in the mean, the scales of the
-    effector, and the half of the ramp's derivative.
+    Constant factors and terms are folded into the weights: the share of each member in the mean, the scales of the
+    effector, and the factor one half of the ramp's derivative.
     """
     n, e = model.count, model.effectors
     context = model.context(design.array[None])
@@ -181,8 +181,8 @@ def _header(model: Model, design: Design, name: str) -> str:
         "    free = (displacement, effector) - W (effort, 0).",
         "    Returns 0; or 1, and W unchanged, if an input is not finite or single precision is not sufficient.",
         "",
-        "All quantities are in SI units. The model was trained within the ranges of the actuators; outside it",
-        "extrapolates without clipping. The functions have no state and are safe to call from several threads.",
+        "All quantities are in SI units. The model was trained within the ranges of the actuators and extrapolates",
+        "outside them without clipping. The functions have no state and are safe to call from several threads.",
         "",
         "Compile with -O3 -fno-math-errno if you can: square roots become single instructions, with the same results.",
     ]

@@ -1,4 +1,4 @@
-"""What all exported formats share: which models can be exported, and how their actuators are described."""
+"""Shared by all export formats: which models can be exported, and how their actuators are described."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
 
 FORMATS = (".h", ".onnx")
-"""Endings of the files that can be written."""
+"""File endings of the export formats."""
 
 
 def check_path(path: str | Path, ending: str) -> Path:
-    """Return the path, or raise ``ValueError`` if it ends differently."""
+    """Return the path, or raise ``ValueError`` if it has another ending."""
     path = Path(path)
     if path.suffix != ending:
         raise ValueError(f"'{path}' must end with {ending}")
@@ -25,7 +25,7 @@ def exportable(model: SurrogateModel, members: int | None) -> Model:
     """Return the model with its first members only.
 
     Raises:
-        ValueError: for another network, an energy that is not convex, or a wrong number of members.
+        ValueError: for an unsupported network, an energy that is not convex, or a wrong number of members.
     """
     if not isinstance(model, Model):
         raise ValueError(f"a model of network '{model.network}' cannot be exported; allowed: 'potential'")

@@ -15,7 +15,7 @@ from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.version import __version__
 
 OPSET = 17
-"""Version of the operators: old enough for runtimes of embedded boards, and all that the graph needs."""
+"""Version of the operator set: old enough for the runtimes of embedded boards, and sufficient for the graph."""
 
 _NAMES = {"inputs": ("design", "displacement"), "outputs": ("effort", "effector", "W")}
 
@@ -36,8 +36,8 @@ def export_onnx(model: SurrogateModel, path: str | Path, *, members: int | None 
         The path.
 
     Raises:
-        ValueError: for another network, ending or number of members, if ``onnx`` is not installed, or for values
-            that are not finite in single precision.
+        ValueError: for an unsupported network, file ending or number of members, if ``onnx`` is not installed, or for
+            values that are not finite in single precision.
     """
     path = check_path(path, ".onnx")
     potential = exportable(model, members)
@@ -54,7 +54,7 @@ def export_onnx(model: SurrogateModel, path: str | Path, *, members: int | None 
 
 
 def _traced(model: Model) -> bytes:
-    """Return the graph of a model as torch writes it."""
+    """Return the graph of a model as torch exports it."""
     import torch
 
     from softgym_envs.surrogate.potential.torch import TorchModel
@@ -67,9 +67,9 @@ def _traced(model: Model) -> bytes:
     names = [*_NAMES["inputs"], *_NAMES["outputs"]]
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         file = Path(folder) / "model.onnx"
-        # The exporter by tracing is deprecated. Its successor (``dynamo=True``) computes the same with three more
-        # packages, operators of version 18 and twenty times the time. Tracing also warns of sizes that become
-        # constants: none of them is that of the batch.
+        # The tracing exporter is deprecated, but its successor (``dynamo=True``) needs three more packages, operator
+        # set 18 and twenty times as long for the same result. Tracing also warns about sizes that become constants; the
+        # batch size is not one of them.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             net,
@@ -85,9 +85,9 @@ def _traced(model: Model) -> bytes:
 
 
 def _eliminate(matrix: Any) -> Any:
-    """Invert symmetric positive definite matrices (B, n, n) of order one: Gauss-Jordan, no pivoting.
+    """Invert symmetric positive definite matrices (B, n, n) with entries of order one: Gauss-Jordan, no pivoting.
 
-    ONNX has no inverse. Each step eliminates one column of (A | 1) by a rank-one update of all of it.
+    ONNX has no inverse. Each step eliminates one column of (A | 1) by a rank-one update of the whole matrix.
     """
     import torch
 
@@ -103,7 +103,7 @@ def _eliminate(matrix: Any) -> Any:
 
 
 def _describe(graph: Any, model: Model, onnx: Any) -> None:
-    """Write into a graph what it is for."""
+    """Add the description and the metadata to a graph."""
     robot = model.robot
     graph.producer_name, graph.producer_version = "softgym-envs", __version__
     graph.graph.name = robot.weights_name

@@ -1,4 +1,4 @@
-"""Compiled kernels of the potential networks: many rows, many members, no temporary arrays per row."""
+"""Compiled kernels of the potential networks: they evaluate many rows and members without temporary arrays per row."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROWS_PER_BLOCK = 48
 def _multiply(h, weights, z, rows):
     """``z += h @ weights`` for the first ``rows`` rows, four at a time with four inputs at a time.
 
-    Sixteen products for each load and store of z keep the arithmetic busy, not the memory.
+    With sixteen products for each load and store of z, arithmetic limits the speed rather than memory.
     """
     inputs, width = weights.shape
     whole = inputs - inputs % 4
@@ -120,7 +120,7 @@ def _gradients(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, ef
 
 @njit(**_FAST)
 def _curvatures(index, slot, A1, A2, PT, quadratic, kept, hessian):
-    """Fill the rows ``index`` of ``hessian`` (rows, n, n) of a block, from what `_gradients` ``kept``."""
+    """Fill the rows ``index`` of ``hessian`` (rows, n, n) of a block, from what `_gradients` stored in ``kept``."""
     members, n, w = A1.shape
     share = np.float32(1.0 / members)
     tangents = len(index) * n
@@ -294,7 +294,7 @@ def jacobians(u, slot, B1, B2, V, H, d1, d2, slope, held0, jacobian, held):
 
 @njit(cache=True, error_model="numpy")
 def _invert(a):
-    """Invert a positive definite matrix in place (Gauss and Jordan; no pivoting needed); False if it is not one."""
+    """Invert a positive definite matrix in place (Gauss-Jordan without pivoting); return False if it is not one."""
     n = len(a)
     for p in range(n):
         if not a[p, p] > 0.0:
@@ -313,7 +313,7 @@ def _invert(a):
 
 
 def _compile_search(source: int) -> Any:
-    """Compile `search` for the file of `solve_row` with the checksum ``source``.
+    """Compile `search`; ``source`` is the checksum of the file of `solve_row`.
 
     The code of `solve_row` becomes part of the compiled search, but numba's cache notices changes of this file only. It
     also compares the values of free variables: the checksum is one, so an edit of that file recompiles the search.
@@ -326,9 +326,9 @@ def _compile_search(source: int) -> Any:
     ):  # fmt: skip
         """Newton's method on the complementarity problem of each row; see `SurrogateModel.search`.
 
-        The steps use the curvature of the first member alone, whose quadratic part is ``first``. One row in five needs
-        one step more for it (cable trunk; up to one in four elsewhere), which costs less than the curvature of all
-        members: that took half of the time.
+        The steps use the curvature of the first member alone, whose quadratic part is ``first``. One row in five
+        therefore needs one more step (cable trunk; up to one in four elsewhere). That costs less than the curvature of
+        all members, which took half of the time.
 
         The rows of a block take their steps together, so that one evaluation of the network serves all rows that move.
         """
@@ -341,7 +341,7 @@ def _compile_search(source: int) -> Any:
         W, gap, taut = np.empty((size, n, n)), np.empty(n), np.empty(n)
         work, index = np.empty((n, n + 1)), np.empty(n, np.int64)
         for start in range(0, len(target), ROWS_PER_BLOCK):
-            # Of this block: displacements, efforts, and the rows that still move.
+            # Displacements, efforts, and the rows of this block that still move.
             d, e = displacement[start : start + ROWS_PER_BLOCK], effort[start : start + ROWS_PER_BLOCK]
             count = len(d)
             for row in range(count):
@@ -395,7 +395,7 @@ def _compile_search(source: int) -> Any:
                         step = 0.0
                         for j in range(n):
                             step += W[row, i, j] * (taut[j] - e[row, j])
-                        # Far steps are cut: the network is only asked where its neighbourhood of known states reaches.
+                        # Long steps are cut, so that the network is evaluated near known states only.
                         step = min(max(step, -limit[i]), limit[i])
                         d[row, i] += step
                         far = far or abs(step) > tolerance[i]
@@ -403,7 +403,7 @@ def _compile_search(source: int) -> Any:
                         moving[left] = row
                         left += 1
                         continue
-                    # A last step below the tolerance is taken without asking the model again.
+                    # A last step below the tolerance is taken without evaluating the model again.
                     converged[start + row] = True
                     for i in range(n):
                         e[row, i] = taut[i]

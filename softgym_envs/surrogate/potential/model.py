@@ -23,7 +23,7 @@ derivative, but positive definite only where the body is stable.
 
 Every FEM state teaches values and first derivatives of efforts and effectors (through W_aa and W_ea), so few states are
 needed. The layers of the design are separate from those of the actuation and are evaluated once per body. An ensemble
-is the mean of its members' ``Phi``, and so a potential again; the spread of the members is its uncertainty.
+is the mean of its members' ``Phi``, which is a potential as well; the spread of the members is its uncertainty.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Model(SurrogateModel):
 
     Attributes:
         members: how many members are used.
-        trained: how many the spread was calibrated for, at least 2; with fewer in use the spread is infinite.
+        trained: how many members the spread was calibrated for, at least 2; if fewer are used, the spread is infinite.
         middle: middle of the actuators' ranges, shape (n_a,).
         half_range: half of the ranges, shape (n_a,); networks see displacements scaled by both to [-1, 1].
         energy_scale: unit of the networks' energy [J].
@@ -104,7 +104,7 @@ class Model(SurrogateModel):
         rest = tensors["rest"].astype(np.float32) if "rest" in tensors else None
         self._rest = rest
         if rest is not None and rest.shape != (self.count,):
-            raise ValueError(f"the rest has shape {rest.shape}; the robot has {self.count} actuators")
+            raise ValueError(f"'rest' has shape {rest.shape}; the robot has {self.count} actuators")
 
     def _prepare(self, design: np.ndarray) -> dict[str, np.ndarray]:
         rows, n, e, w, M = len(design), self.count, self.effectors, self.width, self.members
@@ -175,7 +175,7 @@ class Model(SurrogateModel):
         return self._hessian(context, displacement, self._energy, "quadratic")
 
     def _curvature(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        """Stiffness of the first member alone, in a fifth of the time: members agree that actuators become soft."""
+        """Stiffness of the first member alone, in a fifth of the time: members agree where actuators become soft."""
         return self._hessian(context, displacement, [part[:1] for part in self._energy], "first")
 
     def _hessian(

@@ -21,12 +21,12 @@ Coefficients = dict[str, Tensor]
 class PotentialEnsemble:
     """The members of an ensemble in one batch, in scaled quantities.
 
-    Constant factors are part of the weights: the halves of the ramp and its derivatives, and each member's share of the
-    mean. Bodies can be as many as rows of displacements, or one for all rows.
+    Constant factors are part of the weights: the factors one half of the ramp and its derivatives, and each member's
+    share of the mean. There is one body for each row of displacements, or one body for all rows.
 
     Args:
         weights: weights of the members by name, with leading dimension M, as in `Model.tensors`.
-        rest: scaled displacement without effort, shape (n,), or None where the network learns it.
+        rest: scaled displacement at which the effort is zero, shape (n,), or None where it is learned.
         convex: the energy is convex; otherwise its quadratic part may have any sign.
     """
 
@@ -119,7 +119,7 @@ class PotentialEnsemble:
         index, diagonal = self._triangles[size]
         if positive:
             entries = torch.where(diagonal, torch.exp(entries), entries)
-        # What lies above the diagonal reads the zero that is appended.
+        # Entries above the diagonal read the appended zero.
         filled = nn.functional.pad(entries, (0, 1)).index_select(2, index)
         return filled.reshape(self.members, -1, size, size)
 
@@ -189,7 +189,7 @@ class PotentialEnsemble:
 
 
 def _triangle(size: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Where each entry of a matrix stands in the list of its lower triangle, and which of the list are diagonal."""
+    """Return the index of each matrix entry in the list of its lower triangle, and which of the list are diagonal."""
     rows, columns = np.tril_indices(size)
     index = np.full(size * size, len(rows))
     index[rows * size + columns] = np.arange(len(rows))
@@ -235,7 +235,7 @@ class PotentialNet(nn.Module):
         self.register_buffer("rest", None if rest is None else torch.as_tensor(rest, dtype=torch.float32))
 
     def forward(self, design: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return gradient and Hessian of the energy, effector, its Jacobian, and the factor of the held compliance.
+        """Return gradient and Hessian of the energy, the effector, its Jacobian, and the factor of the held compliance.
 
         Args:
             design: features (B, d).
@@ -253,8 +253,8 @@ class TorchModel(nn.Module):
 
     Args:
         model: a trained ensemble.
-        dtype: of all inputs and results.
-        inverse: inverts symmetric matrices of order one, (B, n, n).
+        dtype: type of all inputs and results.
+        inverse: function that inverts symmetric matrices (B, n, n) with entries of order one.
 
     Raises:
         ValueError: for another kind of network: its outputs are not exact derivatives of each other.

@@ -138,7 +138,7 @@ class Targets(NamedTuple):
 
 
 def make_targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) -> Targets:
-    """Return states as a network is trained on them."""
+    """Return the scaled inputs and targets that a network is trained on."""
     import torch
 
     n = states.effort.shape[1]
@@ -153,7 +153,8 @@ def make_targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) ->
     size = W_ee.shape[1]
     C = W_ee - J @ states.W[:, a, c] / scales["held"]
     W_ee = W_ee[metric_of]
-    # Where nothing can move while the actuators are held, C is 0 up to rounding; its factor needs a little more.
+    # Where nothing can move while the actuators are held, C is 0 up to rounding, and a Cholesky factor needs a little
+    # more.
     floor = 1e-6 * np.einsum("bii->b", W_ee)[:, None, None] / size
     C = 0.5 * (C + C.swapaxes(1, 2)) + 2.0 * size * floor * np.eye(size)
     whitening = np.linalg.inv(np.linalg.cholesky(C + 0.03 * W_ee))
