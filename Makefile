@@ -109,7 +109,7 @@ lint: $(VENV)/.stamp
 types: $(VENV)/.stamp
 	$(BIN)/mypy
 
-# Freeze the newest versions that pyproject.toml allows, below the comment at the head of the present lock. The CUDA
+# Freeze the newest versions that pyproject.toml allows, and keep the comment at the head of the present lock. The CUDA
 # packages of torch are left out: pip adds them if the installed build of torch requires them.
 lock:
 	rm -rf build/lock
