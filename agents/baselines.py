@@ -20,7 +20,8 @@ Agent = Callable[[np.ndarray, Any], np.ndarray]
 
 PI_GAINS = (0.1, 0.3)
 """Proportional and integral gain per control step. The plant responds to a correction within one step, so the integral
-alone leaves 0.7^k of an error after k steps. The gains in the thesis (0.01 and 0.002) are for many calls per goal."""
+alone leaves 0.7^k of an error after k steps. The gains of the thesis (0.01 and 0.002) are meant for many calls per
+goal."""
 
 
 def make_controller(robot: Robot, task: Task) -> InverseQP:
@@ -35,7 +36,7 @@ class InverseQPAgent:
         self._controllers: WeakKeyDictionary[Any, InverseQP] = WeakKeyDictionary()
 
     def __call__(self, observation: Any, env: Any) -> np.ndarray:
-        """Return the action in the state of ``env``, shape (n_a,); it holds the command if the QP finds no other.
+        """Return the action in the state of ``env``, shape (n_a,); the command is held if the QP finds no solution.
 
         A state in which no actuator is commanded begins an episode.
         """
@@ -56,7 +57,7 @@ class InverseQPAgent:
 
 
 class StaticQPAgent(InverseQPAgent):
-    """Inverse QP on the static equilibrium under the present command, which disregards momentum."""
+    """Inverse QP on the static equilibrium under the present command, which ignores momentum."""
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
         still = env.backend.probe(present) if env.backend.moving else env.state
@@ -66,8 +67,8 @@ class StaticQPAgent(InverseQPAgent):
 class ModelQPAgent(InverseQPAgent):
     """Inverse QP on the surrogate, which only sees the commands: open loop, or closed by a PI controller.
 
-    On FEM, as on a physical robot, the model then differs from the plant. For robots without a surrogate, the static
-    equilibrium of the plant replaces it.
+    On FEM, as on a physical robot, the model then differs from the plant. For robots without a surrogate, it is
+    replaced by the static equilibrium of the plant.
 
     Args:
         closed: shift the goal by a PI controller on the measured effector (thesis, algorithm 2).
@@ -136,8 +137,8 @@ def make_baseline(name: str, seed: int = 0) -> Agent:
     Args:
         name: ``"qp"``: inverse QP on the condensed model of the plant's present state, in dynamics of its next time
             step; ``"qp_static"``: on the static equilibrium under the present command, without momentum;
-            ``"qp_model"``: on the surrogate, whatever the plant is; ``"qp_pi"``: that with a PI controller on the
-            measured effector; ``"random"``: uniform actions.
+            ``"qp_model"``: on the surrogate, whatever the plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI
+            controller on the measured effector; ``"random"``: uniform actions.
         seed: seed of the random agent.
 
     Raises:

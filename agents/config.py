@@ -26,7 +26,7 @@ class EnvironmentConfig(Config):
     """An environment by its ID, or a robot with a task, and the options of ``gymnasium.make``.
 
     A robot and a task are registered names or paths such as ``my_module:MyRobot``; in Python they may be classes, which
-    are stored as their paths. With ``residual_scale`` the agent corrects the inverse QP: the environment is given
+    are stored as their paths. With ``residual_scale`` the agent corrects the inverse QP: the executed action is
     ``clip(QP action + residual_scale * agent action, -1, 1)``.
     """
 
@@ -59,7 +59,7 @@ class EnvironmentConfig(Config):
         if self.id is None and (self.robot is None or self.task is None):
             raise ValueError("an environment needs an id, or a robot and a task")
         if self.id is not None and (self.robot is not None or self.task is not None):
-            raise ValueError("an environment has an id, or a robot and a task, not both")
+            raise ValueError("an environment takes an id, or a robot and a task, not both")
         row = self.row  # checks the ID, or the task
         if "backend" not in self.model_fields_set:
             backend = row.backend or default_backend(self.make_robot(), self.backend_options)
@@ -98,7 +98,7 @@ class EnvironmentConfig(Config):
         return (self.row.backend or default_backend(self.make_robot(), {})) == "surrogate"
 
     def on(self, backend: str) -> EnvironmentConfig:
-        """Return the same environment on another backend, without the options of the present one."""
+        """Return the same environment on another backend, without the options of the present backend."""
         options = self.backend_options if backend == self.backend else {}
         return self.model_copy(update={"backend": backend, "backend_options": options})
 
@@ -106,7 +106,7 @@ class EnvironmentConfig(Config):
         """Return the robot.
 
         Raises:
-            ValueError: for an unknown robot or a wrong option of it.
+            ValueError: for an unknown robot or a wrong robot option.
         """
         row = self.row
         if row.robot is None:
@@ -220,7 +220,7 @@ class TrainConfig(Config):
 
 def check_hindsight(sac: SACConfig, environment: EnvironmentConfig) -> None:
     """Raise ValueError for hindsight goals with a residual agent."""
-    # The stored actions contain the QP's action for the original goal, so they do not fit another goal.
+    # The stored actions include the QP's action for the original goal, so they do not fit another goal.
     if sac.hindsight and environment.residual_scale:
         raise ValueError(
             f"sac.hindsight = {sac.hindsight:g} cannot be combined with environment.residual_scale = "

@@ -26,7 +26,7 @@ class Evaluation:
             error.
         returns: sum of rewards, shape (n,).
         successes: whether each episode ended within the task's success distance, shape (n,); in an average of several
-            evaluations the share that did.
+            evaluations, the share that did.
         efforts: mean actuator effort over the episode [N, ...], shape (n,).
         steps: environment steps.
         seconds: wall-clock time [s].
@@ -78,7 +78,7 @@ class Evaluation:
 
     @classmethod
     def merge(cls, parts: Sequence[Evaluation]) -> Evaluation:
-        """Join evaluations on different goals into one on all of them; costs add up."""
+        """Join evaluations on different goals into one evaluation on all of them; costs add up."""
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _PER_GOAL}
         return cls(**columns, **_total_cost(parts))
 
@@ -146,7 +146,7 @@ def _total_cost(evaluations: Sequence[Evaluation]) -> _Cost:
 def sample_goals(
     environment: EnvironmentConfig, count: int, seed: int, design: dict[str, float] | None = None
 ) -> np.ndarray:
-    """Draw goals [m] (count, p, 3) as the task of an environment does, for a body; default the environment's."""
+    """Draw goals [m] (count, p, 3) as the task of an environment does, for a body (default the environment's)."""
     env = environment.make()
     try:
         paths = []

@@ -22,7 +22,7 @@ OPSET, IR_VERSION = 17, 8
 
 
 def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
-    """Write a policy as an ONNX graph with the scaling of its observations inside, atomically.
+    """Write a policy as an ONNX graph that includes the scaling of its observations, atomically.
 
     Inputs, all float32 and in SI units, for any number B of states at once: ``command``, ``displacement`` and
     ``effort`` of the actuators (B, n_a), ``effector`` and ``goal`` [m] (B, 3), in dynamics the effector's ``velocity``
@@ -40,7 +40,7 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
 
     Raises:
         WeightsError: if the policy cannot be read.
-        ValueError: for another ending, or if ``onnx`` is not installed.
+        ValueError: for another file ending, or if ``onnx`` is not installed.
     """
     path = Path(path)
     if path.suffix != ".onnx":
@@ -80,7 +80,7 @@ class _Nodes:
         return name
 
     def squashed(self, value: str) -> str:
-        """Return x / (1 + |x|)."""
+        """Return the output of x / (1 + |x|)."""
         return self("Div", value, self("Add", self("Abs", value), 1.0))
 
 
@@ -157,7 +157,7 @@ def _unit_design(spaces: AgentSpaces, g: _Nodes) -> str:
     low, high = (np.where(is_log, np.log(np.where(is_log, end, 1.0)), end) for end in (low, high))
     shown = "design"
     if is_log.any():
-        # Both branches are evaluated; the logarithm only ever sees positive numbers.
+        # Both branches are evaluated, and the logarithm must only get positive numbers.
         inside = g("Log", g("Max", "design", 1e-30))
         mixed = g("Mul", inside, is_log.astype(float))
         shown = g("Add", mixed, g("Mul", "design", (~is_log).astype(float)))

@@ -1,4 +1,4 @@
-"""Hindsight experience replay: an episode that missed its goal shows how to reach the places that it visited."""
+"""Hindsight experience replay: an episode that missed its goal shows how to reach the positions that it visited."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class HindsightBuffer(ReplayBuffer):
     Args:
         *args: as for `ReplayBuffer`.
         spaces: layout of the observations.
-        task: computes rewards; its goal must not move during an episode.
+        task: the task that computes rewards; its goal must not move during an episode.
         share: share of samples with another goal.
         **kwargs: as for `ReplayBuffer`.
 
@@ -38,7 +38,7 @@ class HindsightBuffer(ReplayBuffer):
     def __init__(self, *args: Any, spaces: AgentSpaces, task: Task, share: float, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if task.horizon != 1:
-            raise ValueError(f"hindsight = {share} needs a fixed goal, task '{task.name}' moves it; allowed: 0")
+            raise ValueError(f"hindsight = {share} needs a fixed goal, but task '{task.name}' moves it; allowed: 0")
         self.spaces, self.task, self.share = spaces, task, share
         self.ends = np.full((self.buffer_size, self.n_envs), -1, dtype=np.int64)
 
@@ -83,7 +83,7 @@ class HindsightBuffer(ReplayBuffer):
         following = self.next_observations[batch_inds, columns]
         rewards = self.rewards[batch_inds, columns].copy()
 
-        # A reward of exactly zero marks a step without an equilibrium, which no goal improves.
+        # A reward of exactly zero marks a step without an equilibrium, which is zero for every goal.
         chosen = np.flatnonzero((draws[1] < self.share) & (rewards != 0.0))
         goals = self.spaces.observed_effector(self.next_observations[later[chosen], columns[chosen]])
         observations[chosen] = self.spaces.with_goal(observations[chosen], goals)

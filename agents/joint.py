@@ -1,8 +1,8 @@
-"""Design proposers: bodies and policy that learn together in one training.
+"""Design proposers: body and policy are optimised together in one training.
 
 A policy that observes the body is trained on many bodies, and a proposer draws them. `CriticProposer` prefers bodies
-that the critic values (Luck, Ben Amor and Calandra 2019, arXiv:1911.06832); `DistributionProposer` moves a mixture of
-Gaussians over bodies towards larger returns (Schaff et al. 2019, arXiv:1801.01432).
+with a high value of the critic (Luck, Ben Amor and Calandra 2019, arXiv:1911.06832); `DistributionProposer` moves a
+mixture of Gaussians over bodies towards larger returns (Schaff et al. 2019, arXiv:1801.01432).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class DesignProposer(ABC):
     """
 
     def attach(self, model: SAC, config: TrainConfig, folder: Path) -> None:
-        """Draw the bodies of a training from now on, continuing where an interrupted run stopped.
+        """Start drawing the bodies of a training, continuing where an interrupted run stopped.
 
         Raises:
             ValueError: if the environment does not sample bodies.
@@ -83,7 +83,7 @@ class DesignProposer(ABC):
 
 
 class CriticProposer(DesignProposer):
-    """Proposes bodies whose first states the critic values most.
+    """Proposes bodies whose first states have the largest value of the critic.
 
     A share of the episodes explores with uniformly drawn bodies; the others use the best bodies of a cross-entropy
     search on the critic's value. The search takes no environment steps and depends on the weights alone, so a resumed
@@ -141,7 +141,7 @@ class DistributionProposer(DesignProposer):
     Args:
         components: number of Gaussians.
         batch: episodes per step of the mixture.
-        warmup: environment steps with a uniform draw, in which the policy learns its first motions.
+        warmup: environment steps with uniform draws, in which the policy learns its first motions.
         rate: step size of the means, relative to the reference.
         smallest: lower bound of the standard deviations, in unit coordinates.
     """
@@ -214,7 +214,7 @@ class DistributionProposer(DesignProposer):
         log_density = -0.5 * (scaled**2).sum(axis=2) - np.log(self.spreads).sum(axis=1) + np.log(weights)
         share = np.exp(log_density - log_density.max(axis=1, keepdims=True))
         share /= share.sum(axis=1, keepdims=True)
-        pull = utility[:, None] * share / weights  # of each body on each component
+        pull = utility[:, None] * share / weights  # pull of each body on each component
         rate_spread = (3.0 + np.log(k)) / (5.0 * np.sqrt(k))
         self.means = np.clip(
             self.means + self.rate * self.spreads * np.einsum("bc,bck->ck", pull, scaled).clip(-1.0, 1.0), -1.0, 1.0
@@ -239,7 +239,7 @@ PROPOSERS: dict[str, type[DesignProposer]] = {"critic": CriticProposer, "distrib
 def critic_values(
     model: SAC, environment: EnvironmentConfig, names: tuple[str, ...], bodies: np.ndarray, goals: int
 ) -> np.ndarray:
-    """Return the mean over goals of the smaller critic's value of the first state of an episode, under the mean action.
+    """Return the mean over goals of the smaller critic value of an episode's first state, under the mean action.
 
     Args:
         model: policy and critics that observe the body.

@@ -37,7 +37,7 @@ def policy_path(policy: str | Path) -> Path:
 
 
 def save_policy(path: Path, tensors: dict[str, np.ndarray], card: dict[str, Any]) -> None:
-    """Write ``policy.safetensors`` and beside it its JSON card, whose ``config`` is that of the training."""
+    """Write ``policy.safetensors`` and its JSON card next to it; the card's ``config`` is that of the training."""
     from safetensors.numpy import save
 
     with atomic_write(path) as stream:
@@ -68,9 +68,9 @@ class Policy:
         path: ``policy.safetensors``, with its card beside it, or the name of a shipped policy.
 
     Attributes:
-        path: its file.
-        card: its JSON card.
-        environment: the environment of the training.
+        path: file of the policy.
+        card: JSON card of the policy.
+        environment: the environment of its training.
         hidden: weights (d, w) and biases (w,) of each hidden layer.
         mean: weights and biases of the last layer.
         observation_size: number of inputs.
@@ -108,12 +108,12 @@ class Policy:
         self.observation_size = int((self.hidden[0][0] if self.hidden else self.mean[0]).shape[0])
 
     def check_environment(self, environment: EnvironmentConfig) -> None:
-        """Refuse an environment in which observations or actions have another meaning than in the training.
+        """Refuse an environment in which observations or actions have another meaning than in training.
 
         Backend, body, goals and ID may differ if robot and task are the same.
 
         Raises:
-            ConfigError: with the key, its value and that of the policy.
+            ConfigError: with the key, its value and the policy's value.
         """
         own = _meaning(self.environment)
         for key, (meaning, shown) in _meaning(environment).items():
@@ -142,7 +142,7 @@ class Policy:
 
 
 def _meaning(environment: EnvironmentConfig) -> dict[str, tuple[Any, object]]:
-    """Return what observations and actions mean: for each key what must be equal, and how a message shows it."""
+    """Return what defines observations and actions: for each key, the value to compare and the text for a message."""
     row, robot = environment.row, environment.make_robot()
     shown = design_names(robot.design_space, environment.design_in_observation)
     variables = [robot.design_space[name] for name in shown]

@@ -104,7 +104,7 @@ class StoredRuns:
 
     @property
     def follows(self) -> bool:
-        """Whether the goal moves along a path."""
+        """Whether the goal of the task moves along a path."""
         return self.environment.task_class.horizon > 1
 
     @property

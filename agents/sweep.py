@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from agents.results import Evaluations
 
 TEST_SEED = 2_000_003
-"""Seed of the goals that are used neither in trainings nor to choose policies."""
+"""Seed of the goals that are used neither for training nor for choosing policies."""
 
 
 def unseen_goals(environment: EnvironmentConfig, count: int) -> tuple[list[dict[str, float]] | None, np.ndarray]:
-    """Return bodies (None: the one body) and goals [m] (n, p, 3) of the final evaluation; n = 1 if all are equal."""
+    """Return bodies (None: the single body) and goals [m] (n, p, 3) of the final evaluation; n = 1 if all are equal."""
     from agents.evaluation import evaluation_set
 
     designs, goals = evaluation_set(environment, count, TEST_SEED)
@@ -48,7 +48,7 @@ def unseen_goals(environment: EnvironmentConfig, count: int) -> tuple[list[dict[
 def _evaluations(
     environment: EnvironmentConfig, agents: dict[str, str | Path], goals: int, fem_goals: int
 ) -> Evaluations:
-    """Evaluate agents on the environment's backend and on FEM: ``{backend: {agent: evaluation}}``, SI."""
+    """Evaluate agents on the environment's backend and on FEM: ``{backend: {agent: evaluation}}``, in SI units."""
     from agents.evaluation import evaluate
 
     counts = _counts(environment, goals, fem_goals)
@@ -87,16 +87,16 @@ def _short(values: np.ndarray) -> list[float]:
 
 
 def _finished(result: Path, config: TrainConfig, goals: int, fem_goals: int) -> bool:
-    """Whether a result is there, of this configuration and on so many goals.
+    """Whether the result of this configuration on these numbers of goals exists.
 
     Args:
-        result: ``seed<k>.json``, or ``baselines.json``, for which only the environment of ``config`` counts.
+        result: ``seed<k>.json``, or ``baselines.json``, for which only the environment of ``config`` is compared.
         config: the requested configuration, with its seed.
         goals: unseen goals on the environment's backend.
         fem_goals: unseen goals on FEM.
 
     Raises:
-        DataError: if there is another result, or it cannot be read.
+        DataError: if the file holds another result or cannot be read.
     """
     if not result.exists():
         return False
@@ -174,7 +174,7 @@ def evaluate_baselines(path: Path, folder: Path, goals: int, fem_goals: int) -> 
 
 
 def _attempt(function: Callable[..., Path], arguments: tuple[Any, ...]) -> tuple[str, str | None]:
-    """Run a job and return its label and traceback, so that the error of one job does not end the others."""
+    """Run a job and return its label and traceback, so that an error in one job does not stop the others."""
     label = " ".join(str(a) for a in arguments[:2] if not isinstance(a, Path)) or "baselines"
     label = f"{arguments[0].stem} {label}"
     try:
@@ -210,13 +210,15 @@ def sweep(
         fem_goals: number of unseen goals on FEM; 0 skips FEM for environments on the surrogate.
 
     Raises:
-        ConfigError: before anything runs, if a file is not valid or an environment would not be evaluated.
+        ConfigError: before anything runs, if a file is invalid or an environment would not be evaluated.
         DataError: before anything runs, if the folder holds results of another configuration or number of goals.
     """
     loaded = {path: load_config(path, TrainConfig) for path in configs}
     for path, config in loaded.items():
         if config.environment.backend == "fem" and fem_goals < 1:
-            raise ConfigError(f"fem_goals = {fem_goals}, but the environment of '{path}' is on FEM; allowed: 1 or more")
+            raise ConfigError(
+                f"fem_goals = {fem_goals}, but the environment of '{path}' runs on FEM; allowed: 1 or more"
+            )
     jobs: list[tuple[float, Callable[..., Path], tuple[Any, ...]]] = []
     for path, config in loaded.items():
         place = folder / "results" / path.stem
@@ -253,7 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="number of unseen goals on FEM; 0 skips FEM for environments on the surrogate",
     )
     given = parser.parse_args(arguments)
-    # Worker processes, which start later, read these variables.
+    # Worker processes read these variables when they start.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
     if find_spec("platformdirs") is None:

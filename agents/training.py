@@ -54,16 +54,16 @@ def train(
     Writes ``policy.safetensors`` (actor and critics) with its card, ``curve.csv``, and TensorBoard logs if TensorBoard
     is installed. Until the end, ``checkpoint.safetensors`` holds weights, optimiser moments, replay buffer and random
     states, so that a resumed training gives the same policy as an uninterrupted one (all episodes restart after each
-    evaluation). The policy is the evaluated one with the largest mean return; the card gives its step, and the CPU time
-    of all processes that took part in the training.
+    evaluation). The saved policy is the one with the largest mean return in an evaluation; the card gives its step, and
+    the CPU time of all processes that took part in the training.
 
     Args:
         config: configuration of the training.
         folder: folder of the results.
         initial: initial policy (actor and critics): a file or the name of a shipped one; replaces that of the
             configuration.
-        report: called with step and outcome after each evaluation, and on resuming with those of the last one, for
-            which it may not have been called; returning True stops the training.
+        report: called with step and outcome after each evaluation, and again on resuming with those of the last one,
+            whose call an interruption may have lost; returning True stops the training.
         proposer: draws the sampled bodies and learns along with the policy; default a uniform draw from the box.
         progress: show a progress bar.
 
@@ -74,7 +74,7 @@ def train(
         ValueError: if the environment cannot be made; a new folder is then not created.
         ConfigError: if ``initial`` was trained for another environment, or the folder's configuration cannot be read.
         DataError: if the folder holds the training of another configuration.
-        WeightsError: if ``initial`` or a checkpoint is damaged or does not fit.
+        WeightsError: if ``initial`` or a checkpoint is damaged or does not fit the configuration.
     """
     import torch
     from tqdm import tqdm
@@ -109,7 +109,7 @@ def train(
     if proposer is not None:
         proposer.attach(model, config, folder)
     designs, goals = evaluation_set(config.environment, config.evaluation_episodes, EVALUATION_SEED)
-    if not begun:  # after all checks, so that wrong values do not leave a folder behind
+    if not begun:  # after all checks, so that invalid values do not leave a folder behind
         save_resolved(folder, config)
     _log_to(model, folder)
 
@@ -135,7 +135,7 @@ def train(
                     "mean_return": outcome.mean_return,
                 }
             )
-            # A proposer concentrates on other bodies than those of the evaluation, so its last policy counts.
+            # A proposer concentrates on bodies other than those of the evaluation, so the last policy is kept.
             if proposer is not None or curve[-1]["mean_return"] >= max(row["mean_return"] for row in curve):
                 best = _weights(model)
             bar.set_postfix_str(f"success {outcome.success_rate:.0%}, distance {1e3 * outcome.mean_distance:.2f} mm")
@@ -169,7 +169,7 @@ def cpu_before(policy: Path, began: float) -> float:
     """Return the CPU time [s] that earlier processes spent on a training that this process resumed.
 
     Args:
-        policy: what `train` returned.
+        policy: return value of `train`.
         began: ``time.process_time()`` before the call of `train`.
     """
     card = read_json(policy.with_suffix(".json"))
@@ -177,7 +177,7 @@ def cpu_before(policy: Path, began: float) -> float:
 
 
 def _best_step(curve: list[CurvePoint]) -> int:
-    """Return the step of the evaluation with the largest mean return, the last one among equals."""
+    """Return the step of the evaluation with the largest mean return; the last one in case of a tie."""
     return int(max(curve, key=lambda row: (row["mean_return"], row["step"]))["step"])
 
 

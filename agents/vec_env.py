@@ -14,7 +14,7 @@ class SB3VecEnv(VecEnv):
     """Adapter from a `gymnasium.vector.VectorEnv` with same-step autoreset to a stable-baselines3 `VecEnv`.
 
     Raises:
-        ValueError: for another autoreset mode, whose resets stable-baselines3 would count as steps.
+        ValueError: for other autoreset modes, whose resets stable-baselines3 would count as steps.
     """
 
     def __init__(self, env: VectorEnv) -> None:

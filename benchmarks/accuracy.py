@@ -16,7 +16,7 @@ ELASTICITIES = ((5000, 0.47, 0.91), (1000, 0.45, 0.29), (7000, 0.40, 0.90), (300
 
 
 def test_set(folder: str | Path = "results/test_set", workers: int = 2) -> dict[str, object]:
-    """Errors of the shipped weights on their test sets, whose FEM states are solved again (minutes for some robots).
+    """Errors of the shipped weights on their test sets, whose FEM states are computed again (minutes for some robots).
 
     States that `stable_rows` excludes from training, because they are about to buckle, are reported separately.
     """
@@ -78,7 +78,7 @@ def test_set(folder: str | Path = "results/test_set", workers: int = 2) -> dict[
 
 
 def positive_definite(count: int = 1_000_000) -> dict[str, object]:
-    """Check in a million random states of every robot that W is positive definite and the derivative of delta.
+    """Check in a million random states of every robot that W is positive definite and equals the derivative of delta.
 
     The derivative of the predicted state is taken by central differences in the last 10,000 states. Errors are relative
     to the largest entry of the same state; the network computes in single precision.
@@ -148,7 +148,7 @@ def design_gradients(bodies: int = 12) -> dict[str, object]:
         for _ in range(bodies):
             design = {k: v.low + rng.uniform(0.05, 0.95) * (v.high - v.low) for k, v in space.variables.items()}
             try:
-                # Hold the actuators where real cables can be: taut or slack.
+                # Hold the actuators at displacements that real cables can have, taut or slack.
                 statics = Statics(robot.build(design))
                 statics.solve(np.zeros(len(robot.actuators)), robot.rest_mode)
                 held = statics.solve(robot.displacements(rng.random((1, net.model.count)))[0]).condensed.delta.a

@@ -39,7 +39,7 @@ def shell_octant(count: int, layers: int) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def to_sphere(points: np.ndarray) -> np.ndarray:
-    """Move points (n, 3) along their rays so that |x| + |y| + |z| becomes their distance."""
+    """Move points (n, 3) along their rays so that their distance from the origin becomes |x| + |y| + |z|."""
     lengths = np.linalg.norm(points, axis=1)
     return points * (np.abs(points).sum(axis=1) / lengths)[:, None]
 
@@ -57,7 +57,7 @@ def solid(
         mesh: nodes (n, 3) and tetrahedra (m, 4) before the mapping.
         element: a name of `SOLIDS`.
         fixed: mask (n,) or (n, 3) of clamped nodes, from the nodes before the mapping.
-        mapping: nodes before -> nodes [m].
+        mapping: function from the nodes before to the final nodes [m].
         **options: of the element block.
     """
     nodes, tetrahedra = mesh
@@ -68,7 +68,7 @@ def solid(
 
 
 def traction(model: MechanicalModel, selected: Callable[[np.ndarray], np.ndarray], force: np.ndarray) -> np.ndarray:
-    """Return nodal loads (n, 3) of a uniform traction, total ``force`` [N], on the outer faces of selected nodes."""
+    """Return nodal loads (n, 3) of a uniform traction, in total ``force`` [N], on the outer faces of selected nodes."""
     connectivity = model.solids[0].connectivity
     corners = connectivity[:, :4]
     faces = corners[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)

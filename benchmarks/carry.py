@@ -1,8 +1,8 @@
-"""How far to the right the Tetrapod gets with controllers, an optimised swing and learned policies.
+"""How far to the right the Tetrapod moves with controllers, an optimised swing and learned policies.
 
-``softgym bench carry`` compares them. ``python -m benchmarks.carry`` searches the swing again (half an hour): servo
-angles through a few knots, optimised by differential evolution on finite elements for the farthest point of the
-centre. It shows what can be reached at all.
+``softgym bench carry`` compares them. ``python -m benchmarks.carry`` searches for the swing again (half an hour): servo
+angles through a few knots, optimised by differential evolution on finite elements so that the centre gets as far as
+possible. It shows what is possible at all.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Studies whose processes are killed and whose database is restarted; and where the time of a study goes.
+"""Studies whose processes are killed and whose database is restarted, and how the time of a study is spent.
 
 ``softgym bench codesign_kills codesign_profile`` (ten minutes).
 """
@@ -60,7 +60,7 @@ def finished(folder: StudyFolder, storage: StudyStorage) -> dict[int, Any]:
 
 
 def faults(folder: StudyFolder, seen: dict[int, Any]) -> list[str]:
-    """Return what is wrong with a finished sweep; empty if every finished trial was kept exactly once.
+    """Return the faults of a finished sweep; empty if every finished trial was kept exactly once.
 
     Args:
         folder: the study.
@@ -89,11 +89,11 @@ def faults(folder: StudyFolder, seen: dict[int, Any]) -> list[str]:
 
 
 class Sweep:
-    """Worker processes, one for each folder of a study, that are killed at random moments.
+    """Worker processes, one for each folder of a study, which are killed at random moments.
 
     Args:
         folders: of one study; several if its storage is a database.
-        seed: of the moments of the kills.
+        seed: seed of the moments of the kills.
 
     Attributes:
         seen: finished results, by number.
@@ -130,7 +130,7 @@ class Sweep:
         total = self.folders[0].config.trials
         goal = min(len(self.seen) + trials, total)
         while len(self.seen) < goal:
-            for index, folder in enumerate(self.folders):  # or they ended for want of a trial
+            for index, folder in enumerate(self.folders):  # start again any that ended because there was no trial left
                 if index not in self._processes or not self._processes[index].is_alive():
                     self._processes[index] = self._context.Process(target=_work, args=(str(folder.path),), daemon=True)
                     self._processes[index].start()
@@ -165,7 +165,7 @@ def _storage(name: str) -> Iterator[PostgresServer | None]:
 
 
 def _killed_sweep(storage: str, seed: int) -> dict[str, object]:
-    """Kill a sweep ten times with all its processes; with PostgreSQL, restart the server twice on the way."""
+    """Kill a sweep ten times with all its processes; with PostgreSQL, restart the server twice in between."""
     rng = np.random.default_rng(seed)
     started, restarts = time.perf_counter(), 0
     seen: dict[int, Any] = {}
@@ -177,7 +177,7 @@ def _killed_sweep(storage: str, seed: int) -> dict[str, object]:
         for attempt in range(KILLS + 1):
             last = attempt == KILLS
             goal = TRIALS if last else len(seen) + int(rng.integers(0, 20))
-            # If the goal is already reached, the kill hits processes that are starting.
+            # If enough trials are already finished, the kill hits processes that are starting.
             pause = rng.uniform(0.0, 8.0 if goal == len(seen) else 1.0)
             with subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True) as process:
                 while process.poll() is None and len(seen) < goal:
@@ -243,7 +243,7 @@ def _timed_worker(path: str, output: str, started: str) -> None:
 
 
 def profile() -> dict[str, object]:
-    """Where the time of a plain sweep goes (training from scratch, 8 trials, 2 workers)."""
+    """How the time of a plain sweep is spent (training from scratch, 8 trials, 2 workers)."""
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     with tempfile.TemporaryDirectory() as place:
         folder = StudyFolder.create(Path(place) / "sweep", StudyConfig.model_validate({**PLAIN, **TRAINED}))

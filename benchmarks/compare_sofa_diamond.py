@@ -33,7 +33,8 @@ def build_diamond(mesh: dict[str, np.ndarray], *, same_elements: bool) -> Mechan
 
     Args:
         mesh: arrays of ``diamond_mesh.npz``, in mm.
-        same_elements: extrapolate cable anchors outside the mesh from the elements SOFA took instead of the nearest.
+        same_elements: extrapolate cable anchors outside the mesh from the elements that SOFA chose instead of the
+            nearest ones.
     """
     model = MechanicalModel.from_mesh(
         mesh["nodes"] * 1e-3,

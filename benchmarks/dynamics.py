@@ -133,9 +133,9 @@ def conservation(steps: int = 1000) -> list[Row]:
 
 
 def swinging(model: MechanicalModel, speed: float, **options) -> Dynamics:
-    """Return a clamped body that starts with the velocities of its first mode, scaled to this tip speed [m/s].
+    """Return a clamped body that starts with the velocities of its first mode, scaled to a tip speed [m/s].
 
-    The start contains no motion that a step cannot resolve.
+    The initial motion contains nothing that a time step cannot resolve.
     """
     _, modes = eigenmodes(model, lumped=False, count=1)
     solver = Dynamics(model, tolerance=1e-12, **options)
@@ -160,7 +160,7 @@ def tumbling(duration: float, spin: np.ndarray, inertia: np.ndarray) -> tuple[np
 
 
 SPIN = np.array([0.3, 3.0, 0.2])
-"""Of the box: almost about its middle axis, so that it turns over [rad/s]."""
+"""Spin of the box, almost about its middle axis, so that it turns over [rad/s]."""
 
 
 def order(levels: Sequence[int] = (64, 128, 256), fine: int = 2048) -> list[Row]:
@@ -462,7 +462,7 @@ def compliance(scheme: str = "euler") -> list[Row]:
 
 
 def book_keeping(levels: Sequence[int] = (50, 100, 200)) -> list[Row]:
-    """Error of the balance work = change of energy + dissipation, over the work, while actuators move for 0.5 s.
+    """Error of the balance ``work = change of energy + dissipation`` over the work, while actuators move for 0.5 s.
 
     Implicit Euler loses energy by numerical damping, so its error is positive and falls with the step.
     """
@@ -489,7 +489,7 @@ def book_keeping(levels: Sequence[int] = (50, 100, 200)) -> list[Row]:
     return rows
 
 
-# -- all of it ------------------------------------------------------------------------------------------------------
+# -- all cases ------------------------------------------------------------------------------------------------------
 
 CASES: dict[str, Callable[[], list[Row]]] = {
     "conservation": conservation,

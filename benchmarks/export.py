@@ -27,7 +27,7 @@ FLAGS = {
 
 EFFORT_WEIGHT, STEP_WEIGHT = 1e-5, 1e-3
 
-# Times of many calls, and the whole of algorithm 2 (thesis): the quadratic program has only bounds and rates of
+# Times of many calls, and the whole loop (thesis, algorithm 2): the quadratic program has only bounds and rates of
 # efforts and is solved by an active-set method, with the objective of `softgym_envs.control.InverseQP`.
 _SOURCE = r"""
 #define _POSIX_C_SOURCE 199309L
@@ -66,7 +66,7 @@ double time_condensed(int calls, const float *q, float *sum)
     return now() - start;
 }
 
-/* Least c^T H c / 2 + g^T c within bounds, from a c that keeps them: primal active set. `typical` scales tolerances. */
+/* Minimise c^T H c / 2 + g^T c within bounds from a feasible c: primal active set. `typical` scales tolerances. */
 static void minimise(double H[N][N], const double *g, const double *low, const double *high, const double *typical,
                      double *c)
 {
@@ -96,7 +96,7 @@ static void minimise(double H[N][N], const double *g, const double *low, const d
                 d[i] -= L[k][i] * d[k];
             d[i] /= L[i][i];
         }
-        /* As far as the first bound; where there is none, let go of what is pulled inwards most. */
+        /* Step to the first bound; without one, free the fixed variable that is pulled inwards most. */
         double length = 1.0, pull = 0.0;
         int change = -1;
         for (int i = 0; i < N; ++i) {
@@ -361,7 +361,7 @@ def _measure(model: Any) -> dict[str, object]:
 
 
 def _constant_bytes(header: Path) -> int:
-    """What the header says of its memory."""
+    """Return the bytes of constants that the header states."""
     line = next(line for line in header.read_text().splitlines() if "bytes of constants" in line)
     return int(line.split()[2])
 

@@ -19,7 +19,7 @@ from softgym_envs.storage import write_json
 
 __all__ = ["gpu", "gpu_step", "measure"]
 
-#: Compiling takes most of the time of a run: one robot is enough to see what it gives.
+#: Compiling takes most of the time of a run, and one robot is enough to show its effect.
 COMPILED = "SoftGym/FingerReach-v0"
 
 
@@ -54,10 +54,10 @@ def measure(identifier: str, num_envs: int, device: torch.device, *, steps: int,
     Args:
         identifier: environment ID.
         num_envs: number of sub-environments.
-        device: where.
+        device: device of the environment.
         steps: steps in one repeat.
-        repeats: the median of so many is reported.
-        **options: of `TorchVectorEnv`.
+        repeats: number of repeats, whose median is reported.
+        **options: options of `TorchVectorEnv`.
 
     Returns:
         Seconds of a step and of a reset; environment steps per second with one reset for each episode of the ID's
@@ -112,7 +112,7 @@ def gpu(
         device: default ``"cuda"`` where there is one, else ``"cpu"``.
         num_envs: default 100,000 on a CUDA device, else 256.
         steps: steps in one repeat.
-        repeats: the median of so many is reported.
+        repeats: number of repeats, whose median is reported.
         budget: seconds after which no further measurement begins; those left out are listed under ``"left_out"``.
         out: JSON file to write.
 
@@ -131,7 +131,7 @@ def gpu(
         modes["compiled graph"] = {"compile": True, "cuda_graph": True}
         jobs += [(COMPILED, sampled, "compiled graph") for sampled in (False, True)]
 
-    # Batches this small lose more by handing work from core to core than they gain.
+    # For such small batches, several threads cost more than they gain.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     begun, rows, left_out = time.perf_counter(), {}, []
@@ -146,7 +146,7 @@ def gpu(
                 f"{row['steps_per_second']:>14,.0f} steps/s   step {1e3 * row['step_seconds']:8.3f} ms   "
                 f"reset {1e3 * row['reset_seconds']:8.1f} ms   first {row['first_step_seconds']:5.1f} s"
             )
-        except Exception as error:  # a mode that this device or this torch cannot do is a result too
+        except Exception as error:  # a mode that this device or torch version does not support is a result too
             row = {"error": f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"}
             text = row["error"]
         rows[label] = row

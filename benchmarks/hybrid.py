@@ -11,7 +11,7 @@ import numpy as np
 
 from softgym_envs.testing import sample_states, train_small_surrogate
 
-#: The surrogate knows the cables up to here [m], of 20 mm.
+#: The surrogate is trained on cable displacements up to this [m], of 20 mm.
 KNOWN = 10e-3
 EPISODES = 40
 #: An error above this should have been flagged [m].
@@ -61,8 +61,8 @@ def _follow(env: gymnasium.Env, goals: np.ndarray) -> list[np.ndarray]:
 def hybrid() -> dict[str, object]:
     """FingerReach beyond what the surrogate was trained on: FEM calls of the hybrid backend, errors, flagged states.
 
-    The surrogate knows two cables of the baseline finger up to 10 mm; the goals need 10 to 20 mm of both. The inverse
-    QP drives to 40 of them on the hybrid backend, which learns between episodes, and on FEM.
+    The surrogate is trained on the two cables of the baseline finger up to 10 mm; the goals need 10 to 20 mm of both.
+    The inverse QP drives to 40 of them on the hybrid backend, which learns between episodes, and on FEM.
     """
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.backends.fem import FEMBackend

@@ -60,9 +60,9 @@ CASES: dict[str, dict[str, Any]] = {
     },
 }
 """Bodies; 50 states in each group. The Diamond's circle needs cables that push, so they are in its data. The third is
-the thesis' own set: as many states, and cables that are pulled by 0 to 30 mm. The gripper is learned whole, three
-fingers and their cube: of one finger, as in the thesis, W is nearly singular where the gripper goes, and a loss of it
-says little."""
+the thesis' own set: as many states, and cables that are pulled by 0 to 30 mm. The gripper is learned as a whole, three
+fingers and their cube: W of a single finger, as in the thesis, is nearly singular in the states of a gripper, so a loss
+on it says little."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class Row:
     """A network of the table.
 
     Attributes:
-        options: of its training; 4000 steps of 128 states unless they say otherwise.
+        options: options of its training; by default 4000 steps of 128 states.
         sizes: which of a case's numbers of states it learns from.
-        seeds: how many.
-        cases: the bodies it learns; some take minutes for each.
-        validated: its best step is chosen by 200 validation states of the body, beside those it learns from; otherwise
-            by these themselves.
+        seeds: number of seeds.
+        cases: the bodies it learns; some networks take minutes for each.
+        validated: its best step is chosen on 200 additional validation states of the body; otherwise on the training
+            states.
     """
 
     options: dict[str, Any]
@@ -309,7 +309,7 @@ def networks() -> dict[str, object]:
 
 
 def _factor(case: str, runs: list[dict[str, Any]]) -> dict[str, object]:
-    """How many times fewer states the potential network needs for the best error the thesis' network reaches."""
+    """How many times fewer states the potential network needs to match the best error of the thesis' network."""
 
     def curve(name):
         sizes = sorted({r["states"] for r in runs if r["network"] == name})

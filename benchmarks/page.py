@@ -46,7 +46,7 @@ def fill(text: str) -> str:
 
 
 def pages() -> list[Path]:
-    """Markdown files that may hold marked places."""
+    """Return the Markdown files that may contain marked places."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 __all__ = ["PostgresServer", "find_programs", "temporary_server"]
 
 ACCOUNT = "postgres"
-"""Account that runs the server if we are root, whom PostgreSQL refuses; Debian's package creates it."""
+"""Account that runs the server if we are root, which PostgreSQL refuses. Debian's package creates the account."""
 
 
 def find_programs() -> Path | None:
@@ -32,11 +32,11 @@ class PostgresServer:
     """A server that can be stopped, started and restarted.
 
     Args:
-        folder: an empty folder of the account that runs it.
+        folder: an empty folder that belongs to the account that runs the server.
         programs: folder of ``initdb`` and ``pg_ctl``.
 
     Attributes:
-        address: of its database, as Optuna and ``softgym codesign --storage`` take it.
+        address: address of its database, in the form of Optuna and ``softgym codesign --storage``.
     """
 
     def __init__(self, folder: Path, programs: Path) -> None:

@@ -13,7 +13,7 @@ from softgym_envs.errors import DataError
 
 HERE = Path(__file__).resolve().parent
 SOURCES = (HERE / "data" / "recorded.json", HERE / "results.json")
-"""Later files win: a benchmark that has been run replaces a recorded result."""
+"""Later files take precedence: a benchmark that has been run replaces a recorded result."""
 
 DERIVED = ("networks", "strategies")
 """Benchmarks that evaluate a data file of their own, in a second."""

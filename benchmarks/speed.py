@@ -66,7 +66,7 @@ def fem_step() -> dict[str, object]:
 class _Shares:
     """Adds up the seconds spent in the parts of finite-element steps while it is entered as a context.
 
-    Time that one part spends in another counts for the outer part.
+    The time of a nested part counts for the outer part.
     """
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ class _Shares:
 
 
 def fem_profile() -> dict[str, object]:
-    """Where the time of a FEM step goes (milliseconds per step, default finger, increments up to 1 mm)."""
+    """How the time of a FEM step is spent (milliseconds per step, default finger, increments up to 1 mm)."""
     from softgym_envs.mechanics.solvers.statics import Statics
     from softgym_envs.robots import make_robot
 

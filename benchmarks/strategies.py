@@ -8,8 +8,8 @@ three times with other seeds. Everything is kept in the folder, and a second cal
 this repository keeps are in ``benchmarks/data/strategies.json``; ``softgym bench strategies`` shows them.
 
 The score of a body between those of the grid is that of the inverse QP, which is cheap, plus the interpolated gap
-between it and the trained policies (thin plate spline). Regret is the part of the way from the baseline body to the
-best one that is left: 100 % at the baseline, 0 % at the best.
+between it and the trained policies (thin plate spline). Regret is the remaining part of the way from the baseline body
+to the best one: 100 % at the baseline, 0 % at the best.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ KEPT = Path(__file__).parent / "data" / "strategies.json"
 QUESTION = Path(__file__).parent.parent / "configs" / "codesign" / "finger_reach.yaml"
 VARIABLES = ("length", "height", "joint_height")
 LEVELS = (-0.9, -0.3, 0.3, 0.9)
-"""Of each variable, in unit coordinates."""
+"""Grid of each variable, in unit coordinates."""
 TRUTH_STEPS = 8_000
 GOALS = 40
-"""That the true score of a body is over; strategies may look at fewer."""
+"""Number of goals of the true score of a body; strategies may use fewer."""
 REPEATS = 3
 PRETRAINING = 80_000 + 10 * 200 * 50
 """Environment steps behind the policy ``finger_reach_designs``: training, and the points of its learning curve."""
@@ -181,7 +181,8 @@ def _run_study(path: Path, name: str, repeat: int) -> Path:
             {
                 "design": trial.design,
                 "score": trial.score,
-                # Every trial is also scored by the inverse QP; strategies do not need that score, so it does not count.
+                # Every trial is also scored by the inverse QP; strategies do not need that score, so its steps do not
+                # count.
                 "steps": trial.training_steps + reports + scored,
                 "cpu_seconds": trial.cpu_seconds - qp_seconds,
             }

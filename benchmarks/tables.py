@@ -18,7 +18,7 @@ WEIGHTS = {
     "cable_trunk": "cable trunk",
     "contact_finger": "contact finger",
 }
-"""Names of the shipped weights, as people call the robots."""
+"""Readable names of the robots, by name of the shipped weights."""
 
 HEADLINES = ("finger", "diamond", "trunk", "two_finger_gripper", "tetrapod")
 
@@ -109,7 +109,7 @@ def strategies() -> str:
 
 
 def _spread(value: object) -> str:
-    """Write ``median (smallest to largest)`` without a spread where there is none."""
+    """Write ``median (smallest to largest)``, or only the value if there is no spread."""
     if not isinstance(value, str):
         return f"{value:,}"
     text = value.replace("inf", "not reached").replace(" (one repeat)", "")
@@ -135,7 +135,7 @@ def kills() -> str:
 
 
 def profile() -> str:
-    """Where the time of a study goes."""
+    """How the time of a study is spent."""
     found = results("codesign_profile")
     shares = {k[len("share of ") : -4]: v for k, v in found.items() if k.startswith("share of ")}
     return markdown(["part", "share of the time"], [[k, f"{v:.1f}%"] for k, v in shares.items()], "lr")
@@ -152,7 +152,7 @@ def agents() -> str:
 
 
 def carry() -> str:
-    """How far to the right the Tetrapod comes."""
+    """How far to the right the Tetrapod moves."""
     found: dict[str, dict[str, str]] = {}
     for key, value in results("carry").items():
         payload, _, name = key.partition(", ")
@@ -374,4 +374,4 @@ TABLES: dict[str, Callable[[], str]] = {
         tracking, stiff_flop, validation, surrogate_speed, fem_speed, deployed, provenance,
     )
 }  # fmt: skip
-"""Tables by the name that a marked place gives."""
+"""Tables by the name in a marked place."""

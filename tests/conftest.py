@@ -51,7 +51,7 @@ class SlowTestsWriter:
     def pytest_runtest_logreport(self, report):
         path, _, function = report.nodeid.partition("[")[0].partition("::")
         if report.when == "setup" and report.duration > SLOW:
-            function = ""  # a fixture is slow, which any test of the file may be the first to need
+            function = ""  # a slow fixture, which any test of the file may be the first to need
         self.seconds[f"{path}::{function}" if function else path] += report.duration
 
     def pytest_sessionfinish(self):
@@ -211,13 +211,13 @@ def finger(request, fingers):
 
 @pytest.fixture(scope="session")
 def robot():
-    """The finger with one cable, of the small ensemble `weights`."""
+    """The finger with one cable that the small ensemble `weights` was trained for."""
     return make_robot("finger", cables=1)
 
 
 @pytest.fixture(scope="session")
 def weights(robot, tmp_path_factory):
-    """A small ensemble that knows the cable of a finger up to 8 mm."""
+    """A small ensemble, trained on the cable of a finger up to 8 mm."""
     folder = tmp_path_factory.mktemp("finger_8mm")
     train_small_surrogate(folder, robot, limit=8e-3, states=30, members=3, width=24, steps=400)
     return folder

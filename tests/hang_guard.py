@@ -1,4 +1,4 @@
-"""Ends a test that hangs, however slow the machine is."""
+"""Timeout of tests that hang, which allows for slow and busy machines."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ The load average follows the true load only slowly, hence the wide margin: it en
 """
 
 INTERVAL = 5.0
-"""Time between two looks at the load of the machine [s]."""
+"""Interval between measurements of the load of the machine [s]."""
 
 
 def slowdown() -> float:
@@ -34,7 +34,7 @@ def end_if_hung(stream: TextIO | int, limit: float = LIMIT, interval: float = IN
     Args:
         stream: where the stacks are written: a file or its descriptor.
         limit: time that the block may take on an idle machine [s].
-        interval: time between two looks at the load [s].
+        interval: time between measurements of the load [s].
     """
     done = threading.Event()
 

@@ -1,4 +1,4 @@
-"""The command line: every verb, and one clear line with status 2 for bad input."""
+"""The command line: every command, and one clear line with status 2 for bad input."""
 
 import json
 import re
@@ -136,7 +136,7 @@ def test_malformed_files(softgym, tmp_path, text):
         ("codesign.tools.gradient", "optimise", ["optimise", "--config", STRENGTH], False),
     ],
 )
-def test_a_stopped_verb_says_so_and_goes_on_only_where_it_can(
+def test_an_interrupted_command_says_whether_it_can_continue(
     module, name, arguments, resumes, softgym, monkeypatch, tmp_path
 ):
     def stop(*_, **__):

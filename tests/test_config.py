@@ -46,7 +46,7 @@ def test_commit_of_a_clone_and_of_its_archive(tmp_path):
     assert commit_of(archive) == head[:12]
 
 
-def test_no_commit_where_none_is_known(tmp_path):
+def test_no_commit_if_it_is_unknown(tmp_path):
     assert commit_of(tmp_path) is None
     (tmp_path / ".git_archival.txt").write_text("node: $Format:%H$\n")  # copied, not exported
     assert commit_of(tmp_path) is None

@@ -138,7 +138,7 @@ def test_single_precision_and_text_round_trips_are_not_out_of_bounds():
                 assert SPACE[name].low <= checked <= SPACE[name].high
 
 
-def test_none_and_nothing_are_the_baseline():
+def test_none_and_an_empty_mapping_give_the_baseline():
     assert SPACE.complete() == SPACE.complete(None) == SPACE.complete({}) == SPACE.baseline
     with pytest.raises(TypeError):
         SPACE.baseline["length"] = 0.0

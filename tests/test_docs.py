@@ -58,7 +58,7 @@ def test_every_robot_has_a_page_with_a_description(name):
     assert dict(writing.split(page.read_text())).get("Published beside ours")
 
 
-def test_an_empty_description_is_seen():
+def test_an_empty_description_is_detected():
     assert not writing.describes(
         "# Title\n\n## Description\n\n<!-- to be written, by somebody, in many words: " + "x " * 60 + "-->"
     )
@@ -113,7 +113,7 @@ def test_names_of_the_reference_can_be_imported(package):
     assert [name for name, _ in links] == api.public_names(package)
 
 
-def test_what_a_page_says_itself_wins():
+def test_sections_written_in_a_page_take_precedence():
     template = {"One": lambda: "generated one", "Two": lambda: "generated two", "Three": lambda: ""}
     page = "# T\n\n## Two\n\nbefore\n\n<!-- generated -->\n\n## Own\n\n```sh\n## no heading\n```\n"
     composed = writing.compose(page, "top", template)

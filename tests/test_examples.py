@@ -1,4 +1,4 @@
-"""The examples run as they are."""
+"""The examples run without changes."""
 
 import subprocess
 import sys

@@ -35,7 +35,7 @@ def test_one_worker_is_this_process():
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_errors_arrive(workers):
+def test_errors_reach_the_caller(workers):
     with pytest.raises(ValueError, match="math domain error"):
         list(parallel_map(math.sqrt, [(4.0,), (-1.0,), (9.0,)], workers))
 
@@ -54,10 +54,8 @@ def test_workers_end_with_their_owner():
         try:
             assert process.stdout is not None
             assert [process.stdout.readline() for _ in range(2)] == [b"done\n"] * 2
-            assert (
-                len(live_processes(process.pid)) >= 4
-            )  # the owner, three workers; and what watches over shared memory
-            # The owner is a zombie while the workers have to notice its end.
+            assert len(live_processes(process.pid)) >= 4  # the owner, three workers and the tracker of shared memory
+            # The owner remains a zombie while the workers notice its end.
             os.kill(process.pid, signal.SIGKILL)
             wait_until(lambda: not live_processes(process.pid))
         finally:

@@ -1,4 +1,4 @@
-"""A test that hangs ends its process with a traceback; a slow machine does not."""
+"""A test that hangs ends its process with a traceback; a test on a slow machine is not stopped."""
 
 import subprocess
 import sys

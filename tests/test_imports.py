@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("softgym_envs", "agents", "codesign")
 
-# From the bottom to the top. A room imports from rooms below it and from itself.
+# From the bottom to the top. A package imports from packages in lower layers and from itself.
 LAYERS = [
     {"softgym_envs.version", "softgym_envs.errors", "softgym_envs._lazy"},
     {"softgym_envs.storage"},
@@ -29,8 +29,8 @@ LAYERS = [
     {"softgym_envs.viewer", "softgym_envs.testing"},
     {"softgym_envs.cli"},
 ]
-LEVEL = {room: level for level, layer in enumerate(LAYERS) for room in layer}
-# Pictures are made where they are asked for: inside functions, and only there.
+LEVEL = {package: level for level, layer in enumerate(LAYERS) for package in layer}
+# The viewer is imported only inside the functions that draw.
 LAZY = {("softgym_envs.envs", "softgym_envs.viewer"), ("codesign", "softgym_envs.viewer")}
 HEAVY = ("torch", "gmsh", "stable_baselines3", "optuna", "rerun", "pyvista", "vtk", "numba", "scipy", "matplotlib")
 
@@ -42,8 +42,8 @@ def module_name(path):
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def room_of(module):
-    """The room of a module's dotted name; the package softgym_envs itself has none."""
+def package_of(module):
+    """The package in `LAYERS` of a dotted module name; softgym_envs itself has none."""
     parts = module.split(".")
     if parts[0] != "softgym_envs":
         return parts[0]
@@ -73,34 +73,34 @@ def imports_of(path):
                 yield name, id(node) in lazy, node.lineno
 
 
-def test_the_rooms_are_known():
-    rooms = {room_of(module_name(path)) for path in FILES} - {None}
-    assert rooms <= set(LEVEL), rooms - set(LEVEL)
+def test_every_package_has_a_layer():
+    names = {package_of(module_name(path)) for path in FILES} - {None}
+    assert names <= set(LEVEL), names - set(LEVEL)
     assert len(FILES) > 30
 
 
 @pytest.mark.parametrize("path", FILES, ids=module_name)
 def test_imports_go_downwards(path):
     module = module_name(path)
-    here = room_of(module)
+    here = package_of(module)
     for name, lazy, line in imports_of(path):
-        there = room_of(name)
+        there = package_of(name)
         if here is None:
-            continue  # ``softgym_envs/__init__.py`` exports from several rooms; that it stays light is tested below
+            continue  # ``softgym_envs/__init__.py`` exports from several packages; a test below keeps it light
         if there not in LEVEL or there == here:
             continue
         allowed = LEVEL[there] < LEVEL[here] or (lazy and (here, there) in LAZY)
         assert allowed, f"{module}, line {line}: {here} must not import {name}"
 
 
-def test_the_checker_sees_a_forbidden_import(tmp_path):
+def test_the_checker_detects_a_forbidden_import(tmp_path):
     path = tmp_path / "bad.py"
     path.write_text(
         "from softgym_envs import viewer\n\ndef f():\n    import agents.training\n    from softgym_envs.envs import x\n"
     )
     found = [(name, lazy) for name, lazy, _ in imports_of(path)]
     assert found == [("softgym_envs.viewer", False), ("agents.training", True), ("softgym_envs.envs.x", True)]
-    assert [room_of(name) for name, _ in found] == ["softgym_envs.viewer", "agents", "softgym_envs.envs"]
+    assert [package_of(name) for name, _ in found] == ["softgym_envs.viewer", "agents", "softgym_envs.envs"]
 
 
 def loaded_by(statement):
@@ -191,7 +191,7 @@ def test_files_are_short(path):
     assert len(path.read_text().splitlines()) <= MAX_LINES
 
 
-def test_the_checkers_see_circles_and_private_names(tmp_path):
+def test_the_checkers_detect_circles_and_private_names(tmp_path):
     sources = {
         "agents.one": "def f():\n    from agents import two\n",
         "agents.two": "from agents.three import _hidden, shown\n",

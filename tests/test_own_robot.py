@@ -1,4 +1,4 @@
-"""A robot of one's own, from `examples/05_own_robot.py`: trained and co-designed without touching the package."""
+"""Your own robot, from `examples/05_own_robot.py`: trained and co-designed without touching the package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The public API: what the packages export, lazily, is there, and type checkers see the same."""
+"""The public API: lazily exported names exist, and type checkers see the same ones."""
 
 from __future__ import annotations
 

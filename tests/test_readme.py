@@ -37,7 +37,7 @@ def test_numbers_are_those_of_the_results(page):
     """`python -m benchmarks.page` would change nothing."""
     text = page.read_text()
     assert bench.fill(text) == text, f"run python -m benchmarks.page ({page.name})"
-    # A comment at the start of a line begins a block of raw HTML, which would tear a paragraph apart.
+    # A comment at the start of a line begins a block of raw HTML, which would split a paragraph.
     assert not re.search(r"^ *<!-- bench: [^\n]+? :: ", text, flags=re.MULTILINE)
     assert (
         len(re.findall("<!-- bench: ", text))

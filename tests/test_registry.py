@@ -48,7 +48,7 @@ def registry():
     return Registry("shape", {"disc": f"{__name__}:Disc"}, base=BASE)
 
 
-def test_names_paths_classes_and_objects_are_all_taken(registry):
+def test_names_paths_classes_and_objects_are_accepted(registry):
     disc = registry.make("disc", radius=2)
     assert isinstance(disc, Disc)
     assert disc.radius == 2
@@ -83,10 +83,10 @@ def test_registered_by_call_and_by_decorator(registry):
     assert Triangle.name == "triangle"
     assert Square.name == "square"
     assert list(registry) == ["disc", "rod", "square", "triangle", "ellipse", "late"]
-    registry.register(Square)  # once more is no conflict
+    registry.register(Square)  # registering it again is not a conflict
 
 
-def test_a_class_that_is_defined_again_takes_the_place_of_its_old_self(registry):
+def test_a_redefined_class_replaces_the_old_one(registry):
     def define():
         class Again(Shape):
             name = "again"
@@ -108,7 +108,7 @@ def test_a_class_that_is_defined_again_takes_the_place_of_its_old_self(registry)
         (("pen", "pens.Pen"), "'pens.Pen' must look like module:class"),
     ],
 )
-def test_what_cannot_be_registered(registry, arguments, message):
+def test_invalid_registrations_are_refused(registry, arguments, message):
     with pytest.raises(ValueError, match=message):
         registry.register(*arguments)
 
@@ -145,7 +145,7 @@ def test_a_class_without_a_name_is_refused(registry):
     ],
     ids=lambda value: value if isinstance(value, str) else None,
 )
-def test_each_mistake_has_its_line(registry, name, options, message):
+def test_each_mistake_has_its_own_message(registry, name, options, message):
     with pytest.raises(ValueError, match=message):
         registry.make(name, **options)
 
@@ -186,7 +186,7 @@ def test_entry_points_of_installed_packages(tmp_path, monkeypatch):
     (info / "entry_points.txt").write_text("[tests.shapes]\nstar = their_shapes:Star\ndisc = their_shapes:Disc\n")
     monkeypatch.syspath_prepend(tmp_path)
     registry = Registry("shape", {"disc": f"{__name__}:Disc"}, base=BASE, group="tests.shapes")
-    assert registry.make("disc").radius == 1.0  # a name of our own is found without a search
+    assert registry.make("disc").radius == 1.0  # names of this package are found without a search
     with pytest.warns(UserWarning, match="'disc' of the entry point their_shapes:Disc is ignored: the name belongs to"):
         assert list(registry) == ["disc", "star"]
     assert "their_shapes" not in sys.modules

@@ -46,7 +46,7 @@ def reset(**options):
 
 
 def config(folder, model, name, *overrides):
-    """Load a configuration of the repository, or one made of plain data, with overrides."""
+    """Load a configuration of the repository, or one given as plain data, with overrides."""
     path = ROOT / "configs" / name if isinstance(name, str) else folder / "x.yaml"
     if not isinstance(name, str):
         path.write_text(yaml.safe_dump(name))
@@ -56,7 +56,7 @@ def config(folder, model, name, *overrides):
 TRAIN, FINGER, STRENGTH = "agents/finger_reach.yaml", "codesign/finger_reach.yaml", "design/finger_strength.yaml"
 ZONE = "codesign/finger_zone.yaml"
 
-# Mistake -> (what makes it, given a temporary folder; the message, in which * stands for any text)
+# Mistake -> (function of a temporary folder that makes it; the message, in which * stands for any text)
 MISTAKES = {
     # Units
     "body in millimetres": (

@@ -1,4 +1,4 @@
-"""The record of an evaluation: parts, repeats and files."""
+"""Records of evaluations: merged parts, averaged repeats and files."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Hindsight goals: what is stored is relabelled as the environment itself would have shown and rewarded it."""
+"""Hindsight goals: relabelled transitions are those that the environment itself gives for the new goal."""
 
 import numpy as np
 import pytest
@@ -88,10 +88,10 @@ def test_new_goals_were_reached_at_or_after_the_transition_in_its_episode():
         away = np.linalg.norm(effectors[rest, column] - goal, axis=1)
         assert away.min() < 1e-7
         ahead.append(np.argmin(away))
-    assert 10 < np.mean(ahead) < 15  # uniform over what is left: a quarter of 50 steps on average
+    assert 10 < np.mean(ahead) < 15  # uniform over the rest of the episode: a quarter of 50 steps on average
 
 
-def test_the_share_and_the_unchanged_rest():
+def test_a_share_is_relabelled_and_the_rest_unchanged():
     env = REACH.make_vec(4)
     buffer = make_buffer(env, share=0.8)
     fill(buffer, env, 100)
@@ -107,7 +107,7 @@ def test_the_share_and_the_unchanged_rest():
         if same:
             assert reward[0] == plain[observation.tobytes()]
     assert samples.rewards[~np.array(kept)].mean() > 3 * samples.rewards[np.array(kept)].mean()
-    assert (samples.dones == 0).all()  # a time limit does not end what could be earned
+    assert (samples.dones == 0).all()  # a time limit is not a terminal state
 
 
 def test_without_hindsight_it_is_the_plain_buffer():
@@ -123,7 +123,7 @@ def test_without_hindsight_it_is_the_plain_buffer():
         assert (one == other).all()
 
 
-def test_a_ring_that_overwrites_and_a_cut():
+def test_overwritten_and_cut_episodes():
     env = REACH.make_vec(2)
     buffer = make_buffer(env, share=1.0, size=70)
     fill(buffer, env, 120)  # episodes end at 49 and 99; positions 0 to 49 hold steps 70 to 119
@@ -135,7 +135,7 @@ def test_a_ring_that_overwrites_and_a_cut():
     assert (buffer.ends[30:50] == 49).all() and (buffer.ends[:30] == 29).all() and (buffer.ends[50:] == 29).all()
 
 
-def test_a_step_that_was_not_found_earns_nothing_whatever_the_goal():
+def test_a_step_without_equilibrium_has_no_reward_for_any_goal():
     env = REACH.make_vec(2)
     buffer = make_buffer(env, share=1.0)
     fill(buffer, env, 10)
@@ -154,5 +154,5 @@ def test_hindsight_on_top_of_the_qp_is_refused():
 
 def test_a_moving_goal_is_refused():
     env = EnvironmentConfig(id="SoftGym/DiamondTrack-v0").make_vec(2)
-    with pytest.raises(ValueError, match=r"hindsight = 0\.5 needs a fixed goal, task 'track'"):
+    with pytest.raises(ValueError, match=r"hindsight = 0\.5 needs a fixed goal, but task 'track'"):
         make_buffer(env, share=0.5)

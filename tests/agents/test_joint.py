@@ -1,4 +1,4 @@
-"""Bodies and policy that learn together."""
+"""Joint training of body and policy."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ def test_distribution_moves_to_the_better_bodies(alone, target, rng):
 
 
 def test_distribution_stays_where_no_body_is_better(alone, rng):
-    """Ranks of noise alone pull it nowhere: over many steps its mean wanders, but not out of the box."""
+    """Ranks of pure noise have no direction: over many steps the mean wanders, but it stays in the box."""
     for _ in range(400):
         alone.episode(alone.draw(rng, 1)[0], float(rng.normal()))
     assert np.abs(alone.means).max() <= 1.0 and alone.weights.min() > 0.02
 
 
-def test_an_episode_is_told_with_its_own_body(tmp_path):
+def test_an_episode_is_reported_with_its_own_body(tmp_path):
     told = []
 
     class Listener(CriticProposer):
@@ -96,7 +96,7 @@ def test_an_episode_is_told_with_its_own_body(tmp_path):
 
 
 @pytest.mark.parametrize("kind", PROPOSERS)
-def test_a_stopped_training_ends_as_one_that_was_not(kind, tmp_path):
+def test_a_stopped_training_ends_as_an_uninterrupted_one(kind, tmp_path):
     train(config(), tmp_path / "whole", proposer=proposer_of(kind), progress=False)
 
     class Stop(Exception):
@@ -116,7 +116,7 @@ def test_a_stopped_training_ends_as_one_that_was_not(kind, tmp_path):
 
 
 def test_critic_values_rank_bodies_as_the_critic_does(monkeypatch, tmp_path):
-    """A critic that likes length alone: its values must not depend on the height."""
+    """With a critic that only rewards length, values must not depend on the height."""
 
     model = _make_model(config())
     names, bodies = ("length", "height"), np.array([[-0.5, 0.3], [0.5, 0.3], [0.5, -0.9]])

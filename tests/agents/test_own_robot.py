@@ -95,7 +95,7 @@ def test_classes_are_stored_as_paths():
     assert EnvironmentConfig.model_validate(environment.model_dump(mode="json")) == environment
     envs = environment.make_vec(2)
     assert envs.unwrapped.max_episode_steps == 3
-    Policy("finger_reach").check_environment(environment)  # the same robot and task by other names
+    Policy("finger_reach").check_environment(environment)  # the same robot and task under other names
 
 
 class Outer:
@@ -110,7 +110,7 @@ class Outer:
         ({"robot": "finger"}, "an environment needs an id, or a robot and a task"),
         (
             {"id": "SoftGym/FingerReach-v0", "task": "reach"},
-            "an environment has an id, or a robot and a task, not both",
+            "an environment takes an id, or a robot and a task, not both",
         ),
         ({"id": "SoftGym/FingrReach-v0"}, "unknown environment 'SoftGym/FingrReach-v0'; did you mean"),
         ({"id": "SoftGym/Reach-v0"}, "environment 'SoftGym/Reach-v0' needs a robot: give robot and task"),

@@ -13,7 +13,7 @@ def on(identifier, **options):
 
 
 @pytest.mark.parametrize("identifier", ["FingerReach", "CableTrunkReach", "TrunkReach", "DiamondTrack"])
-def test_the_batched_qp_is_the_single_one(identifier):
+def test_the_batched_qp_agrees_with_the_single_one(identifier):
     config = on(identifier, residual_scale=0.25)
     envs = config.make_vec(3)
     goals = sample_goals(config, 3, seed=4)
@@ -33,7 +33,7 @@ def test_the_batched_qp_is_the_single_one(identifier):
             assert np.abs((env.unwrapped.state.command - states[k][i]) / span).max() < 1e-5
 
 
-def test_what_is_done_is_the_clipped_sum():
+def test_the_executed_action_is_the_clipped_sum():
     config = on("FingerReach", residual_scale=0.5)
     env = config.make()
     env.reset(seed=3)
@@ -46,7 +46,7 @@ def test_what_is_done_is_the_clipped_sum():
         assert np.abs(env.unwrapped.state.command - done).max() < 1e-9
 
 
-def test_an_agent_that_does_nothing_leaves_the_qp():
+def test_a_zero_action_leaves_the_qp_unchanged():
     plain, topped = on("DiamondReach"), on("DiamondReach", residual_scale=1.0)
     goal = sample_goals(plain, 1, seed=2)[0]
     env = topped.make()
@@ -54,11 +54,11 @@ def test_an_agent_that_does_nothing_leaves_the_qp():
     for _ in range(50):
         _, _, _, _, info = env.step(np.zeros(4))
     assert info["distance"] == pytest.approx(evaluate("qp", plain, goal[None]).distances[0], abs=1e-7)
-    # The baselines are not put on top of themselves.
+    # Baselines are not added to themselves.
     assert evaluate("qp", topped, goal[None]).returns == pytest.approx(evaluate("qp", plain, goal[None]).returns)
 
 
-def test_residual_works_in_processes_of_their_own():
+def test_residual_agents_in_separate_processes():
     config = on("TrunkReach", residual_scale=0.3, backend="fem")
     envs = config.make_vec(2)
     single = config.make()
@@ -73,18 +73,18 @@ def test_residual_works_in_processes_of_their_own():
     envs.close()
 
 
-def test_pi_corrects_a_model_that_is_not_the_plant():
+def test_pi_corrects_a_model_that_differs_from_the_plant():
     plant = on("TrunkReach", backend="fem")
     goals = sample_goals(on("TrunkReach"), 3, seed=11)
     distances = {name: evaluate(name, plant, goals).distances for name in ("qp", "qp_model", "qp_pi")}
     assert (distances["qp_model"] > 2e-5).all()  # the surrogate's own error
     assert (distances["qp_pi"] < 0.2 * distances["qp_model"]).all()
-    # Where the model is the plant there is nothing to correct.
+    # If the model is the plant, there is nothing to correct.
     own = on("TrunkReach")
     assert evaluate("qp_model", own, goals).distances == pytest.approx(evaluate("qp", own, goals).distances, abs=1e-6)
 
 
-def test_pi_does_not_take_a_moving_goal_for_an_error():
+def test_pi_does_not_count_the_motion_of_the_goal_as_an_error():
     own = on("GripperPinch")
     path = sample_goals(own, 1, seed=0)
     corrected, plain = (evaluate(name, own, path).mean_distances[0] for name in ("qp_pi", "qp_model"))

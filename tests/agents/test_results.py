@@ -45,7 +45,7 @@ def test_every_environment_has_a_configuration():
 def test_configurations_fit_their_environment(path):
     config = load_config(path, TrainConfig)
     row = ENVIRONMENTS[config.environment.id]
-    # A leg of the training that ends within an episode would cut it off.
+    # A part of the training that ended within an episode would cut it off.
     assert config.report_every % (config.num_envs * row.max_episode_steps) == 0 or row.backend == "fem"
     assert config.steps % config.report_every == 0
     assert config.environment.sample_design == config.environment.design_in_observation
@@ -59,7 +59,7 @@ def test_interquartile_mean():
     assert interquartile_mean(np.array([3.0])) == 3.0
 
 
-def test_intervals_cover_the_truth_about_as_often_as_they_say():
+def test_intervals_have_about_their_nominal_coverage():
     rng = np.random.default_rng(0)
     stratified = crossed = 0
     for _ in range(60):
@@ -73,7 +73,7 @@ def test_intervals_cover_the_truth_about_as_often_as_they_say():
     assert 51 <= stratified and 51 <= crossed  # 57 expected of 60
 
 
-def test_crossed_intervals_know_that_a_seed_shares_its_policy():
+def test_crossed_intervals_account_for_the_policy_that_a_seed_shares():
     rng = np.random.default_rng(1)
     seeds = rng.normal(size=(4, 1)) + 0.01 * rng.normal(size=(4, 200))
     one = crossed_estimate(seeds)
@@ -82,7 +82,7 @@ def test_crossed_intervals_know_that_a_seed_shares_its_policy():
     assert entries.high - entries.low < 0.3
 
 
-def test_what_cannot_be_resampled_has_no_interval():
+def test_scores_that_cannot_be_resampled_have_no_interval():
     assert np.isnan(crossed_estimate(np.ones((1, 1))).low)
     assert np.isnan(stratified_estimate(np.ones((1, 5))).low)
     assert crossed_estimate(np.array([[1.0, 2.0, 3.0, 4.0]])).low < 2.0
@@ -110,7 +110,7 @@ def _environment():
     return {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
-def test_a_sweep_leaves_results_of_every_seed_and_the_baselines(swept):
+def test_a_sweep_writes_results_of_every_seed_and_the_baselines(swept):
     place = swept / "out" / "results" / "tiny"
     assert {path.name for path in place.iterdir()} == {"seed0.json", "seed3.json", "baselines.json"}
     run = json.loads((place / "seed3.json").read_text())
@@ -124,7 +124,7 @@ def test_a_sweep_leaves_results_of_every_seed_and_the_baselines(swept):
     assert max(baselines["surrogate"]["qp"]["distances"]) < 1e-4 < min(baselines["surrogate"]["random"]["distances"])
 
 
-def test_a_finished_sweep_runs_nothing_and_a_lost_result_is_made_again(swept, monkeypatch):
+def test_a_finished_sweep_runs_nothing_and_a_lost_result_is_computed_again(swept, monkeypatch):
     place = swept / "out" / "results" / "tiny"
     before = (place / "seed0.json").read_text()
     monkeypatch.setattr("agents.training._make_model", lambda *_: pytest.fail("trained again"))
@@ -168,7 +168,7 @@ def test_stored_results_count_as_finished(path):
         assert sweep._finished(stored, config.model_copy(update={"seed": seed}), goals=100, fem_goals=10)
 
 
-def test_an_error_of_one_job_does_not_end_the_others(swept, tmp_path, capsys):
+def test_an_error_in_one_job_does_not_stop_the_others(swept, tmp_path, capsys):
     (tmp_path / "tiny.yaml").write_text(TINY)
     broken = tmp_path / "out" / "runs" / "tiny" / "seed1"
     broken.mkdir(parents=True)
@@ -187,12 +187,12 @@ def test_environments_on_fem_are_evaluated_on_the_goals_for_fem(tmp_path):
     assert {backend: len(agents["random"]["distances"]) for backend, agents in found.items()} == {"fem": 2}
     path = tmp_path / "tiny.yaml"
     path.write_text(TINY.replace("v0}", "v0, backend: fem}"))
-    with pytest.raises(ConfigError, match=r"fem_goals = 0, but the environment of '.*tiny\.yaml' is on FEM"):
+    with pytest.raises(ConfigError, match=r"fem_goals = 0, but the environment of '.*tiny\.yaml' runs on FEM"):
         sweep.sweep([path], [0], 1, tmp_path / "out", goals=5, fem_goals=0)
     assert not (tmp_path / "out").exists()
 
 
-def test_goals_of_the_final_evaluation_are_unseen_and_single_where_they_are_all_the_same():
+def test_final_goals_are_unseen_and_equal_goals_are_evaluated_once():
     from agents.evaluation import evaluation_set
     from agents.training import EVALUATION_SEED
 
@@ -239,7 +239,7 @@ POLICIES = {
 
 
 @pytest.mark.parametrize("case", POLICIES)
-def test_the_graph_of_a_policy_is_the_policy(case, tmp_path):
+def test_the_graph_of_a_policy_agrees_with_the_policy(case, tmp_path):
     pytest.importorskip("onnx")
     runtime = pytest.importorskip("onnxruntime")
     small = {"sac": {"net_arch": [16, 16], "learning_starts": 4}, "steps": 10, "num_envs": 2, "report_every": 10}

@@ -1,4 +1,4 @@
-"""SAC training: files, resume, warm start, and what a damaged policy says."""
+"""SAC training: files, resumption, warm start and damaged policies."""
 
 import csv
 import json
@@ -70,7 +70,7 @@ def test_same_seed_same_policy(trained, tmp_path):
 
 
 @pytest.mark.parametrize("hindsight", [0.0, 0.8])
-def test_interrupted_training_resumes_as_if_it_had_not_been(hindsight, tmp_path, monkeypatch):
+def test_interrupted_training_ends_as_an_uninterrupted_one(hindsight, tmp_path, monkeypatch):
     # 200 steps of 8 environments end in the middle of episodes.
     config = CONFIG.model_copy(update={"sac": CONFIG.sac.model_copy(update={"hindsight": hindsight})})
     uninterrupted = train(config, tmp_path / "uninterrupted", progress=False).read_bytes()
@@ -97,7 +97,7 @@ def test_interrupted_training_resumes_as_if_it_had_not_been(hindsight, tmp_path,
     )
     train(config, folder, progress=False)
     own = time.process_time() - began
-    assert steps == [200]  # went on where it was
+    assert steps == [200]  # continued from the checkpoint
     card = json.loads((folder / "policy.json").read_text())
     assert spent < card["cpu_seconds"] <= spent + own + 0.01  # of both processes
     with open(folder / "curve.csv") as stream:
@@ -105,10 +105,10 @@ def test_interrupted_training_resumes_as_if_it_had_not_been(hindsight, tmp_path,
     assert (folder / "policy.safetensors").read_bytes() == uninterrupted
     before = (folder / "policy.safetensors").stat().st_mtime_ns
     train(config, folder, progress=False)
-    assert (folder / "policy.safetensors").stat().st_mtime_ns == before  # done is done
+    assert (folder / "policy.safetensors").stat().st_mtime_ns == before  # a finished training is not repeated
 
 
-def test_a_report_that_was_lost_with_its_process_is_made_again(trained, tmp_path):
+def test_a_report_lost_with_its_process_is_repeated(trained, tmp_path):
     seen = []
 
     def report(step, outcome):
@@ -124,7 +124,7 @@ def test_a_report_that_was_lost_with_its_process_is_made_again(trained, tmp_path
     assert policy.read_bytes() == trained.read_bytes()
 
 
-def test_a_training_that_was_to_stop_stops_when_it_goes_on(tmp_path, monkeypatch):
+def test_a_training_that_should_stop_stops_on_resuming(tmp_path, monkeypatch):
     def lost(step, outcome):
         raise KeyboardInterrupt
 
@@ -153,7 +153,7 @@ def test_damaged_checkpoint_is_named(tmp_path, monkeypatch):
         train(CONFIG, tmp_path, progress=False)
 
 
-def test_another_configuration_does_not_mix(trained):
+def test_a_folder_of_another_configuration_is_refused(trained):
     with pytest.raises(DataError, match="another configuration: steps = 400, got 800"):
         train(CONFIG.model_copy(update={"steps": 800}), trained.parent, progress=False)
     shown = CONFIG.environment.model_copy(update={"robot_options": {"cables": 1}})
@@ -168,7 +168,7 @@ def test_a_damaged_configuration_of_a_folder_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("option", [{"backend": "foo"}, {"action_mode": "foo"}, {"task_options": {"foo": 1}}])
-def test_a_wrong_environment_takes_no_folder(option, tmp_path):
+def test_a_wrong_environment_creates_no_folder(option, tmp_path):
     environment = CONFIG.environment.model_copy(update=option)
     with pytest.raises(ValueError, match="foo"):
         train(CONFIG.model_copy(update={"environment": environment}), tmp_path / "run", progress=False)
@@ -326,7 +326,7 @@ def test_each_goal_may_have_its_own_body(trained):
         assert both.distances[i] == pytest.approx(one.distances[0], abs=1e-6)
 
 
-def test_the_best_policy_is_kept_also_over_an_interruption(tmp_path, monkeypatch):
+def test_the_best_policy_survives_an_interruption(tmp_path, monkeypatch):
     seen = []
 
     def worse_and_worse(policy, *arguments, **options):

@@ -1,4 +1,4 @@
-"""The finite-element backend in time: its end in statics, torque limits, failures, and its environments."""
+"""The finite-element backend in dynamics: static limit, torque limits, failures and environments."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ SMALL = {"SoftGym/FingerReach-v0": {}, "SoftGym/DiamondReach-v0": {"mesh_size": 
 
 
 def weak(limit):
-    """A Tetrapod whose servos give way at a torque [N m]."""
+    """A Tetrapod whose servos have a torque limit [N m]."""
     robot = make_robot("tetrapod")
     robot.actuators = tuple(replace(actuator, max_effort=limit) for actuator in robot.actuators)
     return robot
 
 
-# -- statics in the end ---------------------------------------------------------------------------------------------
+# -- the static limit ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", list(cases.ROBOTS))
@@ -48,7 +48,7 @@ def test_a_moving_body_starts_at_rest():
 
 
 def test_control_steps_are_divided_and_commands_ramped():
-    """Three time steps of 0.02 s in a control step of 0.05 s; the same by hand."""
+    """Three time steps of at most 0.02 s in a control step of 0.05 s, compared with steps made by hand."""
     robot = make_robot("tetrapod")
     backend = FEMBackend(robot, dynamics=True, time_step=0.02, stiffness_damping=0.01)
     start = backend.state
@@ -102,8 +102,8 @@ def test_a_push_moves_the_effector():
 
 
 @pytest.mark.parametrize("dynamics", [False, True])
-def test_a_servo_gives_way_at_its_torque_and_is_released(dynamics):
-    """It stands with its largest torque where that leads, and follows again once the command comes back."""
+def test_a_servo_saturates_at_its_torque_limit_and_is_released(dynamics):
+    """It rests where its largest torque leads, and follows again once the command comes back."""
     backend = FEMBackend(weak(0.04), dynamics=dynamics)
     strong = FEMBackend(make_robot("tetrapod"), dynamics=dynamics)
     command = np.zeros(4)
@@ -115,12 +115,12 @@ def test_a_servo_gives_way_at_its_torque_and_is_released(dynamics):
     assert state.effort[0] == pytest.approx(-0.04, rel=1e-9)
     assert -0.6 < state.displacement[0] < -0.3
     np.testing.assert_allclose(state.displacement[1:], 0.0, atol=1e-8)
-    # The same by the effort alone.
+    # The same state, commanded by the effort.
     driven = FEMBackend(make_robot("tetrapod"))
     target = np.array([state.effort[0], 0.0, 0.0, 0.0])
     found = driven._statics.solve(target, ["effort", "displacement", "displacement", "displacement"])
     np.testing.assert_allclose(found.delta[4:7], state.effector[0], atol=1e-6 if not dynamics else 1e-4)
-    # Less than where it stands is asked for: it follows.
+    # The servo follows a command below the angle that it has reached.
     command[0] = -0.2
     for _ in range(20):
         state = backend.step(command)
@@ -139,7 +139,7 @@ def test_efforts_are_cut_to_the_limit():
 
 @pytest.mark.parametrize("dynamics", [False, True])
 def test_random_commands_beyond_the_torque(dynamics):
-    """No torque is exceeded, no loop is endless, and the solver stands where the state says."""
+    """No torque is exceeded, every loop ends, and the solver agrees with the state."""
     backend = FEMBackend(weak(0.03), dynamics=dynamics, time_step=0.05)
     rng = np.random.default_rng(0)
     command = np.zeros(4)
@@ -163,7 +163,7 @@ def test_random_commands_beyond_the_torque(dynamics):
 
 
 def test_a_step_that_fails_leaves_the_state(monkeypatch):
-    """Also time, energies and history of the motion: it goes on as if it had not been tried."""
+    """Also time, energies and history of the motion, which continues as if the step had not been tried."""
     robot = make_robot("tetrapod")
     options = {"dynamics": True, "scheme": "generalised_alpha", "time_step": 0.025}
     backend, twin = FEMBackend(robot, **options), FEMBackend(robot, **options)
@@ -208,7 +208,7 @@ def test_a_probe_does_not_disturb_the_motion():
     np.testing.assert_allclose(probed.effector, still.effector, atol=1e-8)
 
 
-def test_going_back_to_a_state():
+def test_restoring_a_state():
     backend = FEMBackend(make_robot("tetrapod"), dynamics=True)
     path = [0.05 * k * np.array([1.0, -0.5, 0.2, 0.0]) for k in range(1, 7)]
     for command in path[:3]:
@@ -262,7 +262,7 @@ def test_environments_of_solids_in_time(identifier):
 
 
 def test_random_actions_at_the_largest_rates():
-    """Short for the benchmark's 10,000; held actions go to the ends of the servos."""
+    """A short version of the benchmark with 10,000 actions; held actions reach the ends of the servos."""
     rows = cases.robustness(60, 2) + cases.robustness(240, 3, ("SoftGym/TetrapodReach-v0",), hold=12)
     for row in rows:
         print(row)

@@ -1,4 +1,4 @@
-"""The hybrid backend: who answers when, how states go on from one to the other, and what is learned in between."""
+"""The hybrid backend: which model answers when, how states pass between both, and what is learned between episodes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from softgym_envs.errors import ConvergenceError, DataError, WeightsError
 from softgym_envs.robots import make_robot
 from softgym_envs.testing import train_small_surrogate
 
-LIMIT = 8e-3  # that of `weights`
+LIMIT = 8e-3  # largest displacement in the training of `weights` [m]
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def assert_same(a, b):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-9, err_msg=name)
 
 
-def test_finite_elements_cost_nothing_while_the_surrogate_is_trusted(robot, weights, monkeypatch):
+def test_no_finite_elements_are_built_while_the_surrogate_is_trusted(robot, weights, monkeypatch):
     monkeypatch.setattr(robot, "build", lambda design=None: pytest.fail("the body was built"), raising=False)
     backend = HybridBackend(robot, weights=weights)
     surrogate = SurrogateBackend(robot, weights=weights)
@@ -40,15 +40,15 @@ def test_finite_elements_cost_nothing_while_the_surrogate_is_trusted(robot, weig
     assert (backend.calls, backend.fem_calls) == (3, 0)
 
 
-def test_finite_elements_answer_where_it_is_not(robot, weights, fem):
+def test_finite_elements_answer_where_the_surrogate_is_not_trusted(robot, weights, fem):
     backend = HybridBackend(robot, weights=weights)
     fem.reset()
     state, expected = backend.step(np.array([0.015])), fem.step(np.array([0.015]))
     np.testing.assert_allclose(state.effector, expected.effector, atol=1e-7)
     np.testing.assert_allclose(state.condensed.compliance, expected.condensed.compliance, rtol=1e-4)
     assert state.trusted and state.uncertainty == 0.0 and state.nodes is not None
-    assert backend.fem_calls == 2  # the rest of the body, and this
-    assert_same(backend.step(np.array([0.015])), state)  # standing still asks for nothing new
+    assert backend.fem_calls == 2  # the body at rest, and this state
+    assert_same(backend.step(np.array([0.015])), state)  # holding the command needs no new solution
     beside, expected = backend.step(np.array([0.015015])), fem.step(np.array([0.015015]))
     assert backend.fem_calls == 2
     np.testing.assert_allclose(beside.effector, expected.effector, atol=2e-7)
@@ -77,7 +77,7 @@ def test_states_of_a_body_are_kept_once(robot, weights, tmp_path):
     assert episodes(again) == 4
 
 
-def test_probe_and_restore_know_both(robot, weights):
+def test_probe_and_restore_work_for_both_models(robot, weights):
     backend = HybridBackend(robot, weights=weights)
     near = backend.step(np.array([0.005]))
     far = backend.probe(np.array([0.016]))
@@ -104,8 +104,8 @@ def test_efforts(robot, weights, fem):
         backend.step(-strong, "effort")
 
 
-def test_slack_cables_go_on_from_one_to_the_other(weights, tmp_path):
-    """Two cables, weights that know nothing of them: everything by the finite elements and their condensed models."""
+def test_slack_cables_across_both_models(weights, tmp_path):
+    """Two cables on weights that were not trained for them: only finite elements and their condensed models answer."""
     robot = make_robot("finger")
     folder = tmp_path / "weights"
     train_small_surrogate(folder, robot, limit=0.002, states=6, members=2, width=8, steps=4)
@@ -119,14 +119,14 @@ def test_slack_cables_go_on_from_one_to_the_other(weights, tmp_path):
     assert (backend.calls, backend.fem_calls) == (3, 2)
 
 
-def test_an_unknown_body_is_left_to_the_finite_elements(robot, weights):
+def test_finite_elements_answer_for_an_unknown_body(robot, weights):
     backend = HybridBackend(robot, weights=weights)
     state = backend.reset({"length": 0.041})
     assert state.nodes is not None and backend.fem_calls == 1
     np.testing.assert_allclose(state.effector, FEMBackend(robot, {"length": 0.041}).state.effector, atol=1e-9)
     assert backend.step(np.array([0.003])).nodes is not None
     assert backend.reset({}).nodes is None
-    # A stiffness only scales efforts: the body is known.
+    # The stiffness only scales efforts, so this body is in the domain.
     assert backend.reset({"young_modulus": 5e6}).nodes is None
 
 
@@ -143,7 +143,7 @@ def test_a_failed_step_keeps_the_state(robot, weights, monkeypatch):
     assert backend.state is kept
 
 
-def test_it_learns_between_episodes_and_goes_on_from_its_folder(robot, weights, fem, tmp_path):
+def test_it_learns_between_episodes_and_resumes_from_its_folder(robot, weights, fem, tmp_path):
     options = {"weights": weights, "folder": tmp_path, "retrain_after": 20, "steps": 200}
     backend = HybridBackend(robot, **options)
     commands = np.linspace(0.0085, 0.015, 25)[:, None]
@@ -151,7 +151,7 @@ def test_it_learns_between_episodes_and_goes_on_from_its_folder(robot, weights, 
     for command in commands:
         assert backend.step(command).nodes is not None
     assert backend.model is first  # within an episode the physics does not change
-    assert len(list(tmp_path.glob("states_*.npz"))) == 2  # what an interruption would not lose
+    assert len(list(tmp_path.glob("states_*.npz"))) == 2  # an interruption would not lose these
     backend.reset()
     assert backend.retrainings == 1 and backend.retraining_seconds > 0.0
     before = backend.fem_calls
@@ -169,7 +169,7 @@ def test_it_learns_between_episodes_and_goes_on_from_its_folder(robot, weights, 
     resumed = HybridBackend(robot, **options)
     assert resumed.retrainings == 0
     assert all(np.array_equal(resumed.model.tensors[k], v) for k, v in backend.model.tensors.items())
-    # With other options the kept states are learned anew, at once.
+    # With other options the kept states are learned again immediately.
     assert HybridBackend(robot, **{**options, "steps": 3}).retrainings == 1
     with pytest.raises(DataError, match="another robot"):
         HybridBackend(make_robot("finger", cables=1, mesh_size=0.01), weights=weights, folder=tmp_path)

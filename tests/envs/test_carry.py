@@ -1,4 +1,4 @@
-"""Carry: how its distance counts, its pushes, and its refusals."""
+"""Carry: its distance, its pushes and refused options."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def robot():
 
 
 def no_kinematics(commands):
-    raise AssertionError("the goal does not depend on where commands lead")
+    raise AssertionError("the goal must not depend on where commands lead")
 
 
-def test_only_the_right_counts(robot):
+def test_only_the_distance_to_the_right_counts(robot):
     task = make_task("carry", robot, distance=0.1)
     goal = task.sample(np.random.default_rng(0), 2, no_kinematics)
     assert goal.shape == (2, 1, 3)
@@ -38,7 +38,7 @@ def test_the_reward_grows_to_the_right(robot):
 
 
 def test_pushes(robot):
-    """Each episode draws its own, within the window and the largest force."""
+    """Each episode draws its own push, within the window and the largest force."""
     task = make_task("carry", robot, push=0.5, push_steps=3, push_window=10)
     rng = np.random.default_rng(0)
     firsts, forces = set(), []
@@ -52,7 +52,7 @@ def test_pushes(robot):
     assert firsts == set(range(10))
     sizes = np.linalg.norm(forces, axis=1)
     assert sizes.max() <= 0.5 and sizes.max() > 0.45 and sizes.min() < 0.05
-    assert (np.abs(np.mean(forces, axis=0)) < 0.06).all()  # from all sides
+    assert (np.abs(np.mean(forces, axis=0)) < 0.06).all()  # in all directions
 
 
 def test_no_push_by_default(robot):
@@ -61,7 +61,7 @@ def test_no_push_by_default(robot):
     assert all(task.push(k) is None for k in range(100))
 
 
-def test_pushes_move_the_robot_and_the_seed_decides_them():
+def test_pushes_move_the_robot_and_depend_on_the_seed():
     def run(seed, **task_options):
         env = gymnasium.make("SoftGym/TetrapodCarry-v0", task_options=task_options)
         env.reset(seed=seed)
@@ -77,7 +77,7 @@ def test_pushes_move_the_robot_and_the_seed_decides_them():
     assert (run(4, push=0.5, push_window=4) != pushed).any()
 
 
-def test_success_is_to_be_beyond_the_goal():
+def test_an_episode_succeeds_beyond_the_goal():
     env = gymnasium.make("SoftGym/TetrapodCarry-v0", task_options={"distance": 0.02})
     env.reset(seed=0)
     right = np.array([1.0, 1.0, -1.0, 1.0], dtype=np.float32)

@@ -22,15 +22,15 @@ CASES = [
     for identifier, row in softgym_envs.ENVIRONMENTS.items()
     for backend in (("fem", "surrogate") if row.backend == "surrogate" else ("fem",))
 ]
-# Hybrid is made of the other two: one environment stands for all.
+# The hybrid backend consists of the other two, so one environment is enough.
 CASES.append(("SoftGym/FingerReach-v0", "hybrid"))
 assert {backend for _, backend in CASES} == set(BACKENDS)
-# Light bodies for the finite elements of robots that have a choice.
+# Coarse meshes for robots that have an option for them.
 LIGHT = {"cable_trunk": {"layers": 10, "rings": 1}}
 
 
 def make(identifier, **options):
-    """Make an environment with a light body."""
+    """Make an environment with a coarse mesh."""
     robot = softgym_envs.ENVIRONMENTS[identifier].robot
     backend = options.get("backend", softgym_envs.ENVIRONMENTS[identifier].backend)
     light = (LIGHT.get(robot, {}) if backend == "fem" else {}) | options.pop("robot_options", {})
@@ -102,7 +102,7 @@ def test_pickle_deepcopy_and_spec(identifier, backend):
 
 
 def kinds(identifier):
-    """Options of the robot that the contracts are checked with, and episodes: few where they are finite elements."""
+    """Options with which the contracts of an environment are checked, and episodes: fewer on finite elements."""
     row = softgym_envs.ENVIRONMENTS[identifier]
     return [({"cables": 1}, 5), ({"cables": 2}, 5)] if row.robot == "finger" else [({}, 1)]
 
@@ -137,7 +137,7 @@ def test_bounds_time_limit_and_info(identifier, options, episodes, action_mode):
         assert steps == limit
     assert set(info) >= {"effector", "goal", "distance", "is_success", "reward_terms", "displacement", "effort"}
     task = env.unwrapped.task
-    if task.name != "carry":  # which counts one side only
+    if task.name != "carry":  # whose distance counts one side only
         error = task.axes * (info["effector"] - info["goal"])
         assert info["distance"] == pytest.approx(np.linalg.norm(error), abs=1e-12)
     assert info["is_success"] == (info["distance"] < env.unwrapped.task.success_distance)
@@ -163,7 +163,7 @@ def test_rows_choose_the_backend_and_make_vec_follows():
 
 
 @pytest.mark.parametrize("identifier", ["SoftGym/TetrapodReach-v0", "SoftGym/TetrapodTrack-v0"])
-def test_a_surrogate_without_weights_says_what_ships(identifier):
+def test_a_surrogate_without_weights_names_the_shipped_ones(identifier):
     from softgym_envs.errors import WeightsError
 
     variant = make_robot(softgym_envs.ENVIRONMENTS[identifier].robot).weights_name
@@ -176,10 +176,10 @@ def test_track_follows_the_reference_path_of_its_robot(identifier):
     env = make(identifier).unwrapped
     env.reset(seed=0)
     assert (env.path == env.robot.reference_path()).all()
-    assert (np.abs(env.path) < 1.25 * env.robot.size).all()  # goals are seen whole
+    assert (np.abs(env.path) < 1.25 * env.robot.size).all()  # observations do not clip the goals
 
 
-def test_a_robot_without_a_reference_path_asks_for_one(monkeypatch):
+def test_track_needs_a_path_or_a_reference_path(monkeypatch):
     robot = make_robot("finger")
     monkeypatch.setattr(type(robot), "reference_path", Robot.reference_path)
     with pytest.raises(ValueError, match="robot 'finger' has no reference path"):
@@ -218,7 +218,7 @@ def test_reset_does_not_rebuild_the_same_design(monkeypatch):
 
 
 def test_backends_agree():
-    """The surrogate follows the FEM along a rollout, slack cables included, to a fraction of a millimetre."""
+    """The surrogate agrees with FEM along a rollout, slack cables included, to a fraction of a millimetre."""
     envs = [
         gymnasium.make("SoftGym/FingerReach-v0", backend=b, design={"joint_height": 0.007})
         for b in ("fem", "surrogate")
@@ -254,13 +254,13 @@ def test_backends_agree():
         ({"render_mode": "hologram"}, ValueError, ["hologram", "rgb_array"]),
     ],
 )
-def test_bad_options_name_the_thing(options, error, words):
+def test_bad_options_are_named(options, error, words):
     if words is None:
         from softgym_envs.errors import WeightsError as error  # noqa: N813
 
         words = ["nowhere", "does not exist"]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Gymnasium warns of an unknown render mode before we refuse it
+        warnings.simplefilter("ignore")  # Gymnasium warns about an unknown render mode before we refuse it
         with pytest.raises(error) as caught:
             gymnasium.make("SoftGym/FingerReach-v0", **options)
     message = str(caught.value)
@@ -287,7 +287,7 @@ def test_bad_actions_and_reset_options(backend):
     with pytest.raises(DesignError, match="length"):
         env.reset(options={"design": {"length": 1.0}})
     env.reset()
-    assert np.isfinite(env.step(np.array([5.0, -5.0]))[0]).all()  # out of range is clipped
+    assert np.isfinite(env.step(np.array([5.0, -5.0]))[0]).all()  # values out of range are clipped
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

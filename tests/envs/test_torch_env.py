@@ -17,7 +17,7 @@ FINGER = "SoftGym/FingerReach-v0"
 
 
 def pair(identifier, count, **options):
-    """The two environments in the same episodes: bodies, goals and first observations are checked to be equal."""
+    """Return both environments in the same episodes, after checking that bodies, goals and observations agree."""
     reference = gymnasium.make_vec(identifier, num_envs=count, **options).unwrapped
     env = TorchVectorEnv(identifier, count, device="cpu", **options)
     expected, _ = reference.reset(seed=0)
@@ -30,7 +30,7 @@ def pair(identifier, count, **options):
 
 
 def compare(reference, env, actions):
-    """One step of both; returns the reference's."""
+    """Step both environments; return the result of the reference."""
     expected, reward, _, truncated, info = reference.step(actions)
     observation, rewards, terminated, truncations, infos = env.step(torch.as_tensor(actions))
     np.testing.assert_allclose(infos["effector"], info["effector"], atol=1e-6)
@@ -39,7 +39,7 @@ def compare(reference, env, actions):
     np.testing.assert_array_equal(truncations, truncated)
     np.testing.assert_array_equal(infos["converged"], info["converged"])
     np.testing.assert_allclose(infos["uncertainty"], info["uncertainty"], rtol=2e-2, atol=1e-7)
-    assert (infos["trusted"].numpy() != info["trusted"]).sum() <= 1  # one may be at the limit
+    assert (infos["trusted"].numpy() != info["trusted"]).sum() <= 1  # one row may be at the limit
     np.testing.assert_allclose(infos["displacement"], info["displacement"], atol=1e-3 * env.robot.rates.max())
     assert not terminated.any()
     return expected, reward, truncated, info
@@ -104,7 +104,7 @@ def test_autoreset(sampled):
     assert bool((env.designs != designs).any()) == sampled
 
 
-def test_rows_end_alone_and_get_their_own_bodies():
+def test_rows_end_independently_and_get_their_own_bodies():
     env = TorchVectorEnv(FINGER, 5, device="cpu", seed=1, sample_design=True, design_in_observation=True)
     env.reset()
     designs = env.designs.clone()
@@ -148,7 +148,7 @@ def test_rows_without_a_state_end_where_they_were(monkeypatch):
 
 
 def test_rows_that_take_longer_are_finished(monkeypatch):
-    """With a single Newton step for all rows most are finished one by one, to the same states."""
+    """With a single Newton step for all rows, most rows are finished separately and reach the same states."""
     monkeypatch.setattr(torch_env, "NEWTON_STEPS", 1)
     reference, env = pair("SoftGym/DiamondReach-v0", 8, sample_design=True)
     finish, calls = env._finish, []
@@ -239,7 +239,7 @@ def test_single_precision_is_enough():
 
 @pytest.mark.parametrize("identifier", [FINGER, "SoftGym/DiamondTrack-v0"])
 def test_a_step_is_one_graph(identifier):
-    """A question to the host in the step would break the graph, and the compiler would say so."""
+    """Waiting for the host inside the step would break the graph, which the compiler reports."""
     env = TorchVectorEnv(identifier, 3, device="cpu", seed=0, sample_design=True)
     env.reset()
     actions = torch.ones(3, len(env.robot.actuators))

@@ -1,4 +1,4 @@
-"""Datasets: reproducible states, resumable generation that loses and repeats nothing, honest about damage."""
+"""Datasets: reproducible states, generation that resumes without losing or repeating work, damaged files."""
 
 import json
 import os
@@ -161,7 +161,7 @@ def length(points, start):
 
 
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 40), dimension=st.integers(1, 6))
-def test_paths_visit_all(seed, count, dimension):
+def test_paths_visit_every_point(seed, count, dimension):
     rng = np.random.default_rng(seed)
     points, start = rng.random((count, dimension)), rng.random(dimension)
     order = path_order(points, start)
@@ -182,7 +182,7 @@ def test_paths_among_equal_points():
 
 
 def states_along(t):
-    """Made-up states of one actuator and one effector, whose condensed model moves with ``t`` alone."""
+    """Artificial states of one actuator and one effector, whose condensed model moves with ``t`` alone."""
     W = np.broadcast_to(np.eye(4), (len(t), 4, 4)).copy()
     W[:, 0, 3] = W[:, 3, 0] = 0.5 * t
     effector = np.stack([np.zeros_like(t), np.ones_like(t), t], axis=1)
@@ -202,7 +202,7 @@ def states_along(t):
     kinds=st.integers(1, 60),
 )
 def test_states_are_chosen_once(seed, rows, share, kinds):
-    """Also where many are the same."""
+    """Also if many states are equal."""
     data = states_along(np.random.default_rng(seed).integers(0, kinds, rows) / kinds)
     count = max(1, round(share * rows))
     chosen = select_states(data, count, seed)
@@ -211,8 +211,8 @@ def test_states_are_chosen_once(seed, rows, share, kinds):
     np.testing.assert_array_equal(select_states(data, count, seed), chosen)
 
 
-def test_choice_covers_better_than_chance(rng):
-    t = np.concatenate([0.02 * rng.random(380), rng.random(20)])  # a crowd, and a few that go far
+def test_chosen_states_cover_better_than_random_ones(rng):
+    t = np.concatenate([0.02 * rng.random(380), rng.random(20)])  # a dense cluster and a few distant points
     data = states_along(t)
 
     def uncovered(chosen):
@@ -223,13 +223,13 @@ def test_choice_covers_better_than_chance(rng):
         assert uncovered(select_states(data, 12, seed)) < 0.5 * by_chance
 
 
-def test_choice_where_there_are_contacts():
+def test_choice_of_states_with_contacts():
     data, _ = sample_group(make_robot("finger", contacts=True), SamplingPlan(1, 3, vary=()), 0)
     assert data["compliance"].shape == (4, 14 * 15 // 2)
     assert len(select_states(data, 2)) == 2
 
 
-def test_choice_out_of_range():
+def test_counts_of_states_out_of_range_are_refused():
     data = states_along(np.arange(5.0))
     assert select_states(data, 5).tolist() == [0, 1, 2, 3, 4]
     for count in (0, 6):
@@ -294,7 +294,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trunk(tmp_path_factory):
-    """A dataset of three shards that is quickly made."""
+    """A small dataset of three shards."""
     folder = tmp_path_factory.mktemp("trunk")
     return folder, generate_dataset(folder, "trunk", PLAN, groups_per_shard=2, progress=False)
 
@@ -334,7 +334,7 @@ def test_manifest_and_card(made):
 
 
 def test_a_finished_dataset_is_only_read(copied, trunk, monkeypatch):
-    """So that trainings may share it, even while one of them has come first and looks it through."""
+    """Several trainings may therefore read it at the same time."""
     before = {path.name: path.stat().st_mtime_ns for path in copied.iterdir()}
     with FileLock(copied / ".lock"):
         again = generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
@@ -345,7 +345,7 @@ def test_a_finished_dataset_is_only_read(copied, trunk, monkeypatch):
     }
 
 
-def test_a_card_that_is_missing_is_written(copied, trunk):
+def test_a_missing_card_is_written(copied, trunk):
     card = copied / "README.md"
     content = card.read_text()
     card.unlink()
@@ -364,7 +364,7 @@ def test_two_runs_at_once_are_refused(copied):
     generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
 
 
-def test_what_killed_writers_left_is_cleared_away(copied, trunk):
+def test_files_left_by_killed_writers_are_removed(copied, trunk):
     (copied / "shard_00001.npz").unlink()
     for name in (".shard_00001.npz.a1b2c3", ".README.md.x", ".manifest.json.y"):
         (copied / name).write_bytes(b"PK\x03\x04")
@@ -413,7 +413,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
-def test_damaged_shards_are_named_set_aside_and_made_again(copied, trunk, damage, capsys):
+def test_damaged_shards_are_reported_renamed_and_generated_again(copied, trunk, damage, capsys):
     first, second = copied / "shard_00000.npz", copied / "shard_00001.npz"
     stamp, content = first.stat().st_mtime_ns, second.read_bytes()
     damage(second)
@@ -428,7 +428,7 @@ def test_damaged_shards_are_named_set_aside_and_made_again(copied, trunk, damage
     assert equal(again, trunk[1])
 
 
-def test_another_plan_does_not_mix(copied):
+def test_data_of_another_plan_are_refused(copied):
     for options, name in (
         ({"groups_per_shard": 3}, "groups_per_shard"),
         ({"robot_options": {"elements": 9}}, "mechanics_key, robot_options"),
@@ -443,7 +443,7 @@ def test_another_plan_does_not_mix(copied):
 
 @pytest.mark.parametrize("sequence", ["halton", "sobol", "random"])
 def test_a_dataset_grows(tmp_path, sequence):
-    """More groups keep those there are, and are what they would have been at once."""
+    """Adding groups keeps the existing ones and gives the same data as generating all at once."""
 
     def plan(groups):
         return SamplingPlan(groups, 2, sequence, 3)
@@ -461,7 +461,7 @@ def test_a_dataset_grows(tmp_path, sequence):
 
 
 def test_a_dataset_that_cannot_grow(tmp_path):
-    """A Latin hypercube is laid out for its number of points; a shard that is not full would have to be."""
+    """A Latin hypercube depends on its number of points; an incomplete last shard would have to be made again."""
     for sequence, first in (("latin", 2), ("halton", 1)):
         for groups in (first, 4):
             plan = SamplingPlan(groups, 2, sequence, 3)
@@ -493,7 +493,13 @@ def test_infeasible_designs_are_counted(tmp_path, monkeypatch, trunk):
         return original(robot, plan, group) if group == 1 else (None, plan.states)
 
     monkeypatch.setattr(dataset, "sample_group", sample)
-    data = generate_dataset(tmp_path / "one", "trunk", PLAN, groups_per_shard=2, progress=False)  # none of the second
+    data = generate_dataset(
+        tmp_path / "one",
+        "trunk",
+        PLAN,
+        groups_per_shard=2,
+        progress=False,  # the second shard has no feasible design
+    )  # no feasible design in the second shard
     assert data["rest"].sum() == 1
     np.testing.assert_array_equal(data["effector"], trunk[1]["effector"][4:8])
     card = (tmp_path / "one" / "README.md").read_text()
@@ -526,7 +532,7 @@ def test_unknown_executor(tmp_path):
 
 
 def test_interruption_loses_no_finished_shard(tmp_path, monkeypatch, trunk):
-    """An interruption in the second shard leaves the first, and no half-written file."""
+    """An interruption in the second shard keeps the first and leaves no half-written file."""
     original = dataset.sample_group
 
     def sample(robot, plan, group):
@@ -544,7 +550,7 @@ def test_interruption_loses_no_finished_shard(tmp_path, monkeypatch, trunk):
 
 LONG = SamplingPlan(groups=200, states=2, sequence="random", seed=1)
 
-# What starts the runs: each in its own session, without the seconds that imports take.
+# Starts each run in its own session by a fork, so that imports are done once.
 STARTER = f"""
 import os, sys
 import joblib.externals.loky.backend.resource_tracker
@@ -556,18 +562,18 @@ for folder in sys.stdin:
     if process == 0:
         os.setsid()
         os.write(1, b"%d\\n" % os.getpid())
-        os.dup2(2, 1)  # whatever else is said is no process number
+        os.dup2(2, 1)  # other output must not mix with the process IDs
         generate_dataset(folder.strip(), "trunk", {LONG!r}, groups_per_shard=1, workers=2, progress=False)
         os._exit(0)
 """
 
 
 def test_ten_kills_lose_no_finished_shard_and_repeat_none(tmp_path, rng):
-    """kill -9 of the run alone or with its workers, as it starts or anywhere among its shards; then another run."""
+    """Kill the run alone or with its workers, at its start or between any of its shards; then start another run."""
     folder = tmp_path / "data"
 
     def shards():
-        """Name -> i-node, time and bytes, of what counts as finished."""
+        """Return name -> (i-node, time, bytes) of the finished shards."""
         return {p.name: (p.stat().st_ino, p.stat().st_mtime_ns, p.read_bytes()) for p in folder.glob("shard_*")}
 
     finished, sessions, survivors, gained = {}, [], 0, []
@@ -609,7 +615,7 @@ def test_ten_kills_lose_no_finished_shard_and_repeat_none(tmp_path, rng):
                 assert now.items() >= finished.items()
                 gained.append(len(now) - before)
                 finished = now
-            assert survivors >= 3  # there were orphans to look after
+            assert survivors >= 3  # workers outlived their killed run
             assert sum(n > 0 for n in gained) >= 8 and len(finished) < LONG.groups, gained
 
             start()
@@ -620,11 +626,11 @@ def test_ten_kills_lose_no_finished_shard_and_repeat_none(tmp_path, rng):
             for session in sessions:
                 for process in live_processes(session):
                     os.kill(process, signal.SIGKILL)
-                # A killed group has nobody left to clear its semaphores away.
+                # Nobody removes the semaphores of a killed process group.
                 for left in Path("/dev/shm").glob(f"*[-_]{session}[-_]*"):
                     shutil.rmtree(left) if left.is_dir() else left.unlink()
 
-    # Nothing is lost, repeated, left lying or different from a run that nobody stopped.
+    # Nothing is lost, repeated, left behind or different from an uninterrupted run.
     final = shards()
     assert final.items() >= finished.items()
     assert {path.name for path in folder.iterdir()} == {".lock", "README.md", "manifest.json", *final}

@@ -39,7 +39,7 @@ CASES = {
 
 
 def random_model(case, seed=0, learned=None):
-    """A model with random weights and magnitudes like real ones; its width is no multiple of a vector's.
+    """A model with random weights and magnitudes like real ones; its width is not a multiple of a vector register's.
 
     ``learned``: the design variables it depends on, beside the stiffness; default all of the robot.
     """
@@ -114,7 +114,7 @@ class Compiled:
 
 @needs_compiler
 @pytest.mark.parametrize("case", CASES)
-def test_the_header_computes_what_the_model_does(case, tmp_path):
+def test_the_header_agrees_with_the_model(case, tmp_path):
     model = random_model(case)
     designs, displacement = random_states(model.robot, 40)
     design = dict(zip(model.robot.design_space.names, designs[0].tolist(), strict=True))
@@ -128,7 +128,7 @@ def test_the_header_computes_what_the_model_does(case, tmp_path):
     assert (W == W.swapaxes(1, 2)).all()
     (effort, effector, _), _ = compiled(displacement, 3, "state")
     assert_same(model, designs, displacement, (effort, effector, W))
-    # What is not finite is reported, not returned.
+    # Results that are not finite are reported, not returned.
     (_, _, W), status = compiled(np.full((1, model.count), np.nan), 3)
     assert status == [1] and np.isnan(W).all()
 
@@ -148,7 +148,7 @@ def test_fewer_members_are_the_first_ones(tmp_path):
     assert_same(fewer, designs, displacement, run_graph(runtime, path, designs, displacement))
 
 
-def test_the_header_says_what_it_is_and_keeps_every_digit(tmp_path):
+def test_the_header_describes_itself_and_keeps_every_digit(tmp_path):
     model = random_model("two")
     text = export_c(model, {"young_modulus": 4e6}, tmp_path / "a" / "model.h", name="my_robot").read_text()
     assert re.findall(r"#include.*", text) == ["#include <math.h>"]
@@ -171,13 +171,13 @@ def run_graph(runtime, path, designs, displacement):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_graph_computes_what_the_model_does(case, tmp_path):
+def test_the_graph_agrees_with_the_model(case, tmp_path):
     onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
     model = random_model(case)
     path = export_onnx(model, tmp_path / "model.onnx")
     for rows in (1, 30):
         designs, displacement = random_states(model.robot, rows, seed=rows)
-        # The nearly incompressible end is where single precision of the input counts.
+        # The single precision of the input matters at the nearly incompressible end.
         assert_same(model, designs, displacement, run_graph(runtime, path, designs, displacement), 1e-4)
     properties = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
     assert properties["robot"] == model.robot.name
@@ -188,7 +188,7 @@ def test_the_graph_computes_what_the_model_does(case, tmp_path):
 
 
 def test_a_graph_of_one_body(tmp_path):
-    """No design variable but the stiffness, or none at all: the layers of the design have nothing to depend on."""
+    """No design variable but the stiffness, or none at all: the layers of the design have no inputs."""
     pytest.importorskip("onnx")
     runtime = pytest.importorskip("onnxruntime")
     for case in ("two", "four", "six"):
@@ -199,7 +199,7 @@ def test_a_graph_of_one_body(tmp_path):
 
 
 class Other(SurrogateModel):
-    """A model of another network."""
+    """A model of an unsupported network."""
 
     network = "thesis"
 

@@ -13,7 +13,7 @@ NAMES = ("finger", "trunk", "press_finger")
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_torch_says_what_the_compiled_model_says(name):
+def test_torch_agrees_with_the_compiled_model(name):
     robot = make_robot(name)
     model, _ = untrained_potential(robot, members=2)
     designs, displacement = random_states(robot, 10)

@@ -134,8 +134,8 @@ def test_compiled_potential_agrees_with_torch(name):
 
 
 @pytest.mark.parametrize("name", ["finger", "diamond", "trunk"])
-def test_search_of_a_batch_is_that_of_its_rows(name):
-    """Rows of a batch do not touch each other: not those that end early, not those without a state."""
+def test_search_of_a_batch_equals_the_search_of_each_row(name):
+    """Rows of a batch do not affect each other, even if some end early or have no state."""
     robot = make_robot(name)
     model = pretrained_model(robot)
     count, lost = 2 * kernels.ROWS_PER_BLOCK + 5, [3, kernels.ROWS_PER_BLOCK + 1]
@@ -164,7 +164,7 @@ def test_search_of_a_batch_is_that_of_its_rows(name):
 
 
 def test_the_search_is_recompiled_when_the_code_it_inlines_changes():
-    """Numba looks for a compiled function by the values of its free variables, beside its signature and code."""
+    """Numba's key for a compiled function includes the values of its free variables, besides signature and code."""
     checksum = zlib.crc32(Path(complementarity.__file__).read_bytes())
     assert [cell.cell_contents for cell in kernels.search.py_func.__closure__] == [checksum]
     codegen = numba.core.registry.cpu_target.target_context.codegen()
@@ -172,7 +172,7 @@ def test_the_search_is_recompiled_when_the_code_it_inlines_changes():
     assert len(keys) == 2 and kernels.search._cache._index_key((), codegen) in keys
 
 
-def test_a_row_without_a_definite_compliance_is_lost_alone(monkeypatch):
+def test_a_row_without_a_definite_compliance_does_not_affect_others(monkeypatch):
     robot = make_robot("finger")
     model = untrained_residual(robot)
     designs, target = random_states(robot, 16)
@@ -201,7 +201,7 @@ def test_members_of_an_ensemble():
     model, _ = untrained_potential(robot, members=3)
     designs, displacement = random_states(robot, 5)
     assert np.isfinite(model.state(model.context(designs), displacement)[2]).all()
-    for members in (1, 2):  # whose spread is smaller than that of all, which was calibrated
+    for members in (1, 2):  # uncalibrated: their spread is smaller than that of all
         part = Model(robot, model.tensors, {}, members=members)
         assert part.members == members and np.isinf(part.state(part.context(designs), displacement)[2]).all()
     with pytest.raises(ValueError, match=r"members = 4.*1 to 3"):
@@ -210,7 +210,7 @@ def test_members_of_an_ensemble():
         residual.Model(robot, untrained_residual(robot).tensors, {}, members=2)
 
 
-def test_context_rows_share_and_part():
+def test_rows_of_a_context_share_bodies_until_overwritten():
     robot = make_robot("finger")
     model, _ = untrained_potential(robot)
     designs, displacement = random_states(robot, 6)
@@ -251,7 +251,7 @@ def test_trust_ends_where_actuators_become_soft():
     context = model.context(designs)
     found = model.growth(context, displacement)
     zero = np.zeros_like(displacement)
-    # One member judges it.
+    # A single member judges the growth.
     first = Model(robot, online._member(model.tensors, 0), {})
     W, unmoved = (
         first.compliance(first.context(designs), d)[:, : model.count, : model.count] for d in (displacement, zero)
@@ -260,7 +260,7 @@ def test_trust_ends_where_actuators_become_soft():
     np.testing.assert_allclose(found, ratio, rtol=1e-4)
     np.testing.assert_allclose(model.growth(context, zero), 1.0, rtol=1e-6)
     limit = float(np.median(found))
-    # Young's modulus is another in every row, and does not matter.
+    # Young's modulus differs between the rows and has no influence.
     limited = Model(robot, model.tensors, {"domain": {"growth": limit}})
     trusted = limited.trust(limited.context(designs), displacement, np.zeros(200))[1]
     assert trusted.tolist() == (found < limit).tolist()
@@ -299,7 +299,7 @@ def test_condensed_model_is_consistent(cables):
 
 @pytest.mark.parametrize("cables", CABLES)
 def test_shipped_weights_keep_their_recorded_accuracy_on_fresh_fem_states(cables):
-    """Designs that were in no dataset; the bounds are those the project promises over the whole box."""
+    """Designs from no dataset; the bounds are those that the project promises over the whole box."""
     from softgym_envs.backends.fem import FEMBackend
     from softgym_envs.backends.surrogate import SurrogateBackend
 
@@ -319,14 +319,14 @@ def test_shipped_weights_keep_their_recorded_accuracy_on_fresh_fem_states(cables
 
 
 @pytest.mark.parametrize("cables", CABLES)
-def test_card_tells_where_the_weights_come_from(cables):
+def test_card_records_the_origin_of_the_weights(cables):
     robot = make_robot("finger", cables=cables)
     card = json.loads((pretrained_folder(robot) / "model.json").read_text())
     assert card["network"] in NETWORKS
     assert card["test"]["positive_definite"] == 1.0
     assert card["states"]["test"] >= 500
     config = load_config(CONFIGS / f"{robot.weights_name}.yaml", FitConfig)
-    asked = config.model_dump(mode="json", exclude={"workers", "executor"})  # what made them is not part of it
+    asked = config.model_dump(mode="json", exclude={"workers", "executor"})  # how the data are generated does not count
     assert {k: v for k, v in card["config"].items() if k != "workers"} == asked
 
 
@@ -342,7 +342,7 @@ def test_effort_mode_inverts_displacement_mode():
         backend.step(driven.effort, mode="magnetic")
 
 
-def test_slack_cables_carry_nothing_and_reach_more():
+def test_slack_cables_have_no_effort_and_a_larger_displacement():
     from softgym_envs.backends.surrogate import SurrogateBackend
 
     backend = SurrogateBackend(make_robot("finger"))
@@ -350,7 +350,7 @@ def test_slack_cables_carry_nothing_and_reach_more():
     assert state.slack.tolist() == [False, True]
     assert state.effort[1] == 0.0 and state.effort[0] > 0.0
     assert state.displacement[0] == pytest.approx(0.015, abs=1e-5) and state.displacement[1] > 0.005
-    # The same place is found from elsewhere.
+    # The same state is found from another start.
     backend.step(np.array([0.02, 0.02]))
     again = backend.step(np.array([0.015, 0.0]))
     assert np.abs(again.displacement - state.displacement).max() < 5e-6
@@ -428,7 +428,7 @@ def splits(**changes):
     return {name: data[name] | changes.get(name, {}) for name in data}
 
 
-def test_splits_are_of_different_states():
+def test_splits_have_different_states():
     data = FitConfig.model_validate({"robot": "finger", "data": splits()}).data
     assert [getattr(data, name).seed for name in splits()] == [0, 1, 2]
     robot = make_robot("finger")
@@ -438,7 +438,7 @@ def test_splits_are_of_different_states():
         FitConfig.model_validate({"robot": "finger", "data": splits(test={"seed": 0})})
 
 
-def test_a_refused_run_leaves_the_configuration_of_the_data(tmp_path):
+def test_a_refused_run_does_not_change_the_configuration_of_the_data(tmp_path):
     config = {"robot": "finger", "robot_options": {"cables": 1}, "workers": 1}
     asked = [FitConfig.model_validate({**config, "data": splits(train={"states": states})}) for states in (4, 5)]
     generate_datasets(asked[0], tmp_path, progress=False)
@@ -469,7 +469,7 @@ def test_a_damaged_part_is_trained_again(tmp_path, capsys):
 
 @pytest.mark.parametrize("kind", sorted(NETWORKS))
 def test_fit_end_to_end(kind, tmp_path, tmp_path_factory):
-    """A tiny fit of each network learns something, ships a card, and can be loaded."""
+    """A tiny fit of each network learns something, writes a card, and can be loaded."""
     config = FitConfig.model_validate(
         {
             "robot": "finger",

@@ -16,12 +16,12 @@ from softgym_envs.surrogate.potential.training import stack_members, unstack_mem
 from softgym_envs.surrogate.weight_files import load_model, save_model
 from softgym_envs.testing import sample_states
 
-LIMIT = 8e-3  # that of `weights`
+LIMIT = 8e-3  # largest displacement in the training of `weights` [m]
 
 
 @pytest.fixture(scope="module")
 def model(robot, weights):
-    """With a limit of 0.2 mm, as the hybrid backend sets it."""
+    """The ensemble with a limit of 0.2 mm, as the hybrid backend sets it."""
     given = load_model(weights, robot)
     return Model(robot, given.tensors, {**given.card, "domain": {**given.card["domain"], "limit": 2e-4}})
 
@@ -34,7 +34,7 @@ def full(robot):
 
 @pytest.fixture(scope="module")
 def middle(robot):
-    """States up to 14 mm, beyond what the weights know."""
+    """States up to 14 mm, beyond the training data of the weights."""
     data = sample_states(robot, 40, 6, limit=14e-3)
     rows = (data["displacement"][:, 0] > LIMIT) | data["rest"]
     return {k: v[rows] for k, v in data.items()}
@@ -54,14 +54,14 @@ def judged(model, data, low, high):
     return np.linalg.norm(effector - data["effector"][rows], axis=1), uncertainty, trusted
 
 
-def test_members_can_be_taken_apart_and_put_together(model):
+def test_stacking_members_inverts_unstacking(model):
     states, scales = unstack_members(model.tensors)
     again = stack_members(states, scales)
     assert again.keys() == model.tensors.keys()
     assert all(np.array_equal(again[k], model.tensors[k]) for k in again)
 
 
-def test_members_in_torch_are_those_of_the_kernel(model, robot):
+def test_members_in_torch_agree_with_the_kernel(model, robot):
     import torch
 
     from softgym_envs.surrogate.potential.torch import PotentialNet
@@ -79,8 +79,8 @@ def test_members_in_torch_are_those_of_the_kernel(model, robot):
     np.testing.assert_allclose(effector * scales["effector"] + scales["effector_mean"], found, atol=1e-6)
 
 
-def test_the_given_ensemble_flags_what_it_does_not_know(model, full):
-    """By its spread alone, also where it errs by more than 1 mm; the box flags everything outside."""
+def test_the_given_ensemble_flags_unknown_states(model, full):
+    """The spread alone flags states outside, also those with an error above 1 mm; the box flags all of them."""
     error, uncertainty, trusted = judged(model, full, 1.01 * LIMIT, 1.0)
     bad = error > 1e-3
     assert bad.sum() > 10
@@ -98,8 +98,8 @@ def test_new_states_are_learned_and_old_ones_not_forgotten(model, learned, full)
     assert judged(learned, full, LIMIT, 13.5e-3)[2].mean() > 0.7
 
 
-def test_what_is_still_unknown_is_not_trusted_even_inside_the_box(model, learned, middle, full):
-    """One lonely state at 20 mm makes the box as large as the range; the spread goes on deciding inside."""
+def test_unknown_states_are_not_trusted_even_inside_the_box(model, learned, middle, full):
+    """A single state at 20 mm makes the box as large as the range; inside the box the spread still decides."""
     assert not judged(learned, full, 15e-3, 1.0)[2].any()  # by the box
     lonely = {k: np.concatenate([middle[k], v[[np.argmax(full["displacement"][:, 0])]]]) for k, v in full.items()}
     tuned = fine_tune(model, lonely, steps=250)
@@ -121,7 +121,7 @@ def test_the_domain_grows_and_its_limit_stays(model, learned, middle):
     assert learned.card["data_sha256"] != model.card.get("data_sha256")
 
 
-def test_the_growth_rises_to_what_was_learned_and_not_to_what_was_left_out(model, middle):
+def test_the_growth_rises_to_learned_states_and_not_to_left_out_ones(model, middle):
     rows = np.flatnonzero(~middle["rest"].astype(bool))
     strict = Model(model.robot, model.tensors, {**model.card, "domain": {**model.card["domain"], "growth": 0.1}})
 
@@ -132,7 +132,7 @@ def test_the_growth_rises_to_what_was_learned_and_not_to_what_was_left_out(model
 
     found, states = growth(middle)
     assert found == pytest.approx(min(10.0, states.max()))
-    # One that is as good as buckled: its actuators' compliance is a hundred times that at rest.
+    # A state close to buckling: the compliance of its actuators is a hundred times that at rest.
     compliance = middle["compliance"].copy()
     compliance[rows[5], 0] *= 100.0 * compliance[0, 0] / compliance[rows[5], 0]
     found, states = growth({**middle, "compliance": compliance})
@@ -153,7 +153,7 @@ def test_rehearsed_states_lie_where_the_model_is_trusted(model):
     assert model.trust(context, displacement, model.state(context, displacement)[2])[1].all()
 
 
-def test_weights_are_written_and_read_as_ordinary_ones(model, learned, middle, robot, tmp_path):
+def test_learned_weights_are_ordinary_weight_files(model, learned, middle, robot, tmp_path):
     save_model(learned, tmp_path)
     read = load_model(tmp_path, robot)
     context = read.context(middle["design"])
@@ -165,7 +165,7 @@ def test_weights_are_written_and_read_as_ordinary_ones(model, learned, middle, r
     assert not is_tuned_from(model, model, middle, 250, 0)
 
 
-def test_models_that_cannot_decide_are_refused(robot, weights, middle, model):
+def test_models_without_a_calibrated_ensemble_are_refused(robot, weights, middle, model):
     with pytest.raises(WeightsError, match="2 or more"):
         check_ensemble(load_model(weights, robot, members=1))
     with pytest.raises(WeightsError, match="needs all members of an ensemble of 2 or more.*got 2"):
@@ -189,7 +189,7 @@ def test_states_are_read_again(robot, middle, tmp_path):
     assert again.count == store.count == 6
     assert again.data.keys() == set(COLUMNS)
     assert all(np.array_equal(again.data[k], store.data[k]) for k in COLUMNS)
-    for both in (again, store):  # names are their own, in one process too
+    for both in (again, store):  # file names are unique, also within one process
         both.add({k: v[:2] for k, v in middle.items()})
     assert StateStore(robot, tmp_path).count == 8
     assert StateStore(robot).count == 0
