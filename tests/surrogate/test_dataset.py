@@ -493,13 +493,8 @@ def test_infeasible_designs_are_counted(tmp_path, monkeypatch, trunk):
         return original(robot, plan, group) if group == 1 else (None, plan.states)
 
     monkeypatch.setattr(dataset, "sample_group", sample)
-    data = generate_dataset(
-        tmp_path / "one",
-        "trunk",
-        PLAN,
-        groups_per_shard=2,
-        progress=False,  # the second shard has no feasible design
-    )  # no feasible design in the second shard
+    # The second shard has no feasible design.
+    data = generate_dataset(tmp_path / "one", "trunk", PLAN, groups_per_shard=2, progress=False)
     assert data["rest"].sum() == 1
     np.testing.assert_array_equal(data["effector"], trunk[1]["effector"][4:8])
     card = (tmp_path / "one" / "README.md").read_text()
