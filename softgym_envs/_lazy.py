@@ -13,8 +13,8 @@ Exports = Mapping[str, Sequence[str]]
 def lazy_exports(package: str, exports: Exports) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
 
-    The package also lists the same imports under ``if TYPE_CHECKING``, for type checkers and editors; a test compares
-    both.
+    The package also lists the same imports under ``if TYPE_CHECKING``, for type checkers and editors; a test checks
+    that both agree.
 
     Args:
         package: its ``__name__``.

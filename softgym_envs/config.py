@@ -22,7 +22,7 @@ from softgym_envs.version import __version__
 
 
 class Config(BaseModel):
-    """Base of all configurations: immutable, without unknown keys and with finite numbers only."""
+    """Base class of all configurations: immutable, without unknown keys, finite numbers only."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=False, allow_inf_nan=False)
 
@@ -96,12 +96,12 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
 
 
 def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> ModelT:
-    """Return plain data as a configuration.
+    """Return a configuration made from plain data.
 
     Args:
         model: class of the configuration.
         data: keys and values.
-        where: where the data come from, for the message: ``"config 'x.yaml'"``.
+        where: source of the data, for the message: ``"config 'x.yaml'"``.
 
     Raises:
         ConfigError: one line that describes the first problem.
@@ -165,14 +165,14 @@ def _difference(old: Any, new: Any, key: str, ignore: frozenset[str]) -> str | N
 def check_compatible(
     old: Config, new: Config, found: str, *, may_change: Sequence[str] = (), use: str = "folder"
 ) -> None:
-    """Check that stored results may be continued with a new configuration.
+    """Check that stored results can be continued with a new configuration.
 
     Args:
         old: the configuration of the results.
         new: the requested configuration.
-        found: where the results are and what they are, for the message: ``"folder 'x' holds a search"``.
+        found: location and kind of the results, for the message: ``"folder 'x' holds a search"``.
         may_change: dotted keys that may differ.
-        use: what to change to start again: ``"folder"`` or ``"name"``.
+        use: what to change to start afresh: ``"folder"`` or ``"name"``.
 
     Raises:
         ConfigError: one line naming the first key that differs, both values, and the keys that may differ.
@@ -184,7 +184,7 @@ def check_compatible(
 
 
 def _allowed(model: type[BaseModel], path: list[str]) -> list[str]:
-    """Return the keys of the group of keys at ``path``; none if the group is not a configuration."""
+    """Return the keys allowed in the group at ``path``; none if the group is not a configuration."""
     for name in path:
         field = model.model_fields.get(name)
         inner = None if field is None else field.annotation
@@ -195,9 +195,9 @@ def _allowed(model: type[BaseModel], path: list[str]) -> list[str]:
 
 
 def commit_of(root: Path) -> str | None:
-    """Return the git commit of a source tree, with ``-dirty`` if files differ from it, or None if it is unknown.
+    """Return the git commit of a source tree, with ``-dirty`` if files are modified, or None if it is unknown.
 
-    In a clone git knows the commit; a source archive (``git archive``, a downloaded tag) stores it in a file.
+    In a clone, git provides the commit; a source archive (``git archive``, a downloaded tag) stores it in a file.
     """
     archived = root / ".git_archival.txt"
     if (root / ".git").exists():
@@ -236,7 +236,7 @@ def provenance() -> dict[str, Any]:
 
 
 def save_resolved(folder: str | Path, config: Config) -> None:
-    """Write a configuration and its provenance to the folder of a result."""
+    """Write a configuration and its provenance to a results folder."""
     folder = Path(folder)
     with atomic_write(folder / "config.yaml", "w") as stream:
         yaml.safe_dump(config.model_dump(mode="json"), stream, sort_keys=False)

@@ -27,7 +27,7 @@ class DesignVariable:
         baseline: value of the reference body [unit].
         unit: SI unit, or ``"1"`` for a pure number.
         description: what the variable means to a designer.
-        log: sample and normalise on a logarithmic scale.
+        log: whether to sample and normalise on a logarithmic scale.
     """
 
     name: str
@@ -60,7 +60,7 @@ class DesignVariable:
             raise DesignError(f"design variable '{self.name}' = {value!r} is not a number; {allowed}") from None
         if not math.isfinite(number):
             raise DesignError(f"design variable '{self.name}' = {number} is not finite; {allowed}")
-        # Bounds that were rounded to text or float32 are accepted, nothing beyond.
+        # Tolerate only the rounding of a bound to text or float32.
         slack = 1e-6 * (self.high - self.low)
         if not self.low - slack <= number <= self.high + slack:
             raise DesignError(f"design variable '{self.name}' = {number:g}{unit} is out of bounds; {allowed}")
@@ -85,9 +85,9 @@ class DesignVariable:
 
 
 class Design(Mapping[str, float]):
-    """A value for every variable of a design space, checked once and unchangeable.
+    """A value for every variable of a design space, checked once and immutable.
 
-    It reads like a mapping ``{name: value}``, is made by `DesignSpace.complete` and is accepted wherever a design is.
+    A mapping ``{name: value}``, created by `DesignSpace.complete` and accepted wherever a design is.
 
     Attributes:
         space: the variables.
@@ -122,7 +122,7 @@ class Design(Mapping[str, float]):
 
 
 class DesignSpace:
-    """An ordered set of `DesignVariable`; iteration goes over the variables."""
+    """An ordered set of design variables; iteration yields them in order."""
 
     def __init__(self, *variables: DesignVariable) -> None:
         names = [variable.name for variable in variables]
@@ -157,11 +157,11 @@ class DesignSpace:
         return f"DesignSpace({', '.join(self.names)})"
 
     def complete(self, design: Mapping[str, float] | None = None, base: Mapping[str, float] | None = None) -> Design:
-        """Return a whole, checked design.
+        """Return a complete, checked design.
 
         Args:
-            design: values of some or all variables. A `Design` of this space is returned as it is.
-            base: the other values; by default the baseline.
+            design: values of some or all variables. A `Design` of this space is returned unchanged.
+            base: values of the other variables; default: the baseline.
 
         Raises:
             DesignError: for an unknown name, or a value that is not finite or out of bounds.

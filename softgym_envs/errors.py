@@ -8,7 +8,7 @@ from os.path import commonprefix
 
 
 class SoftGymError(Exception):
-    """Base of all errors that softgym-envs raises for its users."""
+    """Base class of all errors that softgym-envs raises for its users."""
 
 
 class DesignError(SoftGymError, ValueError):
@@ -23,7 +23,7 @@ class InfeasibleDesign(SoftGymError):
 
 
 class MeshingError(SoftGymError):
-    """The mesh generator is missing, or a drawing function fails: this is never the fault of a design."""
+    """The mesh generator is missing or a drawing function fails; the design is never the cause."""
 
 
 class ConvergenceError(SoftGymError):
@@ -51,13 +51,13 @@ class ConfigError(SoftGymError, ValueError):
 
 
 MAX_NAMES = 12
-"""Most allowed names that a message lists besides the nearest one."""
+"""Largest number of allowed names that a message lists besides the nearest one."""
 
 
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> str:
     """Return the message for a name that does not exist: the nearest name, if there is one, and the allowed names.
 
-    A long list of allowed names is left out if there is a near one.
+    A long list of allowed names is omitted if there is a near one.
 
     Args:
         kind: what the name should be: ``"robot"``, ``"option"``, ...
@@ -65,7 +65,7 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> str:
         allowed: the names that exist.
     """
     allowed = list(allowed)
-    # Names that all begin or end alike, as IDs do, are compared without those parts.
+    # Ignore a prefix or suffix that all names share, as in environment IDs.
     start = commonprefix(allowed) if len(allowed) > 1 else ""
     end = commonprefix([each[::-1] for each in allowed])[::-1] if len(allowed) > 1 else ""
 

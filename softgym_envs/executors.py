@@ -1,4 +1,4 @@
-"""Parallel evaluation of a function, on processes of this machine or on a Ray cluster."""
+"""Parallel evaluation of a function, in processes on this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ EXECUTORS = ("loky", "ray")
 """``"loky"``: processes on this machine; ``"ray"``: a Ray cluster (the extra ``ray``)."""
 
 PARENT_CHECK_INTERVAL = 0.2
-"""Time between two checks of a worker process whether its parent still lives [s]."""
+"""Interval at which a worker process checks that its parent is still alive [s]."""
 
 
 def parallel_map(function: Callable, arguments: Sequence[tuple], workers: int, executor: str = "loky") -> Iterator[Any]:
     """Yield ``function(*row)`` for each row of ``arguments``.
 
-    Processes of this machine yield results in the order in which they finish, and end when this process ends, even if
-    it is killed. A Ray cluster yields all results at the end. One local worker is this process itself.
+    Local processes yield results in the order in which they finish, and end when this process ends, even if it is
+    killed. A Ray cluster yields all results at the end. With one local worker, this process does the work itself.
 
     Args:
         function: importable in a worker process.
@@ -45,7 +45,7 @@ def parallel_map(function: Callable, arguments: Sequence[tuple], workers: int, e
     else:
         from joblib import Parallel, delayed, parallel_config
 
-        # loky replaces workers that were idle for minutes or use much memory: the user need not act.
+        # loky replaces workers that were idle for minutes or use much memory; the warning needs no action.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         with parallel_config("loky", n_jobs=workers, initializer=_end_with_parent, initargs=(os.getpid(),)):
             yield from Parallel(return_as="generator_unordered", batch_size=1)(
@@ -57,8 +57,8 @@ def parallel_map(function: Callable, arguments: Sequence[tuple], workers: int, e
 def ray_cluster() -> Iterator[Any]:
     """Yield the module ``ray``, connected to a cluster.
 
-    The cluster is the one that this process is connected to already, else the one of ``RAY_ADDRESS``, else a new local
-    one. A connection or cluster that this function made is closed at the end.
+    The cluster is the one that this process is already connected to, else the one at ``RAY_ADDRESS``, else a new local
+    one. A connection or cluster that this function opened is closed at the end.
 
     Raises:
         ConfigError: if Ray is not installed.
@@ -90,7 +90,7 @@ def _map_on_ray(function: Callable, arguments: Sequence[tuple], workers: int) ->
 
 
 def _end_with_parent(parent: int) -> None:
-    """End this process soon after its parent process ends, which may be killed without a chance to stop it.
+    """End this process soon after its parent ends, since a killed parent cannot stop its workers.
 
     The thread compares the parent's ID instead of checking whether ``parent`` exists, because a killed process exists
     as a zombie until its own parent collects it.

@@ -1,4 +1,4 @@
-"""Registries: classes found by name, registered by hand or by the entry points of other packages."""
+"""Registries: classes found by name, registered in code or through entry points of other packages."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from softgym_envs.errors import unknown_name
 
 
 class Registry(Mapping[str, type]):
-    """A table from names to classes, which are imported when they are first used.
+    """A table of classes by name; each class is imported when it is first used.
 
-    Packages that are installed add their classes by entry points: the name of the entry point is the name of the class.
+    Installed packages add classes through entry points; the name of the entry point is the registered name.
 
     Args:
         kind: what the table holds, for messages: ``"robot"``, ...
@@ -42,10 +42,10 @@ class Registry(Mapping[str, type]):
             entry: the class, or ``"module:class"`` to import it when it is used.
 
         Returns:
-            The class or path, or a decorator that still waits for the class.
+            The class or path, or a decorator that takes the class.
 
         Raises:
-            ValueError: for an entry of the wrong kind, without a name or with two, or a name that is taken.
+            ValueError: for an entry of the wrong kind, a missing or conflicting name, or a name that is taken.
         """
         if name_or_class is None:
             return self.register
@@ -65,7 +65,7 @@ class Registry(Mapping[str, type]):
         return cls
 
     def resolve(self, name_or_class: str | type) -> type:
-        """Return the class of a registered name or of a path ``"module:class"``; a class is returned as it is.
+        """Return the class for a registered name or a path ``"module:class"``; a class is returned unchanged.
 
         Raises:
             ValueError: for an unknown name, or a class of the wrong kind.
@@ -81,14 +81,14 @@ class Registry(Mapping[str, type]):
         return self._checked(import_object(self.kind, found) if isinstance(found, str) else found)
 
     def class_of(self, source: object) -> Any:
-        """Return the class of a registered name, a path, a class or an object, see `resolve`."""
+        """Return the class for a registered name, a path, a class or an object, see `resolve`."""
         return self.resolve(source if isinstance(source, str | type) else type(source))
 
     def make(self, name_or_class: object, *arguments: object, **options: object) -> Any:
         """Return an object of a class of this registry.
 
         Args:
-            name_or_class: registered name, path ``"module:class"``, class, or an object, which is returned as it is.
+            name_or_class: registered name, path ``"module:class"``, class, or an object, which is returned unchanged.
             *arguments: positional arguments of the class, which are not options.
             **options: keyword arguments of the class.
 
@@ -100,7 +100,7 @@ class Registry(Mapping[str, type]):
             self._checked(type(made))
             if options:
                 raise ValueError(
-                    f"{self.kind} '{_shown(type(made))}' is already made: it cannot take {', '.join(options)}"
+                    f"{self.kind} '{_shown(type(made))}' is already an object: it cannot take {', '.join(options)}"
                 )
             return made
         cls = self.resolve(name_or_class)
@@ -131,7 +131,7 @@ class Registry(Mapping[str, type]):
     # -- details ----------------------------------------------------------------------------------------------------
 
     def _discover(self) -> None:
-        """Add the entry points of installed packages, once. A name that is taken keeps its class."""
+        """Add the entry points of installed packages, once. Names already taken keep their class."""
         if self._discovered:
             return
         from importlib.metadata import entry_points
@@ -154,7 +154,7 @@ class Registry(Mapping[str, type]):
         return cls
 
     def _name_of(self, cls: type, name: str) -> str:
-        """Return the name to register a class under, and give it to a class that has none of its own."""
+        """Return the name to register a class under, and assign it to a class without a name."""
         own: str = vars(cls).get("name", "")
         name = name or own or getattr(cls, "name", "")
         if not name:
@@ -190,7 +190,7 @@ def import_object(kind: str, path: str) -> Any:
 def options_of(cls: type) -> dict[str, tuple[inspect.Parameter, Any]]:
     """Return the keyword arguments of a class by name, each with its resolved type.
 
-    A constructor that takes ``**options`` hands them on to the next base class with a constructor of its own.
+    A constructor that takes ``**options`` passes them on to the next base class with its own constructor.
     """
     found: dict[str, tuple[inspect.Parameter, Any]] = {}
     for base in cls.__mro__:
@@ -214,7 +214,7 @@ def check_options(owner: str, cls: type, positional: int, options: Mapping[str, 
     """Check the options of a class against its signature and the type annotations in it.
 
     Args:
-        owner: who takes the options, for messages: ``"robot 'finger'"``.
+        owner: what takes the options, for messages: ``"robot 'finger'"``.
         cls: the class.
         positional: number of leading arguments that are not options.
         options: keyword arguments.
@@ -235,12 +235,12 @@ def check_options(owner: str, cls: type, positional: int, options: Mapping[str, 
 
 
 def class_path(cls: type) -> str:
-    """Return the path ``"module:class"`` by which other processes import a class.
+    """Return the path ``"module:class"`` from which other processes import a class.
 
     The module of a class in the running script is the script's file, as if it were imported.
 
     Raises:
-        ValueError: for a class that cannot be imported: one inside a function or of an interactive session.
+        ValueError: for a class that cannot be imported: one defined inside a function or in an interactive session.
     """
     module = cls.__module__
     if module == "__main__":
@@ -262,7 +262,7 @@ def _path(entry: str | type) -> str:
 
 
 def _is_a(value: object, annotation: Any) -> bool:
-    """Whether a value can be of an annotated type; annotations without a plain type accept everything."""
+    """Whether a value matches an annotated type; annotations that are not plain types accept everything."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin in (Union, types.UnionType):
         return any(_is_a(value, each) for each in arguments)
@@ -275,7 +275,7 @@ def _is_a(value: object, annotation: Any) -> bool:
     if annotation in (bool, str):
         return isinstance(value, annotation)
     if origin is tuple and Ellipsis not in arguments:
-        # Lists are accepted: configuration files know no tuples.
+        # Lists are accepted: configuration files have no tuples.
         return (
             isinstance(value, Sequence)
             and not isinstance(value, str)
@@ -291,5 +291,5 @@ def _described(annotation: Any) -> str:
         return " or ".join(map(_described, arguments))
     if origin is tuple and set(arguments) <= {int, float}:
         return f"{len(arguments)} numbers"
-    words = {float: "a number", int: "an integer", bool: "true or false", str: "a text", type(None): "none"}
+    words = {float: "a number", int: "an integer", bool: "true or false", str: "a string", type(None): "none"}
     return words.get(annotation, str(annotation))

@@ -74,7 +74,7 @@ def write_json(path: str | Path, value: object) -> None:
 
 
 def drop_torn_line(path: str | Path) -> None:
-    """Cut off the last line of an append-only file if it has no end, as after a crash in the middle of a write.
+    """Remove an incomplete last line of an append-only file, as left by a crash in the middle of a write.
 
     Call this only while no other process writes to the file.
     """
@@ -125,7 +125,7 @@ class JsonLines:
 
 
 def cache_directory(name: str) -> Path:
-    """Return the folder of a cache, below ``$SOFTGYM_CACHE`` if that is set, else below the user's cache folder."""
+    """Return the folder of a cache, in ``$SOFTGYM_CACHE`` if that is set, else in the user's cache folder."""
     root = os.environ.get("SOFTGYM_CACHE")
     if root is None:
         from platformdirs import user_cache_dir

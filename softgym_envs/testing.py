@@ -1,4 +1,4 @@
-"""Helpers shared by tests and benchmarks: small meshes and bodies, derivatives, quick surrogates, processes."""
+"""Helpers shared by tests and benchmarks: small meshes and bodies, derivatives, small surrogates, processes."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def derivative_errors(model: MechanicalModel, x: np.ndarray, effort: np.ndarray)
     slope, matrix, gradients = np.empty(count), np.empty((count, count)), np.empty_like(H)
     for k in range(count):
         step = np.zeros(count)
-        # Round-off of the energy demands larger steps [m] than round-off of the residual.
+        # Round-off of the energy requires larger steps [m] than round-off of the residual.
         for h, quantity in ((1e-6, "energy"), (1e-7, "residual")):
             step[k] = h / scale[k]
             plus, minus = x + model.warping.displacement(x, step), x + model.warping.displacement(x, -step)
@@ -167,7 +167,7 @@ def derivative_errors(model: MechanicalModel, x: np.ndarray, effort: np.ndarray)
                 matrix[:, k] = (after[0] - before[0]) / (2 * step[k])
                 gradients[k] = (after[3] - before[3]) / (2 * step[k])
     symmetric = 0.5 * (matrix + matrix.T)
-    # Entries of rotations and displacements differ in unit and size: scale each by its row and column.
+    # Rotations and displacements differ in unit and magnitude: scale each entry by its row and column.
     unit = 1.0 / np.sqrt(np.abs(np.diag(symmetric)))
     scaled = unit[:, None] * np.abs(symmetric - tangent) * unit
     return DerivativeErrors(
@@ -183,7 +183,7 @@ def derivative_errors(model: MechanicalModel, x: np.ndarray, effort: np.ndarray)
 def random_condensed_model(
     rng: np.random.Generator, actuators: int = 2, effectors: int = 3, contacts: int = 0, spread: float = 0.03
 ) -> CondensedModel:
-    """Return a condensed model with a random positive definite W whose size is that of a finger's.
+    """Return a condensed model with a random positive definite W of a finger's order of magnitude.
 
     Args:
         rng: random generator.
@@ -215,7 +215,7 @@ def untrained_potential(
     """Return a potential with random weights, and its ensemble members as torch modules.
 
     Args:
-        robot: what the potential describes.
+        robot: robot that the potential describes.
         members: size of the ensemble.
         width: of the hidden layers.
         rest: whether the effort is zero at zero displacement by construction.
@@ -250,7 +250,7 @@ def sample_states(
     """Return FEM equilibria of the baseline body as columns of a dataset.
 
     Args:
-        robot: what is sampled.
+        robot: robot to sample.
         states: number of equilibria.
         seed: of the commands.
         limit: largest actuator displacement [m].
@@ -320,12 +320,12 @@ def live_processes(session: int) -> list[int]:
 def wait_until(
     condition: Callable[[], object], *, interval: float = 0.01, failed: Callable[[], str | None] = lambda: None
 ) -> None:
-    """Wait until ``condition()`` holds, for as long as it takes: a slow machine is not an error.
+    """Wait until ``condition()`` holds, without a deadline, so that a slow machine causes no failure.
 
     Args:
         condition: what to wait for.
         interval: time between two checks [s].
-        failed: returns a message once the condition can no longer come true, else None.
+        failed: returns a message once the condition can no longer become true, else None.
 
     Raises:
         RuntimeError: with the message of ``failed``.

@@ -129,7 +129,7 @@ def test_a_class_without_a_name_is_refused(registry):
         ("no_such_module:Disc", {}, "there is no module 'no_such_module'"),
         (f"{__name__}:Disk", {}, "module '.*' has no 'Disk'"),
         ("json:JSONDecoder", {}, "a shape must be a subclass of"),
-        (Bar(0, length=1.0), {"length": 2.0}, "is already made: it cannot take length"),
+        (Bar(0, length=1.0), {"length": 2.0}, "is already an object: it cannot take length"),
         (3, {}, "a shape must be a subclass of .*int"),
         (
             "disc",
@@ -139,7 +139,7 @@ def test_a_class_without_a_name_is_refused(registry):
         ("disc", {"radius": "2"}, "shape 'disc': option radius = '2' must be a number$"),
         ("disc", {"radius": True}, "option radius = True must be a number"),
         ("disc", {"holes": 1.5}, "option holes = 1.5 must be an integer"),
-        ("disc", {"label": 3}, "option label = 3 must be a text or none"),
+        ("disc", {"label": 3}, "option label = 3 must be a string or none"),
         ("disc", {"filled": 1}, "option filled = 1 must be true or false"),
         ("disc", {"at": [1.0]}, r"option at = \[1.0\] must be 2 numbers"),
     ],

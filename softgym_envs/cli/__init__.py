@@ -1,4 +1,4 @@
-"""The command line: ``softgym VERB``. Every verb calls a Python function of the same meaning."""
+"""The command line: ``softgym VERB``. Every verb calls the Python function that does the same."""
 
 from softgym_envs.cli.app import main
 

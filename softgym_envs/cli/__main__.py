@@ -1,4 +1,4 @@
-"""The command line without its script: ``python -m softgym_envs.cli``."""
+"""The command line without the installed script: ``python -m softgym_envs.cli``."""
 
 from softgym_envs.cli.app import main
 

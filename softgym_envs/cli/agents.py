@@ -53,7 +53,7 @@ def evaluate(
 ) -> None:
     """Evaluate agents on the same unseen goals.
 
-    CONFIG is the file of their training.
+    CONFIG is the configuration file that they were trained with.
     """
     from agents.baselines import BASELINES
     from agents.config import TrainConfig
@@ -67,7 +67,7 @@ def evaluate(
     chosen = options.design_of(design) or None
     if goals < 1:
         raise ConfigError(f"--goals {goals} must be at least 1")
-    for agent in agents:  # reject a wrong policy before the others are evaluated
+    for agent in agents:  # reject an invalid policy before any evaluation
         if agent not in BASELINES:
             Policy(agent).check_environment(environment)
     points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)

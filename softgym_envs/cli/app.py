@@ -1,4 +1,4 @@
-"""Entry point of the command line: its verbs, and errors as one line with status 2."""
+"""Entry point of the command line: its verbs, and errors reported as one line with status 2."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class _Verbs(click.Group):
     """A group whose help lists the verbs by section, and whose errors suggest the nearest verb."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        width = max(map(len, self.commands))  # all sections in one pair of columns
+        width = max(map(len, self.commands))  # all sections share the same two columns
         for title, verbs in SECTIONS.items():
             with formatter.section(title):
                 formatter.write_dl([(f"{verb.name:{width}}", verb.get_short_help_str(80)) for verb in verbs])
@@ -59,17 +59,17 @@ for _verbs in SECTIONS.values():
 
 
 def main() -> None:
-    """Run the command line; an error of the user's input ends it with one line and status 2."""
+    """Run the command line; an error in the user's input ends it with one line and status 2."""
     import gymnasium
     from threadpoolctl import threadpool_limits
 
-    # One thread per process: more slow these small problems down. The variables reach libraries that are loaded later
-    # and worker processes; the limit reaches the libraries that are loaded already.
+    # One thread per process: more threads slow down these small problems. The variables affect libraries loaded later
+    # and worker processes; the limit affects libraries that are already loaded.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     threadpool_limits(1)
     # Robots, tasks and objectives of your own ("my_module:MyRobot") may be in the current folder. At the end of the
-    # search path, its files cannot replace modules of the suite.
+    # search path, files in it cannot replace modules of the suite.
     sys.path.append(os.getcwd())
     try:
         cli(prog_name="softgym", standalone_mode=False)
@@ -82,7 +82,7 @@ def main() -> None:
     except click.ClickException as error:
         _fail(error.format_message())
     except (SoftGymError, ValueError, OSError, gymnasium.error.Error) as error:
-        if hasattr(error, "__notes__"):  # an error in the code of a robot, noted by `Robot.build`
+        if hasattr(error, "__notes__"):  # an error in a robot's code, annotated by `Robot.build`
             raise
         _fail(str(error))
 

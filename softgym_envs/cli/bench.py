@@ -12,7 +12,7 @@ from softgym_envs.errors import ConfigError
 
 @click.command()
 @click.option(
-    "--output", type=options.PATH, default=Path("results/bench.json"), show_default=True, help="File of the results."
+    "--output", type=options.PATH, default=Path("results/bench.json"), show_default=True, help="File for the results."
 )
 @click.argument("names", nargs=-1)
 def bench(output: Path, names: tuple[str, ...]) -> None:

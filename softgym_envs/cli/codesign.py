@@ -15,7 +15,7 @@ from softgym_envs.cli import options
 @options.run_options
 @options.results_folder
 @click.option("--workers", type=int, help="Number of worker processes (default: the config's).")
-@click.option("--storage", help="PostgreSQL database that several machines share (default: the config's).")
+@click.option("--storage", help="PostgreSQL database shared by several machines (default: the config's).")
 def codesign(
     config: Path,
     folder: Path | None,
@@ -62,7 +62,7 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
         click.echo(f"\n{metric:24s} " + " ".join(f"{key:>16s}" for key in keys))
         for variable, row in table.items():
             click.echo(f"  {variable:22s} " + " ".join(f"{row[key]:16.5g}" for key in keys))
-    kept = f" ({100 * result.groups_kept:.0f} % of the sample groups remain)" if result.infeasible else ""
+    kept = f" ({100 * result.groups_kept:.0f} % of the sample groups remain usable)" if result.infeasible else ""
     click.echo(f"\n{result.designs} designs, {result.infeasible} infeasible{kept}; wrote {folder}")
 
 
@@ -72,7 +72,7 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
 def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
     """Search for the best bodies without a controller.
 
-    The solver is an Optuna sampler, whose interrupted runs continue where they stopped, or descent along gradients.
+    The solver is an Optuna sampler, whose interrupted runs continue where they stopped, or gradient descent.
     """
     from codesign.tools import gradient
     from codesign.tools.config import OptimiseConfig
@@ -116,7 +116,7 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
         ends = (result.intervals or {}).get(name)
         text = f"{name} = {value:.6g}"
         if ends is not None and ends[1] > ends[0]:
-            # Enough digits to distinguish the ends.
+            # Enough digits to distinguish both ends.
             digits = max(6, 2 - math.floor(math.log10((ends[1] - ends[0]) / (abs(value) or 1.0))))
             text += f", {100 * (result.level or 0.0):g} % interval {ends[0]:.{digits}g} to {ends[1]:.{digits}g}"
         elif ends is not None:
@@ -125,4 +125,4 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
             text += "; at its bound: the best fit may lie outside the bounds"
         click.echo(text)
     errors = ", ".join(f"{name} {value:.3g}" for name, value in result.errors.items())
-    click.echo(f"root mean square errors: {errors} [SI]; {result.seconds:.1f} s; wrote {folder}")
+    click.echo(f"root mean square errors: {errors} (SI units); {result.seconds:.1f} s; wrote {folder}")

@@ -48,7 +48,7 @@ def rollout(
     from softgym_envs.config import check_config
 
     chosen = options.design_of(design)
-    # A policy needs the observations and actions of its training.
+    # A policy needs the same observations and actions as in training.
     policy = None if agent in BASELINES else Policy(agent)
     trained = {} if policy is None else policy.environment.model_dump()
     config = check_config(EnvironmentConfig, {**trained, "id": environment}, "rollout")

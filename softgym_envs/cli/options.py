@@ -1,4 +1,4 @@
-"""Options and arguments that several verbs share, and how their values are read."""
+"""Options and arguments shared by several verbs, and the parsing of their values."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 PATH: Any = click.Path(path_type=Path)
 
 config = click.option("--config", type=PATH, required=True, help="YAML file of the run.")
-folder = click.option("--folder", type=PATH, required=True, help="Folder of the results.")
+folder = click.option("--folder", type=PATH, required=True, help="Folder for the results.")
 results_folder = click.option(
-    "--folder", type=PATH, help="Folder of the results (default: results/NAME of the config)."
+    "--folder", type=PATH, help="Folder for the results (default: results/NAME, with the config's name)."
 )
 overrides = click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
 quiet = click.option("--quiet", is_flag=True, help="Hide progress bars.")

@@ -65,7 +65,7 @@ def export(
     from softgym_envs.robots.geometry.moulds import export_moulds
 
     if not files and moulds is None:
-        raise ConfigError("nothing to write: name a file ending with .step or .stl, or a folder with --moulds")
+        raise ConfigError("nothing to write: pass a file ending with .step or .stl, or a folder with --moulds")
     body = options.robot_of(robot, options_)
     chosen = options.design_of(design)
     written = [export_body(body, file, chosen) for file in files]

@@ -1,4 +1,4 @@
-"""Controllers and couplings that work on condensed models, whether from finite elements or learned."""
+"""Controllers and couplings that work on condensed models, whether computed by finite elements or learned."""
 
 from typing import TYPE_CHECKING
 

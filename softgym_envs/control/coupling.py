@@ -1,14 +1,14 @@
-"""Condensed models of robots that are turned, tied to each other, or hold a rigid object (thesis, eq. 4.6-4.10).
+"""Condensed models of robots that are rotated, tied to each other, or hold a rigid object (thesis, eq. 4.6-4.10).
 
 Each part keeps its own model; ties couple them. With ``W`` the block-diagonal compliance of the parts, ``C`` the
 tied rows, ``u`` the motion of the object, ``J`` the Jacobian of its tied points and ``f`` the load on it:
 
     delta = W (effort + C^T m) + free          every part, under actuator efforts and tie forces m
-    C delta - J u = gap                        tied rows follow each other, or the object
+    C delta - J u = gap                        tied rows move together, or with the object
     J^T m + K u = f                            the object is in equilibrium
 
-``K`` is the change of the tie forces' torque as the object turns; with it, the coupled ``W`` is the exact derivative of
-the coupled equilibrium. Eliminating ``m`` and ``u`` leaves a symmetric model of actuators and object.
+``K`` is the derivative of the tie forces' torque as the object rotates; with it, the coupled ``W`` is the exact
+derivative of the coupled equilibrium. Eliminating ``m`` and ``u`` leaves a symmetric model of actuators and object.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ def rotate(
     *,
     points: str = "ec",
 ) -> CondensedModel:
-    """Return the model of a copy of a robot that is turned about the origin, then moved (thesis, sec. 4.3.1).
+    """Return the model of a copy of a robot, rotated about the origin and then shifted (thesis, sec. 4.3.1).
 
     Args:
-        condensed: model of the robot itself; leading batch shapes are kept.
+        condensed: model of the original robot; leading batch shapes are kept.
         rotation: rotation matrix, shape (3, 3).
-        shift: motion after the turn [m], shape (3,).
+        shift: translation after the rotation [m], shape (3,).
         points: roles whose rows are coordinates of points; all other rows are scalars and do not change.
 
     Raises:
@@ -60,7 +60,7 @@ def rotate(
         if role in points:
             if size % 3:
                 raise ValueError(
-                    f"role '{role}' has {size} rows, which is not a multiple of three: they are not points"
+                    f"role '{role}' has {size} rows, which is not a multiple of three, so they are not points"
                 )
             rows = condensed.slices[role]
             turn[rows, rows] = np.kron(np.eye(size // 3), R)
@@ -80,10 +80,10 @@ class HeldObject:
 
     Attributes:
         position: its centre [m], shape (3,).
-        points: where it is held, from its centre and in its own axes [m], shape (k, 3).
+        points: where it is held, relative to its centre and in its own axes [m], shape (k, 3).
         rotation: its orientation, shape (3, 3).
         load: external force [N] and torque about its centre [N m] (its weight, the spring of a button), shape (6,).
-        free: which translations along x, y, z and rotations about them are free, six flags; the others are guided.
+        free: which translations along x, y, z and rotations about them are free, six flags; the others are blocked.
     """
 
     position: np.ndarray
@@ -111,7 +111,7 @@ class HeldObject:
 
     @property
     def arms(self) -> np.ndarray:
-        """Where it is held, from its centre, in the world's axes [m], shape (k, 3)."""
+        """Where it is held, relative to its centre, in the world's axes [m], shape (k, 3)."""
         return self.points @ self.rotation.T
 
     @property
@@ -126,7 +126,7 @@ class HeldObject:
         return np.concatenate([np.tile(np.eye(3), (k, 1, 1)), -cross_matrix(self.arms)], axis=2).reshape(3 * k, 6)
 
     def moved(self, motion: np.ndarray) -> HeldObject:
-        """Return the body after a translation and a turn about its centre, shape (6,) [m, rad]."""
+        """Return the body after a translation and a rotation about its centre, shape (6,) [m, rad]."""
         motion = np.asarray(motion, dtype=float)
         return replace(
             self, position=self.position + motion[:3], rotation=rotation_vector_matrix(motion[3:]) @ self.rotation
@@ -135,7 +135,7 @@ class HeldObject:
     def stiffness(self, forces: np.ndarray) -> np.ndarray:
         """``K = d (J^T m) / d u`` at fixed tie forces ``m`` [N] (3 k,), shape (6, 6).
 
-        The lever arms of the forces turn with the body. The matrix is symmetric when the forces have no torque about
+        The lever arms of the forces rotate with the body. The matrix is symmetric when the forces have no torque about
         the centre; its antisymmetric part, which occurs during iterations and under a torque load, is dropped.
         """
         result = np.zeros((6, 6))
@@ -152,7 +152,7 @@ def tie_points(
     Args:
         models: the parts; ``n`` is the number of all their rows.
         first: part, role (``"e"`` or ``"c"``) and index of the first point within its role.
-        second: the same of the second point.
+        second: the same for the second point.
     """
     starts = np.cumsum([0, *(len(model.free) for model in models)])
     C = np.zeros((3, starts[-1]))
@@ -171,12 +171,12 @@ class Coupled:
 
     Attributes:
         condensed: roles ``a`` (the actuators of all parts, in order) and ``e``: with an object, its centre [m] and, if
-            wanted, its rotation vector from the present orientation [rad]; then the effectors of the chosen parts.
+            requested, its rotation vector from the current orientation [rad]; then the effectors of the chosen parts.
         condition: condition number of the scaled system of ties that was solved.
         dropped: number of redundant directions of the ties, which carry no force.
         part_sizes: number of rows of each part.
         force_map: efforts on all rows of the parts as an affine function of the actuator efforts, shape (n, 1 + n_a).
-        motion_map: motion of the object [m, rad] as such a function, shape (6, 1 + n_a).
+        motion_map: motion of the object [m, rad] as an affine function of them, shape (6, 1 + n_a).
     """
 
     condensed: CondensedModel
@@ -187,19 +187,19 @@ class Coupled:
     motion_map: np.ndarray
 
     def efforts(self, effort: np.ndarray) -> list[np.ndarray]:
-        """Return the efforts of all rows of every part under actuator efforts (n_a,): including tie forces."""
+        """Return the efforts of all rows of every part under actuator efforts (n_a,), including tie forces."""
         every = self.force_map @ np.append(1.0, effort)
         return np.split(every, np.cumsum(self.part_sizes)[:-1])
 
     def motion(self, effort: np.ndarray) -> np.ndarray:
-        """Return the motion of the object from its present pose [m, rad], shape (6,), under actuator efforts (n_a,)."""
+        """Return the motion of the object from its current pose [m, rad], shape (6,), under actuator efforts (n_a,)."""
         return self.motion_map @ np.append(1.0, effort)
 
 
 def _side_by_side(
     models: Sequence[CondensedModel],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
-    """Return block-diagonal W, delta_free and present efforts of the parts, and the rows of each role of each part."""
+    """Return block-diagonal W, delta_free and current efforts of the parts, and the rows of each role of each part."""
     if not models or any(model.free.ndim != 1 for model in models):
         raise ValueError("couple needs at least one model, and models without a batch dimension")
     starts = np.cumsum([0, *(len(model.free) for model in models)])
@@ -210,7 +210,7 @@ def _side_by_side(
         W[here, here], free[here], present[here] = model.compliance, model.free, model.effort
         rows.append({role: start + np.arange(at.start, at.stop) for role, at in model.slices.items()})
     if not (np.isfinite(W).all() and np.isfinite(free).all() and np.isfinite(present).all()):
-        raise ValueError("a condensed model holds values that are not finite")
+        raise ValueError("a condensed model contains values that are not finite")
     return W, free, present, rows
 
 
@@ -225,8 +225,8 @@ class _Saddle:
 
 def _solve_saddle(G: np.ndarray, J: np.ndarray, K: np.ndarray, tolerance: float) -> _Saddle:
     m = len(G)
-    # Rows and columns of G are brought to a largest entry of one (Ruiz 2001) and columns of J to length one, which
-    # cancels units. G may be indefinite, as a part that is unstable alone can be stable when it is tied.
+    # Scale rows and columns of G to a largest entry of one (Ruiz 2001) and columns of J to length one, which
+    # cancels units. G may be indefinite: a part that is unstable alone can be stable when it is tied.
     ties = np.ones(m)
     for _ in range(10):
         largest = np.abs(ties[:, None] * G * ties).max(axis=1)
@@ -239,7 +239,9 @@ def _solve_saddle(G: np.ndarray, J: np.ndarray, K: np.ndarray, tolerance: float)
     if J.shape[1]:
         hold = np.linalg.svd(system[:m, m:], compute_uv=False)
         if len(hold) < J.shape[1] or not hold[-1] > 1e-6 * hold[0]:
-            raise ValueError("the points do not hold the object: it can move freely; guide it by its flags 'free'")
+            raise ValueError(
+                "the points do not hold the object: it can move freely; block directions with its flags 'free'"
+            )
     values, vectors = np.linalg.eigh(system)
     size = np.abs(values)
     regular = size > tolerance * size.max()
@@ -260,22 +262,22 @@ def couple(
 ) -> Coupled:
     """Tie robots to each other, or to a rigid object that their contact points hold.
 
-    Rows that are neither actuators nor tied keep the effort of their model as a dead load. Like the contacts of the
-    thesis, ties act in tension, in compression and sideways.
+    Rows that are neither actuators nor tied keep the effort in their model as a dead load. Like the contacts of the
+    thesis, ties act in tension, compression and shear.
 
     Coupling amplifies errors of the parts: held parts are far stiffer than free ones, so the compliance of a gripper is
-    a small difference of theirs. Random relative errors in W of three fingers grow about a thousandfold in W_ea of the
-    cube that they hold (1e-5 becomes 1.5 %).
+    a small difference of large numbers. Random relative errors in W of three fingers grow about a thousandfold in W_ea
+    of the cube that they hold (1e-5 becomes 1.5 %).
 
     Args:
-        models: models of the parts at their present states (roles ``a`` and ``e``, ``c``, ...), unbatched.
+        models: models of the parts at their current states (roles ``a`` and ``e``, ``c``, ...), unbatched.
         ties: rows ``C``, shape (m, n), over all rows of the parts, see `tie_points`.
         gap: ``C delta`` to hold, shape (m,); for two points, their distance as a vector [m].
         body: object whose points are tied to all rows of role ``c``, part by part.
         orientation: include the rotation of the object.
         effectors: parts whose effector rows are kept; default the first, or none with an object.
-        tolerance: directions of the ties whose relative compliance is below this count as rigid and, unless the object
-            needs them, as redundant: they carry no force.
+        tolerance: tie directions with a relative compliance below this count as rigid and, unless the object needs
+            them, as redundant: they carry no force.
 
     Raises:
         ValueError: for malformed or non-finite input, an object that its points do not hold, or redundant ties that

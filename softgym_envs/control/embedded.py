@@ -1,4 +1,4 @@
-"""Embedded control loop: commands efforts, and needs at most the measured effector position (thesis, algorithm 2)."""
+"""Embedded control loop: commands efforts and measures at most the effector position (thesis, algorithm 2)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class PICorrection:
     moves the goal by more than ``limit``.
 
     Args:
-        proportional: gain on the present error.
+        proportional: gain on the current error.
         integral: gain on the sum of errors.
         limit: largest correction by the integral [m].
         slip: distance below which the model counts as having reached the corrected goal [m]. It must exceed the error
@@ -130,7 +130,7 @@ class EmbeddedLoop:
 
         Args:
             goal: desired effector coordinates [m], shape (n_e,).
-            measured: measured effector coordinates [m], shape (n_e,); None leaves the goal uncorrected.
+            measured: measured effector coordinates [m], shape (n_e,); with None, the goal is not corrected.
             displacement: measured actuator displacements, shape (n_a,), if there are sensors.
 
         Raises:
@@ -167,14 +167,14 @@ class EmbeddedLoop:
 def follow(
     loop: EmbeddedLoop, plant: Backend, goals: Iterable[np.ndarray], *, feedback: bool = True, encoders: bool = False
 ) -> list[State]:
-    """Drive a plant by efforts along goals [m] (n_e,), with one call of the loop for each.
+    """Drive a plant by efforts along goals [m] (n_e,), calling the loop once per goal.
 
     Args:
         loop: the control loop.
         plant: backend of the robot.
         goals: one goal per call.
-        feedback: pass the measured effector to the loop.
-        encoders: pass the measured actuator displacements to the loop.
+        feedback: whether to pass the measured effector to the loop.
+        encoders: whether to pass the measured actuator displacements to the loop.
 
     Returns:
         The state of the plant after each call.

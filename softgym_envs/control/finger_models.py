@@ -1,4 +1,4 @@
-"""Models of one finger, on finite elements or learned, from which `softgym_envs.control.fingers` makes grippers."""
+"""Models of one finger, with finite elements or learned, from which `softgym_envs.control.fingers` builds grippers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from softgym_envs.surrogate.model import Context, SurrogateModel
 
 
 class FingerModel(Protocol):
-    """A model of equal fingers, which are evaluated together.
+    """A model of identical fingers, which are evaluated together.
 
     Attributes:
         origin: origin of the pose at rest, in the finger's axes [m], shape (3,).
@@ -85,7 +85,7 @@ class SurrogateFingers:
     def __init__(self, model: SurrogateModel, design: Mapping[str, float] | None = None) -> None:
         robot = model.robot
         if not isinstance(robot, ContactFinger):
-            raise ValueError(f"the model must be one of robot 'contact_finger', got one of '{robot.name}'")
+            raise ValueError(f"the model must be of robot 'contact_finger', got one of robot '{robot.name}'")
         complete = robot.design_space.complete(design)
         self.model = model
         self.origin = robot.object_frame(complete)

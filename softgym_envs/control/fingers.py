@@ -1,4 +1,4 @@
-"""Grippers of turned and moved copies of one finger, from the finger's own model (thesis, sec. 4.3.1 and 4.3.2).
+"""Grippers of rotated and shifted copies of one finger, from the finger's own model (thesis, sec. 4.3.1 and 4.3.2).
 
 Eight coordinates describe a `ContactFinger`: its cables ``l`` and the pose ``z`` of its contact points in its own axes.
 With ``U`` the energy of a finger, a rigid object that fingers ``k`` hold at the pose ``p`` has the energy
@@ -6,10 +6,10 @@ With ``U`` the energy of a finger, a rigid object that fingers ``k`` hold at the
     E(l, p) = sum_k U(l_k, z_k(p)) - work of the load on the object,
 
 so with ``J_k = dz_k / dp`` the tensions are ``dU / dl_k`` and the object is in equilibrium when the wrenches
-``J_k^T dU / dz_k`` add up to the load. These are six equations beside those of the cables. Their tangent is the second
-derivative of ``E``, including that of ``z_k``, as an object that turns also turns the lever arms of its forces. Its
+``J_k^T dU / dz_k`` add up to the load. These are six equations besides those of the cables. Their tangent is the second
+derivative of ``E``, including that of ``z_k``, because the lever arms of the forces rotate with the object. Its
 inverse gives the condensed model of the gripper, the exact derivative of its equilibrium, whether the finger's model is
-exact or learned. One learned finger thus serves any number of fingers in any place.
+exact or learned. One learned finger thus serves any number of fingers in any placement.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class _Point:
     rotation: np.ndarray
 
     def moved(self, step: np.ndarray) -> _Point:
-        """Return the point after a step of cables, position and spin, shape (n_a + 6,)."""
+        """Return the point after a step in cables, position and spin, shape (n_a + 6,)."""
         cables, shift, spin = np.split(step, [-POSE, -3])
         rotation = rotation_vector_matrix(spin) @ self.rotation
         # Orthonormalise, so that round-off does not accumulate over a long motion.
@@ -90,7 +90,7 @@ class _Linear:
     Attributes:
         point: the point.
         coordinates, effort, tips: of the fingers, shapes (F, 8), (F, 8), (F, 3).
-        jacobian: derivative of the fingers' poses by position and spin of the object, shape (F, 6, 6).
+        jacobian: derivative of the fingers' poses with respect to position and spin of the object, shape (F, 6, 6).
         wrench: sum of the fingers' wrenches on position and spin [N, N m], shape (6,).
         stiffness: of cables and object without the load, shape (n_a + 6, n_a + 6).
     """
@@ -161,7 +161,7 @@ class CoupledFingers:
         if not placements:
             raise ValueError("placements are empty: a gripper needs at least one finger")
         for turn, shift in placements:
-            frame_rows(shift, turn)  # refuses reflections: a mirrored finger has another model
+            frame_rows(shift, turn)  # rejects reflections: a mirrored finger has a different model
         self.fingers = fingers
         self.turns = np.array([turn for turn, _ in placements], dtype=float)
         self.shifts = np.array([shift for _, shift in placements], dtype=float)
@@ -173,7 +173,7 @@ class CoupledFingers:
         ):
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be finite with shape {shape}, got {value.tolist()}")
-        #: Where the fingers hold the object, from its centre and in its own axes [m], shape (F, 3).
+        #: Where the fingers hold the object, relative to its centre and in its own axes [m], shape (F, 3).
         self.offsets = self.turns @ fingers.origin + self.shifts - self.centre
         self.cables = len(fingers.span) - POSE
         self.count = self.cables * len(placements)
@@ -186,7 +186,7 @@ class CoupledFingers:
     def for_robot(
         cls, robot: FingerRobot, fingers: FingerModel, design: Mapping[str, float] | None = None, **options
     ) -> CoupledFingers:
-        """Return the coupled fingers of a gripper; ``options`` are ``load`` and others of the class.
+        """Return the coupled fingers of a gripper; ``options`` are ``load`` and other arguments of the class.
 
         Raises:
             ValueError: for a gripper without an object.
@@ -211,7 +211,7 @@ class CoupledFingers:
     # -- one linearisation ------------------------------------------------------------------------------------------
 
     def _linearise(self, point: _Point) -> _Linear | None:
-        """Linearise at a point; None if a finger has no state there or the object has turned too far."""
+        """Linearise at a point; None if a finger has no state there or the object has rotated too far."""
         R = point.rotation
         # Sines determine a rotation only up to 90 degrees.
         if not np.trace(R) > 1.0 + 2.0 * 0.05:
@@ -298,7 +298,7 @@ class CoupledFingers:
                 raise _NewtonFailed
             poses = np.einsum("fij,j->fi", here.jacobian, step[-POSE:])
             change = np.concatenate([step[:-POSE].reshape(-1, self.cables), poses], axis=1)
-            # Stay within the range in which the model is known.
+            # Stay within the range in which the model is valid.
             length = float(min(1.0, 1.0 / max((np.abs(change) / self._limit).max(), 1e-12)))
             while True:
                 there = self._linearise(here.point.moved(length * step))
@@ -318,14 +318,14 @@ class CoupledFingers:
         raise _NewtonFailed
 
     def solve(self, command: np.ndarray | Sequence[float], mode: str = "displacement") -> FingersState:
-        """Return the equilibrium under commanded cables, found from the present one.
+        """Return the equilibrium under commanded cables, starting from the current one.
 
         Args:
             command: displacements [m] or tensions [N] of all cables, finger by finger, shape (n_a,).
             mode: ``"displacement"`` or ``"effort"``.
 
         Raises:
-            ConvergenceError: if no equilibrium is found; the present state is then unchanged.
+            ConvergenceError: if no equilibrium is found; the current state is then unchanged.
             ValueError: for a malformed command, an unknown mode, or a negative tension of cables that cannot push.
         """
         command = np.asarray(command, dtype=float)
@@ -338,7 +338,7 @@ class CoupledFingers:
             raise ValueError(f"tensions {command.tolist()} N must not be negative: the cables cannot push")
         here = self._linearise(self._point) if self._present is None else self._present
         if here is None:
-            raise ConvergenceError("the model of the fingers has no state at the starting point")
+            raise ConvergenceError("the model of the fingers has no equilibrium at the starting point")
         start, start_load = (here.tension if forced else here.point.cables), self._carried
         done, size, iterations = 0.0, 1.0, 0
         while done < 1.0:

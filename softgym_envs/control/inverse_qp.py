@@ -31,16 +31,16 @@ class InverseQP:
         lower <= delta_a <= upper,  |delta_a - command| <= rate.
 
     Regularisation: published codes use three definitions of eps; this one makes the weights dimensionless. The defaults
-    are far below the 0.01 in some codes, with which the finger stops 0.58 mm short of a goal 54 mm away; with 1e-5 it
+    are far below the 0.01 in some codes, for which the finger stops 0.58 mm short of a goal 54 mm away; with 1e-5 it
     stops 0.6 um short.
     ``effort_weight`` decides between redundant actuators and pulls the result towards rest by about that fraction of
     its distance; ``step_weight`` only slows down the last part of the approach and causes no steady error.
-    ``goal_weights`` multiply the squared error of each effector coordinate: zero leaves a coordinate free, and of
-    coordinates that cannot all be reached, those with larger weights come closer.
+    ``goal_weights`` multiply the squared error of each effector coordinate: zero leaves a coordinate free, and if
+    not all coordinates can be reached, those with larger weights get closer to their goals.
 
     The problem is scaled to order one (displacements by the rate, efforts by the compliance) before ProxQP's dense
     backend solves it with box constraints and a warm start. The two norms in ``eps`` are taken in units of the rates,
-    so the result does not depend on the units of displacements and efforts, also when they are mixed.
+    so the result does not depend on the units of displacements and efforts, even when actuators differ in unit.
 
     Args:
         lower: smallest displacements [m, m3, ...], shape (n_a,).
@@ -55,12 +55,12 @@ class InverseQP:
         max_effort: largest efforts, shape (n_a,), or None.
         effort_rates: largest change of the efforts per call, shape (n_a,), or None.
         mode: ``"displacement"`` or ``"effort"`` for all actuators, or one of them per actuator: what `solve` takes as
-            the present command and returns as the next. Rates limit the step from the command in the actuator's mode,
-            and from the state of the model in the other quantity.
+            the current command and returns as the next. Rates limit the step from the command in the actuator's own
+            quantity, and from the state of the model in the other.
 
     Attributes:
-        displacement: actuator displacements that the model predicts for the last answer, shape (n_a,).
-        effort: efforts that it predicts for it, shape (n_a,).
+        displacement: actuator displacements that the model predicts for the last result, shape (n_a,).
+        effort: actuator efforts that the model predicts for the last result, shape (n_a,).
 
     Raises:
         ValueError: for malformed bounds, rates, weights or modes.
@@ -159,16 +159,16 @@ class InverseQP:
     def solve(
         self, condensed: CondensedModel, goal: np.ndarray, command: np.ndarray, slack: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the next command, shape (n_a,): displacements or efforts, by the actuators' modes.
+        """Return the next command, shape (n_a,): displacements or efforts, according to the actuators' modes.
 
         Args:
-            condensed: model at the present state.
+            condensed: model at the current state.
             goal: desired effector coordinates [m], shape (n_e,) or (k, 3).
-            command: present command, shape (n_a,).
+            command: current command, shape (n_a,).
             slack: actuators that are slack, shape (n_a,); default none.
 
         Raises:
-            ValueError: if goal, command or model have a wrong shape or are not finite.
+            ValueError: if goal, command or model has a wrong shape or is not finite.
             ConvergenceError: if ProxQP does not reach its tolerance, for example because no step within the rates
                 brings an effort back below ``max_effort``.
         """
@@ -182,7 +182,7 @@ class InverseQP:
                 f"command must be {len(self.rates)} finite numbers, got {command.tolist()} for {len(effort)} actuators"
             )
         if not (np.isfinite(condensed.compliance).all() and np.isfinite(delta.array).all()):
-            raise ValueError("the condensed model holds values that are not finite")
+            raise ValueError("the condensed model contains values that are not finite")
         if self.goal_weights is not None and self.goal_weights.shape != goal.shape:
             raise ValueError(f"goal_weights must be {goal.size} numbers, got {self.goal_weights.tolist()}")
         slack = np.zeros(len(command), dtype=bool) if slack is None else slack
@@ -204,7 +204,7 @@ class InverseQP:
         pull = to_effort.T @ (Waa @ effort)
         energies, modes = np.linalg.eigh(0.5 * (quadratic + quadratic.T))
         if energies[0] < 0.0:
-            # A state that is stable only while its actuators are held: make the energy of efforts positive.
+            # The state is stable only while its actuators are held: make the energy of efforts positive.
             quadratic = (modes * np.abs(energies)) @ modes.T
             pull = quadratic @ np.linalg.solve(to_effort, effort) / epsilon
         hessian = jacobian.T @ jacobian + (self.effort_weight + self.step_weight) * quadratic
@@ -239,7 +239,7 @@ class InverseQP:
             box_low,
             box_high,
         )
-        # From a distant solution, a warm start may fail where a cold one converges.
+        # A warm start from a distant solution may fail where a cold one converges.
         for warm in (True, False):
             if self._qp is None or not warm:
                 self._qp = self._make_qp()

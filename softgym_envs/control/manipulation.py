@@ -35,23 +35,23 @@ class Manipulation:
     """Controller that moves an object held at contact points to a goal.
 
     Each call ties the condensed models of the parts to the object, ``X = A effort + B`` (eq. 4.8-4.10), asks the
-    inverse QP for actuator efforts, and evaluates contact forces and pose at them. The thesis takes the force on the
-    object from the last step. Here the object is in equilibrium under its load at every step, so this force is known:
-    zero or the weight for a gripper, the spring for a button. The last contact forces enter through the models, which
-    are evaluated under them, and through the torque that they exert on an object that turns.
+    inverse QP for actuator efforts, and evaluates the contact forces and the pose for these efforts. The thesis takes
+    the force on the object from the last step. Here the object is in equilibrium under its load at every step, so this
+    force is known: zero or the weight for a gripper, the spring for a button. The last contact forces enter through the
+    models, which are evaluated under them, and through the torque that they exert on a rotating object.
 
-    Between calls, bring the parts to the plan: each to its commands and under its contact forces (or with its contact
-    points at ``body.contacts``). As parts bend, tied points then separate by a distance of second order in the step;
+    Between calls, apply the plan to the parts: each gets its commands and its contact forces (or its contact points are
+    driven to ``body.contacts``). As parts bend, tied points then separate by a distance of second order in the step;
     the next call closes this gap, as Newton's method does.
 
     Args:
         controller: inverse QP over the actuators of all parts; its ``goal_weights`` choose the degrees of freedom of
             the object that count. By default, a radian counts as much as a metre.
-        body: the object at its first pose; for a guided one, such as a button, its flags ``free`` name its directions.
+        body: the object at its first pose; for a guided one, such as a button, the flags ``free`` select directions.
         tolerance: see `couple`.
 
     Attributes:
-        body: the object at its present pose, predicted or measured.
+        body: the object at its current pose, predicted or measured.
         contact_forces: last forces of the object on the parts [N], shape (k, 3); zero at the start.
     """
 
@@ -79,9 +79,9 @@ class Manipulation:
         """Plan the next step.
 
         Args:
-            models: condensed models of the parts at their present states, roles ``a`` and ``c``.
+            models: condensed models of the parts at their current states, roles ``a`` and ``c``.
             goal: position of the object's centre [m], shape (3,).
-            command: present command of the actuators of all parts, shape (n_a,).
+            command: current command of the actuators of all parts, shape (n_a,).
             slack: actuators that are slack, shape (n_a,).
             rotation: desired orientation, shape (3, 3), or None to leave it free.
             body: the measured object, if there is a sensor; by default the predicted one.

@@ -1,4 +1,4 @@
-"""Mechanics of soft bodies: finite elements, actuators, solvers, and the condensed model that they lead to."""
+"""Mechanics of soft bodies: finite elements, actuators, solvers and the condensed model."""
 
 from typing import TYPE_CHECKING
 

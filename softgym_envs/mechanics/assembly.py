@@ -1,4 +1,4 @@
-"""Assembly: the equilibrium equations of a body and their derivative, on a sparsity pattern that is found once."""
+"""Assembly: the equilibrium equations of a body and their derivative, on a sparsity pattern computed once."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _symmetric_product(low, high, values, vector):
 
 @njit(cache=True)
 def _find_entries(keys, total, indptr, indices, out):
-    """Write the places of keys ``column * total + row`` in a CSC pattern; leave ``out`` alone for all other keys."""
+    """Write to ``out`` where keys ``column * total + row`` are in a CSC pattern; other keys leave it unchanged."""
     for k in range(keys.shape[0]):
         column = keys[k] // total
         if keys[k] < 0 or column >= indptr.shape[0] - 1:
@@ -87,13 +87,13 @@ class MassMatrix(NamedTuple):
 
 
 class MassAndDamping(NamedTuple):
-    """What resists the motion of a body: its mass and Rayleigh damping.
+    """Mass and Rayleigh damping of a body.
 
     Attributes:
         mass: mass matrix.
         mass_damping: Rayleigh's alpha [1/s].
         stiffness_damping: Rayleigh's beta [s].
-        viscosity: values that beta acts on, see `Assembly.viscosity`; needed where beta is not zero.
+        viscosity: stiffness values that beta multiplies, see `Assembly.viscosity`; needed where beta is not zero.
     """
 
     mass: MassMatrix
@@ -103,7 +103,7 @@ class MassAndDamping(NamedTuple):
 
 
 class Inertia(ABC):
-    """What one implicit time step adds to the equilibrium: inertia and damping at its end.
+    """Terms that one implicit time step adds to the equilibrium: inertia and damping at its end.
 
     Attributes:
         body: mass and damping of the body.
@@ -123,25 +123,25 @@ class Inertia(ABC):
 class Assembly:
     """Evaluates the equilibrium equations of a body on a fixed sparsity pattern.
 
-    Values of the tangent are listed entry by entry of the lower triangle (CSC, see `indptr` and `indices`). While they
-    are being added up, entries that touch carried rows follow behind; the kinematic map then moves them to the
-    equations.
+    Values of the tangent are stored in the order of its lower triangle (CSC, see `indptr` and `indices`). During
+    assembly, entries that involve carried rows are appended at the end; the kinematic map then adds them to those of
+    the equations.
 
     Args:
         nodes: rest rows [m], shape (n, 3).
         kinematics: degrees of freedom.
         blocks: element blocks.
         rows: constraints and their rows.
-        bonds: those of the constraints that are bonds.
+        bonds: the bonds among the constraints.
 
     Attributes:
         size: number of constraint rows.
         indptr: CSC column pointers of the tangent's lower triangle over the equations, shape (N + 1,).
         indices: its row indices.
         bond_stiffness: stiffness [N/m] of the term ``bond_stiffness H_b H_b^T`` that bonds add to the tangent. Without
-            it a part that only bonds hold would make the tangent singular; on motions that keep the bonds it changes
-            nothing, so that any positive value gives the same equilibrium. It is high compared with the elements, so
-            that the tangent is positive definite where the bonded body is stable.
+            it, a part held only by bonds would make the tangent singular. It has no effect on motions that satisfy the
+            bonds, so any positive value gives the same equilibrium. It is much stiffer than the elements, so the
+            tangent is positive definite wherever the bonded body is stable.
     """
 
     def __init__(
@@ -175,10 +175,10 @@ class Assembly:
         number, n, total = kinematics.number, kinematics.equations, kinematics.total
         stencils = [block.stencils() for block in self.blocks]
         curved = [c for c, _ in self._rows if type(c).hessian is not Constraint.hessian]
-        # Of constraints both halves are listed; the upper one is left out.
+        # Constraints list both halves; drop the upper one.
         halves = [c.hessian_pattern() for c in curved]
         halves += [(np.repeat(c.dofs, len(c.dofs)), np.tile(c.dofs, len(c.dofs))) for c in self._bonds]
-        # Keys of entries: column-major in the lower triangle; those that touch a carried row come last.
+        # Keys of entries: column-major in the lower triangle; those that involve a carried row come last.
         keys = []
         for pairs, lower_only in ((sum(stencils, []), False), (halves, True)):
             for rows, columns in pairs:
@@ -211,7 +211,7 @@ class Assembly:
         self._low, self._high = self._keys // total, self._keys % total
 
     def _plan_expansion(self, kinematic_map: KinematicMap, direct: np.ndarray, extra: np.ndarray) -> np.ndarray:
-        """Add to the keys of direct entries those that entries of carried rows lead to, and keep where these go."""
+        """Return the keys of direct entries and of those to which carried rows contribute; keep where the latter go."""
         total = self.kinematics.total
         self._expansion = kinematic_map.plan(extra // total, extra % total)
         spins = kinematic_map.spin_pairs
@@ -231,7 +231,7 @@ class Assembly:
             x: positions of the rows [m], shape (n, 3).
             effort: efforts of all constraint rows, shape (size,).
             loads: dead loads [N], shape (n, 3).
-            inertia: what a time step adds; none in statics.
+            inertia: terms that a time step adds; None in statics.
         """
         gradient, values = self._gradient, self._values
         np.negative(loads, out=gradient)

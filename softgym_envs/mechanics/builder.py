@@ -1,4 +1,4 @@
-"""ModelBuilder: solids, beams and rigid parts become one model."""
+"""ModelBuilder: combines solids, beams and rigid parts into one model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ModelBuilder:
 
     Args:
         gravity: acceleration [m/s2], shape (3,).
-        floating: allow bodies that no fixed node holds.
+        floating: allow bodies without a fixed node.
         solver: name of the linear solver.
     """
 
@@ -67,8 +67,8 @@ class ModelBuilder:
         Args:
             position: [m], shape (3,).
             rotation: matrix (3, 3), default identity.
-            fixed: whether the origin is held, as a whole or by axis of space.
-            fixed_spin: whether the rotation is held, as a whole or by axis of space.
+            fixed: whether the origin is held, entirely or per axis of space.
+            fixed_spin: whether the rotation is held, entirely or per axis of space.
             on: first row of another frame on which this one is mounted.
 
         Returns:
@@ -78,7 +78,7 @@ class ModelBuilder:
         mask[0] = fixed
         start = self._append(frame_rows(position, rotation), mask)
         if on is not None and on not in self._frames:
-            raise ValueError(f"no frame begins at row {on} to mount on; frames begin at {self._frames}")
+            raise ValueError(f"on = {on} is not the first row of a frame; frames start at rows {self._frames}")
         if on is not None:
             self._mounted.setdefault(self._frames.index(on), []).append(start)
             return start
@@ -89,7 +89,7 @@ class ModelBuilder:
     def carry(self, frame: int, rows: np.ndarray) -> None:
         """Attach mesh nodes to the frame at a row, so that they move with it."""
         if frame not in self._frames:
-            raise ValueError(f"no frame begins at row {frame}; frames begin at {self._frames}")
+            raise ValueError(f"frame = {frame} is not the first row of a frame; frames start at rows {self._frames}")
         index = self._frames.index(frame)
         self._carried[index] = np.concatenate([self._carried.get(index, np.empty(0, dtype=np.int64)), rows])
 
@@ -98,11 +98,13 @@ class ModelBuilder:
         known = {*self._frames, *(row for rows in self._mounted.values() for row in rows)}
         unknown = [int(row) for row in frames if int(row) not in known]
         if unknown:
-            raise ValueError(f"no frame begins at row {unknown[0]} for a beam; frames begin at {sorted(known)}")
+            raise ValueError(
+                f"row {unknown[0]} of the beam is not a frame's first row; frames start at rows {sorted(known)}"
+            )
         self._parts.append((Beam, np.asarray(frames, dtype=np.int64), {"section": section, **options}))
 
     def add_mass(self, frame: int, mass: float, inertia: np.ndarray) -> None:
-        """Give the rigid part at a frame a mass [kg] and an inertia along the directors [kg m2], shape (3, 3)."""
+        """Assign a mass [kg] and an inertia along the directors [kg m2] (3, 3) to the rigid part at a frame."""
         self._parts.append((RigidBody, np.array(frame), {"mass": mass, "inertia": inertia}))
 
     def build(self) -> MechanicalModel:

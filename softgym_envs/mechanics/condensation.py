@@ -1,4 +1,4 @@
-"""The condensed model: everything that controllers, environments and objectives need to know of a soft robot.
+"""The condensed model: everything that controllers, environments and objectives need to know about a soft robot.
 
 Thesis, eq. 2.5-2.14 and 4.1-4.3: with ``H_i`` the gradient of constraint function ``delta_i`` and ``A`` the tangent of
 the equilibrium,
@@ -38,7 +38,7 @@ class Row(NamedTuple):
 
 
 def effort_unit(unit: str) -> str:
-    """Return the unit of the effort that is conjugate to a displacement in a unit, e.g. N for m."""
+    """Return the unit of the effort conjugate to a displacement in ``unit``, e.g. N for m."""
     return _EFFORT_UNITS.get(unit, f"J/{unit}")
 
 
@@ -48,7 +48,7 @@ def point_rows(name: str, unit: str = "m") -> list[Row]:
 
 
 class _RoleView:
-    """An array whose parts along its last axes are read by role letters.
+    """An array whose parts along its last axes are accessed by role letter.
 
     Args:
         title: what the array holds.
@@ -77,12 +77,12 @@ class _RoleView:
 
 
 class RoleVector(_RoleView):
-    """A vector (..., n) whose parts are read by role letter: ``delta.e``."""
+    """A vector (..., n) whose parts are accessed by role letter: ``delta.e``."""
 
     __slots__ = ()
 
     def __getattr__(self, role: str) -> np.ndarray:
-        part = self._slice(role, role)  # first: it refuses what copying and unpickling look for
+        part = self._slice(role, role)  # first: it rejects the special names that copying looks up
         return self.array[..., part]
 
     def __repr__(self) -> str:
@@ -95,7 +95,7 @@ class RoleVector(_RoleView):
 
 
 class RoleMatrix(_RoleView):
-    """A matrix (..., n, n) whose blocks are read by two role letters: ``W.ea``."""
+    """A matrix (..., n, n) whose blocks are accessed by two role letters: ``W.ea``."""
 
     __slots__ = ()
 
@@ -115,7 +115,7 @@ class RoleMatrix(_RoleView):
 
 
 def _table(rows: Sequence[str], columns: Mapping[str, Sequence[str]], corner: str = "") -> str:
-    """Return a table of texts with names of rows at the left and of columns above."""
+    """Format a text table with row names on the left and column names on top."""
     width = max(map(len, [*rows, corner]))
     widths = [max(map(len, [name, *values])) for name, values in columns.items()]
     head = "  ".join([corner.ljust(width), *(name.rjust(w) for name, w in zip(columns, widths, strict=True))])
@@ -135,12 +135,12 @@ def _batch_summary(title: str, array: np.ndarray, rows: Sequence[Row]) -> str:
 class CondensedModel:
     """Compliance and free displacement between the actuators, effectors and contacts of a robot.
 
-    Printed, ``W``, ``delta_free`` and ``delta`` show names and units.
+    ``W``, ``delta_free`` and ``delta`` print with names and units.
 
     Attributes:
         compliance: ``W``, shape (..., n, n), symmetric [displacement unit / effort unit].
         free: ``delta_free``, shape (..., n): the displacements at zero effort, extrapolated with the tangent.
-        effort: efforts at which the model was taken, shape (..., n).
+        effort: efforts at which the model was computed, shape (..., n).
         roles: role letters and sizes, in order.
         rows: names and units of the rows, where they are known.
 
@@ -171,17 +171,17 @@ class CondensedModel:
 
     @property
     def W(self) -> RoleMatrix:
-        """Compliance, read by blocks: ``W.ea`` has shape (..., n_e, n_a)."""
+        """Compliance, accessed by blocks: ``W.ea`` has shape (..., n_e, n_a)."""
         return RoleMatrix("W", self.compliance, self)
 
     @property
     def delta_free(self) -> RoleVector:
-        """Free displacement, read by role: ``delta_free.e`` has shape (..., n_e)."""
+        """Free displacement, accessed by role: ``delta_free.e`` has shape (..., n_e)."""
         return RoleVector("delta_free", self.free, self)
 
     @property
     def lambda_(self) -> RoleVector:
-        """Efforts, read by role."""
+        """Efforts, accessed by role."""
         return RoleVector("effort", self.effort, self)
 
     @property

@@ -144,7 +144,7 @@ class Frames:
         nodes: rest rows [m], shape (n, 3).
         rows: first row (the origin) of each frame, shape (f,).
         carried: mesh nodes that move with a frame: index of the frame -> rows.
-        mounted: frames that are fixed to another one, and not among ``rows``: index of the frame -> first rows.
+        mounted: frames fixed to another one and therefore not in ``rows``: index of the frame -> first rows.
 
     Attributes:
         rows: as given.
@@ -196,7 +196,7 @@ class Frames:
         return x[self.carried] - self.moves[:, None] * x[self.rows[self.owner]]
 
     def displace(self, x: np.ndarray, translation: np.ndarray, spin: np.ndarray, out: np.ndarray) -> None:
-        """Write the displacement of all rows of frames and what they carry under a finite motion to ``out`` (n, 3).
+        """Write to ``out`` (n, 3) the displacement of the frames' rows and carried rows under a finite motion.
 
         Args:
             x: positions [m], shape (n, 3).
@@ -243,7 +243,7 @@ class KinematicMap:
         self.matrix = csr_matrix(
             (np.ones(len(columns)), np.array(columns, dtype=np.int64), pointers), shape=(3 * len(frames.owner), size)
         )
-        #: Its transpose, on the same data.
+        #: Its transpose, which shares its data.
         self.transposed = self.matrix.T
         # Terms of the map with the identity of the equations before it.
         self._start = np.concatenate([np.arange(size), size + pointers])
@@ -259,7 +259,7 @@ class KinematicMap:
 
     def __setstate__(self, state: dict) -> None:
         self.__dict__.update(state)
-        self.transposed = self.matrix.T  # also in a copy, both must share their data
+        self.transposed = self.matrix.T  # in a copy, too, both must share their data
 
     def linearise(self, x: np.ndarray) -> np.ndarray:
         """Update the map at positions ``x`` (n, 3) and return the vectors r of the carried rows, shape (c, 3)."""
@@ -270,7 +270,7 @@ class KinematicMap:
         return arms
 
     def plan(self, low: np.ndarray, high: np.ndarray) -> Expansion:
-        """Find what tangent entries between rows ``low`` and ``high`` add to entries of the equations.
+        """Find how tangent entries between rows ``low`` and ``high`` contribute to entries of the equations.
 
         Rows are numbered as equations, then components of carried rows.
         """
@@ -281,7 +281,7 @@ class KinematicMap:
         i, j = low[source], high[source]
         first, second = self._start[i] + within // counts[j], self._start[j] + within % counts[j]
         one, other = self._column[first], self._column[second]
-        lower = (i != j) | (other <= one)  # of an entry on the diagonal, both halves would be listed
+        lower = (i != j) | (other <= one)  # a diagonal entry would otherwise list both halves
         factor = np.where((i != j) & (one == other), 2.0, 1.0)
         pairs = np.sort(np.stack([one, other], axis=1), axis=1)
         return Expansion(source[lower], first[lower], second[lower], factor[lower], pairs[lower])

@@ -1,4 +1,4 @@
-"""Meshes from files: tetrahedra as they are, or a closed surface that is filled with tetrahedra."""
+"""Meshes from files: tetrahedra are read as they are, closed surfaces are filled with tetrahedra."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def read_mesh(
         path: mesh file.
         scale: factor to metres, 1e-3 for a file in millimetres.
         unit: unit of the file instead of ``scale``: ``"m"``, ``"cm"``, ``"mm"`` or ``"in"``.
-        mesh_size: length of the edges [m] that a surface is filled with; default a twentieth of its diagonal.
-        time_limit: of the meshing [s].
+        mesh_size: edge length [m] for filling a surface; default: a twentieth of its diagonal.
+        time_limit: time limit for meshing [s].
 
     Raises:
         DataError: if the file is missing or unreadable, or holds neither tetrahedra nor a closed surface.
@@ -85,7 +85,9 @@ def read_mesh(
 
 def _checked(path: Path, name: str, cells: np.ndarray, count: int) -> np.ndarray:
     if cells.size and not 0 <= cells.min() <= cells.max() < count:
-        raise DataError(f"mesh file '{path}': {name} refer to nodes {cells.min()}..{cells.max()}, it has {count}")
+        raise DataError(
+            f"mesh file '{path}': {name} refer to nodes {cells.min()}..{cells.max()}, but it has {count} nodes"
+        )
     return cells
 
 
@@ -97,15 +99,15 @@ def _read(path: Path) -> Any:
         raise DataError(f"mesh file '{path}' does not exist")
     file_format = None
     if path.suffix.lower() == ".msh":
-        # Two programs use this suffix. meshio tries Ansys first, and never ends on a truncated section.
+        # Two programs use this suffix. meshio tries Ansys first and hangs on a truncated section.
         content = path.read_bytes()
         file_format = "gmsh" if content.lstrip().startswith(b"$") else "ansys"
         if file_format == "ansys" and not content.rstrip().endswith(b")"):
             raise DataError(f"mesh file '{path}' is neither a Gmsh mesh nor a complete Ansys mesh")
     try:
-        with np.errstate(over="ignore"):  # meshio takes the text of an STL for a number of triangles
+        with np.errstate(over="ignore"):  # meshio reads part of a text STL as the number of triangles
             return meshio.read(path, file_format=file_format)
-    except (Exception, SystemExit) as error:  # meshio leaves with SystemExit on some malformed files
+    except (Exception, SystemExit) as error:  # meshio raises SystemExit on some malformed files
         raise DataError(f"mesh file '{path}' cannot be read: {error}") from error
 
 

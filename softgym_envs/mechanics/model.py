@@ -97,10 +97,10 @@ class MechanicalModel:
         self.set_gravity(gravity)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the factorisations of warping, which cannot be copied and are made again when needed."""
+        """Leave out the factorisations of warping, which cannot be copied and are recomputed when needed."""
         return {**self.__dict__, "_warping": None}
 
-    # -- making one -------------------------------------------------------------------------------------------------
+    # -- construction -----------------------------------------------------------------------------------------------
 
     @classmethod
     def from_mesh(
@@ -124,8 +124,8 @@ class MechanicalModel:
 
         Args:
             nodes: [m], shape (n, 3).
-            tetrahedra: corner indices (m, 4), or with midside nodes (m, 10) for ``"quadratic"``. Quadratic elements
-                get their midside nodes otherwise: these come after the other nodes, fixed where both ends are.
+            tetrahedra: corner indices (m, 4), or with midside nodes (m, 10) for ``"quadratic"``. Midside nodes that
+                are not given are added after the other nodes, fixed where both ends of the edge are.
             fixed: clamped nodes: indices, a mask (n,), a mask (n, 3) by axis, or a function of the nodes that returns
                 one of them.
             element: ``"linear"``, ``"averaged"`` (no locking near a Poisson's ratio of 0.5) or ``"quadratic"``.
@@ -138,7 +138,7 @@ class MechanicalModel:
             regions: elements of each region by name, see `read_mesh`.
             gravity: acceleration [m/s2], shape (3,).
             solver: name of the linear solver, see `make_solver`.
-            max_size: a body with a longer side [m] is refused as a mistake of units.
+            max_size: largest allowed side of the body [m]; a longer one is rejected as a unit mistake.
         """
         part = solid_part(
             nodes,
@@ -177,8 +177,8 @@ class MechanicalModel:
             fixed_box: nodes inside (xmin, xmax, ymin, ymax, zmin, zmax) [m] are clamped.
             scale: factor from the file's unit to metres, default 1.
             unit: unit of the file instead of ``scale``: ``"m"``, ``"cm"``, ``"mm"`` or ``"in"``.
-            mesh_size: length of the edges [m] that a surface is filled with; default a twentieth of its diagonal.
-            time_limit: of meshing a surface [s].
+            mesh_size: edge length [m] for filling a surface; default: a twentieth of its diagonal.
+            time_limit: time limit for meshing a surface [s].
             **options: as for `from_mesh`.
 
         Raises:
@@ -189,7 +189,7 @@ class MechanicalModel:
         mesh = read_mesh(path, scale=scale, unit=unit, mesh_size=mesh_size, time_limit=time_limit)
         check_size(mesh.nodes, options.get("max_size", MAX_BODY_SIZE), "for a file in millimetres pass unit='mm'")
         if (fixed is None) == (fixed_box is None):
-            raise ValueError("pass either 'fixed' or 'fixed_box': the nodes that are clamped")
+            raise ValueError("pass the clamped nodes as either 'fixed' or 'fixed_box'")
         if fixed_box is not None:
             fixed = _nodes_in_box(mesh.nodes, fixed_box)
         assert fixed is not None
@@ -212,7 +212,7 @@ class MechanicalModel:
             name: what the points are, for messages.
 
         Raises:
-            ValueError: if a point lies more than the size of the body away from it.
+            ValueError: if a point is farther from the body than the body's size.
         """
         solid = self._solid(block)
         check_distance(points, self._solid_nodes, name, 1.0)
@@ -253,12 +253,12 @@ class MechanicalModel:
             name: identifier.
             points: guides in a solid [m], ordered from the pull point to the anchor, shape (p, 3).
             pull_point: fixed point where the cable leaves the body [m], shape (3,).
-            unilateral: a real cable cannot push.
+            unilateral: True for a real cable, which cannot push.
             hint: elements from which guides outside the mesh are extrapolated, shape (p,).
             block: number of the solid among `solids`.
 
         Raises:
-            ValueError: if a guide lies more than the size of the body away from it, or the pull point ten times that.
+            ValueError: if a guide is farther from the body than its size, or the pull point than ten times its size.
         """
         check_distance(pull_point, self._solid_nodes, f"the pull point of cable '{name}'", 10.0)
         embedding = self.embed(points, hint, block=block, name=f"a guide of cable '{name}'")
@@ -375,14 +375,14 @@ class MechanicalModel:
 
     @property
     def assembly(self) -> Assembly:
-        """The equilibrium equations with the present constraints; a new constraint makes a new assembly."""
+        """The equilibrium equations with the current constraints; adding a constraint creates a new assembly."""
         if self._assembly is None:
             self._assembly = Assembly(self.nodes, self.kinematics, self.blocks, self.rows, self.constraints["b"])
         return self._assembly
 
     @property
     def warping(self) -> Warping:
-        """The bending of Newton steps into large motions."""
+        """Warping of Newton steps into large motions."""
         if self._warping is None:
             floating = self.floating or bool(self.constraints["b"])
             self._warping = Warping(self.kinematics, self.blocks, solver=self.solver, floating=floating)

@@ -21,7 +21,7 @@ SOLIDS: dict[str, type[SolidBlock]] = {
 """Solid elements by name."""
 
 MAX_BODY_SIZE = 10.0
-"""Largest side [m] of a body that is not taken for a mistake of units."""
+"""Largest side [m] of a body; a longer one is rejected as a unit mistake."""
 
 PerElement = float | np.ndarray | Mapping[str, float] | Callable[[np.ndarray], np.ndarray]
 """A value for all elements, one for each (m,), one for each region by name, or a function of the centroids (m, 3)."""
@@ -88,10 +88,10 @@ def solid_part(
 
 
 def check_size(nodes: np.ndarray, max_size: float, hint: str) -> None:
-    """Refuse a body whose largest side [m] exceeds a limit.
+    """Reject a body whose largest side [m] exceeds a limit.
 
     Raises:
-        ValueError: with a hint how to correct the unit.
+        ValueError: with a hint on how to correct the unit.
     """
     sides = np.ptp(nodes, axis=0) if len(nodes) else np.zeros(3)
     if sides.max() > max_size:
@@ -100,7 +100,7 @@ def check_size(nodes: np.ndarray, max_size: float, hint: str) -> None:
 
 
 def check_distance(points: np.ndarray, nodes: np.ndarray, name: str, sizes: float) -> None:
-    """Refuse points that lie more than so many body sizes outside the box around a body.
+    """Reject points that lie more than ``sizes`` body sizes outside the bounding box of a body.
 
     Args:
         points: [m], shape (p, 3) or (3,).

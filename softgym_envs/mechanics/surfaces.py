@@ -30,7 +30,7 @@ def inner_surfaces(nodes: np.ndarray, tetrahedra: np.ndarray) -> list[np.ndarray
     Returns:
         Triangles (k, 3) of each cavity, seen counter-clockwise from inside it.
     """
-    # Material lies inside the hull and outside the cavities: the volume within a cavity counts negative.
+    # Material lies inside the hull and outside the cavities: the volume within a cavity counts as negative.
     pieces = connected_pieces(boundary_triangles(tetrahedra))
     return [piece for piece in pieces if enclosed_volume(nodes, piece) < 0.0]
 
@@ -67,7 +67,7 @@ def cavity_around(nodes: np.ndarray, tetrahedra: np.ndarray, point: np.ndarray, 
         middles = [np.round(nodes[np.unique(piece)].mean(axis=0), 4).tolist() for piece in found]
         known = f"its cavities lie around {middles} m" if found else "it has none, or they are open to the outside"
         raise ValueError(f"no closed cavity of the body encloses {point.tolist()} m for '{name}'; {known}")
-    # A part inside a cavity may have a cavity itself: the smallest one is meant.
+    # A part inside a cavity may itself have a cavity: take the smallest one.
     return min(around, key=lambda piece: abs(enclosed_volume(nodes, piece)))
 
 
@@ -110,7 +110,7 @@ def _first_crossing(points, triangles, order, low, high, tolerance):
 
 
 def self_intersection(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
-    """Return a place [m] (3,) where triangles (k, 3) cross each other, or None. Touching is allowed."""
+    """Return a point [m] (3,) where triangles (k, 3) cross each other, or None. Touching is allowed."""
     corners = points[triangles]
     axes = np.argsort(-np.ptp(points, axis=0))  # few triangles overlap along the longest side
     low, high = corners.min(axis=1)[:, axes], corners.max(axis=1)[:, axes]

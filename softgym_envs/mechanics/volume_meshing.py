@@ -1,4 +1,4 @@
-"""Filling closed surfaces with tetrahedra, by gmsh in a process of its own with a time limit."""
+"""Filling closed surfaces with tetrahedra, by gmsh in a separate process with a time limit."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def fill_surface(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mesh the volume within a closed surface; closed surfaces inside it become cavities.
 
-    The surface is meshed anew with triangles of the mesh size; its sharp edges are kept.
+    The surface is remeshed with triangles of the mesh size; its sharp edges are kept.
 
     Args:
         points: [m], shape (n, 3).
-        triangles: point indices, shape (k, 3); points at the same place count as one.
-        mesh_size: length of the edges [m]; default a twentieth of the diagonal.
+        triangles: point indices, shape (k, 3); coincident points count as one.
+        mesh_size: edge length [m]; default: a twentieth of the diagonal.
         time_limit: wall-clock limit [s].
         source: name of the surface in messages.
 
@@ -79,7 +79,7 @@ def fill_surface(
 
 
 def _weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge points at the same place, and drop triangles that have no area left."""
+    """Merge coincident points, and drop triangles that have no area left."""
     points, triangles = np.asarray(points, dtype=float), np.asarray(triangles, dtype=np.int64)
     if not np.isfinite(points).all():
         raise DataError("the points of the surface must be finite")
@@ -113,7 +113,7 @@ def _shells(points: np.ndarray, triangles: np.ndarray, source: str) -> list[np.n
             f"the first near {place} m"
         )
     if len(np.unique(edges, axis=0)) != len(edges):
-        raise DataError(f"the triangles of '{source}' are oriented differently; make their normals consistent")
+        raise DataError(f"the triangles of '{source}' are oriented inconsistently; make their normals consistent")
     return connected_pieces(triangles)
 
 
@@ -138,7 +138,7 @@ def _nesting(points: np.ndarray, shells: list[np.ndarray], source: str) -> np.nd
 
 
 def _run(request: Path, output: Path, time_limit: float, source: str, size: float) -> None:
-    """Mesh in a process of its own: gmsh may crash, or never end, on a malformed surface."""
+    """Mesh in a separate process: gmsh may crash or hang on a malformed surface."""
     command = [sys.executable, "-m", "softgym_envs.mechanics.gmsh_process", str(request), str(output)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     try:

@@ -1,9 +1,9 @@
-"""Warping of Newton steps: a linear step becomes a large bending motion without spurious growth.
+"""Warping of Newton steps: turns a linear step into a large bending motion without spurious growth.
 
-Rotation-strain warping (Huang et al. 2011): every solid element is turned by the exponential of the step's spin and
+Rotation-strain warping (Huang et al. 2011): every solid element is rotated by the exponential of the step's spin and
 strained by its symmetric part, and the nodes follow in the least-squares sense (a Poisson problem, factorised once).
-Beams are treated alike, along their axis. The result equals the linear step to first order, so Newton's method keeps
-its quadratic convergence and takes far larger steps in bending.
+Beams are treated the same way, along their axis. The result equals the linear step to first order, so Newton's method
+keeps its quadratic convergence and takes far larger steps in bending.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Warping:
         # A rigid part moves as a whole: its origin must not be warped apart from what it carries.
         carried[frames.rows[frames.owner[frames.moves > 0.0]]] = True
         _, part = connected_components(laplacian, directed=False)
-        # Nodes may be held along some axes only; axes along which the same nodes are held share a factorisation.
+        # Nodes may be held along some axes only; axes that hold the same nodes share a factorisation.
         patterns, group = np.unique(kinematics.held | carried[:, None], axis=1, return_inverse=True)
         for number, held in enumerate(patterns.T):
             anchored = np.isin(part, part[held & touched])

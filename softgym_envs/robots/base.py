@@ -1,4 +1,4 @@
-"""The Robot base class: a family of bodies over a design space."""
+"""The Robot base class: a family of bodies spanned by a design space."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Drawing = tuple[Callable[..., None], dict]
 """A module-level function that draws one volume with gmsh in millimetres, and its parameters (JSON-serialisable)."""
 
 LARGEST = 10.0
-"""No robot, stroke or dimension is longer than this [m]; larger ones were probably given in millimetres."""
+"""Largest allowed robot, stroke or dimension [m]; larger ones were probably given in millimetres."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Actuator:
         high: largest commanded displacement [unit].
         rate: largest change of the command per control step [unit].
         unit: unit of displacement.
-        unilateral: cannot push.
+        unilateral: whether it cannot push.
         max_effort: largest effort either way; beyond it a commanded displacement is not reached.
     """
 
@@ -65,7 +65,7 @@ def _recording_options(init: F) -> F:
         options |= options.pop(extra, {}) if extra else {}
         outermost = "_options" not in vars(self)
         recorded = vars(self).setdefault("_options", {})
-        # A constructor runs before those of its bases: an option keeps the value that the class itself was given.
+        # This wrapper runs before those of the base classes: an option keeps the value given to the class itself.
         for name, value in options.items():
             recorded.setdefault(name, value)
         init(self, *args, **kwargs)
@@ -89,7 +89,7 @@ class Robot(ABC):
         size: a characteristic length [m], for scaling.
         effector_rest: nominal effector of the baseline body at rest [m], before loads, shape (3,).
         effort_scale: typical effort of each actuator of the baseline body [N, ...], shape (n_a,).
-        goal_axes: which coordinates of the first effector a goal is about, 1 or 0, shape (3,).
+        goal_axes: which coordinates of the first effector count towards a goal, 1 or 0, shape (3,).
         goal_tolerance: distance at which a goal counts as reached [m].
         workspace_scale: distance over which the effector typically moves [m], by default a quarter of the size; scales
             rewards and errors.
@@ -97,8 +97,8 @@ class Robot(ABC):
         stiffness_variable: design variable that scales all efforts and nothing else (Young's modulus without dead
             loads), or None. Surrogates use it exactly instead of learning it.
         convex: the elastic energy is convex in the actuator displacements, so that the body is also stable when its
-            actuators are driven by efforts. Surrogates build on it; without it, they learn unstable states too.
-        non_mechanical_options: options that leave the condensed model as it is.
+            actuators are driven by efforts. Surrogates rely on it; without it, they learn unstable states too.
+        non_mechanical_options: options that do not change the condensed model.
     """
 
     name: str
@@ -140,7 +140,7 @@ class Robot(ABC):
 
     @property
     def weights_name(self) -> str:
-        """Name of the pretrained weights, one for each variant of the robot that has its own."""
+        """Name of the pretrained weights; variants of a robot with different mechanics have different names."""
         return self.name
 
     def drawing(self, design: Mapping[str, float]) -> Drawing:
@@ -148,9 +148,9 @@ class Robot(ABC):
 
         Raises:
             InfeasibleDesign: if the shape cannot exist.
-            ValueError: if the body is not drawn with gmsh as a whole.
+            ValueError: if no single gmsh drawing describes the body.
         """
-        raise ValueError(f"robot '{self.name}' has no exact shape to write as STEP; write its triangles: .stl")
+        raise ValueError(f"robot '{self.name}' has no exact shape for STEP; write its triangles as .stl")
 
     def reference_path(self, count: int = 30) -> np.ndarray:
         """Return the published trajectory of the first effector [m], shape (count, 3), on which tracking is compared.
@@ -158,7 +158,7 @@ class Robot(ABC):
         Raises:
             ValueError: if the robot has none.
         """
-        raise ValueError(f"robot '{self.name}' has no reference path: give a path of your own")
+        raise ValueError(f"robot '{self.name}' has no reference path: pass your own")
 
     def displacements(self, fractions: np.ndarray) -> np.ndarray:
         """Return the commands, shape (N, n_a), at which states are sampled, for points of the unit cube (N, n_a).
@@ -176,7 +176,7 @@ class Robot(ABC):
             DesignError: for a malformed design.
             InfeasibleDesign: if the geometry cannot exist.
 
-        Any other exception is an error in the robot's code; a note in it names the robot and the design.
+        Any other exception is an error in the robot's code; a note is added that names the robot and the design.
         """
         complete = self.design_space.complete(design)
         try:
@@ -189,10 +189,10 @@ class Robot(ABC):
 
     @property
     def mechanics_key(self) -> dict[str, Any]:
-        """All options that change the mechanics, JSON-serialisable. Weights are valid for one key.
+        """All options that change the mechanics, JSON-serialisable. Weights are valid for exactly one key.
 
-        The options are the arguments of the constructor, defaults included. Where the robot has an attribute of the
-        same name, as for a default that depends on other options, its value counts.
+        The options are the arguments of the constructor, defaults included. If the robot has an attribute of the
+        same name, for example because a default depends on other options, the attribute's value is used.
         """
         return {
             name: _json_value(vars(self).get(name, value), f"option '{name}' of robot '{self.name}'")
@@ -221,7 +221,7 @@ class Robot(ABC):
         return np.array([actuator.unilateral for actuator in self.actuators], dtype=bool)
 
     def check_point(self, name: str, point: Any) -> np.ndarray:
-        """Return points [m] as an array (..., 3) after a check that they are near the robot.
+        """Return points [m] as an array (..., 3) after checking that they are near the robot.
 
         Args:
             name: what the point is, for messages: ``"goal"``.
@@ -250,7 +250,7 @@ class Robot(ABC):
         required = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
         missing = [name for name in required if not hasattr(self, name)]
         if missing:
-            raise TypeError(f"robot class '{type(self).__name__}' lacks: {', '.join(missing)} (see Robot)")
+            raise TypeError(f"robot class '{type(self).__name__}' does not define: {', '.join(missing)} (see Robot)")
         if isinstance(self.effectors, str):
             raise TypeError(f"robot '{self.name}': effectors must be a tuple of names, got {self.effectors!r}")
         if not hasattr(self, "workspace_scale"):
@@ -273,7 +273,7 @@ def _json_value(value: Any, label: str) -> Any:
     """Return an option as plain JSON data.
 
     Raises:
-        TypeError: for an option that has no such form.
+        TypeError: for an option that cannot be represented as JSON.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -290,17 +290,17 @@ def _json_value(value: Any, label: str) -> Any:
     if callable(value) and hasattr(value, "__qualname__"):
         return f"{value.__module__}:{value.__qualname__}"
     raise TypeError(
-        f"{label} = {value!r} cannot be compared with that of trained weights: use numbers, texts, lists or mappings, "
+        f"{label} = {value!r} cannot be stored as the key of trained weights: use numbers, strings, lists or mappings, "
         "or list it in 'non_mechanical_options'"
     )
 
 
 class MeshedRobot(Robot):
-    """A robot whose body is one solid, meshed by gmsh; the mesh is moved from design to design.
+    """A robot whose body is one solid, meshed by gmsh; by default, the mesh is moved from design to design.
 
     Args:
         mesh_size: target edge length [m].
-        meshing: ``"morph"`` moves the reference mesh, ``"remesh"`` meshes every design anew.
+        meshing: ``"morph"`` moves the reference mesh, ``"remesh"`` creates a new mesh for every design.
         material: name of a material of `softgym_envs.mechanics.materials`.
         gravity: acceleration [m/s2], shape (3,).
     """
@@ -347,7 +347,7 @@ class MeshedRobot(Robot):
 
     @property
     def reference_design(self) -> Design:
-        """The design whose mesh is moved to all others: the baseline, or one nearer the middle of the box."""
+        """The design whose mesh is moved to all others: the baseline, or one nearer the centre of the design space."""
         return self.design_space.baseline
 
     def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
@@ -385,7 +385,7 @@ class MeshedRobot(Robot):
 
         Args:
             mesh: the meshed body.
-            design: has the variables ``young_modulus`` [Pa] and ``poisson_ratio``.
+            design: a design with the variables ``young_modulus`` [Pa] and ``poisson_ratio``.
             fixed: clamped nodes, boolean, shape (n,).
             density: [kg/m3]; the default is that of silicone.
         """
@@ -403,7 +403,7 @@ class MeshedRobot(Robot):
     def reference_nodes(self, mesh: BodyMesh) -> np.ndarray:
         """Positions [m] (n, 3) of the nodes in the reference body if ``mesh`` was moved from it, else in ``mesh``.
 
-        A set of nodes that is chosen by them stays the same as the mesh moves.
+        A set of nodes selected by these positions stays the same as the mesh moves.
         """
         if mesh.origin != "morphed" or self._morpher is None:
             return mesh.nodes

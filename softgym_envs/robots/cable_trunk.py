@@ -1,4 +1,4 @@
-"""The cable trunk: a slender tapered silicone arm that eight cables bend in two independent halves.
+"""The cable trunk: a slender tapered silicone arm whose two halves are bent independently by eight cables.
 
 Dimensions are those of the public model of an elephant's trunk, without its folds. The trunk stands on its
 clamped base along +z. Four cables run to the tip and four to the middle, each pair in one of the planes xz and yz.
@@ -21,11 +21,11 @@ LONG_GUIDES, SHORT_GUIDES = 20, 10
 
 
 def stretched(share: np.ndarray, short_fraction: float) -> np.ndarray:
-    """Heights, as shares of the length, of equal steps along the trunk; the first half ends with the short cables.
+    """Return heights over the length for equal steps along the trunk; the first half ends with the short cables.
 
-    Sections and guides move with that end. On a mesh that does not move, the force at the end passes from one element
-    to the next as the design changes. As strains jump between elements, even the sign of the tip's derivative changed
-    within 2 % of the range.
+    Sections and guides move with that end. On a fixed mesh, the force at the end would pass from one element to the
+    next as the design changes. Strains jump between elements, so even the sign of the tip's derivative changed within
+    2 % of the range.
     """
     return np.interp(share, [0.0, 0.5, 1.0], [0.0, short_fraction, 1.0])
 
@@ -87,7 +87,7 @@ class CableTrunk(Robot):
         strokes: largest displacement of the long and of the short cables [m]. The default is half of the public model's
             (0.070, 0.040): from 37 mm on, two opposite long cables crush the thin tip and no equilibrium is found; one
             long cable alone can be pulled by 57 mm.
-        unilateral: cables cannot push (default). False reproduces published scenes, where they can.
+        unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the baseline body weighs 42 g.
     """
 
@@ -140,7 +140,7 @@ class CableTrunk(Robot):
 
     @staticmethod
     def volume(design: Mapping[str, float]) -> float:
-        """Volume of the body [m3], exactly: a frustum of an octagon."""
+        """Exact volume of the body [m3]: a frustum of an octagon."""
         base, tip = design["base_half_width"], design["tip_half_width"]
         return 8.0 * np.tan(np.pi / 8) * design["length"] * (base * base + base * tip + tip * tip) / 3.0
 

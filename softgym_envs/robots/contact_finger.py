@@ -1,9 +1,9 @@
-"""One finger whose contact points are tied to a frame that is driven: the building block of grippers.
+"""One finger whose contact points are tied to a driven frame: the building block of grippers.
 
-A finger that holds a rigid object (thesis, sec. 4.3.2) touches it at three points, which keep their triangle. Eight
+A finger that holds a rigid object (thesis, sec. 4.3.2) touches it at three points, whose triangle stays rigid. Eight
 numbers therefore describe its state: the shortening of its two cables and the pose of the triangle. When all eight are
 driven, the finger's energy is a function of them, and its derivatives are the tensions of the cables and the wrench
-that the object exerts. The energy of a gripper of turned and moved copies is the sum of such functions
+that the object exerts. The energy of a gripper of rotated and shifted copies is the sum of such functions
 (`softgym_envs.control.fingers`), so one learned model serves every finger of every gripper.
 
 That energy is not convex. A finger that is pulled and pushed at once is stable while its cables and pose are held, or
@@ -27,10 +27,10 @@ from softgym_envs.robots.grippers import STRAIGHT, FingerRobot
 class ContactFinger(FingerRobot):
     """A two-cable finger whose three contact points are tied to a frame that is driven in all six directions.
 
-    The actuators are the two cables, then the displacement x, y, z [m] of the frame's origin from rest and its turn
+    The actuators are the two cables, then the displacement x, y, z [m] of the frame's origin from rest and its rotation
     rx, ry, rz, the components of ``sin(angle) * axis`` [1]; see `softgym_envs.mechanics.constraints.Pose`. Their
     ranges cover 99 % of the poses that occur in the three-finger gripper under random commands, over its design space;
-    the finger that presses a button turns further (up to 90 degrees). The effector is the tip.
+    the finger that presses a button rotates further (up to 90 degrees). The effector is the tip.
 
     Args:
         **options: options of `FingerRobot`.
@@ -77,7 +77,7 @@ class ContactFinger(FingerRobot):
         self.effort_scale = np.array([20.0, 20.0, 2.0, 2.0, 10.0, 0.2, 0.2, 0.05])
 
     def object_rest(self, design: Mapping[str, float]) -> np.ndarray:
-        """Middle of the tip."""
+        """Return the middle of the tip."""
         return self.finger.tip(design)
 
     def object_frame(self, design: Mapping[str, float]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The Diamond: a soft parallel robot, four legs with an elbow each between a clamped base and a free top.
+"""The Diamond: a soft parallel robot with four elbowed legs between a clamped base and a free top.
 
 Dimensions are those of its public model (thesis, sec. 4.3.1). The legs lie in the planes xz and yz; a
 cable pulls each elbow inwards, which lifts the top and tilts it away.
@@ -68,14 +68,14 @@ def draw_eighth(**corners: float) -> None:
 class Diamond(MeshedRobot):
     """Four-legged parallel robot, pulled by four cables at its elbows.
 
-    The body is meshed in one eighth and mirrored, so its response has the symmetry of its shape.
+    One eighth of the body is meshed and mirrored, so its response has the symmetry of its shape.
 
     Args:
         mesh_size: target edge length [m]; the default gives 1529 nodes and 5272 tetrahedra. Edges of the outline are
             shorter than that, so elements are smaller.
-        meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` meshes every design anew.
+        meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` creates a new mesh for every design.
         material: name of a material of `softgym_envs.mechanics.materials`.
-        unilateral: cables cannot push (default). False reproduces published scenes, where they can.
+        unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the condensed-model work of the thesis has none. Its reinforcement-learning scene
             is ``gravity=(0, 0, -9.81)`` with the design ``{"young_modulus": 1.8e5}``; the baseline body weighs 0.5 kg.
     """
@@ -108,7 +108,7 @@ class Diamond(MeshedRobot):
         self.effector_rest = self._top(self.design_space.baseline)
         self.effort_scale = np.full(4, 40.0)
         self.actuators = tuple(
-            # The published range is 0 to 30 mm. Without paying out the antagonists the top stays 6 mm above the
+            # The published range is 0 to 30 mm. Unless the antagonists are paid out, the top stays 6 mm above the
             # published circle.
             Actuator(name, -0.010, 0.030, 0.0015, unilateral=unilateral)
             for name in ("north", "west", "south", "east")
@@ -182,7 +182,7 @@ class Diamond(MeshedRobot):
         return part
 
     def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
-        """Stretch the legs with the elbow, and the upper half with the top."""
+        """Return displacements that stretch the legs with the elbow, and the upper half with the top."""
         base, mm = self.reference_design, 1e-3
         x, y, z = nodes.T
         moved = np.column_stack(
@@ -218,8 +218,8 @@ class Diamond(MeshedRobot):
     def reference_path(self, count: int = 30) -> np.ndarray:
         """Circle of radius 20 mm in the plane z = 133 mm, as published; the same for every body.
 
-        With cables that cannot push the top of the baseline body comes within 1.2 mm of it, with others it follows
-        exactly.
+        With cables that cannot push, the top of the baseline body stays within 1.2 mm of it; with cables that can, it
+        follows exactly.
         """
         angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
         return np.column_stack([0.020 * np.cos(angle), 0.020 * np.sin(angle), np.full(count, 0.133)])

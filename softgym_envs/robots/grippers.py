@@ -1,4 +1,4 @@
-"""Grippers made from turned and moved copies of the Soft Finger (thesis, sec. 4.3.1 and 4.3.2).
+"""Grippers made from rotated and shifted copies of the Soft Finger (thesis, sec. 4.3.1 and 4.3.2).
 
 The fingers and the object that they hold are one finite-element model. Contact is that of the thesis: contact points
 are tied to the object by ball joints, which pull as well as push and transmit no moments.
@@ -34,7 +34,7 @@ class FingerRobot(Robot):
         mesh_size: target edge length of a finger [m].
         meshing: ``"morph"`` or ``"remesh"``, as for the finger.
         material: name of a material.
-        unilateral: cables cannot push (default).
+        unilateral: whether cables cannot push (default).
         gravity: acceleration [m/s2].
     """
 
@@ -72,7 +72,7 @@ class FingerRobot(Robot):
         self.stiffness_variable = "young_modulus" if self.proportional_to_modulus and not any(gravity) else None
 
     def variables(self) -> tuple[DesignVariable, ...]:
-        """Return the design variables: those of the finger, then those of the gripper."""
+        """Return the design variables: first those of the finger, then those of the gripper."""
         return tuple(self.finger.design_space)
 
     @abstractmethod
@@ -124,7 +124,7 @@ class FingerRobot(Robot):
     def material_point(
         self, model: MechanicalModel, finger: int, point: np.ndarray, reference: np.ndarray
     ) -> EmbeddedPoints:
-        """Embed a point of the finger [m] (3,), given in the finger's own axes, in one of its copies.
+        """Embed a point [m] (3,), given in the finger's own axes, in one copy of the finger.
 
         Args:
             model: the gripper.
@@ -152,7 +152,7 @@ class PressFinger(FingerRobot):
 
     Args:
         button_force: force of the button [N]. The published "10 N" pushes this finger back by 66 mm with its cables
-            held at zero, from where it cannot press the button in a stable way; 2 N is well within its strength.
+            held at zero, from where it cannot press the button stably; 2 N is well within its strength.
         **options: options of `FingerRobot`.
     """
 
@@ -162,7 +162,7 @@ class PressFinger(FingerRobot):
     half_extents = (13.75e-3, 13.75e-3, 13.75e-3)
     goal_axes = np.array([0.0, 1.0, 0.0])
     goal_tolerance = 5e-4
-    proportional_to_modulus = False  # the force of the button does not depend on it
+    proportional_to_modulus = False  # the force of the button does not scale with it
 
     def __init__(self, *, button_force: float = 2.0, **options: Any) -> None:
         if not (np.isfinite(button_force) and button_force >= 0.0):
@@ -171,7 +171,7 @@ class PressFinger(FingerRobot):
         super().__init__(**options)
 
     def variables(self) -> tuple[DesignVariable, ...]:
-        """Return those of the finger, without moduli so low that the button folds the finger."""
+        """Return the variables of the finger, without moduli so low that the button folds the finger."""
         return tuple(
             replace(variable, low=2.0e6) if variable.name == "young_modulus" else variable
             for variable in super().variables()
@@ -184,7 +184,7 @@ class PressFinger(FingerRobot):
     object_frame = object_rest
 
     def reference_path(self, count: int = 9) -> np.ndarray:
-        """Goals along y from where the button has pushed the finger, shape (count, 3); x and z do not count."""
+        """Goals along y, starting where the button has pushed the finger, shape (count, 3); x and z do not count."""
         path = np.tile(self.effector_rest, (count, 1))
         path[:, 1] = np.linspace(0.020, 0.044, count)
         return path
@@ -201,8 +201,8 @@ class PressFinger(FingerRobot):
 class TwoFingerGripper(FingerRobot):
     """Two fingers that face each other and hold a bar between their tips (thesis, eq. 4.6).
 
-    The bar keeps the tips at a constant offset along y. It is shorter than their distance at rest, so the fingers bend
-    towards each other. The effector is the middle of the bar.
+    The bar keeps the tips at a constant offset along y. It is shorter than the tips' distance at rest, so the fingers
+    bend towards each other. The effector is the middle of the bar.
 
     Args: as for `FingerRobot`.
     """
@@ -214,7 +214,7 @@ class TwoFingerGripper(FingerRobot):
     goal_tolerance = 5e-4
 
     def variables(self) -> tuple[DesignVariable, ...]:
-        """Return those of the finger and the length of the bar."""
+        """Return the variables of the finger and the length of the bar."""
         bar = DesignVariable("bar_length", 0.030, 0.055, 0.040, "m", "offset of the two tips along y")
         return (*super().variables(), bar)
 
@@ -229,7 +229,7 @@ class TwoFingerGripper(FingerRobot):
         return path
 
     def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
-        """Tie the tips at the bar's length; the effector lies half way between them."""
+        """Tie the tips at the bar's length; the effector lies halfway between them."""
         tip, reference = self.finger.tip(design), self.finger.tip(self.finger.reference_design)
         first, second = (self.material_point(model, k, tip, reference) for k in (0, 1))
         model.add("b", Bond("bar", first, second, np.array([0.0, -design["bar_length"], 0.0])))

@@ -33,7 +33,7 @@ def make_robot(robot: str | type[Robot] | Robot, **options: object) -> Robot:
     """Return a robot.
 
     Args:
-        robot: registered name, path ``"module:class"``, class, or a robot, which is returned as it is.
+        robot: registered name, path ``"module:class"``, class, or a robot, which is returned unchanged.
         **options: options of the robot, see its class.
 
     Raises:
@@ -47,8 +47,8 @@ def register_robot(name_or_class: Any = None, robot: str | type[Robot] | None = 
 
     Used as a decorator (``@register_robot`` or ``@register_robot("arm")``) or as a call (``register_robot(Arm)``,
     ``register_robot("arm", Arm)``, ``register_robot("arm", "my_package.arm:Arm")``). Worker
-    processes do not run your script: use the path ``"my_package.arm:Arm"`` as the robot's name there, or let your
-    package name its robots in entry points of the group ``softgym_envs.robots``.
+    processes do not run your script: use the path ``"my_package.arm:Arm"`` as the robot's name there, or list the
+    robots of your package as entry points of the group ``softgym_envs.robots``.
 
     Args:
         name_or_class: name, or a class whose attribute ``name`` is the name.

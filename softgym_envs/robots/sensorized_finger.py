@@ -51,7 +51,7 @@ class SensorReadings:
         pulled_volumes: of all cavities under the pull [m3].
         pushed_volumes: of all cavities under the lateral force [m3]; None with two cavities.
         tension: of the cable under the pull [N].
-        stable: the equilibrium under the pull is stable.
+        stable: whether the equilibrium under the pull is stable.
     """
 
     volume_change: float
@@ -75,10 +75,10 @@ class SensorizedFinger(MeshedRobot):
     Args:
         cavities: 2 (one in each bellow) or 4 (two in each, with a wall between; its thickness is then a variable).
         mesh_size: target edge length [m].
-        meshing: ``"remesh"`` (default) meshes every design anew, as the published study does. ``"morph"`` moves the
-            baseline mesh if its elements stay good, which holds in about a quarter of this large box.
+        meshing: ``"remesh"`` (default) creates a new mesh for every design, as in the published study. ``"morph"``
+            moves the baseline mesh if its elements stay good, which holds in about a quarter of this large space.
         material: name of a material of `softgym_envs.mechanics.materials`.
-        unilateral: the cable cannot push (default).
+        unilateral: whether the cable cannot push (default).
         gravity: acceleration [m/s2].
         tip_height: height of the effector over the bottom [m]: 0 as published, 10 mm as in the `SoftFinger`.
         cable_clearance: height of the cable over the bellows [m]: 0.8 mm in the published study, 1 mm as built.
@@ -160,7 +160,7 @@ class SensorizedFinger(MeshedRobot):
         cable = 1e3 * self.cable_height(design)
         if not lengths["joint_height"] < cable < HEIGHT:
             raise InfeasibleDesign(
-                f"the cable does not pass through the segments and over the joints: it is {cable:.2f} mm above the "
+                f"the cable must pass through the segments and over the joints: it is {cable:.2f} mm above the "
                 f"bottom, the joints end at {lengths['joint_height']:.2f} mm and the segments at {HEIGHT:.2f} mm"
             )
         return draw_finger, lengths
@@ -206,7 +206,7 @@ class SensorizedFinger(MeshedRobot):
     def readings(
         self, design: Mapping[str, float] | None = None, *, pull: float = 0.010, lateral_force: float = 5.0
     ) -> SensorReadings:
-        """Return the quantities in the published objectives, from their equilibria.
+        """Return the quantities of the published objectives, computed from equilibria.
 
         Args:
             design: the body; missing variables take their baseline.

@@ -40,11 +40,11 @@ class SoftFinger(MeshedRobot):
             1 (thesis, sec. 4.5: x = 0, y = 17.75 mm, notch slope 30 degrees, nu 0.47).
         mesh_size: target edge length [m]; default 8 mm (485 nodes, 1572 tetrahedra) with two cables, 7.9 mm (520
             nodes, 1721 tetrahedra) with one. Meshes of these sizes can be moved to every design without remeshing.
-        meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` meshes every design anew.
+        meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` creates a new mesh for every design.
         material: name of a material of `softgym_envs.mechanics.materials`.
-        unilateral: cables cannot push (default). False reproduces published scenes, where they can.
+        unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the condensed-model work of the thesis has none.
-        contacts: add three contact points (role ``c``) on the front of the last segment (thesis, sec. 4.3.2).
+        contacts: whether to add three contact points (role ``c``) to the front of the last segment (sec. 4.3.2).
     """
 
     name = "finger"
@@ -140,7 +140,7 @@ class SoftFinger(MeshedRobot):
         return np.array([0.0, design["height"], -2.5 * design["length"]]) + circle
 
     def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
-        """Stretch along z with the segment length."""
+        """Return displacements that stretch the body along z with the segment length."""
         displacement = np.zeros_like(nodes)
         displacement[:, 2] = nodes[:, 2] * (design["length"] / self.reference_design["length"] - 1.0)
         return displacement

@@ -1,8 +1,8 @@
 """Stiff-Flop: a pneumatic trunk of two modules with fibre-reinforced chambers (Abidi et al. 2018; thesis, sec. 4.4).
 
 Each module bends and stretches when its three pairs of chambers, 120 degrees apart, are filled. The model is that of
-the thesis: beams along the axis with chambers that act along off-axis lines (Chaillou et al. 2023), here geometrically
-exact ones. The trunk is clamped at the origin and lies along +x.
+the thesis, but with geometrically exact beams: beams along the axis with chambers that act along off-axis lines
+(Chaillou et al. 2023). The trunk is clamped at the origin and lies along +x.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ STIFF_LENGTH = 5e-3
 """Length of the stiff end piece of each module [m]; the chambers fill the rest."""
 
 # The published dimensions determine neither the lever arm of the chambers nor the section that carries load. These four
-# values, the same for both modules, are inferred from the published compliance at rest: they make the errors of all its
-# entries equal, none above 6 % (see the page of this robot).
+# values, the same for both modules, are inferred from the published compliance at rest: they make the largest relative
+# errors of its entries about equal, none above 6 % (see the page of this robot).
 CHAMBER_RADIUS = 0.719e-3
 """Inner radius of one tube [m]: two of them have 3.25 mm2 (nominal 0.75 mm, 3.53 mm2)."""
 CHAMBER_OFFSET = 3.45e-3
@@ -47,8 +47,8 @@ class StiffFlop(Robot):
     Args:
         elements: quadratic beam elements along the chambers of each module.
         gravity: acceleration [m/s2]; the published work has none.
-        unilateral: pressures are not negative (default): a chamber whose commanded volume is below the one to which the
-            others stretch it is open, without pressure.
+        unilateral: whether pressures must not be negative (default): a chamber that the others stretch beyond its
+            commanded volume is open, without pressure.
     """
 
     name = "trunk"

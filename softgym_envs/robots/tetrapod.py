@@ -1,6 +1,6 @@
 """The Tetrapod: four servos bend elastic legs that meet in a small rigid centre (thesis, sec. 5.3).
 
-The published frame has y up. Here z is up: (x, y, z) there is (x, z, -y) here. The robot hangs from its servos.
+The published frame has y up. Here z is up: the published (x, y, z) is (x, z, -y) here. The robot hangs from its servos.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ UP = np.array([0.0, 0.0, 1.0])
 class Tetrapod(Robot):
     """Four servo-driven legs and a rigid centre.
 
-    A leg leaves the horn of its servo downwards and reaches the centre horizontally. It is printed straight and bent by
-    this assembly. With the published lengths, this gives the published rest height and workspace (see the page of this
-    robot).
+    A leg leaves the horn of its servo downwards and reaches the centre horizontally. By default it is printed straight,
+    and the assembly bends it. With the published lengths, this gives the published rest height and workspace (see the
+    page of this robot).
 
     Args:
         payload: mass at the centre [kg].
@@ -133,7 +133,7 @@ class Tetrapod(Robot):
     def _printed(
         self, root: np.ndarray, outwards: np.ndarray, along: np.ndarray, design: Mapping[str, float]
     ) -> np.ndarray:
-        """Frames of a leg as printed: from the root downwards, with a curvature that is quadratic in the length."""
+        """Frames of a leg as printed: from the root downwards, with a curvature that is quadratic along the leg."""
         count, length = 2 * self.elements + 1, design["leg_length"]
         knots = [design[f"curvature_{k}"] for k in (1, 2, 3)]
         curvature = np.polynomial.Polynomial.fit([0.0, 0.5 * length, length], knots, 2)

@@ -16,7 +16,7 @@ class ImageRenderer:
     """Renders states of a robot off screen with a fixed camera.
 
     An image shows the body with its clamped base in dark grey, the cables (amber to red with tension; grey and wavy if
-    slack) with a bead on their pulled end, the effectors (blue), the goal (green) and its path, in front of a wall with
+    slack) with a bead at their pulled end, the effectors (blue), the goal (green) and its path, in front of a wall with
     a scale grid. Cables, effectors and goal remain faintly visible where the body hides them.
 
     Args:

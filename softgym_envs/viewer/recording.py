@@ -43,8 +43,8 @@ class RolloutRecorder:
         robot: the family of bodies.
         path: file to write; missing folders are created.
         name: name of the recording in the viewer.
-        roles: names of several rollouts that are shown side by side. The entities of a rollout lie under its name, and
-            `log` writes to the rollout of the last `begin`.
+        roles: names of several rollouts to show side by side. The entities of a rollout lie under its name, and `log`
+            writes to the rollout selected by the last `begin`.
     """
 
     def __init__(
@@ -251,7 +251,7 @@ def record_comparison(
         steps: largest number of steps; default: the time limit of the environment.
 
     Returns:
-        Results as of `record_rollout`, by name.
+        Results of `record_rollout`, by name.
 
     Raises:
         ValueError: as `record_rollout`, and if there are no rollouts.

@@ -42,7 +42,7 @@ _FILL = np.array([0.3, 1.0, 0.4])
 _VIEW_ANGLE = np.radians(18.0)
 
 STUB = 0.06
-"""Length of an unpulled cable outside the body, relative to the size of the robot."""
+"""Visible length of an unpulled cable outside the body, relative to the size of the robot."""
 
 
 def tension_color(share: float) -> Color:
@@ -250,7 +250,7 @@ class Scene:
     # -- moving objects ---------------------------------------------------------------------------------------------
 
     def set_body(self, model: MechanicalModel, x: np.ndarray) -> None:
-        """Draw a body at node positions [m] (n, 3). The surface is rebuilt only for another model."""
+        """Draw a body at node positions [m] (n, 3). The surface is rebuilt only if the model changes."""
         if model is not self._model:
             self._model = model
             self._surface = BodySurface(model)

@@ -137,7 +137,7 @@ def cable_lines(
         side: direction of the waves of a slack cable, shape (3,).
 
     Returns:
-        Polylines by actuator row; other actuators than cables are left out.
+        Polylines by actuator row; actuators other than cables are left out.
     """
     lines, row = {}, 0
     pulled = commanded_displacement(state)
@@ -152,7 +152,7 @@ def cable_lines(
 
 
 def commanded_displacement(state: State) -> np.ndarray:
-    """Return the displacement of the actuator drives, shape (n_a,), for commands of displacements and efforts.
+    """Return the displacement of the actuator drives, shape (n_a,), for commands in displacement or effort.
 
     It equals the displacement of the state except for a slack cable, whose path shortens further than it is pulled.
     """
@@ -218,7 +218,7 @@ class ShapeFinder:
     @property
     def state(self) -> State:
         """State of the finite-element model after the last call of `at`."""
-        return self._present.state
+        return self._loaded_backend.state
 
     def nodes(self, design: Mapping[str, float], state: State) -> np.ndarray:
         """Return the nodes [m] (n, 3) of a state of a design."""
@@ -233,17 +233,17 @@ class ShapeFinder:
         """
         self.load(design)
         self._move(displacement)
-        nodes = self._present.state.nodes
+        nodes = self._loaded_backend.state.nodes
         assert nodes is not None
         return nodes
 
     @property
-    def _present(self) -> FEMBackend:
+    def _loaded_backend(self) -> FEMBackend:
         assert self._backend is not None, "load a design first"
         return self._backend
 
     def _move(self, displacement: np.ndarray | None) -> None:
-        backend = self._present
+        backend = self._loaded_backend
         if displacement is None:
             self._target = None
             backend.reset()

@@ -183,7 +183,7 @@ def test_a_step_that_fails_leaves_the_state(monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(type(backend._dynamics), "solve", fail_later)
-        with pytest.raises(ConvergenceError, match="no motion over 0.025 s"):
+        with pytest.raises(ConvergenceError, match="cannot advance 0.025 s"):
             backend.step(path[4])
     assert backend.state is kept
     np.testing.assert_array_equal(backend._dynamics.x, kept.nodes)

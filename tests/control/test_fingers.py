@@ -299,7 +299,7 @@ def test_learned_fingers_are_evaluated_together(parts):
 
 
 def test_only_models_of_the_contact_finger_make_a_gripper():
-    with pytest.raises(ValueError, match="must be one of robot 'contact_finger', got one of 'finger'"):
+    with pytest.raises(ValueError, match="must be of robot 'contact_finger', got one of robot 'finger'"):
         SurrogateFingers(Learned(make_robot("finger")))
 
 

@@ -491,7 +491,7 @@ def test_malformed_quadratic_elements_are_refused(box):
         QuadraticTetrahedra(finer, np.where(ten == ten.max(), 99, ten))
     bent = finer.copy()
     bent[ten[2, 4]] = 3.0 * (finer.mean(axis=0) - finer[ten[2, 4]]) + finer.mean(axis=0)
-    with pytest.raises(ValueError, match="inverted by its edges"):
+    with pytest.raises(ValueError, match="inverted by its curved edges"):
         QuadraticTetrahedra(bent, ten)
 
 

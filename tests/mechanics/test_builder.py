@@ -140,7 +140,7 @@ def test_unknown_names_are_refused(box):
     body = ModelBuilder()
     with pytest.raises(ValueError, match="unknown element 'cubic'; allowed: linear, averaged, quadratic"):
         body.add_solid(nodes, tetrahedra, fixed=[0], element="cubic")
-    with pytest.raises(ValueError, match="no frame begins at row 3"):
+    with pytest.raises(ValueError, match="3 is not the first row of a frame"):
         body.carry(3, np.array([0]))
     body.add_solid(nodes, tetrahedra, fixed=[0], material="jelly")
     with pytest.raises(ValueError, match="unknown material 'jelly'"):

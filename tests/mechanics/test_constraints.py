@@ -364,7 +364,7 @@ def test_a_surface_without_volume_is_refused(mesh):
         Cavity("c", triangles[1:], nodes)
     flipped = triangles.copy()
     flipped[3] = flipped[3, ::-1]
-    with pytest.raises(ValueError, match="oriented differently"):
+    with pytest.raises(ValueError, match="not oriented consistently"):
         Cavity("c", flipped, nodes)
     with pytest.raises(ValueError, match="not closed"):
         Cavity("c", np.vstack([triangles, triangles[:1]]), nodes)

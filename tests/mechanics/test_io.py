@@ -411,7 +411,7 @@ FAULTS = {
     "crossing": ([BAR, cuboid((50, 5, 5), (90, 15, 15))], "intersects itself near"),
     "touching": ([BAR, cuboid((10, 20, 5), (30, 30, 15))], "two of its closed shells overlap"),
     "two bodies on one edge": ([BAR, cuboid((60, 20, 0), (70, 30, 20))], "touches itself: 1 edges belong to more than"),
-    "mixed": ([(BAR[0], np.vstack([BAR[1][:1, ::-1], BAR[1][1:]]))], "oriented differently; make their normals"),
+    "mixed": ([(BAR[0], np.vstack([BAR[1][:1, ::-1], BAR[1][1:]]))], "oriented inconsistently; make their normals"),
 }
 
 

@@ -123,7 +123,9 @@ def test_missing_attributes_are_named():
         def assemble(self, design):
             raise NotImplementedError
 
-    with pytest.raises(TypeError, match=r"'Bar' lacks: effectors, size, design_space, .*effort_scale \(see Robot\)"):
+    with pytest.raises(
+        TypeError, match=r"'Bar' does not define: effectors, size, design_space, .*effort_scale \(see Robot\)"
+    ):
         Bar()
 
 

@@ -225,7 +225,7 @@ def test_other_shapes_that_cannot_exist(change, message):
 
 @pytest.mark.parametrize("clearance", [-0.009, 0.006])
 def test_a_cable_outside_the_segments(clearance):
-    with pytest.raises(InfeasibleDesign, match="the cable does not pass"):
+    with pytest.raises(InfeasibleDesign, match="the cable must pass"):
         make_robot("sensorized_finger", cable_clearance=clearance).body()
 
 

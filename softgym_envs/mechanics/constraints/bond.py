@@ -11,14 +11,14 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 class Bond(Constraint):
     """Point ``first`` minus point ``second`` [m], held at ``gap`` by a force [N] on the first and its opposite.
 
-    Bilateral, without friction or rotation: a ball joint. Under the role ``"b"`` of a model it is always held, and is
+    Bilateral, without friction or rotation: a ball joint. Under the role ``"b"`` of a model it is always active and is
     eliminated from the condensed model.
 
     Args:
         name: identifier.
         first: one embedded point.
         second: one embedded point, or a fixed position [m], shape (3,).
-        gap: offset in space that is held [m], shape (3,); zero ties the points together.
+        gap: offset to maintain [m], shape (3,); zero ties the points together.
     """
 
     size = 3

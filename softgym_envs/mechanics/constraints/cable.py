@@ -83,7 +83,7 @@ class Cable(Constraint):
         name: identifier.
         embedding: the points in order from the pull point to the anchor.
         pull_point: fixed point where the cable leaves the body [m], shape (3,).
-        unilateral: a real cable cannot push. False allows it, as some published models do.
+        unilateral: True for a real cable, which cannot push; False lets it push, as in some published models.
 
     Raises:
         ValueError: if two successive points coincide.

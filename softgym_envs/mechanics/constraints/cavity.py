@@ -16,7 +16,7 @@ _WEIGHTS = np.array([2, 3, -5, -5, 5, 5, -3, 4, 24, 4, -5, 3, -5, -24, -4, 4, 4,
 
 
 def enclosed_volume(x: np.ndarray, triangles: np.ndarray) -> float:
-    """Volume [m3] inside a closed surface of triangles (k, 3), positive if seen counter-clockwise from outside."""
+    """Volume [m3] inside a closed surface of triangles (k, 3), positive if they are counter-clockwise from outside."""
     return _weighted_volume(x, triangles, np.ones(len(triangles)))
 
 
@@ -90,7 +90,7 @@ class Cavity(Constraint):
         keys = edges[:, 0] * len(nodes) + edges[:, 1]
         mirrored = edges[:, 1] * len(nodes) + edges[:, 0]
         if len(np.unique(keys)) != len(keys) or not np.array_equal(np.sort(keys), np.sort(mirrored)):
-            raise ValueError(f"the surface of cavity '{name}' is not closed, or its triangles are oriented differently")
+            raise ValueError(f"the surface of cavity '{name}' is not closed or not oriented consistently")
         # Volumes are sums of weighted determinants of triples of nodes: one for each linear triangle.
         triples, weights = triangles, np.ones(len(triangles))
         if quadratic:

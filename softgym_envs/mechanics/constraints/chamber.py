@@ -58,12 +58,12 @@ def _line_hessian(x, ids, weights, group, scale, out):
 class Chamber(Constraint):
     """Growth of fibre-reinforced chambers of constant cross-section; delta [m3] = sum of area x elongation.
 
-    The fibres keep the cross-section, so that volume changes with the length of the centre line alone (Chaillou et al.
-    2023). Effort [Pa] is the pressure: work is done along the line only.
+    The fibres preserve the cross-section, so the volume depends only on the length of the centre line (Chaillou et al.
+    2023). Effort [Pa] is the pressure, which does work only along the line.
 
     Args:
         name: identifier.
-        tangents: per centre line its tangents times quadrature weight as linear combinations of rows (`Beam.line`):
+        tangents: for each centre line, its weighted tangents as linear combinations of rows (`Beam.line`):
             ``node_ids`` (q, k) and ``weights`` (q, k), whose norms add up to the length.
         area: cross-section of one line [m2].
     """

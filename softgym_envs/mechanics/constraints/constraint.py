@@ -18,7 +18,7 @@ class Constraint(ABC):
         name: identifier within a model.
         size: number of rows.
         dofs: degrees of freedom of the full node array (3 * node + axis) it depends on, shape (k,).
-        unilateral: the effort cannot be negative when displacement-driven (a cable cannot push).
+        unilateral: whether the effort must not be negative when displacement-driven (a cable cannot push).
         unit: units of displacement and effort, for tables.
     """
 
@@ -55,6 +55,6 @@ class Constraint(ABC):
     def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray | None:
         """Return the entries of ``sum_i effort_i d2 delta_i / dx2`` in the order of `hessian_pattern`.
 
-        The shape is free, (k, k) for the default pattern; None if delta is linear.
+        Any shape of that size works, such as (k, k) for the default pattern; None if delta is linear.
         """
         return None

@@ -17,7 +17,7 @@ class EmbeddedPoints:
         tetrahedra: corner indices, shape (m, 4).
         hint: elements from which points outside the mesh are extrapolated, shape (p,). The nearest element can
             change abruptly when a mesh of the same topology is moved; a fixed one keeps the point's motion smooth.
-        gradients: of the last three barycentric coordinates [1/m], shape (m, 3, 3), if they are known already.
+        gradients: those of the last three barycentric coordinates [1/m], shape (m, 3, 3), if already known.
 
     Attributes:
         points: reference positions [m], shape (p, 3).

@@ -13,7 +13,7 @@ class Servo(Constraint):
     """Angle of a frame about an axis fixed in space; delta [rad] is zero at rest, effort [N m] is the torque.
 
     The angle is that of one director's projection onto the plane normal to the axis, between -pi and pi. The frame's
-    other motions must be held (fixed origin and spin); the angle is still measured if the frame tilts out of the plane.
+    other motions must be held (fixed origin and spin); the angle remains defined if the frame tilts out of the plane.
 
     Args:
         name: identifier.

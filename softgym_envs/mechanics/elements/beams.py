@@ -1,14 +1,14 @@
 """Geometrically exact beams for slender parts.
 
 The director formulation of the Simo-Reissner beam (Romero and Armero 2002; Betsch and Steinmann 2002): origin and
-directors of the cross-sections are interpolated along the axis, and the strains are taken from them in the material
+directors of the cross-sections are interpolated along the axis, and the strains are computed from them in the material
 frame,
 
     Gamma_i = d_i . r' - (d_i . r')_0,      K_1 = (d_3 . d_2' - d_2 . d_3') / 2 - (...)_0   (and cyclic),
 
 with d_1 along the axis. They are objective (a rigid motion causes no strain), independent of the path, and quadratic in
-the rows of ``x``, so that energy, forces and exact tangent are polynomials of low degree; the frames turn directors
-into rotations. Reduced integration (one Gauss point for two nodes, two for three) avoids shear locking.
+the rows of ``x``, so that energy, forces and exact tangent are polynomials of low degree; the frames replace directors
+by rotations. Reduced integration (one Gauss point for two nodes, two for three) avoids shear locking.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Section:
         inertia: second moments of area about d_2 and d_3 [m4].
         torsion: torsion constant [m4].
         shear: shear correction factors along d_2 and d_3.
-        mass_area: area of the material [m2], if more than ``area`` has mass.
+        mass_area: area that has mass [m2], if it is larger than ``area``.
     """
 
     area: float
@@ -48,12 +48,12 @@ class Section:
 
     @property
     def material_area(self) -> float:
-        """Area of the material [m2], which has mass and volume."""
+        """Area of the material [m2], from which mass and volume follow."""
         return self.area if self.mass_area is None else self.mass_area
 
     @classmethod
     def rectangle(cls, width: float, thickness: float) -> Section:
-        """A rectangle of a width [m] along d_2 and a thickness [m] along d_3 (Timoshenko's torsion series)."""
+        """A rectangle with a width [m] along d_2 and a thickness [m] along d_3 (Timoshenko's torsion series)."""
         if not (width > 0.0 and thickness > 0.0):
             raise ValueError(f"a section of {width} m by {thickness} m must have positive sides")
         area = width * thickness
@@ -112,7 +112,7 @@ def _evaluate(
 ):
     """Energy; forces (m, k, 4, 3) and, unless ``matrix`` is empty, element matrices (m, 12 k, 12 k).
 
-    Without ``stressed`` the matrices are those of strains alone, as if there were no stress.
+    Without ``stressed``, the matrices omit the terms of the stress.
     """
     m, k = rows.shape
     quadrature = weights.shape[1]
@@ -212,7 +212,7 @@ def _cross(a, b, factor, out):
 
 @njit(cache=True, error_model="numpy")
 def _add_warped(x, step, rows, shape, slope, weights, out):
-    """Turn the tangent by the exponential of the spin, and strain it by the remainder of the step."""
+    """Rotate the tangent by the exponential of the spin, and strain it by the remainder of the step."""
     spin = np.empty(3)
     tangent = np.empty(3)
     strained = np.empty(3)
@@ -258,11 +258,11 @@ class Beam(ElementBlock):
         poisson_ratio: scalar or one for each element.
         density: [kg/m3].
         order: 1 or 2, degree of the interpolation.
-        stress_free: rows of the frames of the chain in the shape that is free of stress [m], shape (c, 4, 3); default
-            as in ``nodes``, however curved.
+        stress_free: rows of the chain's frames in the stress-free shape [m], shape (c, 4, 3); default: as in ``nodes``,
+            which may be curved.
 
     Raises:
-        ValueError: for a chain of a wrong length, or two frames that coincide.
+        ValueError: if the chain has the wrong length or two frames coincide.
     """
 
     def __init__(
@@ -389,7 +389,7 @@ class Beam(ElementBlock):
         return np.bincount(self.rows.ravel(), weights=masses.ravel(), minlength=count)
 
     def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        # A cross-section has the kinetic energy rho / 2 (A |p'|^2 + I_3 |d_2'|^2 + I_2 |d_3'|^2) per length.
+        # Kinetic energy of a cross-section per unit length: rho / 2 (A |p'|^2 + I_3 |d_2'|^2 + I_2 |d_3'|^2).
         points, gauss = np.polynomial.legendre.leggauss(self.order + 1)
         shape, _ = _lagrange(self.order, points)
         shares = 0.5 * np.einsum("q,qa,qb->ab", gauss, shape, shape)

@@ -16,15 +16,15 @@ def lower_pairs(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class ElementBlock(ABC):
     """Elements of one kind: an energy of the rows of ``x`` with its gradient and exact tangent.
 
-    Degrees of freedom are numbered ``3 * row + axis`` over all rows of ``x``. Blocks do not know which of them are
-    free, fixed or carried by a frame.
+    Degrees of freedom are numbered ``3 * row + axis`` over all rows of ``x``. Blocks treat all rows alike,
+    whether they are free, fixed or carried by a frame.
 
     Attributes:
         nodes_used: rows of ``x`` that the elements touch, shape (u,).
         volume: rest volume [m3].
         mass: mass [kg].
         stiffness: a typical stiffness against displacements [N/m], for scaling.
-        elasticity_version: grows with every change of the elasticity, so that solvers notice it.
+        elasticity_version: increases with every change of the elasticity, so that solvers can detect it.
     """
 
     nodes_used: np.ndarray
@@ -49,7 +49,7 @@ class ElementBlock(ABC):
         Args:
             x: positions [m], shape (n, 3).
             gradient: output, added to.
-            values: output, added to at the places that ``scatter`` gives for every stencil (-1: nowhere).
+            values: output, to which each entry is added at the index in ``scatter`` (-1: skipped).
             scatter: one array for each of `stencils`, of its shape.
 
         Returns:
@@ -60,8 +60,8 @@ class ElementBlock(ABC):
     def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
         """Add the stiffness against strain rates at positions ``x`` (n, 3), for damping; at rest it is the elastic one.
 
-        It is never negative and does not resist rigid motions. Under stress the tangent has neither property: damping
-        with it would drive compressed parts.
+        It is positive semidefinite and does not resist rigid motions. The tangent under stress has neither property:
+        damping with it would feed energy into compressed parts.
         """
 
     @abstractmethod

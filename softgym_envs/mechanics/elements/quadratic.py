@@ -36,7 +36,7 @@ def quadratic_triangles(triangles: np.ndarray, tetrahedra: np.ndarray) -> np.nda
         ]
     except KeyError as error:
         first, second = error.args[0]
-        raise ValueError(f"from node {first} to {second} is not an edge of the quadratic elements") from None
+        raise ValueError(f"nodes {first} and {second} are not joined by an edge of the quadratic elements") from None
     return np.hstack([triangles, np.array(middles, dtype=np.int64).reshape(-1, 3)])
 
 
@@ -44,7 +44,7 @@ def split_triangles(triangles: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray
     """Split boundary triangles (k, 3) of corners into four at the midside nodes of tetrahedra (m, 10): (4 k, 3).
 
     For pictures. Use `quadratic_triangles` for a cavity: on split triangles the pressure is not distributed according
-    to the elements' shape functions, which spoils their accuracy.
+    to the elements' shape functions, which reduces their accuracy.
     """
     parts = quadratic_triangles(triangles, tetrahedra)[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]]
     return parts.reshape(-1, 3)
@@ -145,7 +145,7 @@ class QuadraticTetrahedra(SolidBlock):
             raise ValueError(
                 f"tetrahedra refer to nodes {connectivity.min()}..{connectivity.max()}, the mesh has {len(nodes)}"
             )
-        # Turning an element swaps corners 1 and 2, and with them the edges 01/02 and 13/23.
+        # Reorienting an element swaps corners 1 and 2, and with them the edges 01/02 and 13/23.
         connectivity[turned] = connectivity[turned][:, [0, 2, 1, 3, 6, 5, 4, 7, 9, 8]]
         assert (connectivity[:, :4] == corners).all()
         x = nodes[connectivity]
@@ -157,7 +157,7 @@ class QuadraticTetrahedra(SolidBlock):
             jacobian = np.einsum("mad,ak->mdk", x, local)
             determinant = np.linalg.det(jacobian)
             if not (determinant > 0.0).all():
-                raise ValueError(f"quadratic tetrahedron {int(np.argmin(determinant))} is inverted by its edges")
+                raise ValueError(f"quadratic tetrahedron {int(np.argmin(determinant))} is inverted by its curved edges")
             gradients[:, q] = np.einsum("ak,mkd->mad", local, np.linalg.inv(jacobian))
             weights[:, q] = determinant / 24.0
         super().__init__(connectivity, gradients.reshape(-1, 10, 3), weights.ravel(), **options)

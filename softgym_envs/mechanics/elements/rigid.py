@@ -43,7 +43,7 @@ class RigidBody(ElementBlock):
         # Kinetic energy in terms of directors: 1/2 sum_kl E_kl d_k' . d_l' with Euler's tensor E.
         self._euler = 0.5 * np.trace(inertia) * np.eye(3) - inertia
         if np.linalg.eigvalsh(self._euler)[0] < -1e-9 * np.trace(inertia):
-            raise ValueError(f"inertia {inertia.tolist()} kg m2 violates the triangle inequality: no body has it")
+            raise ValueError(f"inertia {inertia.tolist()} kg m2 violates the triangle inequality: no body can have it")
         self.row = int(row)
         self.mass = float(mass)
         self.nodes_used = self.row + np.arange(4)

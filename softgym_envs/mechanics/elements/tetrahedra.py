@@ -101,7 +101,7 @@ def viscosity(F, mu, lame, inverse, out):
 
 @njit(cache=True, error_model="numpy")
 def _add_warped(x, step, connectivity, points, gradients, volumes, out):
-    """Add ``V (F' - F) g_a``, with F' the gradient F turned and strained by a step, to ``out``, shape (n, 3)."""
+    """Add ``V (F' - F) g_a``, with F' the gradient F rotated and strained by a step, to ``out``, shape (n, 3)."""
     f = np.empty((3, 3))
     d = np.empty((3, 3))
     h = np.empty((3, 3))
@@ -188,14 +188,14 @@ def check_nodes(nodes: np.ndarray) -> np.ndarray:
 
 
 def orient_corners(nodes: np.ndarray, connectivity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Check tetrahedra and turn those that are negatively oriented.
+    """Check tetrahedra and reorient those that are negatively oriented.
 
     Args:
         nodes: rest positions [m], shape (n, 3).
         connectivity: corner indices, shape (m, 4).
 
     Returns:
-        Corner indices (m, 4), volumes [m3] (m,), and which were turned (m,).
+        Corner indices (m, 4), volumes [m3] (m,), and which elements were reoriented (m,).
 
     Raises:
         ValueError: for a wrong shape, an index out of range or a degenerate element.
@@ -214,7 +214,7 @@ def orient_corners(nodes: np.ndarray, connectivity: np.ndarray) -> tuple[np.ndar
     connectivity[turned] = connectivity[turned][:, [0, 2, 1, 3]]
     flat = np.flatnonzero(np.abs(volumes) < 1e-9 * np.abs(edges).max(axis=(1, 2)) ** 3)
     if len(flat):
-        raise ValueError(f"{len(flat)} degenerate tetrahedra, the first is number {flat[0]}")
+        raise ValueError(f"{len(flat)} degenerate tetrahedra, the first at index {flat[0]}")
     return connectivity, np.abs(volumes), turned
 
 
@@ -265,7 +265,7 @@ class SolidOptions(TypedDict, total=False):
 
 
 class SolidBlock(ElementBlock):
-    """Base of the blocks of solid elements: material, quadrature and warping of steps.
+    """Base class of blocks of solid elements: material, quadrature and warping of steps.
 
     Args:
         connectivity: node indices, shape (m, k).
@@ -370,7 +370,7 @@ class Tetrahedra(SolidBlock):
 
     Args:
         nodes: rest positions [m], shape (n, 3).
-        connectivity: corner indices, shape (m, 4). Negatively oriented elements are turned.
+        connectivity: corner indices, shape (m, 4). Negatively oriented elements are reoriented.
         **options: material, young_modulus, poisson_ratio and density, see `SolidBlock`.
 
     Raises:

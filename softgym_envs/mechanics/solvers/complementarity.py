@@ -8,10 +8,10 @@ from numba import njit
 
 @njit(cache=True, error_model="numpy")
 def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
-    """Fill y (m,) with the efforts if the actuators in ``slack`` carry none.
+    """Fill y (m,) with the efforts, assuming that the actuators in ``slack`` carry none.
 
-    Returns the actuators that contradict this: taut ones that would have to push, and slack ones that would fall short
-    of their commands; -1 if W of the taut ones is not positive definite. Sets of actuators are bits of an integer.
+    Returns the actuators that contradict this assumption: taut ones that would have to push, and slack ones that would
+    fall short of their commands; -1 if W of the taut ones is not positive definite. Sets of actuators are bit masks.
     """
     m = len(gap)
     k = 0
@@ -43,7 +43,7 @@ def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
             value = gap[i]
             for j in range(m):
                 value += W[i, j] * y[j]
-            if not value >= -tolerance:  # true for NaN, too
+            if not value >= -tolerance:  # also true for NaN
                 wrong |= 1 << i
         elif unilateral[i] and not y[i] >= 0.0:
             wrong |= 1 << i

@@ -66,7 +66,7 @@ class Dynamics(Statics):
         model: the body.
         step: time step [s].
         scheme: a name of `SCHEMES`.
-        spectral_radius: of the generalised alpha scheme; 1 does not damp, 0 damps all that the step does not resolve.
+        spectral_radius: of the generalised alpha scheme; 1 does not damp, 0 damps motions too fast for the step most.
         mass_damping: Rayleigh's alpha [1/s].
         stiffness_damping: Rayleigh's beta [s], applied to the stiffness against strain rates at the start of each step.
         lumped: lump the masses.
@@ -75,7 +75,7 @@ class Dynamics(Statics):
         max_cuts: how often a step that cannot be solved is halved.
 
     Attributes:
-        velocity: present velocity of the rows [m/s], shape (n, 3).
+        velocity: current velocity of the rows [m/s], shape (n, 3).
         time: [s].
 
     Raises:
@@ -119,7 +119,7 @@ class Dynamics(Statics):
         self.rest()
 
     def rest(self) -> None:
-        """Stop all motion in the present shape, and set time and energies to zero."""
+        """Stop all motion in the current shape, and set time and energies to zero."""
         self.velocity = np.zeros_like(self.x)
         self.time = 0.0
         self._history: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
@@ -143,7 +143,7 @@ class Dynamics(Statics):
 
     @property
     def snapshot(self) -> tuple:
-        """Everything that a step starts from; assign it to undo steps."""
+        """State that a step starts from; assign it to undo steps."""
         return (
             self.x,
             self.effort,
@@ -165,7 +165,7 @@ class Dynamics(Statics):
         return np.concatenate([np.zeros(0), *parts])
 
     def energies(self) -> tuple[float, float]:
-        """Kinetic and potential energy [J] of the present state."""
+        """Kinetic and potential energy [J] of the current state."""
         return 0.5 * float(np.vdot(self.velocity, self._mass.rows @ self.velocity)), self.model.energy(self.x)
 
     def advance(
@@ -179,7 +179,7 @@ class Dynamics(Statics):
         A step that cannot be solved is divided into halves, along which commands are ramped.
 
         Raises:
-            ConvergenceError: if that does not help either; the state at the start of the step is kept.
+            ConvergenceError: if the halves cannot be solved either; the state at the start of the step is kept.
             ValueError: as `Statics.solve`.
         """
         target = np.asarray(target, dtype=float)
@@ -189,7 +189,7 @@ class Dynamics(Statics):
             count = 2**cut
             try:
                 for k in range(count):
-                    # The last one takes the target itself: no round-off.
+                    # The last step takes the target itself, to avoid round-off.
                     part = target if k == count - 1 else first + (k + 1) / count * (target - first)
                     found = self._advance(part, mode, self.step / count, applied)
                 break
@@ -197,11 +197,11 @@ class Dynamics(Statics):
                 self.snapshot = start
                 if cut == self.max_cuts:
                     raise ConvergenceError(
-                        f"no motion over {self.step:g} s to actuators {target.tolist()}, even in {count} steps",
+                        f"cannot advance {self.step:g} s to actuators {target.tolist()}, even in {count} steps",
                         fraction=0.0,
                     ) from None
             except BaseException:
-                # Whatever stopped it, a refused command or Ctrl-C: the body has not moved.
+                # Any exception, such as an invalid command or Ctrl-C, leaves the body where it was.
                 self.snapshot = start
                 raise
         kinetic, potential = self.energies()
@@ -250,7 +250,7 @@ class Dynamics(Statics):
         return found
 
     def _mass_and_damping(self) -> MassAndDamping:
-        """Mass and damping of a step that starts at the present state."""
+        """Mass and damping of a step that starts at the current state."""
         viscosity = self._assembly.viscosity(self.x) if self.stiffness_damping else None
         return MassAndDamping(self._mass, self.mass_damping, self.stiffness_damping, viscosity)
 
@@ -258,7 +258,7 @@ class Dynamics(Statics):
         self, inertia: Inertia, h: float, target: np.ndarray, mode: str | Sequence[str], applied: AppliedLoads
     ) -> Equilibrium:
         kinematics, start = self.model.kinematics, self.x
-        # What moves is likely to move on; where that inverts an element, the step starts where it is.
+        # Start from where the current velocity leads, unless that inverts an element.
         drift = h * kinematics.equation_velocity(start, self.velocity)
         self.x = start + kinematics.displacement(start, drift)
         try:
@@ -272,7 +272,7 @@ class Dynamics(Statics):
 
     @contextmanager
     def _moving(self, inertia: Inertia) -> Iterator[None]:
-        """Add inertia to the equilibrium, and let dead loads act in full: their ramp belongs to statics."""
+        """Add inertia to the equilibrium, and apply dead loads in full: only statics ramps them."""
         self._carried = self.linearisation.loads = self.model.loads
         self.linearisation.inertia = inertia
         self.linearisation.current = False
@@ -289,10 +289,10 @@ class Dynamics(Statics):
         speed = kinematics.equation_velocity(self.x, self.velocity)
         delta = self._values(self.x)
         rows = self._displacement_rows(mode)
-        # A cable that hangs slack continues to do so.
+        # A slack cable stays slack.
         slack = self.unilateral[rows] & (self.effort[rows] <= 0.0) & (delta[rows] > target[rows])
         driven = np.concatenate([rows[~slack], self._bonds])
-        # Along a steady motion a driven value changes by h^2 times this; the acceleration makes up for it.
+        # Along a steady motion a driven value changes by h^2 times this; the acceleration compensates for it.
         before, after = (
             self._values(self.x + kinematics.displacement(self.x, s * self.step * speed)) for s in (-0.01, 0.01)
         )

@@ -132,7 +132,7 @@ class SuperLUSolver(LinearSolver):
 
 
 def make_solver(name: str, indptr: np.ndarray, indices: np.ndarray) -> LinearSolver:
-    """Return the solver of a name: ``"cholmod"``, ``"superlu"``, or ``"auto"`` for the fastest one installed.
+    """Return a solver by name: ``"cholmod"``, ``"superlu"``, or ``"auto"`` for the fastest one installed.
 
     Raises:
         ValueError: for an unknown name.

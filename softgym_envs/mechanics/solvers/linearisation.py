@@ -18,7 +18,7 @@ class Linearisation:
     Attributes:
         loads: dead loads that act [N], shape (n, 3); a solver may apply them in steps.
         inertia: what a time step adds to the equilibrium; None in statics.
-        current: whether the linearisation belongs to the present state of the solver, which resets it.
+        current: whether this is the linearisation at the solver's current state; the solver resets it.
         residual: of the equilibrium, shape (N,).
         correction: ``A^-1 residual``, shape (N,).
         H: gradients of the constraints, shape (N, size).

@@ -25,7 +25,7 @@ class ImplicitEuler(Inertia):
 
 
 class Start(Inertia):
-    """The start of a motion at rows ``x`` with velocities of the equations ``v``: a step is ``h^2`` accelerations."""
+    """Scheme that finds accelerations at rows ``x`` and velocities ``v`` (N,): a step is ``h^2`` times them."""
 
     def __init__(self, kinematics: Kinematics, x: np.ndarray, v: np.ndarray, h: float, body: MassAndDamping) -> None:
         self._motion = kinematics.row_velocity(x, v), kinematics.row_acceleration(x, v, np.zeros_like(v))

@@ -62,7 +62,7 @@ class NewtonFailure(Exception):
 
 
 def _complementary_step(W: np.ndarray, gap: np.ndarray, effort: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
-    """Return steps of driven efforts that close ``gap`` in bilateral rows, and with which no unilateral row pushes."""
+    """Return steps of driven efforts that close ``gap`` in bilateral rows and make no unilateral row push."""
     if not unilateral.any():
         return np.linalg.solve(W, -gap)
     if unilateral.all():
@@ -90,11 +90,11 @@ class Statics:
         model: the body.
         tolerance: largest remaining correction of any node at convergence [m].
         max_iterations: limit of Newton iterations per load increment.
-        max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the way.
+        max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the whole step.
 
     Attributes:
-        x: present node positions [m], shape (n, 3).
-        effort: present efforts of all rows, shape (size,).
+        x: current node positions [m], shape (n, 3).
+        effort: current efforts of all rows, shape (size,).
         unilateral: actuator rows that cannot push, shape (n_a,); may be changed between solves.
         linearisation: the equations linearised where the last iteration ended.
     """
@@ -130,7 +130,7 @@ class Statics:
         """Go back to the undeformed shape with no effort. The equilibrium under loads is found by `solve`."""
         self.x = self.model.nodes.copy()
         self.effort = np.zeros(self._assembly.size)
-        self._carried = np.zeros_like(self.x)  # dead loads that the present state carries
+        self._carried = np.zeros_like(self.x)  # dead loads that the current state carries
         self.linearisation.current = False
 
     def restore(self, x: np.ndarray, effort: np.ndarray) -> None:
@@ -143,7 +143,7 @@ class Statics:
     # -- Newton -----------------------------------------------------------------------------------------------------
 
     def _linearise(self) -> bool:
-        """Linearise at the present state. False if elements are inverted or the tangent is singular."""
+        """Linearise at the current state. False if elements are inverted or the tangent is singular."""
         return self.linearisation.update(self.x, self.effort)
 
     def _correction(
@@ -171,7 +171,7 @@ class Statics:
             unilateral[: self._actuators] = self.unilateral
             try:
                 step_effort[driven] = _complementary_step(W, gap, effort[driven], unilateral[driven])
-            except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (two actuators do the same)
+            except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (two actuators act alike)
                 raise NewtonFailure from None
         step_q = linear.response(step_effort) - Ar
         if len(self._bonds):
@@ -211,7 +211,7 @@ class Statics:
                     Ar = linear.solve(assembled.residual)
                     next_q, next_effort = self._correction(Ar, assembled.delta, effort, target, driven)
                     remaining = self._norm(next_q)
-                    # Near convergence round-off decides, not Newton.
+                    # Near convergence, round-off dominates.
                     if remaining <= (1.0 - 0.25 * length) * norm or remaining <= self.tolerance:
                         break
                 length *= 0.5
@@ -256,8 +256,8 @@ class Statics:
             contact_mode: ``"effort"`` (forces) or ``"displacement"`` (driven positions).
 
         Returns:
-            The equilibrium. Unilateral actuators driven in displacement may end slack: their reached displacement
-            is then larger than commanded, and their effort is zero.
+            The equilibrium. Unilateral actuators driven in displacement may end slack: their displacement is then
+            larger than commanded, and their effort is zero.
 
         Raises:
             ConvergenceError: if no equilibrium is found; the last converged state is kept.
@@ -280,7 +280,9 @@ class Statics:
         forced = np.array([i for i, m in enumerate(modes) if m == "effort"], dtype=int)
         for row in forced[self.unilateral[forced]] if len(forced) else forced:
             if target[row] < 0.0:
-                raise ValueError(f"effort {target[row]:g} on actuator row {row} must not be negative: it cannot push")
+                raise ValueError(
+                    f"effort {target[row]:g} on actuator row {row} must not be negative: this actuator cannot push"
+                )
         goal = np.zeros(self._assembly.size)
         goal[:count] = target
         if effector_force is not None:
@@ -299,7 +301,7 @@ class Statics:
         if not linear.current and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
-        # Commands are ramped from the present values.
+        # Commands are ramped from the current values.
         start = self.effort.copy()
         start[driven] = linear.delta[driven]
         done, size, iterations, increments = 0.0, 1.0, 0, 0
@@ -314,7 +316,7 @@ class Statics:
             try:
                 iterations += self._newton(start + level * (goal - start), driven)
             except BaseException as problem:
-                # Whatever stopped it, even Ctrl-C, the last equilibrium stays.
+                # After any exception, even Ctrl-C, the last equilibrium is restored.
                 self.x, self.effort = kept
                 linear.loads = self._carried
                 linear.current = False
@@ -340,7 +342,7 @@ class Statics:
         slack = np.zeros(self._actuators, dtype=bool)
         rows = driven[driven < self._actuators]
         rows = rows[self.unilateral[rows]] if len(rows) else rows
-        # At rest the effort alone would be a matter of round-off.
+        # The sign of the effort alone does not suffice: at rest it is round-off.
         slack[rows] = (effort[rows] <= 0.0) & (delta[rows] > target[rows] + 1e-9)
         count = len(effort) - len(self._bonds)
         if len(self._bonds):

@@ -16,7 +16,7 @@ from softgym_envs.robots.geometry.meshing import BodyMesh, run_gmsh
 from softgym_envs.storage import atomic_write
 
 FORMATS = (".step", ".stl")
-"""Allowed endings of files."""
+"""Allowed file endings."""
 
 
 def export_body(
@@ -28,7 +28,7 @@ def export_body(
         robot: the family of bodies.
         path: ends with ``.step`` (the exact shape) or ``.stl`` (the boundary of its finite-element mesh).
         design: the body; missing variables take their baseline.
-        time_limit: wall-clock limit of drawing a STEP file [s].
+        time_limit: wall-clock limit for drawing a STEP file [s].
 
     Returns:
         The path.
@@ -36,7 +36,7 @@ def export_body(
     Raises:
         DesignError: for a malformed design.
         InfeasibleDesign: if the geometry cannot exist.
-        ValueError: for another ending, or a robot without an exact or a solid shape.
+        ValueError: for another ending, or a robot without an exact shape (STEP) or a solid part (STL).
     """
     path = _check_path(path)
     if path.suffix == ".step":

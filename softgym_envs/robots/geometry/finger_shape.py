@@ -135,11 +135,11 @@ def check_finger(lengths: Mapping[str, float]) -> None:
         raise InfeasibleDesign(
             f"the cavity vanishes: the cork ends at {cork:.2f} mm, the cavity at a radius of {outer:.2f} mm"
         )
-    # Where the cavity is widest along z, only the segment beside it closes it.
+    # Where the cavity is widest along z, only the adjacent segment closes it.
     closed = joint_height + half / tangent
     if inner > cork and inner >= closed:
         raise InfeasibleDesign(
-            f"the cavity opens into the notch: it is {inner:.2f} mm high at its ends, the segment beside it "
+            f"the cavity opens into the notch: it is {inner:.2f} mm high at its ends, the adjacent segment "
             f"{closed:.2f} mm"
         )
 

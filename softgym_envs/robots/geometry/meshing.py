@@ -29,7 +29,7 @@ from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
 from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
 _FORMAT = 2
-# Exit statuses of the meshing process: gmsh is missing or does not load; gmsh refuses the shape; the drawing has a bug.
+# Exit statuses of the meshing process: gmsh is missing or does not load; gmsh rejects the shape; the drawing has a bug.
 _NO_GMSH, _NO_SHAPE, _BUG = 3, 4, 5
 _SHIPPED = Path(__file__).parents[1] / "meshes"
 
@@ -112,7 +112,7 @@ class BodyMesh:
 def mesh_geometry(
     build: Callable[..., None], parameters: dict[str, float], *, mesh_size: float, time_limit: float = 60.0
 ) -> BodyMesh:
-    """Return the mesh of a geometry, from the cache if it is there.
+    """Return the mesh of a geometry, from the cache if it is stored there.
 
     Args:
         build: module-level function that draws one volume with ``gmsh.model.occ`` in millimetres.
@@ -136,7 +136,7 @@ def mesh_geometry(
             except DataError:
                 if folder == _SHIPPED:
                     raise
-                path.unlink(missing_ok=True)  # make a damaged cache entry again
+                path.unlink(missing_ok=True)  # replace a damaged cache entry
     with tempfile.TemporaryDirectory() as scratch:
         output = Path(scratch) / "mesh.npz"
         run_gmsh({**request, "output": str(output)}, time_limit=time_limit)
@@ -144,15 +144,15 @@ def mesh_geometry(
     try:
         mesh.save(path)
     except OSError as error:
-        warnings.warn(f"the mesh is not cached, as '{path.parent}' cannot be written: {error}", stacklevel=2)
+        warnings.warn(f"the mesh is not cached, because '{path.parent}' cannot be written: {error}", stacklevel=2)
     return mesh
 
 
 def _cache_key(build: Callable[..., None], parameters: dict[str, float], mesh_size: float) -> str:
     """Return the cache key of a mesh: a hash of the drawing's code, constants and parameters.
 
-    A new mesh is made when the drawing function is edited. Comments, its docstring, white space and the path of the
-    file do not count, as they do not change the shape.
+    Editing the drawing function changes the key. Comments, its docstring, white space and the path of the file do not
+    count, because they do not change the shape.
     """
     code = ast.parse(textwrap.dedent(inspect.getsource(build)))
     function = code.body[0]
@@ -273,7 +273,7 @@ def _main() -> int:
         print(problem, file=sys.stderr)
         return _NO_GMSH
     except Exception as problem:
-        # What gmsh reports is a plain Exception; any other type comes from the code of the drawing.
+        # gmsh raises plain Exceptions; any other type comes from the drawing's code.
         if type(problem) is not Exception and not isinstance(problem, InfeasibleDesign):
             traceback.print_exc()
             return _BUG

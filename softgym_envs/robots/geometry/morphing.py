@@ -1,8 +1,8 @@
 """Moving a mesh of fixed topology from one design to another.
 
-With remeshing, the number of nodes jumps between neighbouring designs, and so does the compliance. Here the baseline
-mesh is moved instead. Its boundary nodes stay on their geometric features (planes, cylinders, cones), which move with
-the design: first corners are placed, then curves, then surfaces. The interior follows by harmonic extension.
+With remeshing, the number of nodes jumps between neighbouring designs, and so does the compliance. Therefore the
+baseline mesh is moved instead. Its boundary nodes stay on their geometric features (planes, cylinders, cones), which
+move with the design: first corners are placed, then curves, then surfaces. The interior follows by harmonic extension.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Cone(Feature):
     slope: float
 
     def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-12)  # on the axis any gradient will do
+        rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-12)  # on the axis, any gradient will do
         scale = 1.0 / np.hypot(1.0, self.slope)
         distance = (rho - self.radius - self.slope * (x[:, 2] - self.height)) * scale
         gradient = np.column_stack([x[:, 0] / rho, x[:, 1] / rho, np.full(len(x), -self.slope)]) * scale
@@ -77,7 +77,7 @@ def _extension(count: int, edges: np.ndarray, weights: np.ndarray, known: np.nda
     touched[edges.ravel()] = True
     unknown = touched & ~known
     size = int(unknown.sum())
-    # The anchor keeps pieces without a known node at their guess.
+    # The anchor keeps components without a known node at their guess.
     factor = splu(csc_matrix(laplacian[unknown][:, unknown] + anchor * identity(size))) if size else None
     coupling = laplacian[unknown][:, known]
 
@@ -146,7 +146,7 @@ class Morpher:
         """Return the nodes [m] (n, 3) on the features of another design.
 
         Args:
-            features: features of the new design, of the same names.
+            features: features of the new design, under the same names.
             guess: rough displacements of the nodes [m], shape (n, 3); may be zero.
         """
         rest = self.mesh.nodes

@@ -8,7 +8,7 @@ A finger is cast upside down: its flat bottom (y = 0) is the open face of the mo
 * ``cork``: a tray for casting the plugs that are glued into the openings left by the cores.
 * ``clamp``: a yoke with two screw holes that holds the flange of the finished finger against a wall.
 
-Together, the silicone parts are the simulated body except for the cable channels. Lengths are in millimetres.
+Together, the silicone parts form the simulated body except for the cable channels. Lengths are in millimetres.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def mould_parts(robot: Robot, design: Mapping[str, float] | None = None) -> dict
         design: the body; missing variables take their baseline.
 
     Returns:
-        Function and parameters by the name of the part.
+        Drawing function and parameters of each part, by name.
 
     Raises:
         DesignError: for a malformed design.
@@ -78,8 +78,8 @@ def export_moulds(
         robot: a `SoftFinger` or a `SensorizedFinger`.
         folder: output folder, which is created if necessary.
         design: the body; missing variables take their baseline.
-        formats: endings, of ``.step`` and ``.stl``.
-        time_limit: wall-clock limit of one file [s].
+        formats: file endings, from ``.step`` and ``.stl``.
+        time_limit: wall-clock limit for one file [s].
 
     Returns:
         The files: ``box.step``, ``box.stl``, ...

@@ -1,6 +1,6 @@
 """Symmetric bodies from a mesh of one part.
 
-Mesh generators do not preserve symmetry: of two equal legs, one comes out stiffer. A body that is mirrored from one
+Mesh generators do not preserve symmetry: of two identical legs, one becomes stiffer. A body that is mirrored from one
 part responds as symmetrically as its shape, up to round-off.
 """
 
@@ -14,7 +14,7 @@ from softgym_envs.robots.geometry.meshing import BodyMesh
 def mirrored(part: BodyMesh, normal: tuple[float, float, float]) -> BodyMesh:
     """Return a part joined to its mirror image at the plane through the origin with a ``normal`` of any length.
 
-    Nodes on the plane are shared. Boundary triangles in the plane are removed, as they lie inside the whole body.
+    Nodes on the plane are shared. Boundary triangles in the plane are removed, because they lie inside the whole body.
 
     Args:
         part: a mesh on one side of the plane.
