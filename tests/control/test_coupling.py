@@ -1,4 +1,4 @@
-"""Coupled models: against the saddle system written out, against rotated meshes, and against coupled equilibria."""
+"""Coupled models: against the full saddle system, against rotated meshes, and against coupled equilibria."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_W_is_symmetric_and_its_object_rows_answer_loads(rng):
     assert np.isfinite(coupled.efforts(effort)[0]).all()
 
 
-def test_forces_on_rows_that_are_not_tied_stay(rng):
+def test_forces_on_rows_that_are_not_tied_are_kept(rng):
     first, second = random_condensed_model(rng), random_condensed_model(rng, effectors=6)
     second.effort[5:] = [0.1, 0.2, 0.3]  # a load on the second point
     C = tie_points([first, second], (0, "e", 0), (1, "e", 0))
@@ -187,7 +187,7 @@ def test_the_answer_does_not_depend_on_units(rng, units):
 # -- clear errors ---------------------------------------------------------------------------------------------------
 
 
-def test_malformed_couplings_are_refused(rng):
+def test_malformed_couplings_are_rejected(rng):
     models = [random_condensed_model(rng, contacts=3), random_condensed_model(rng, contacts=3)]
     C = tie_points(models, (0, "e", 0), (1, "e", 0))
     contacts = rng.standard_normal((2, 3))
@@ -224,12 +224,12 @@ def test_malformed_couplings_are_refused(rng):
     ],
     ids=str,
 )
-def test_malformed_bodies_are_refused(options, expected):
+def test_malformed_bodies_are_rejected(options, expected):
     with pytest.raises(ValueError, match=expected):
         HeldObject(**{"position": np.zeros(3), "points": np.eye(3), **options})
 
 
-# -- turned robots --------------------------------------------------------------------------------------------------
+# -- rotated robots -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -292,7 +292,7 @@ def test_rotate_is_the_model_of_the_rotated_mesh(contact_finger):
     np.testing.assert_allclose(found.free, there.free, atol=1e-8)
 
 
-def test_rotate_keeps_batches_and_refuses_nonsense(rng):
+def test_rotate_keeps_batches_and_rejects_invalid_input(rng):
     model = random_condensed_model(rng, contacts=3)
     R = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
     batch = CondensedModel(*(np.stack([v, v]) for v in (model.compliance, model.free, model.effort)), model.roles)
@@ -313,7 +313,7 @@ def test_rotate_keeps_batches_and_refuses_nonsense(rng):
 
 
 def drive(finger, place, command, contacts, mode):
-    """Condensed model in the world of a turned finger, its contact rows driven to world points (k, 3)."""
+    """Condensed model, in world axes, of a rotated finger, its contact rows driven to world points (k, 3)."""
     R, shift = place
     local = (contacts.reshape(-1, 3) - shift) @ R
     part = finger.solve(command, mode, contact=local.ravel(), contact_mode="displacement")
@@ -414,7 +414,7 @@ def gripper(model, **options):
 
 
 def test_gripper_W_is_the_derivative_of_the_coupled_equilibrium(contact_finger):
-    """Three fingers and a free cube: W of actuators, centre and orientation, with the cube well turned."""
+    """Three fingers and a free cube: W of actuators, centre and orientation, with the cube clearly rotated."""
     model = contact_finger[1]
     grip = Grip(model, gripper(model, load=np.array([0.0, 0.0, -0.3, 0.0, 0.0, 0.0])))
     command = np.array([0.004, 0.001, 0.003, 0.000, 0.001, 0.005])

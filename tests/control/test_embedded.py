@@ -13,7 +13,7 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots import make_robot
 
-VOLUME, PRESSURE = 3e-8, 1e5  # what the chambers of a small trunk work at [m3, Pa]
+VOLUME, PRESSURE = 3e-8, 1e5  # typical of the chambers of a small trunk [m3, Pa]
 
 
 class ChamberRobot:
@@ -98,8 +98,8 @@ def test_W_of_the_toy_is_its_derivative():
     np.testing.assert_allclose((ends[0] - ends[1]) / 100.0, model.W.ea[:, 0], rtol=1e-5)
 
 
-def test_finer_goals_make_the_predicted_state_better():
-    """Open loop: the error falls with the square of the spacing of the goals, with encoders as without."""
+def test_finer_goals_improve_the_predicted_state():
+    """Open loop: the error falls with the square of the spacing of the goals, with or without encoders."""
     largest = {}
     for count, encoders in ((100, False), (400, False), (400, True)):
         loop = EmbeddedLoop(ChamberRobot(), controller(effort_weight=0.0))
@@ -115,14 +115,14 @@ def test_finer_goals_make_the_predicted_state_better():
     assert largest[400, False] < 1e-6
 
 
-def test_predicted_displacement_is_that_of_the_last_model():
+def test_the_displacement_is_predicted_by_the_last_model():
     loop = EmbeddedLoop(ChamberRobot(), controller())
     first = ChamberRobot()(np.zeros(3))
     effort = loop.step(ChamberRobot.rest + [0.002, 0.0, 0.001])
     assert (effort <= 0.05 * PRESSURE * (1 + 1e-9)).all()
     np.testing.assert_allclose(loop.displacement, first.W.aa @ effort + first.delta_free.a, rtol=1e-10)
     np.testing.assert_allclose(loop.predicted, first.W.ea @ effort + first.delta_free.e, rtol=1e-10)
-    # A measurement takes its place.
+    # A measurement replaces it.
     seen = VOLUME * np.array([0.2, 0.1, 0.0])
     loop.step(ChamberRobot.rest, displacement=seen)
     model = ChamberRobot()(seen)
@@ -146,7 +146,7 @@ def test_a_plant_of_the_wrong_stiffness_is_corrected(gains, calls):
 
 
 def test_the_integral_does_not_wind_up():
-    """A goal out of reach for long, then one in reach: the loop comes back as if it had not been there."""
+    """A goal out of reach for a long time, then one in reach: the loop recovers without delay."""
     far, near = ChamberRobot.rest + [0.3, 0.0, 0.0], ChamberRobot.rest + [0.008, 0.0, 0.004]
     calls = {}
     for wait in (60, 1000):
@@ -163,7 +163,7 @@ def test_the_integral_does_not_wind_up():
     assert calls[1000] <= calls[60] + 20
 
 
-def test_what_no_answer_was_found_for_is_not_summed_up(monkeypatch):
+def test_an_error_without_a_solution_is_not_integrated(monkeypatch):
     correction = PICorrection(0.05, 0.05)
     loop, goal = EmbeddedLoop(ChamberRobot(), controller(), correction), ChamberRobot.rest + [0.008, 0.0, 0.004]
     loop.step(goal, ChamberRobot.rest)
@@ -180,7 +180,7 @@ def test_what_no_answer_was_found_for_is_not_summed_up(monkeypatch):
     np.testing.assert_array_equal(loop.effort, effort)
 
 
-def test_bad_measurements_are_refused():
+def test_bad_measurements_are_rejected():
     loop = EmbeddedLoop(ChamberRobot(), controller(), PICorrection())
     goal = ChamberRobot.rest
     loop.step(goal, goal)

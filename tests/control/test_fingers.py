@@ -26,7 +26,7 @@ LOADS = {"three_finger_gripper": np.zeros(6), "press_finger": np.array([0.0, -2.
 
 
 class Energy:
-    """A finger that is a formula: a quadratic and a quartic function of scaled coordinates."""
+    """An analytic finger: a quadratic and a quartic function of scaled coordinates."""
 
     scale = np.array([0.01] * 5 + [0.3] * 3)
 
@@ -60,7 +60,7 @@ class Energy:
 
 
 def turned(count=3):
-    """Placements in no special direction around the origin."""
+    """Placements around the origin without special directions."""
     turns = Rotation.random(count, random_state=5).as_matrix()
     return [(turn, 0.03 * np.array([np.cos(k), np.sin(k), 0.3 * k])) for k, turn in enumerate(turns)]
 
@@ -76,7 +76,7 @@ def vector(rotation):
 
 @pytest.fixture(scope="module")
 def parts():
-    """The finger as a robot, with cables as they come."""
+    """The finger as a robot, with the default cables."""
     return make_robot("contact_finger", mesh_size=MESH_SIZE)
 
 
@@ -84,7 +84,7 @@ def parts():
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))
-def test_fingers_around_an_object_are_the_gripper(parts, name):
+def test_fingers_around_an_object_agree_with_the_gripper(parts, name):
     """Pose, tensions, slack cables and W of two states, to 1e-7 of the gripper in one finite-element model."""
     robot = make_robot(name, mesh_size=MESH_SIZE)
     model = robot.build()
@@ -109,7 +109,7 @@ def test_fingers_around_an_object_are_the_gripper(parts, name):
     assert name != "three_finger_gripper" or found.slack.any()
 
 
-def test_other_designs_are_the_gripper_too(parts):
+def test_other_designs_agree_with_the_gripper_too(parts):
     robot = make_robot("three_finger_gripper", mesh_size=MESH_SIZE)
     design = {"length": 0.041, "height": 0.0215, "joint_height": 0.0055, "young_modulus": 5e6, "poisson_ratio": 0.4}
     command = COMMANDS[robot.name][0]
@@ -120,7 +120,7 @@ def test_other_designs_are_the_gripper_too(parts):
 
 
 def test_the_inverse_controller_moves_the_object(parts):
-    """With the coupled model alone; the gripper as one model goes where it says."""
+    """With the coupled model alone; the gripper as one model goes where it predicts."""
     robot = make_robot("three_finger_gripper", mesh_size=MESH_SIZE)
     coupled = CoupledFingers.for_robot(robot, FEMFingers(parts))
     controller = InverseQP.for_robot(robot)
@@ -136,7 +136,7 @@ def test_the_inverse_controller_moves_the_object(parts):
 
 
 def test_one_learned_finger_makes_the_gripper():
-    """Shipped weights, on commands and bodies that were in no dataset, against the gripper in one model."""
+    """Shipped weights, on commands and bodies that are in no dataset, against the gripper in one model."""
     robot, model = make_robot("three_finger_gripper"), pretrained_model(make_robot("contact_finger"))
     rng = np.random.default_rng(3)
     for design in (robot.design_space.baseline, robot.design_space.sample(rng)):
@@ -151,7 +151,7 @@ def test_one_learned_finger_makes_the_gripper():
             assert found.trusted and 0.0 < found.uncertainty < 1e-3
 
 
-def test_a_finger_out_of_its_domain_is_told():
+def test_a_finger_out_of_its_domain_is_reported():
     model, gripper = pretrained_model(make_robot("contact_finger")), make_robot("three_finger_gripper")
     box = np.array(model.card["domain"]["displacement"])
     box[0, 1] = 2e-3  # of the first cable
@@ -174,7 +174,7 @@ def test_a_contact_finger_alone_is_not_an_environment():
         export_c(pretrained_model(make_robot("contact_finger")), {}, "finger.h")
 
 
-# -- algebra on a finger that is a formula --------------------------------------------------------------------------
+# -- algebra on the analytic finger ---------------------------------------------------------------------------------
 
 
 def test_W_is_the_derivative_of_the_coupled_equilibrium():
@@ -195,7 +195,7 @@ def test_W_is_the_derivative_of_the_coupled_equilibrium():
             ends.append(np.append(end.displacement, end.position))
         columns.append((ends[0] - ends[1]) / (2.0 * h))
     np.testing.assert_allclose(np.array(columns).T, W, rtol=0, atol=1e-8 * np.abs(W).max())
-    # The free shape belongs to it.
+    # The free displacement is consistent with W.
     np.testing.assert_allclose(here.condensed.delta.a, here.displacement, atol=1e-15)
     np.testing.assert_allclose(here.condensed.delta.e, here.position, atol=1e-15)
 
@@ -231,7 +231,7 @@ def test_cables_that_cannot_push_hang_slack():
     np.testing.assert_allclose(same.position, pulling.position, atol=1e-9)
 
 
-def test_turning_everything_turns_the_answer():
+def test_rotating_everything_rotates_the_result():
     turn, shift = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), np.array([0.03, -0.02, 0.1])
     command = np.array([0.004, 0.002, 0.003, -0.001, 0.005, 0.0])
     one = made()
@@ -247,7 +247,7 @@ def test_turning_everything_turns_the_answer():
     np.testing.assert_allclose(there.condensed.W.aa, here.condensed.W.aa, atol=1e-9)
 
 
-def test_states_can_be_gone_back_to():
+def test_earlier_states_can_be_restored():
     coupled = made()
     first = coupled.solve(np.full(6, 0.003))
     coupled.solve(np.array([0.006, 0.0, 0.004, 0.0, 0.0, 0.006]))
@@ -263,7 +263,7 @@ def test_states_can_be_gone_back_to():
 
 
 class Learned(SurrogateModel):
-    """The formula in the place of a network."""
+    """The formula in place of a network."""
 
     network = "formula"
 
@@ -306,7 +306,7 @@ def test_only_models_of_the_contact_finger_make_a_gripper():
 # -- clear errors ---------------------------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_reached_is_told_and_nothing_moves():
+def test_unreachable_commands_are_reported_and_nothing_moves():
     coupled = made(Energy(limit=1.5))
     kept = coupled.solve(np.full(6, 0.003))
     with pytest.raises(ConvergenceError, match=r"no equilibrium for cables .* \(displacement\): stopped at") as caught:
@@ -315,8 +315,8 @@ def test_what_cannot_be_reached_is_told_and_nothing_moves():
     np.testing.assert_allclose(coupled.solve(kept.command).position, kept.position, atol=1e-12)
 
 
-def test_an_object_turned_over_is_told():
-    """Beyond 90 degrees sines no longer tell the turn."""
+def test_an_object_turned_over_is_reported():
+    """Beyond 90 degrees, the sines no longer determine the rotation."""
     coupled = made(load=np.zeros(6))
     coupled.load = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 5.0e4])
     with pytest.raises(ConvergenceError):
@@ -335,12 +335,12 @@ def test_an_object_turned_over_is_told():
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
-def test_malformed_grippers_are_refused(options, message):
+def test_malformed_grippers_are_rejected(options, message):
     with pytest.raises(ValueError, match=message):
         CoupledFingers(**{"fingers": Energy(), "placements": turned(), "centre": np.zeros(3), **options})
 
 
-def test_malformed_commands_are_refused(parts):
+def test_malformed_commands_are_rejected(parts):
     coupled = made()
     for command, mode, message in [
         (np.zeros(5), "displacement", "must be 6 finite numbers"),

@@ -1,4 +1,4 @@
-"""Inverse control: on linear models of known answer, and on the finite elements of the finger."""
+"""Inverse control: on linear models with known answers, and on the finite elements of the finger."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_reaches_reachable_goals(linear, rng):
         linear.go(np.zeros(3))
         start = np.linalg.norm(linear.effector - goal)
         distances = linear.follow(linear.controller(effort_weight=0.0), goal)
-        # With no weight on the effort there is no steady error; the step weight only slows the end.
+        # With no weight on the effort, there is no steady error; the step weight only slows the end.
         assert start > 1e-3
         assert distances[-1] < 1e-6
         assert (np.diff(distances) < 1e-7).all()
@@ -232,7 +232,7 @@ def test_modes_may_differ_between_actuators(linear):
 
 
 def test_goal_weights_choose_the_coordinates(linear):
-    """With only y weighed the other goals do not matter; with two that conflict the heavier wins."""
+    """With only y weighted, the other goals do not matter; of two conflicting goals, the heavier wins."""
     controllers = [linear.controller(goal_weights=[0.0, 1.0, 0.0]) for _ in range(2)]
     goal = linear.rest + [0.0, 0.003, 0.0]
     answers = [
@@ -290,7 +290,7 @@ def test_mixed_units_give_the_same_answer(linear, units, mode, length):
         np.testing.assert_allclose(answers[1], answers[0], rtol=1e-6)
 
 
-def test_a_state_that_is_stable_only_while_held_is_no_trap(linear):
+def test_a_state_that_is_stable_only_while_held_can_be_left(linear):
     """W_aa indefinite: the regularisation stays convex and the goal is reached."""
     Waa = np.array([[1e-3, 0.0, 0.0], [0.0, -2e-3, 0.0], [0.0, 0.0, 1e-3]])
     Wea = np.array([[2e-3, 1e-3, 0.0], [0.0, 2e-3, 1e-3], [1e-3, 0.0, 2e-3]])
@@ -316,12 +316,12 @@ def test_a_state_that_is_stable_only_while_held_is_no_trap(linear):
     ],
     ids=str,
 )
-def test_malformed_options_are_refused(linear, options, expected):
+def test_malformed_options_are_rejected(linear, options, expected):
     with pytest.raises(ValueError, match=expected):
         linear.controller(**options)
 
 
-def test_other_malformed_input_is_refused(linear):
+def test_other_malformed_input_is_rejected(linear):
     unlimited = np.full(3, np.inf)
     for mode in ("displacement", "effort"):
         with pytest.raises(ValueError, match="needs a finite rate"):
@@ -344,7 +344,7 @@ def test_other_malformed_input_is_refused(linear):
     [[np.nan, 0.0, 0.0], [0.0, 0.0, np.inf], [0.0, 0.0], [[0.0] * 3] * 2, 0.0],
     ids=["NaN", "inf", "two", "two effectors", "scalar"],
 )
-def test_malformed_goals_are_refused(linear, goal):
+def test_malformed_goals_are_rejected(linear, goal):
     controller = linear.controller()
     with pytest.raises(ValueError, match="goal must be 3 finite coordinates"):
         controller.solve(linear.model, goal, linear.command)
@@ -377,7 +377,7 @@ def test_rates_must_be_positive(rates):
     ids=["one cable", "two cables", "one of two cables slack"],
 )
 def test_finger_reaches_a_reachable_goal(cables, target):
-    """Within 0.01 mm (measured: 0.001 mm), linearising anew at each step; the goal is that of other displacements."""
+    """Within 0.01 mm (measured: 0.001 mm), relinearising at each step; the goal is the tip at other displacements."""
     robot = make_robot("finger", cables=cables)
     backend = FEMBackend(robot)
     there = backend.step(np.array(target))

@@ -1,4 +1,4 @@
-"""Algorithm 1: an object moved by fingers, on linear parts of known answer and on the finite elements."""
+"""Algorithm 1: an object moved by fingers, on linear parts with known answers and on the finite elements."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_three_fingers_carry_a_cube_along_a_circle():
             command = plan.command
             models = gripper.models(command, plan.body)
         errors.append(np.linalg.norm(control.body.position - goal))
-    # Where it stands the fingers hold the cube in balance: what the plan says is so.
+    # At its final pose, the fingers hold the cube in balance, as planned.
     assert gripper.unbalanced(models, control.body) < 1e-4
     np.testing.assert_allclose(np.concatenate([m.lambda_.c for m in models]), plan.contact_forces.ravel(), atol=1e-4)
     print(f"largest error {1e3 * max(errors):.4f} mm, force up to {np.abs(plan.contact_forces).max():.1f} N")

@@ -1,4 +1,4 @@
-"""Every element block with every material: exact derivatives, objectivity, masses, patch tests, refusals."""
+"""Every element block with every material: exact derivatives, objectivity, masses, patch tests, invalid input."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def symmetric(stencils, values, size):
 
 
 def places_of(stencils):
-    """Scatter maps that give each entry of the stencils its own place, and the number of places."""
+    """Scatter maps that give each entry of the stencils its own slot, and the number of slots."""
     sizes = [rows.size for rows, _ in stencils]
     places = np.split(np.arange(sum(sizes), dtype=np.int32), np.cumsum(sizes)[:-1])
     return [place.reshape(rows.shape) for place, (rows, _) in zip(places, stencils, strict=True)], sum(sizes)
@@ -94,8 +94,8 @@ def test_residual_and_tangent_are_derivatives(body, derivatives, rng):
     assert errors.tangent < 1e-8
 
 
-def test_derivatives_by_all_rows(body, rng):
-    """Derivatives by every row of x, also with directors that are not orthonormal."""
+def test_derivatives_with_respect_to_all_rows(body, rng):
+    """Derivatives with respect to every row of x, also with directors that are not orthonormal."""
     x = moved(body, rng) + 1e-4 * rng.standard_normal(body.nodes.shape)
     for block in body.blocks:
         _, gradient, matrix = element_matrix(block, x)
@@ -109,7 +109,7 @@ def test_derivatives_by_all_rows(body, rng):
 
 
 def test_tangent_at_rest_has_no_negative_eigenvalue_and_six_rigid_motions(body):
-    """Each block alone at rest: energy is zero and least; solids have the six rigid motions and no other soft one."""
+    """Each block alone at rest: the energy is zero and minimal; solids have the six rigid motions and no others."""
     for block in body.blocks:
         energy, gradient, matrix = element_matrix(block, body.nodes)
         scale = np.abs(matrix).max()
@@ -138,7 +138,7 @@ def test_viscosity_is_the_stiffness_without_stress(body, rng):
         scale = np.abs(matrix).max()
         assert np.linalg.eigvalsh(matrix)[0] > -1e-10 * scale
         np.testing.assert_allclose(matrix @ (turning + shifts).ravel(), 0.0, atol=1e-11 * scale)
-        # Under stress the tangent is something else.
+        # Under stress the tangent differs.
         assert np.abs(matrix - element_matrix(block, x)[2]).max() > 1e-5 * scale
 
 
@@ -334,7 +334,7 @@ def test_sections():
 
 
 @pytest.mark.parametrize("values", [(0.0, (1.0, 1.0), 1.0), (1.0, (1.0, -1.0), 1.0), (1.0, (1.0, 1.0), np.nan)])
-def test_an_impossible_section_is_refused(values):
+def test_an_impossible_section_is_rejected(values):
     with pytest.raises(ValueError, match="section values must be positive"):
         Section(*values)
 
@@ -365,7 +365,7 @@ def test_a_curved_rest_shape_is_free_of_strain(make_beam):
         np.testing.assert_allclose(Statics(model).solve([]).x, model.nodes, atol=1e-14)
 
 
-def test_malformed_beams_are_refused():
+def test_malformed_beams_are_rejected():
     nodes = np.vstack([frame_rows([s, 0, 0]) for s in (0.0, 0.1, 0.2, 0.3)])
     options = {"section": Section.circle(0.01), "young_modulus": 1e6}
     for change, message in [
@@ -456,7 +456,7 @@ def test_model_embeds_in_the_chosen_block(make_solid):
     np.testing.assert_allclose(effector.value(model.nodes), [0.01, 0.012, 0.03], atol=1e-15)
 
 
-def test_negatively_oriented_quadratic_elements_are_turned(box, rng):
+def test_negatively_oriented_quadratic_elements_are_reoriented(box, rng):
     nodes, tetrahedra = box((1, 1, 1), (2, 2, 2), 0.2)
     mirrored = tetrahedra.copy()
     mirrored[::3] = mirrored[::3][:, [1, 0, 2, 3]]
@@ -482,7 +482,7 @@ def test_curved_edges_change_the_volume(box):
     assert abs(curved - np.pi / 6) < 0.25 * abs(straight - np.pi / 6)
 
 
-def test_malformed_quadratic_elements_are_refused(box):
+def test_malformed_quadratic_elements_are_rejected(box):
     nodes, tetrahedra = box((1, 1, 1), (1, 1, 1))
     finer, ten = add_midside_nodes(nodes, tetrahedra)
     with pytest.raises(ValueError, match=r"shape \(m, 10\)"):

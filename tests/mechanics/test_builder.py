@@ -1,4 +1,4 @@
-"""ModelBuilder: parts become one model, with the specified rows and boundary conditions."""
+"""ModelBuilder: parts are combined into one model, with the specified rows and boundary conditions."""
 
 from __future__ import annotations
 
@@ -66,13 +66,13 @@ def test_midside_nodes_are_fixed_along_the_axes_of_both_ends(box):
     assert not model.fixed.any()  # none along all axes
 
 
-def test_ready_made_quadratic_elements_are_taken_as_they_are(box):
+def test_given_quadratic_elements_are_used_unchanged(box):
     nodes, ten = add_midside_nodes(*box(SIZE, (2, 1, 1)))
     body = ModelBuilder()
     body.add_solid(nodes, ten, fixed=nodes[:, 0] == 0.0, element="quadratic")
     model = body.build()
     assert len(model.nodes) == len(nodes)
-    # Some are turned.
+    # Some are reoriented.
     np.testing.assert_array_equal(np.sort(model.blocks[0].connectivity, axis=1), np.sort(ten, axis=1))
 
 
@@ -135,7 +135,7 @@ def test_a_model_can_be_pickled(box):
     np.testing.assert_allclose(found.condensed.compliance, expected.condensed.compliance, rtol=1e-9, atol=1e-15)
 
 
-def test_unknown_names_are_refused(box):
+def test_unknown_names_are_rejected(box):
     nodes, tetrahedra = box(SIZE, (2, 1, 1))
     body = ModelBuilder()
     with pytest.raises(ValueError, match="unknown element 'cubic'; allowed: linear, averaged, quadratic"):

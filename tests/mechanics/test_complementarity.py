@@ -90,6 +90,6 @@ def test_an_indefinite_matrix_without_a_solution_is_an_error():
         solve_complementarity(np.array([[[-1.0]]]), np.array([[-1.0]]), np.array([True]))
 
 
-def test_too_many_actuators_are_refused():
+def test_too_many_actuators_are_rejected():
     with pytest.raises(ValueError, match="at most 16"):
         solve_complementarity(np.eye(17)[None], np.ones((1, 17)), np.ones(17, dtype=bool))

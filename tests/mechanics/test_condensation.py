@@ -1,7 +1,7 @@
 """The condensed model: W is the derivative of the equilibrium, and delta = W effort + delta_free.
 
 Measured relative errors of W against central differences: 1e-8 and less, over both materials, both fingers, rest and
-full actuation; the tests ask for 1e-7. Steps of 1e-3 N and 1e-6 m leave a truncation of about 1e-9 of W and, with
+full actuation; the tests require 1e-7. Steps of 1e-3 N and 1e-6 m leave a truncation of about 1e-9 of W and, with
 equilibria to 1e-14 m, a round-off of about 1e-8.
 """
 
@@ -28,7 +28,7 @@ def pulled(request, finger):
     finger.count = count
     finger.statics.tolerance = 1e-13
     finger.statics.unilateral[:] = False  # differences need both signs, at rest too
-    # Unequal cables, so that nothing holds by symmetry only.
+    # Unequal cables, so that no result holds only by symmetry.
     finger.state = finger.statics.solve(request.param * finger.robot.upper * np.array([1.0, 0.8])[:count])
     yield finger
     finger.model.nodal_loads[:] = 0.0
@@ -163,7 +163,7 @@ def test_blocks_by_role_of_a_batch(batch):
         np.testing.assert_allclose(batch.delta.array[k], expected, atol=1e-13)
 
 
-def test_unknown_roles_are_refused(batch):
+def test_unknown_roles_are_rejected(batch):
     with pytest.raises(AttributeError, match="no block 'ec'; roles: a, e"):
         batch.W.ec  # noqa: B018
     with pytest.raises(AttributeError, match="no role 'c'"):

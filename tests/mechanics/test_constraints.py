@@ -1,4 +1,4 @@
-"""Every constraint: exact derivatives; then each one: signs, rest values, refusals; embedding of points."""
+"""Every constraint: exact derivatives; then each one: signs, rest values, invalid input; embedding of points."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def make_chamber(nodes, tetrahedra):
 
 
 def make_servo(nodes, tetrahedra):
-    # Derivatives hold for any three rows; that they are directors matters to the value only.
+    # Derivatives hold for any three rows; only the value needs them to be directors.
     return Servo("servo", 4, np.array([0.2, 1.0, 0.3]), nodes)
 
 
@@ -113,7 +113,7 @@ FACTORIES = {
 
 
 def full_hessian(constraint, x, effort):
-    """The entries of `hessian` in their places, over all degrees of freedom."""
+    """The entries of `hessian` as a full matrix over all degrees of freedom."""
     entries = constraint.hessian(x, effort)
     if entries is None:
         return np.zeros((x.size, x.size))
@@ -141,7 +141,7 @@ def moved(mesh, rng):
 
 
 def differences(function, x, dofs, h=1e-6):
-    """Central differences of ``function(x)`` by the entries ``dofs`` of x, last axis."""
+    """Central differences of ``function(x)`` with respect to the entries ``dofs`` of x, along the last axis."""
     columns = []
     for dof in dofs:
         plus, minus = x.copy(), x.copy()
@@ -237,7 +237,7 @@ def test_cable_forces_balance_except_at_the_pull_point(mesh, moved):
     np.testing.assert_allclose(cable.jacobian(moved)[0].reshape(-1, 3).sum(axis=0), expected, atol=1e-13)
 
 
-def test_cable_with_a_segment_of_zero_length_is_refused(mesh):
+def test_cable_with_a_segment_of_zero_length_is_rejected(mesh):
     nodes, tetrahedra = mesh
     twice = np.array([[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
     with pytest.raises(ValueError, match="zero length"):
@@ -321,7 +321,7 @@ def test_quadratic_triangles_hold_a_curved_volume():
         np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-13)
         np.testing.assert_allclose(np.cross(nodes, force).sum(axis=0), 0.0, atol=1e-13)
         assert np.vdot(force, nodes) == pytest.approx(3.0 * cavity.rest_volume, rel=1e-12)
-        # The other way round it is turned.
+        # The opposite orientation is reversed.
         inward = Cavity("sphere", six[:, [0, 2, 1, 5, 4, 3]], nodes)
         np.testing.assert_allclose(inward.jacobian(nodes), cavity.jacobian(nodes), atol=1e-14)
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
@@ -357,7 +357,7 @@ def test_an_inward_surface_is_reversed(mesh):
     assert enclosed_volume(nodes, outward.triangles[:, ::-1]) == pytest.approx(-1.0, rel=1e-12)
 
 
-def test_a_surface_without_volume_is_refused(mesh):
+def test_a_surface_without_volume_is_rejected(mesh):
     nodes, tetrahedra = mesh
     triangles = make_cavity(nodes, tetrahedra).triangles
     with pytest.raises(ValueError, match="cavity 'c' is not closed"):
@@ -417,7 +417,7 @@ def test_chamber_off_the_axis_of_a_bent_beam():
 
 
 @pytest.mark.parametrize("area", [0.0, -1e-5, np.nan, np.inf])
-def test_a_chamber_without_area_is_refused(area):
+def test_a_chamber_without_area_is_rejected(area):
     nodes, beam = straight_beam()
     with pytest.raises(ValueError, match="chamber 'c': area"):
         Chamber("c", [beam.line(range(2), (0.0, 0.0), nodes)], area=area)
@@ -443,7 +443,7 @@ def test_servo_measures_the_turn_of_its_frame(axis):
         assert np.cross(turned[servo.row], force) @ direction == pytest.approx(1.0, rel=1e-12)
 
 
-def test_servo_without_an_axis_is_refused(mesh):
+def test_servo_without_an_axis_is_rejected(mesh):
     with pytest.raises(ValueError, match="servo 's': axis"):
         Servo("s", 4, np.zeros(3), mesh[0])
 
@@ -554,6 +554,6 @@ def test_points_of_given_weights(mesh, rng):
     assert (points.elements == -1).all()
 
 
-def test_non_finite_points_are_refused(mesh):
+def test_non_finite_points_are_rejected(mesh):
     with pytest.raises(ValueError, match="finite"):
         EmbeddedPoints(np.array([0.5, np.nan, 0.5]), *mesh)

@@ -187,8 +187,8 @@ def test_a_rigid_pendulum_hangs_in_line_with_its_load(box):
     np.testing.assert_allclose(W @ along, 0.0, atol=1e-6)
 
 
-def test_redundant_bonds_are_refused_or_right(bonded):
-    """The force of a bond given twice is shared somehow; everything else is as with one bond."""
+def test_redundant_bonds_are_rejected_or_solved(bonded):
+    """A bond added twice shares its force arbitrarily; everything else is as with one bond."""
     model, _ = bonded
     one = Statics(model, tolerance=1e-13).solve([0.004], effector_force=FORCE)
     model.add("b", model.constraints["b"][0])
@@ -239,11 +239,11 @@ def test_a_force_on_an_effector_is_a_force_on_its_nodes(touched):
     np.testing.assert_allclose(by_effort.condensed.lambda_.e, FORCE)
     np.testing.assert_allclose(by_load.condensed.lambda_.e, 0.0, atol=0)
     np.testing.assert_allclose(by_effort.condensed.compliance, by_load.condensed.compliance, rtol=1e-6, atol=1e-12)
-    # The two describe the force at different places: in `effort`, or in `delta_free`.
+    # The two include the force in different quantities: in `effort`, or in `delta_free`.
     assert relative(by_effort.condensed.delta_free.e, by_load.condensed.delta_free.e) > 1e-3
 
 
-def test_driven_contacts_reach_their_positions_and_their_forces_do_the_same(touched):
+def test_driven_contacts_reach_their_positions_and_their_forces_give_the_same_state(touched):
     statics = Statics(touched, tolerance=1e-13)
     rest = statics.solve([0.004])
     goal = rest.condensed.delta.c + np.array([0.002, 0.0, 0.0, 0.001, -0.001, 0.0])
@@ -279,7 +279,7 @@ def test_driven_contacts_reach_their_positions_and_their_forces_do_the_same(touc
         ),
     ],
 )
-def test_malformed_loads_are_refused(touched, arguments, message):
+def test_malformed_loads_are_rejected(touched, arguments, message):
     statics = Statics(touched)
     with pytest.raises(ValueError, match=message):
         statics.solve([0.001], **arguments)
@@ -317,7 +317,7 @@ def test_nodes_may_be_held_along_some_axes(box):
 
 
 def test_no_node_needs_to_be_held_along_all_axes(box):
-    """Three planes of symmetry without the node they share: the result is the same, and this node finds its place."""
+    """Three planes of symmetry without the node they share: the result is the same, and this node moves correctly."""
     nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 4), jitter=0.2)
     held = np.isclose(nodes, 0.0, atol=1e-12)
     held[held.all(axis=1)] = False
@@ -331,7 +331,7 @@ def test_no_node_needs_to_be_held_along_all_axes(box):
     np.testing.assert_allclose(model.assembly.evaluate(found.x, np.zeros(0), model.loads)[0], 0.0, atol=1e-9)
 
 
-def test_a_body_that_is_not_held_along_an_axis_is_refused(box):
+def test_a_body_that_is_not_held_along_an_axis_is_rejected(box):
     nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 4))
     held = np.isclose(nodes, 0.0, atol=1e-12)
     held[:, 2] = False
@@ -438,10 +438,10 @@ def test_modes_may_differ_between_cavities_and_cables(box):
     other = Statics(model, tolerance=1e-14).solve([mixed.delta[0], mixed.effort[1]], ["displacement", "effort"])
     np.testing.assert_allclose(other.x, mixed.x, rtol=0, atol=1e-11)
     assert other.effort[0] == pytest.approx(1e4, rel=1e-7)
-    # Too long a cable hangs slack while the cavity is held.
+    # A cable that is commanded too long hangs slack while the cavity is held.
     slack = statics.solve([mixed.delta[0], -0.05])
     assert list(slack.slack) == [False, True] and slack.effort[1] == 0.0
-    # A negative pressure is no push.
+    # Negative pressure is allowed, negative tension is not.
     assert statics.solve([-1e3, 0.0], ["effort", "displacement"]).delta[0] < 0.0
     with pytest.raises(ValueError, match="cannot push"):
         statics.solve([-1e3, -1.0], "effort")

@@ -1,4 +1,4 @@
-"""Dynamics: conservation, convergence, frequencies, energies, commands, divided steps and refusals."""
+"""Dynamics: conservation, convergence, frequencies, energies, commands, divided steps and invalid input."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_orders_of_the_schemes():
             assert group[-1].error < 5e-3
 
 
-def test_the_spectral_radius_damps_what_the_step_does_not_resolve():
+def test_the_spectral_radius_damps_motions_that_the_step_does_not_resolve():
     """With 1 the energy is constant; with less it falls, first that of fast motions, while the slow one remains."""
     kept = {}
     model = cases.rod(clamped=True, elements=3)
@@ -87,7 +87,7 @@ def test_free_fall(scheme):
     np.testing.assert_allclose(motion.equilibrium.delta[:3], expected, rtol=0, atol=1e-9)
     assert motion.time == pytest.approx(t)
     np.testing.assert_allclose(solver.effector_velocity(), [1.0, 0.0, 2.0 - 9.81 * t], atol=1e-9)
-    # Euler's directors turn by chords: it damps a spin, too.
+    # Euler's directors move along chords, which also damps a spin.
     turning = 0.5 * 0.008 * 25.0
     kinetic = 0.5 * 2.0 * (1.0 + (2.0 - 9.81 * t) ** 2) + turning
     assert motion.kinetic == pytest.approx(kinetic, abs=0.25 * turning if scheme == "euler" else 1e-9)
@@ -256,7 +256,7 @@ def test_a_step_that_cannot_be_cut_further_leaves_the_state():
     for part, old in zip([p for p in solver.snapshot if p is not None], before, strict=True):
         np.testing.assert_array_equal(part, old)
     assert solver.linearisation.inertia is None
-    motion = solver.advance(0.02 * JUMP)  # and goes on
+    motion = solver.advance(0.02 * JUMP)  # and continues
     np.testing.assert_allclose(motion.equilibrium.delta[:4], 0.02 * JUMP, rtol=0, atol=1e-10)
 
 
@@ -341,7 +341,7 @@ def test_the_starting_acceleration_of_a_pendulum(damping):
     np.testing.assert_allclose(found[2], -found[4] * 0.2, atol=1e-6)
 
 
-# -- refusals -------------------------------------------------------------------------------------------------------
+# -- invalid input --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -408,7 +408,7 @@ def test_every_case_is_in_the_benchmark():
     }  # fmt: skip
 
 
-def test_the_benchmark_prints_a_table_and_returns_what_json_takes(monkeypatch, capsys):
+def test_the_benchmark_prints_a_table_and_returns_json_data(monkeypatch, capsys):
     import json
 
     rows = [cases.Row("case", "one", 1.0), cases.Row("case", "two", 1.0, 2.0, -0.5, 1.99)]

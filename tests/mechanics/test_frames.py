@@ -21,7 +21,7 @@ def cap(nodes, height=0.03):
 
 @pytest.fixture
 def capped(box):
-    """Function that makes a block whose upper face a frame carries, with every kind of constraint on it."""
+    """Function that makes a block whose upper face is carried by a frame, with every kind of constraint on it."""
 
     def make(element="linear", material="corotational", bonds=True):
         nodes, tetrahedra = box((0.02, 0.02, 0.03), (2, 2, 2), jitter=0.2)
@@ -111,7 +111,7 @@ def test_each_constraint_contributes_its_curvature_through_frames(capped, full_t
         errors = derivatives(model, x, effort)
         assert errors.tangent < 1e-6, constraint.name
         change = np.abs(full_tangent(model, model.assembly.evaluate(x, effort, model.loads)[1]) - none).max()
-        # All touch a frame or a carried node, which turn. Bonds do only where their force has an arm.
+        # All involve a frame or a carried node, which rotate. Bonds contribute only if their force has a lever arm.
         assert change > 1e-4, constraint.name
 
 
@@ -173,7 +173,7 @@ def test_displacement_is_the_finite_motion(rng):
         expected = nodes[4] + translation[0] + turn.apply(nodes[row] - nodes[4])
         np.testing.assert_allclose(nodes[row] + out[row], expected, atol=1e-14)
     np.testing.assert_allclose(nodes[5:] + out[5:], turn.apply(nodes[5:]), atol=1e-14)
-    assert (out[[1, 3]] == 7.0).all()  # rows of nobody are left alone
+    assert (out[[1, 3]] == 7.0).all()  # rows that no frame carries are unchanged
     np.testing.assert_allclose(frames.arms(nodes)[:3], nodes[5:], atol=0)
     np.testing.assert_allclose(frames.arms(nodes)[3:], nodes[[0, 2]] - nodes[4], atol=0)
 
@@ -222,10 +222,10 @@ def test_a_clamped_frame_is_a_clamp(box):
     assert tips[0][2] < 0.02 - 1e-4
 
 
-# -- refusals -------------------------------------------------------------------------------------------------------
+# -- invalid input --------------------------------------------------------------------------------------------------
 
 
-def test_malformed_frames_are_refused():
+def test_malformed_frames_are_rejected():
     nodes = np.vstack([np.zeros((4, 3)), frame_rows([0, 0, 0]), frame_rows([1, 0, 0])])
     Frames(nodes, [4, 8], {1: np.array([0, 1])})
     for rows, carried, message in [
@@ -242,7 +242,7 @@ def test_malformed_frames_are_refused():
             Frames(nodes, np.array(rows), carried)
 
 
-def test_malformed_rotations_are_refused():
+def test_malformed_rotations_are_rejected():
     for rotation in (np.eye(2), 2.0 * np.eye(3), np.full((3, 3), np.nan)):
         with pytest.raises(ValueError, match="orthonormal"):
             frame_rows([0, 0, 0], rotation)

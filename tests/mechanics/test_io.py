@@ -1,4 +1,4 @@
-"""Own meshes: files of tetrahedra and of surfaces, units, elasticity by region, cavities, and malformed input."""
+"""User meshes: files of tetrahedra and of surfaces, units, elasticity by region, cavities, and malformed input."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ONE_TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 @pytest.fixture
 def mesh_in_millimetres(box):
     nodes, tetrahedra = box((100, 20, 20), (4, 1, 1))
-    # A node of no tetrahedron, and cells that are not solid, as gmsh writes them.
+    # A node without tetrahedra, and cells that are not solid, as gmsh writes them.
     return meshio.Mesh(np.vstack([nodes, [[1e3, 1e3, 1e3]]]), [("triangle", [[0, 1, 2]]), ("tetra", tetrahedra)])
 
 
@@ -70,7 +70,7 @@ def test_model_from_a_file_of_gmsh(tmp_path, binary):
     assert 4 <= model.fixed.sum() < len(model.nodes)
 
 
-def test_a_box_that_fixes_nothing_is_refused(tmp_path, mesh_in_millimetres):
+def test_a_box_that_fixes_nothing_is_rejected(tmp_path, mesh_in_millimetres):
     mesh_in_millimetres.write(tmp_path / "beam.vtk")
     with pytest.raises(ValueError, match=r"none lies in fixed_box .* the body spans 0 to 0.1, 0 to 0.02, 0 to"):
         MechanicalModel.from_file(tmp_path / "beam.vtk", unit="mm", fixed_box=(-9, -8, -1, 1, -1, 1))
@@ -83,16 +83,16 @@ def test_missing_file(tmp_path):
         read_mesh(tmp_path)
 
 
-class EndlessReading(BaseException):
+class ReaderHangs(BaseException):
     """Not an Exception, which `read_mesh` would report as a malformed file."""
 
 
 @pytest.fixture
-def no_endless_reading():
-    """Interrupt a reader that never ends (a good one needs milliseconds)."""
+def reader_time_limit():
+    """Interrupt a reader that hangs (a good one needs milliseconds)."""
 
     def stop(*_):
-        raise EndlessReading
+        raise ReaderHangs
 
     previous = signal.signal(signal.SIGALRM, stop)
     signal.alarm(10)
@@ -103,7 +103,7 @@ def no_endless_reading():
 
 @pytest.mark.parametrize(("name", "written_as"), FORMATS)
 @pytest.mark.parametrize("kept", [0.0, 0.02, 0.4, 0.7, 0.95])
-def test_truncated_file(tmp_path, no_endless_reading, mesh_in_millimetres, name, written_as, kept):
+def test_truncated_file(tmp_path, reader_time_limit, mesh_in_millimetres, name, written_as, kept):
     path = tmp_path / name
     mesh_in_millimetres.write(path, file_format=written_as)
     content = path.read_bytes()
@@ -113,8 +113,8 @@ def test_truncated_file(tmp_path, no_endless_reading, mesh_in_millimetres, name,
 
 
 @pytest.mark.parametrize("kept", [0.4, 0.44, 0.985])
-def test_truncated_ansys_file(tmp_path, no_endless_reading, mesh_in_millimetres, kept):
-    """``.msh`` is a suffix of Ansys, too: meshio tries that reader first, and on such files it never ends."""
+def test_truncated_ansys_file(tmp_path, reader_time_limit, mesh_in_millimetres, kept):
+    """Ansys also uses the suffix ``.msh``: meshio tries that reader first, which hangs on such files."""
     path = tmp_path / "ansys.msh"
     mesh_in_millimetres.write(path, file_format="ansys")
     content = path.read_bytes()
@@ -163,7 +163,7 @@ def test_unit_and_scale_are_equivalent(tmp_path, mesh_in_millimetres):
         read_mesh(path, scale=0.0)
 
 
-def test_a_body_in_millimetres_is_refused(tmp_path, mesh_in_millimetres, box):
+def test_a_body_in_millimetres_is_rejected(tmp_path, mesh_in_millimetres, box):
     mesh_in_millimetres.write(tmp_path / "beam.vtk")
     message = r"the body measures 100 x 20 x 20 m, more than 10 m; did you mean metres\?"
     with pytest.raises(ValueError, match=message + r" \(for a file in millimetres pass unit='mm'\)"):
@@ -193,7 +193,7 @@ def test_a_body_in_millimetres_is_refused(tmp_path, mesh_in_millimetres, box):
     ],
     ids=["effector", "contact", "guide", "pull point", "cavity", "plane"],
 )
-def test_points_in_millimetres_are_refused(box, add, message):
+def test_points_in_millimetres_are_rejected(box, add, message):
     nodes, tetrahedra = box((0.1, 0.02, 0.02), (5, 1, 1))
     model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] == 0.0)
     with pytest.raises(ValueError, match=message):
@@ -248,7 +248,7 @@ def test_modulus_by_region_by_element_and_by_place(halves):
     ],
     ids=["misspelt", "incomplete", "short", "not per element", "negative"],
 )
-def test_malformed_moduli_are_refused(halves, modulus, message):
+def test_malformed_moduli_are_rejected(halves, modulus, message):
     with pytest.raises(ValueError, match=message):
         MechanicalModel.from_file(halves[0], fixed=lambda x: x[:, 0] == 0.0, young_modulus=modulus)
 
@@ -322,7 +322,7 @@ def test_a_surface_is_filled_and_its_inner_shell_is_a_hole(hollow):
 
 @pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.8, 0.95])
-def test_truncated_surface(tmp_path, no_endless_reading, kept, binary):
+def test_truncated_surface(tmp_path, reader_time_limit, kept, binary):
     path = write_stl(tmp_path, BAR, binary=binary)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
@@ -382,7 +382,7 @@ def test_a_cavity_from_its_surface(hollow):
         model.add_cavity("open", surface=found.triangles[1:])
     quadratic = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=[0], element="quadratic")
     assert quadratic.add_cavity("air", surface=found.triangles).rest_volume == pytest.approx(found.rest_volume)
-    with pytest.raises(ValueError, match="not an edge of the quadratic elements"):
+    with pytest.raises(ValueError, match="not joined by an edge of the quadratic elements"):
         corners = hollow.mesh.tetrahedra[[0, -1]].ravel()
         quadratic.add_cavity("strange", surface=corners[[[0, 1, 6], [0, 6, 2], [1, 2, 6], [0, 2, 1]]])
 
@@ -416,7 +416,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_faulty_surfaces_are_refused(tmp_path, fault):
+def test_faulty_surfaces_are_rejected(tmp_path, fault):
     parts, message = FAULTS[fault]
     with pytest.raises(DataError, match=message):
         read_mesh(write_stl(tmp_path, *parts), unit="mm")
@@ -430,7 +430,7 @@ def test_faulty_surfaces_are_refused(tmp_path, fault):
         (np.nan, "mesh_size = nan m must be positive"),
     ],
 )
-def test_malformed_mesh_sizes_are_refused(tmp_path, size, message):
+def test_malformed_mesh_sizes_are_rejected(tmp_path, size, message):
     with pytest.raises(ValueError, match=message):
         read_mesh(write_stl(tmp_path, BAR), unit="mm", mesh_size=size)
 

@@ -1,4 +1,4 @@
-"""Linear solvers: agreement on definite matrices, refusal of all others."""
+"""Linear solvers: agreement on definite matrices, rejection of all others."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_one_analysis_serves_many_factorisations(definite, rng, name):
         np.testing.assert_allclose(scale * definite @ solver.solve(rhs), rhs, atol=1e-10)
 
 
-def test_cholmod_refuses_an_indefinite_matrix_and_recovers(definite, indefinite, rng):
+def test_cholmod_rejects_an_indefinite_matrix_and_recovers(definite, indefinite, rng):
     lower, other = lower_of(definite), lower_of(indefinite)
     np.testing.assert_array_equal(lower.indices, other.indices)
     solver = CholmodSolver(lower.indptr, lower.indices)
@@ -90,13 +90,13 @@ def test_superlu_solves_an_indefinite_matrix(indefinite, rng):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_singular_matrix_is_refused(name):
+def test_singular_matrix_is_rejected(name):
     lower = lower_of(np.diag([1.0, 0.0, 2.0]) + np.diag([1e-300] * 3))  # the pattern keeps its diagonal
     values = np.where(lower.data < 1e-200, 0.0, lower.data)
     assert not make_solver(name, lower.indptr, lower.indices).factorise(values)
 
 
-def test_auto_is_one_of_them(definite):
+def test_auto_selects_an_available_solver(definite):
     lower = lower_of(definite)
     assert isinstance(make_solver("auto", lower.indptr, lower.indices), LinearSolver)
 
@@ -110,7 +110,7 @@ def test_auto_works_without_cvxopt(definite, monkeypatch, rng):
         make_solver("cholmod", lower.indptr, lower.indices)
 
 
-def test_unknown_name_is_refused(definite):
+def test_unknown_name_is_rejected(definite):
     lower = lower_of(definite)
     with pytest.raises(ValueError, match=r"unknown linear solver 'magic'; allowed: auto, cholmod, superlu"):
         make_solver("magic", lower.indptr, lower.indices)

@@ -30,7 +30,7 @@ def material(request):
 
 @pytest.fixture
 def gradients(rng):
-    """Deformation gradients with det F > 0.2: mild, strongly sheared, and turned by any angle."""
+    """Deformation gradients with det F > 0.2: mild, strongly sheared, and rotated by any angle."""
     F = np.eye(3) + np.concatenate([0.2 * rng.standard_normal((30, 3, 3)), 0.6 * rng.standard_normal((300, 3, 3))])
     F = Rotation.random(len(F), random_state=1).as_matrix() @ F
     F = F[np.linalg.det(F) > 0.2]
@@ -73,7 +73,7 @@ def test_tangent_is_the_symmetric_derivative_of_the_stress(material, gradients, 
 
 
 @pytest.mark.parametrize(("mu", "lame"), ELASTICITIES)
-def test_rotations_need_no_energy(material, mu, lame):
+def test_rotations_store_no_energy(material, mu, lame):
     turned = np.concatenate([np.eye(3)[None], Rotation.random(50, random_state=3).as_matrix()])
     # Half turns, where the iteration for the polar rotation is far from the identity.
     turned = np.concatenate([turned, [np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, -1.0, 1.0])]])
@@ -93,7 +93,7 @@ def test_objectivity_and_isotropy(material, gradients):
         np.testing.assert_allclose(turned[1], Q @ stress, rtol=0, atol=1e-12 * size)
         full = np.einsum("ai,bk,mijkl->majbl", Q, Q, tangent.reshape(-1, 3, 3, 3, 3)).reshape(-1, 9, 9)
         np.testing.assert_allclose(turned[2], full, rtol=0, atol=1e-10 * np.abs(tangent).max())
-        # Isotropy: turning the reference body instead.
+        # Isotropy: rotating the reference body instead.
         other = evaluate(material, gradients @ Q)
         np.testing.assert_allclose(other[0], energy, rtol=1e-12, atol=1e-13)
         np.testing.assert_allclose(other[1], stress @ Q, rtol=0, atol=1e-12 * size)
@@ -187,7 +187,7 @@ def test_infinite_gradients_are_counted(material):
     ("young", "poisson"),
     [(0.0, 0.3), (-1.0, 0.3), (np.nan, 0.3), (np.inf, 0.3), (1e6, 0.5), (1e6, -1.0), (1e6, np.nan)],
 )
-def test_impossible_elasticity_is_refused(young, poisson):
+def test_impossible_elasticity_is_rejected(young, poisson):
     with pytest.raises(ValueError, match=r"young_modulus|poisson_ratio"):
         lame_parameters(young, poisson)
 

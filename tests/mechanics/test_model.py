@@ -15,7 +15,7 @@ ONE_TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 
 
 def evaluate(model, x, effort):
-    """The equilibrium equations of a model under its present loads."""
+    """The equilibrium equations of a model under its current loads."""
     return model.assembly.evaluate(x, effort, model.loads)
 
 
@@ -151,7 +151,7 @@ def test_weight_is_density_times_volume_times_gravity(box):
 
 
 @pytest.mark.parametrize("gravity", [(0.0, 0.0), (0.0, 0.0, np.nan), 9.81])
-def test_malformed_gravity_is_refused(beam, gravity):
+def test_malformed_gravity_is_rejected(beam, gravity):
     with pytest.raises(ValueError, match="three finite numbers"):
         beam.set_gravity(gravity)
 
@@ -165,7 +165,7 @@ def test_reactions_balance_the_weight(beam):
     np.testing.assert_allclose(forces[~beam.fixed] - beam.loads[~beam.fixed], 0.0, atol=1e-8)
     np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=1e-9)  # internal forces balance themselves
     np.testing.assert_allclose(forces[beam.fixed].sum(axis=0) + beam.loads[~beam.fixed].sum(axis=0), 0.0, atol=1e-7)
-    assert x[:, 2].min() < beam.nodes[:, 2].min() - 0.005  # and it does sag
+    assert x[:, 2].min() < beam.nodes[:, 2].min() - 0.005  # and it sags
 
 
 # -- patch test -----------------------------------------------------------------------------------------------------
@@ -192,7 +192,7 @@ def test_patch_of_irregular_elements_reproduces_a_linear_field(box, rng, name):
 # -- meshes ---------------------------------------------------------------------------------------------------------
 
 
-def test_negatively_oriented_elements_are_turned(box):
+def test_negatively_oriented_elements_are_reoriented(box):
     nodes, tetrahedra = box((1, 1, 1), (2, 2, 2))
     mirrored = tetrahedra.copy()
     mirrored[::3] = mirrored[::3][:, [1, 0, 2, 3]]
@@ -260,7 +260,7 @@ def test_mask_and_indices_of_fixed_nodes_are_the_same(box):
         "empty list",
     ],
 )
-def test_malformed_meshes_are_refused(change, message):
+def test_malformed_meshes_are_rejected(change, message):
     arguments = {"nodes": ONE_TETRAHEDRON, "tetrahedra": np.array([[0, 1, 2, 3]]), "fixed": [0, 1, 2], **change}
     nodes, tetrahedra = arguments.pop("nodes"), arguments.pop("tetrahedra")
     with pytest.raises(ValueError, match=message):
@@ -268,11 +268,11 @@ def test_malformed_meshes_are_refused(change, message):
 
 
 @pytest.mark.parametrize("fixed", [[7], [True, False], [0.5]], ids=["out of range", "short mask", "not an index"])
-def test_malformed_fixed_nodes_are_refused(fixed):
+def test_malformed_fixed_nodes_are_rejected(fixed):
     with pytest.raises((ValueError, IndexError)):
         MechanicalModel.from_mesh(ONE_TETRAHEDRON, np.array([[0, 1, 2, 3]]), fixed=fixed)
 
 
-def test_unknown_role_is_refused(beam):
+def test_unknown_role_is_rejected(beam):
     with pytest.raises(ValueError, match="unknown role 'x'"):
         beam.add("x", beam.constraints["a"][0])

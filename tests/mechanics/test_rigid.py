@@ -77,7 +77,7 @@ def test_a_body_has_weight_but_no_stiffness():
 
 
 @pytest.mark.parametrize("scheme", ["euler", "generalised_alpha"])
-def test_a_spin_about_a_principal_axis_stays(scheme):
+def test_a_spin_about_a_principal_axis_is_constant(scheme):
     """The second order scheme turns by exactly w t."""
     solver = free(box_inertia(1.0, np.array([0.1, 0.2, 0.4])), step=0.01, scheme=scheme)
     solver.launch(np.array([0.5, 0.0, 0.0, 0.0, 0.0, 4.0]))
@@ -95,7 +95,7 @@ def test_a_spin_about_a_principal_axis_stays(scheme):
 
 
 def test_a_tumbling_box_and_pendulums_against_exact_equations():
-    """Second order in momentum, energy and place; against Euler's equations and independent solutions of joints."""
+    """Second order in momentum, energy and position; against Euler's equations and independent solutions of joints."""
     for case, group in by_case(cases.rigid(levels=(50, 100))).items():
         if "euler" in case:
             assert 0.6 < group[-1].order < 1.1, case
@@ -147,11 +147,11 @@ def test_a_small_swing_of_a_bar_has_its_period():
     assert 2.0 * np.diff(crossings).mean() == pytest.approx(period, rel=2e-4)
 
 
-# -- refusals -------------------------------------------------------------------------------------------------------
+# -- invalid input --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mass", [0.0, -1.0, np.nan, np.inf])
-def test_an_impossible_mass_is_refused(mass):
+def test_an_impossible_mass_is_rejected(mass):
     with pytest.raises(ValueError, match=f"mass = {mass} kg of a rigid body must be positive and finite"):
         RigidBody(np.zeros((4, 3)), 0, mass=mass, inertia=np.eye(3))
 
@@ -166,12 +166,12 @@ def test_an_impossible_mass_is_refused(mass):
         (np.diag([1.0, 1.0, -1.0]), "violates the triangle inequality"),
     ],
 )
-def test_an_impossible_inertia_is_refused(inertia, message):
+def test_an_impossible_inertia_is_rejected(inertia, message):
     with pytest.raises(ValueError, match=message):
         RigidBody(np.zeros((4, 3)), 0, mass=1.0, inertia=inertia)
 
 
-def test_a_thin_rod_is_a_body():
+def test_a_thin_rod_is_a_valid_body():
     """The limit of the triangle inequality."""
     RigidBody(np.zeros((4, 3)), 0, mass=1.0, inertia=np.diag([0.0, 1.0, 1.0]))
     RigidBody(np.zeros((4, 3)), 0, mass=1.0, inertia=np.diag([1.0, 1.0, 2.0]))

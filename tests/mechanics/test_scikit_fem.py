@@ -1,6 +1,6 @@
 """Statics against an independent program: scikit-fem assembles and solves the same problems from its own elements.
 
-Its large-deflection solutions use the energies written again here, in numpy and by other formulas (singular values
+Its large-deflection solutions use energies reimplemented here, in numpy and with other formulas (singular values
 and the derivative of the polar rotation in the principal frame), on the same linear tetrahedra.
 """
 
@@ -224,7 +224,7 @@ def test_large_deflection_under_weight(box, name, law):
 
 
 def test_forms_are_linear_elasticity_at_rest(box):
-    """Both laws written above have Hooke's tangent at rest, so the comparison is one of the same material."""
+    """Both laws above reduce to Hooke's law at rest, so both programs compute the same material."""
     rng = np.random.default_rng(0)
     dF = rng.standard_normal((5, 3, 3))
     strain = 0.5 * (dF + np.swapaxes(dF, 1, 2))

@@ -157,7 +157,7 @@ def test_scaling_youngs_modulus_scales_the_tensions_only(fingers):
 
 
 def test_a_mirrored_command_gives_a_mirrored_tip(fingers):
-    """The finger is symmetric about x = 0, its mesh nearly: pulling the other cable turns the other way."""
+    """The finger is symmetric about x = 0, its mesh nearly: pulling the other cable bends it the other way."""
     _, model = fingers(2, "corotational")
     left = Statics(model).solve([0.01, 0.004]).delta[2:]
     right = Statics(model).solve([0.004, 0.01]).delta[2:]
@@ -182,7 +182,7 @@ def test_unilateral_cables_are_complementary(fingers, material, target):
     assert (found.slack == (effort == 0.0)).all()
     if found.slack.any():
         assert excess[found.slack].max() > 1e-4
-        # The slack cable might as well not be there: drive it with no tension.
+        # A slack cable has no effect: the state is that of zero tension.
         modes = ["effort" if s else "displacement" for s in found.slack]
         free = Statics(model, tolerance=1e-12).solve(np.where(found.slack, 0.0, target), modes)
         np.testing.assert_allclose(free.x, found.x, rtol=0, atol=1e-9)
@@ -246,7 +246,7 @@ def test_an_impossible_command_reports_the_reached_fraction_and_keeps_the_last_s
     same = statics.solve(fraction * command, mode)
     np.testing.assert_allclose(same.x, kept, rtol=0, atol=1e-9)
     assert np.abs(kept - finger.model.nodes).max() > 1e-3
-    # ... and the body still works.
+    # ... and the solver still works.
     after = statics.solve(0.5 * finger.robot.upper)
     fresh = Statics(finger.model, tolerance=1e-12).solve(0.5 * finger.robot.upper)
     np.testing.assert_allclose(after.x, fresh.x, rtol=0, atol=1e-9)
@@ -312,7 +312,7 @@ def test_a_part_without_a_fixed_node_is_an_error(box):
         ([0.01, 0.01], ["effort", "length"], "mode must be"),
     ],
 )
-def test_malformed_commands_are_refused(fingers, target, mode, message):
+def test_malformed_commands_are_rejected(fingers, target, mode, message):
     _, model = fingers(2, "corotational")
     statics = Statics(model)
     with pytest.raises(ValueError, match=message):
@@ -320,7 +320,7 @@ def test_malformed_commands_are_refused(fingers, target, mode, message):
     np.testing.assert_array_equal(statics.x, model.nodes)
 
 
-def test_heavy_dead_loads_are_found_from_rest(fingers):
+def test_equilibria_under_heavy_dead_loads_are_found_from_rest(fingers):
     robot, _ = fingers(2, "corotational")
     model = robot.build({"young_modulus": 1.0e6, "poisson_ratio": 0.499})
     statics = Statics(model)
@@ -343,7 +343,7 @@ def test_loads_that_change_after_a_solve_are_applied_in_steps(fingers):
     statics.solve([0.0, 0.0], "effort")
     model.set_gravity((0.0, 200.0, 200.0))
     changed = statics.solve([0.0, 0.0], "effort")
-    assert changed.increments > 1  # it does not go at once
+    assert changed.increments > 1  # one increment is not enough
     np.testing.assert_allclose(changed.x, Statics(model).solve([0.0, 0.0], "effort").x, rtol=0, atol=1e-8)
 
 
@@ -355,10 +355,10 @@ def test_two_statics_share_a_model(fingers):
     again = first.solve([0.006, 0.005])
     fresh = Statics(model).solve([0.006, 0.005])
     np.testing.assert_allclose(again.x, fresh.x, rtol=0, atol=1e-9)
-    assert again.iterations <= 3  # it did not start from the other's tangent
+    assert again.iterations <= 3  # it did not use the other solver's tangent
 
 
-def test_a_copied_model_is_whole(fingers):
+def test_a_copied_model_is_complete(fingers):
     _, model = fingers(2, "corotational")
     expected = Statics(model).solve([0.01, 0.01])
     found = Statics(copy.deepcopy(model)).solve([0.01, 0.01])
@@ -393,7 +393,7 @@ def test_a_column_beyond_its_buckling_load_is_not_stable(box, solver):
     assert not statics.solve([20.0 * euler], "effort").stable
 
 
-def test_constraints_that_change_under_a_solver_are_noticed(fingers):
+def test_constraints_that_change_under_a_solver_are_detected(fingers):
     robot, _ = fingers(2, "corotational")
     model = robot.build()
     statics = Statics(model)
@@ -404,7 +404,7 @@ def test_constraints_that_change_under_a_solver_are_noticed(fingers):
     assert len(Statics(model).solve([0.0, 0.0]).delta) == 2 + 3 + 3
 
 
-def test_a_changed_elasticity_is_noticed(fingers):
+def test_a_changed_elasticity_is_detected(fingers):
     robot, _ = fingers(2, "corotational")
     model = robot.build({"young_modulus": 1.0e6, "poisson_ratio": 0.45})
     statics = Statics(model)

@@ -152,7 +152,7 @@ def test_thick_sphere():
         assert errors(groups[case, "averaged"])[-1] < 0.035
         assert errors(groups[case, "quadratic"])[-1] < 0.006
         assert groups[case, "quadratic"][-1].order > 2.2
-        # A cavity of split triangles spoils quadratic elements.
+        # A cavity of split triangles makes quadratic elements inaccurate.
         assert errors(groups[case, "quadratic, split cavity"])[-1] > 2 * errors(groups[case, "quadratic"])[-1]
 
 

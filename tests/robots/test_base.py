@@ -1,4 +1,4 @@
-"""The Robot base class: what a robot of one's own must define, its options, and the errors that name what is wrong."""
+"""The Robot base class: what a user's robot must define, its options, and its error messages."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_equal_options_have_equal_keys_however_they_are_given():
         assert other.mechanics_key != base
 
 
-def test_an_option_that_no_key_can_hold_is_named():
+def test_an_option_that_a_key_cannot_store_is_named():
     robot = Optioned(layers=object())
     with pytest.raises(TypeError, match=r"option 'layers' of robot 'optioned' = .*'non_mechanical_options'"):
         robot.mechanics_key  # noqa: B018
@@ -99,7 +99,7 @@ def test_copies_keep_their_options(copied):
     assert robot.mechanics_key == Optioned(5).mechanics_key
 
 
-def test_registry_knows_options_that_pass_through():
+def test_registry_checks_options_of_base_constructors():
     with pytest.raises(ValueError, match=r"'optioned': unknown option 'colur'; did you mean 'colour'\? .*gravity"):
         make_robot(Optioned, colur="red")
     with pytest.raises(ValueError, match="option gravity = 'down' must be 3 numbers"):
@@ -113,7 +113,7 @@ def test_every_option_of_the_suite_is_in_the_key_or_left_out_on_purpose(name):
     assert json.loads(json.dumps(robot.mechanics_key)) == robot.mechanics_key
 
 
-# -- what a class may lack ------------------------------------------------------------------------------------------
+# -- missing and malformed attributes -------------------------------------------------------------------------------
 
 
 def test_missing_attributes_are_named():
@@ -166,7 +166,7 @@ def test_malformed_attributes(attributes, error, message):
         type("Odd", (Spike,), {"name": "odd", **attributes})()
 
 
-# -- what means infeasible ------------------------------------------------------------------------------------------
+# -- infeasible designs and bugs ------------------------------------------------------------------------------------
 
 
 def test_a_bug_in_a_robot_surfaces_as_itself():
@@ -183,7 +183,7 @@ def test_a_bug_in_a_robot_surfaces_as_itself():
     assert caught.value.__notes__ == ["while assembling robot 'buggy' for Design(length=0.05)"]
 
 
-def test_only_a_robot_says_that_a_design_is_infeasible():
+def test_infeasible_designs_raised_by_a_robot_are_passed_on():
     assert Spike().build({"length": 0.04}).nodes[3, 2] == pytest.approx(0.04)
     with pytest.raises(InfeasibleDesign, match="the spike breaks"):
         Spike().build({"length": 0.065})
@@ -192,7 +192,7 @@ def test_only_a_robot_says_that_a_design_is_infeasible():
 # -- points and controllers -----------------------------------------------------------------------------------------
 
 
-def test_points_in_millimetres_are_refused():
+def test_points_in_millimetres_are_rejected():
     robot = make_robot("finger")
     np.testing.assert_array_equal(robot.check_point("goal", [0.0, 0.05, -0.09]), [0.0, 0.05, -0.09])
     assert robot.check_point("goal", robot.reference_path()).shape == (25, 3)

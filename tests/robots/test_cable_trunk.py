@@ -57,7 +57,7 @@ def test_octagonal_bar_fills_its_shape(layers, rings):
     assert volumes.sum() == pytest.approx(8.0 * np.tan(np.pi / 8))
     faces = np.sort(tetrahedra[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3), axis=1)
     used, count = np.unique(faces, axis=0, return_counts=True)
-    assert count.max() == 2  # no face is shared by three: neighbours fit
+    assert count.max() == 2  # no face belongs to three elements: neighbours fit
     assert (count == 1).sum() == 2 * (16 + 32 * (rings - 1)) + 2 * 16 * layers
     assert len(used) == (4 * len(tetrahedra) + (count == 1).sum()) / 2
 
@@ -69,8 +69,8 @@ def test_bodies_at_the_corners_of_the_design_box(coarse):
         design = space.from_unit(np.array([*signs, elasticity, -elasticity]))
         model = coarse.build(design)
         assert model.volume == pytest.approx(coarse.volume(design), rel=1e-12)
-        # 0.094 with the default's 24 layers too: the half that the short cables' end stretches has elements of 12 mm
-        # along the trunk and 2 mm across its thin tip.
+        # With the default 24 layers also 0.094: in the stretched half, elements are 12 mm long and only 2 mm wide at
+        # the thin tip.
         assert mean_ratio(model.nodes, model.blocks[0].connectivity).min() > 0.09
         for cable in model.constraints["a"]:
             assert cable.embedding.weights.min() > -1e-9  # inside the body
@@ -140,7 +140,7 @@ def test_cables_reach_their_stroke():
 
 
 def test_follows_its_circle(trunk):
-    """Measured: 0.02 mm at most, two steps a goal."""
+    """Measured: 0.02 mm at most, two steps per goal."""
     fem = make_backend("fem", trunk)
     controller = InverseQP.for_robot(trunk)
     path, state, distances = trunk.reference_path(), fem.state, []
@@ -151,7 +151,7 @@ def test_follows_its_circle(trunk):
     assert max(distances[15::2]) < 1e-4
 
 
-def test_describes_itself(trunk, coarse):
+def test_attributes(trunk, coarse):
     assert trunk.weights_name.startswith(trunk.name)
     assert json.loads(json.dumps(trunk.mechanics_key)) == trunk.mechanics_key
     assert coarse.mechanics_key != trunk.mechanics_key

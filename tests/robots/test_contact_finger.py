@@ -1,4 +1,4 @@
-"""The finger driven by cables and the pose of what it holds: coordinates, efforts, W, and the finger it is made of."""
+"""The finger driven by cables and an object's pose: coordinates, efforts, W, agreement with the Soft Finger."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def state(finger):
 
 
 @pytest.mark.parametrize("rest", [np.eye(3), Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()], ids=["", "turned"])
-def test_a_pose_counts_from_rest(rest):
+def test_a_pose_is_measured_from_rest(rest):
     """Displacement of the origin, and sin(angle) times axis of the rotation, for any directors at rest."""
     nodes = np.vstack([np.zeros((1, 3)), frame_rows([0.1, 0.2, 0.3], rest)])
     rows = [Pose("pose", 1, component, nodes) for component in range(6)]
@@ -47,7 +47,7 @@ def test_a_pose_counts_from_rest(rest):
     np.testing.assert_allclose(found, np.append(shift, np.sin(angle) * axis), atol=1e-14)
 
 
-def test_an_unknown_component_is_refused():
+def test_an_unknown_component_is_rejected():
     for component in (6, -1):
         with pytest.raises(ValueError, match="component = .* is unknown; allowed: 0 to 5"):
             Pose("pose", 0, component, np.zeros((4, 3)))
@@ -56,7 +56,7 @@ def test_an_unknown_component_is_refused():
 # -- the robot ------------------------------------------------------------------------------------------------------
 
 
-def test_describes_itself(finger):
+def test_attributes(finger):
     robot, model = finger
     assert robot.weights_name == robot.name == "contact_finger"
     assert [a.name for a in robot.actuators] == [
@@ -109,7 +109,7 @@ def test_commands_are_reached_by_the_frame(finger, state):
 
 
 def test_efforts_are_the_wrench_on_the_contact_points(finger, state):
-    """Forces of the frame on the three points add up to the first three efforts; their torque is what sines make it."""
+    """The frame's forces on the three points sum to the first three efforts; their torque matches the other three."""
     model = finger[1]
     frame = model.frames.rows[0]
     forces = state.effort[-9:].reshape(3, 3)
@@ -121,7 +121,7 @@ def test_efforts_are_the_wrench_on_the_contact_points(finger, state):
     np.testing.assert_allclose(torque, 0.5 * (np.trace(R) * np.eye(3) - R).T @ state.effort[5:8], atol=1e-9)
 
 
-def test_it_is_the_finger_with_its_contact_points_held(finger, state):
+def test_it_equals_the_soft_finger_with_its_contact_points_held(finger, state):
     """The same body as `SoftFinger`, its contact points driven to where the frame has them."""
     model = finger[1]
     alone = SoftFinger(cables=2, mesh_size=MESH_SIZE, unilateral=False, contacts=True).build()

@@ -33,7 +33,7 @@ def area(contour):
 
 
 def crossings(contour):
-    """Whether any two edges of a closed contour that are no neighbours cross."""
+    """Whether any two edges of a closed contour that are not neighbours cross."""
 
     def turn(a, b, c):
         return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
@@ -142,14 +142,14 @@ def follow(robot, laps, hold):
 
 
 def test_follows_the_published_circle(diamond):
-    """Measured: 0.017 mm at most, two steps a goal."""
+    """Measured: 0.017 mm at most, two steps per goal."""
     distances = follow(diamond, 1, 2)
     assert distances.shape == (30,)
     assert distances.max() < 1e-4
 
 
 def test_cables_that_cannot_push_stay_near_the_published_circle():
-    """Lower than their slack neighbours let it, the top cannot go: 1.17 mm at most, 0.53 mm on average (measured)."""
+    """Cables that cannot push do not lower the top far enough: 1.17 mm off at most, 0.53 mm on average (measured)."""
     robot = make_robot("diamond")
     distances = follow(robot, 1, 2)
     assert distances.max() < 1.3e-3
@@ -180,7 +180,7 @@ def test_mirrored():
     np.testing.assert_allclose(whole.nodes[4], [-1, 0, 0])
     corners = whole.nodes[whole.tetrahedra]
     np.testing.assert_allclose(np.linalg.det(corners[:, 1:] - corners[:, :1]), 1.0)
-    # The face in the plane is gone, the others are there twice and are told apart.
+    # The face in the plane is gone; the others appear twice, as distinct surfaces.
     assert len(whole.triangles) == 6
     assert len(set(whole.surfaces)) == 6
     octahedron = mirrored(mirrored(whole, (0, 1, 0)), (0, 0, 1))
@@ -188,6 +188,6 @@ def test_mirrored():
     assert len(octahedron.tetrahedra) == len(octahedron.triangles) == 8
 
 
-def test_a_part_across_the_plane_is_refused():
+def test_a_part_across_the_plane_is_rejected():
     with pytest.raises(ValueError, match="both sides"):
         mirrored(CORNER, (1, -1, 0))

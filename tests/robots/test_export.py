@@ -1,4 +1,4 @@
-"""Bodies and moulds as files: units, closed surfaces, volumes that add up, and clear refusals."""
+"""Bodies and moulds as files: units, closed surfaces, volumes that add up, and clear errors."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def occ():
 
 
 def draw(occ, build, parameters):
-    """Draw into the present model; returns the volumes that came in addition."""
+    """Draw into the current model; returns the added volumes."""
     before = set(occ.getEntities(3))
     build(**parameters)
     return sorted(set(occ.getEntities(3)) - before)
@@ -117,13 +117,13 @@ def test_both_fingers_are_one_drawing(occ):
         ("trunk", "body.step", None, ValueError, "has no exact shape"),
     ],
 )
-def test_refusals_leave_nothing_behind(name, file, design, error, message, tmp_path):
+def test_errors_leave_no_files_behind(name, file, design, error, message, tmp_path):
     with pytest.raises(error, match=message):
         export_body(make_robot(name), tmp_path / file, design)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_drawing_that_fails_or_takes_too_long_leaves_nothing_behind(tmp_path):
+def test_a_drawing_that_fails_or_takes_too_long_leaves_no_files_behind(tmp_path):
     robot = make_robot("finger")
     draw_body, lengths = robot.drawing(robot.design_space.baseline)
     with pytest.raises(InfeasibleDesign, match="the notches meet"):
@@ -137,7 +137,7 @@ def test_a_drawing_that_fails_or_takes_too_long_leaves_nothing_behind(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "options", "design"), FINGERS, ids=lambda p: str(p))
-def test_what_is_cast_is_the_body(name, options, design, occ):
+def test_the_cast_parts_form_the_body(name, options, design, occ):
     import gmsh
 
     robot = make_robot(name, **options)
@@ -151,7 +151,7 @@ def test_what_is_cast_is_the_body(name, options, design, occ):
     for part in (tray, lid, box, clamp):
         assert len(part) == 1
         assert volume(occ, part) > 1000.0
-    # The plugs: what the tray lacks of a block.
+    # The plugs: what is missing from a block to make the tray.
     low, high = np.array(occ.getBoundingBox(*tray[0])).reshape(2, 3)
     plugs = np.prod(high - low) - volume(occ, tray)
     assert plugs == pytest.approx(common(occ, lid, body), rel=1e-4)  # the cores stand where the plugs go
@@ -159,15 +159,15 @@ def test_what_is_cast_is_the_body(name, options, design, occ):
     assert common(occ, box, body) == pytest.approx(0.0, abs=1e-6)
     assert common(occ, clamp, body) == pytest.approx(0.0, abs=1e-6)
     assert common(occ, box, lid) == pytest.approx(0.0, abs=1e-6)
-    # Closed, box and lid leave free the body without its plugs, and the bores of the wires in the box.
+    # The closed mould leaves room for the body without its plugs and, in the box, for the wires.
     low, high = np.array(occ.getBoundingBox(*box[0])).reshape(2, 3)
     block = np.prod(high - low)
     bores = [(3, occ.addCylinder(x, y, low[2], 0, 0, high[2] - low[2], WIRE_RADIUS)) for x, y in wires]
     in_silicone = common(occ, bores, body)
     assert common(occ, bores, cavities) == pytest.approx(0.0, abs=1e-6)
     in_box = volume(occ, bores) - in_silicone
-    # What the lid fills, measured from half of the plugs on and clear of its rim: of faces that coincide gmsh finds
-    # nothing in common in about one run of fifty.
+    # Volume of the lid inside the mould. Start at half the height of the plugs and keep clear of the rim: with
+    # coincident faces, gmsh finds an empty intersection in about one run in fifty.
     middle = lengths["cork_thickness"] / 2
     inside = occ.addBox(low[0] - 0.05, middle, low[2] - 0.05, *(high - low + 0.1))
     in_lid = common(occ, lid, [(3, inside)]) + plugs / 2
@@ -185,7 +185,7 @@ def test_mould_files_are_closed(tmp_path, occ):
         assert check_closed(read_stl(stl)) == pytest.approx(volume(occ, entities), rel=0.003)
 
 
-def test_moulds_are_for_fingers_that_can_exist(tmp_path):
+def test_moulds_need_a_feasible_finger(tmp_path):
     with pytest.raises(ValueError, match="robot 'trunk' has no moulds; allowed: finger, sensorized_finger"):
         mould_parts(make_robot("trunk"))
     with pytest.raises(InfeasibleDesign, match="the notches meet"):

@@ -1,6 +1,6 @@
 """Grippers: against coupled models of single fingers, finite differences, balance of forces, symmetry, designs.
 
-The meshes are coarse: what is tested holds for any.
+The meshes are coarse: the tested properties hold for any mesh.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def contact_forces(state, count):
 
 
 def contacts(model, x):
-    """Contact points of the fingers, or of the first finger its tip [m], shape (k, 3)."""
+    """Contact points of the fingers, or the tip of the first finger [m], shape (k, 3)."""
     return np.array([bond.first.positions(x)[0] for bond in model.constraints["b"]])
 
 
@@ -106,7 +106,7 @@ def agrees(found, state):
 @pytest.mark.parametrize("name", ["three_finger_gripper", "press_finger"])
 @pytest.mark.parametrize("pulled", [False, True], ids=["rest", "pulled"])
 def test_coupled_fingers_hold_the_object_as_one_model_does(grippers, name, pulled):
-    """Two ways to one answer: eq. 4.8 to 4.10 on the fingers' own models, and all bodies in one."""
+    """Eq. 4.8 to 4.10 on the fingers' own models agree with one model of all bodies."""
     robot, model = grippers(name, unilateral=False)
     statics, state = solved((robot, model), pulled * COMMANDS[name])
     points = contacts(model, state.x)
@@ -190,7 +190,7 @@ def test_the_free_object_is_in_balance(grippers, name):
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
 
 
-def test_the_bar_keeps_its_length_and_its_effector_the_middle(grippers):
+def test_the_bar_keeps_its_length_and_the_effector_is_its_middle(grippers):
     robot, model = grippers("two_finger_gripper")
     _, state = solved((robot, model), COMMANDS[robot.name])
     first, second = tips(model, state.x)
@@ -280,12 +280,12 @@ def test_reference_paths():
 def test_corners_of_the_design_space_build_and_solve(name, unit):
     robot = make_robot(name)
     space = robot.design_space
-    # Stiffness as in the baseline: the button's force is one for stiff fingers.
+    # Baseline stiffness: the button's force is too large for soft fingers.
     design = {**space.from_unit(np.full(len(space), unit)), "young_modulus": space.baseline["young_modulus"]}
     model = robot.build(design)
     state = Statics(model).solve(0.5 * COMMANDS[name])
     assert state.stable
-    # No length for W_ee here: units of cables and effector are the same.
+    # The eigenvalues need no scaling: cables and effector have the same units.
     assert np.linalg.eigvalsh(state.condensed.compliance)[0] > 0.0
     assert np.linalg.norm(state.condensed.delta.e - robot.object_rest(design)) < 0.03
 
@@ -295,7 +295,7 @@ def test_stiffness_scales_compliance_and_nothing_else(name):
     robot = make_robot(name, mesh_size=MESH_SIZE)
     soft, stiff = (Statics(robot.build({"young_modulus": E})).solve(0.3 * COMMANDS[name]) for E in (2e6, 6e6))
     same = np.allclose(soft.condensed.compliance, 3.0 * stiff.condensed.compliance, rtol=1e-6, atol=1e-9)
-    # Against the constant force of the button, kinematics depends on it too.
+    # Against the constant force of the button, the kinematics depends on stiffness, too.
     assert same == (robot.stiffness_variable == "young_modulus") == (name != "press_finger")
 
 

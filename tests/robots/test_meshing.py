@@ -25,7 +25,7 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def count_runs(monkeypatch):
-    """How often gmsh was started."""
+    """Count how often gmsh is started."""
     runs, run = [], meshing.subprocess.run
 
     def counted(*args, **options):
@@ -59,7 +59,7 @@ def test_a_bug_in_a_drawing_is_not_an_infeasible_design(cache):
 
 
 def draw_two_volumes():
-    """Draw what is not one body."""
+    """Draw more than one body."""
     import gmsh
 
     for x in (0.0, 10.0):
@@ -67,7 +67,7 @@ def draw_two_volumes():
 
 
 def draw_nonsense():
-    """Ask gmsh for what it refuses."""
+    """Draw a shape that gmsh rejects."""
     import gmsh
 
     gmsh.model.occ.addBox(0, 0, 0, 0, 1, 1)
@@ -76,7 +76,7 @@ def draw_nonsense():
 @pytest.mark.parametrize(
     ("draw", "message"), [(draw_two_volumes, "has 2 volumes, expected one"), (draw_nonsense, "cannot be meshed")]
 )
-def test_what_gmsh_refuses_is_infeasible(cache, draw, message):
+def test_shapes_that_gmsh_rejects_are_infeasible(cache, draw, message):
     with pytest.raises(InfeasibleDesign, match=message):
         mesh_geometry(draw, {}, mesh_size=COARSE)
 
@@ -88,7 +88,7 @@ def test_too_slow_is_infeasible(cache):
     assert not cache.exists()
 
 
-def test_meshes_are_cached_and_damaged_ones_made_again_to_the_bit(cache, count_runs):
+def test_meshes_are_cached_and_damaged_ones_are_reproduced_bit_for_bit(cache, count_runs):
     first = mesh_geometry(draw_finger, GOOD, mesh_size=COARSE)
     assert len(count_runs) == 1
     (path,) = cache.glob("*.npz")
@@ -155,7 +155,7 @@ def test_unreadable_meshes(tmp_path, damage):
 
 
 def test_a_missing_gmsh_is_not_an_infeasible_design(cache, monkeypatch, tmp_path):
-    """An optimiser would take every design for a bad one."""
+    """Otherwise, an optimiser would treat every design as infeasible."""
     (tmp_path / "gmsh.py").write_text("raise ImportError('libGLU.so.1: cannot open shared object file')\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(MeshingError, match="libGLU"):

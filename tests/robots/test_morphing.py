@@ -88,6 +88,6 @@ def test_inversions_show_in_the_quality(cube):
     assert morpher.quality(cube.nodes * [1, 1, -1]) < 0.0
 
 
-def test_a_surface_on_no_feature_is_refused(cube):
+def test_a_surface_on_no_feature_is_rejected(cube):
     with pytest.raises(ValueError, match=r"mesh surface 6 lies on no feature.*'z high'"):
         Morpher(cube, planes((1, 1, 1.01)))

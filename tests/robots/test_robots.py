@@ -1,4 +1,4 @@
-"""Every robot of the registry over its design box: bodies, models and their smoothness; options and designs refused."""
+"""Every robot of the registry over its design box: bodies, models and their smoothness; invalid options and designs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from softgym_envs.robots.geometry.finger_shape import draw_finger
 from softgym_envs.robots.geometry.morphing import mean_ratio
 from softgym_envs.robots.soft_finger import BELLOWS
 
-# Every robot with a mesh from gmsh, in every variant: a new one adds its row. The others have files of their own.
+# Every robot with a mesh from gmsh, in every variant: a new one adds its row. The others have their own files.
 VARIANTS = [("finger", {"cables": 1}), ("finger", {"cables": 2}), ("diamond", {})]
 ELASTICITY = {"young_modulus", "poisson_ratio"}
 
@@ -61,7 +61,7 @@ def test_every_registered_robot_is_tested():
         assert name in here or Path(__file__).with_name(f"test_{module}.py").exists(), name
 
 
-def test_describes_itself(robot):
+def test_attributes(robot):
     count = len(robot.actuators)
     assert robot.name in ROBOTS
     assert robot.lower.shape == robot.upper.shape == robot.rates.shape == (count,)
@@ -136,7 +136,7 @@ def test_bodies_at_the_corners_and_inside_of_the_design_box(robot, rng):
     assert set(origins) == {"morphed"}
 
 
-def test_effectors_outside_the_body_hang_on_one_element(robot, rng):
+def test_effectors_outside_the_body_are_tied_to_one_element(robot, rng):
     """The nearest element changes from design to design; an effector tied to the nearest one would jump."""
     (base,) = robot.build().constraints["e"]
     if base.embedding.weights.min() > -1e-9:
@@ -150,13 +150,13 @@ def test_effectors_outside_the_body_hang_on_one_element(robot, rng):
             assert np.abs(effector.embedding.weights - base.embedding.weights).max() < 0.5
 
 
-def test_reference_body_is_the_mesh_not_moved(robot):
+def test_the_reference_body_is_the_unmoved_mesh(robot):
     mesh = robot.body(robot.reference_design)
     assert mesh.origin == "morphed"
     np.testing.assert_allclose(mesh.nodes, robot.unfold(robot.mesh(robot.reference_design)).nodes, rtol=0, atol=1e-12)
 
 
-def test_the_same_design_gives_the_same_body_to_the_bit(robot):
+def test_the_same_design_gives_the_same_body_bit_for_bit(robot):
     options = next(o for n, o in VARIANTS if make_robot(n, **o).weights_name == robot.weights_name)
     design = robot.design_space.from_unit(np.linspace(-0.3, 0.4, len(robot.design_space)))
     first = robot.body(design)
@@ -195,7 +195,7 @@ def test_compliance_is_smooth_along_design_lines(robot):
     """Entries of W, relative to its diagonal, bend but do not jump.
 
     A jump would make the second differences as large as the first. Where a cable point passes from one element to
-    the next W has a kink: measured 6e-5 of 2e-4 there (one cable, height), 1e-2 of the first differences elsewhere.
+    the next, W has a kink: measured 6e-5 of 2e-4 there (one cable, height), 1e-2 of the first differences elsewhere.
     """
     for name in robot.design_space.names:
         variable = robot.design_space[name]
@@ -238,7 +238,7 @@ def test_cables_can_push_by_option():
     assert [c.unilateral for c in model.constraints["a"]] == [False, False]
 
 
-# -- refusals -------------------------------------------------------------------------------------------------------
+# -- invalid input --------------------------------------------------------------------------------------------------
 
 
 def test_unknown_robot():
@@ -292,7 +292,7 @@ def test_malformed_designs(design, message):
 
 
 def test_a_geometry_that_cannot_exist_is_infeasible(monkeypatch):
-    """`build` passes on what the mesher refuses although the design space allows it."""
+    """`build` passes on `InfeasibleDesign` for a design within its bounds."""
     robot = make_robot("finger", meshing="remesh", mesh_size=0.02)
 
     def impossible(design):

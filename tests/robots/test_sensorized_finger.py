@@ -37,7 +37,7 @@ def exact_cavity_volume(lengths):
     cork = lengths["cork_thickness"]
     half_width = np.sqrt(np.maximum(radius**2 - cork**2, 0.0))
     area = radius**2 * np.arccos(np.minimum(cork / radius, 1.0)) - cork * half_width
-    # The wall in the middle is a slab, to second order in its thickness.
+    # To second order in its thickness, the wall in the middle is a slab.
     area -= 2 * lengths.get("split", 0.0) * np.maximum(radius - cork, 0.0)
     return 2 * np.trapezoid(area, z)
 
@@ -74,7 +74,7 @@ def test_cavities_are_found_in_order_from_the_base_and_from_minus_x(robot):
     assert enclosed_volume(mesh.nodes, mesh.surface()) == pytest.approx(material, rel=1e-9)
 
 
-def test_cavities_have_the_exact_volume_but_for_facets():
+def test_cavities_have_the_exact_volume_except_for_facets():
     """The facets of a 7 mm mesh cut 4 % off, those of a 3 mm mesh 1.2 %."""
     robot = make_robot("sensorized_finger")
     exact = exact_cavity_volume(robot.lengths(robot.design_space.baseline))
@@ -128,19 +128,19 @@ def test_readings_of_the_baseline(robot, readings):
         assert readings.pressure_sensitivity is None and readings.pushed_volumes is None
 
 
-def test_four_cavities_tell_a_lateral_force_from_a_pull():
+def test_four_cavities_distinguish_a_lateral_force_from_a_pull():
     robot = make_robot("sensorized_finger", cavities=4)
     readings = robot.readings(lateral_force=5.0)
     mirrored = robot.readings(lateral_force=-5.0)
     rest, pulled, pushed = (np.array(v) for v in (readings.volumes, readings.pulled_volumes, readings.pushed_volumes))
     left, right = (pulled - rest)[:2]
-    assert left == pytest.approx(right, rel=0.05)  # the plane x = 0 is a symmetry but for the mesh
+    assert left == pytest.approx(right, rel=0.05)  # symmetric about x = 0, except for the mesh
     left, right = (pushed - rest)[:2]
     assert left > 0.0 > right
     assert mirrored.pushed_volumes[0] < rest[0] < mirrored.pushed_volumes[1]
     under_force = abs(pushed[0] - rest[0]) / pushed[0]
     assert readings.pressure_sensitivity == pytest.approx(min(under_force, readings.relative_volume_change))
-    # Behind the force nothing is bent.
+    # Beyond the force, nothing is bent.
     assert np.abs(pushed - rest)[2:].max() < 0.1 * np.abs(pushed - rest)[:2].min()
 
 
@@ -152,7 +152,7 @@ def test_readings_depend_on_the_ratio_of_force_to_stiffness_alone():
     assert stiff.tension == pytest.approx(2.0 * soft.tension, rel=1e-6)
 
 
-def test_options_move_what_they_name():
+def test_options_move_the_tip_and_the_cable():
     plain = make_robot("sensorized_finger").readings()
     middle = make_robot("sensorized_finger", tip_height=0.010).readings()
     assert middle.volume_change == pytest.approx(plain.volume_change, rel=1e-6)
@@ -193,7 +193,7 @@ def test_moved_meshes_where_they_are_good():
     ],
     ids=str,
 )
-def test_closed_formulas_spare_the_mesher(robot, monkeypatch, design, message):
+def test_closed_formulas_detect_infeasible_shapes_without_meshing(robot, monkeypatch, design, message):
     def refuse(*_, **__):
         raise AssertionError("gmsh was called")
 

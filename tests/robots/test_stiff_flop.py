@@ -17,7 +17,7 @@ from softgym_envs.robots.stiff_flop import StiffFlop
 
 UL = 1e-9  # a microlitre, mm3 [m3]
 ACTUATED = UL * np.array([18.0, 4.0, 9.0, 6.0, 15.0, 2.0])
-# Steps that make the two kinds of rows move alike: pressures [Pa], forces [N].
+# Steps that move both kinds of rows by similar amounts: pressures [Pa], forces [N].
 STEPS = np.array([30.0] * 6 + [3e-6] * 3)
 
 # The entries of the first pair of chambers along z; the other two pairs have half of it, with the opposite sign.
@@ -55,7 +55,7 @@ def test_rest_compliance_is_the_published_one(rest):
     assert set(found) == set(PUBLISHED)
     for name, values in found.items():
         np.testing.assert_allclose(values, PUBLISHED[name], rtol=0.15, err_msg=name)
-    # Small beside the others there, exactly zero for beams in series.
+    # Small compared with the others as published; exactly zero for beams in series.
     assert np.abs(aa[:3, 3:]).max() < 3e-3
     np.testing.assert_allclose(ea[1, [0, 3]], 0.0, atol=1e-9)
     np.testing.assert_allclose(ee[~np.eye(3, dtype=bool)], 0.0, atol=1e-9)
@@ -152,7 +152,7 @@ def test_a_chamber_that_others_stretch_is_slack():
     # The same pressures from outside lead to the same state.
     same = statics.solve(state.effort[:6], "effort")
     np.testing.assert_allclose(same.delta, state.delta, atol=1e-10)
-    # Chambers that hold on to their volume are under suction: they keep the inside of the bend short, so it bends more.
+    # Chambers that keep their volume are under suction: they keep the inside of the bend short, so it bends more.
     held = Statics(StiffFlop(unilateral=False).build()).solve(volumes)
     assert (held.effort[1:3] < -1e3).all()
     assert not held.slack.any()

@@ -195,7 +195,7 @@ def test_falls_come_to_rest_in_equilibrium():
 
 
 def test_it_falls_from_its_undeformed_guess(robot):
-    """From the first guess of the legs' shape, at rest, straight to where it hangs."""
+    """Released at rest from the first guess of the legs' shape, it settles in its hanging position."""
     model = robot.build()
     still = Statics(model).solve(np.zeros(4))
     solver = cases.Dynamics(model, step=0.02, stiffness_damping=0.02)
@@ -232,7 +232,7 @@ def test_longer_legs_hang_lower_and_wider_ones_are_stiffer():
         assert (np.diag(stiffer) < np.diag(baseline.condensed.W.ee)).all(), name
 
 
-# -- refusals -------------------------------------------------------------------------------------------------------
+# -- invalid input --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_bad_designs(robot):
         robot.build({"leg_lenght": 0.2})
 
 
-def test_a_command_without_equilibrium_says_how_far_it_came(robot):
+def test_a_command_without_equilibrium_reports_the_reached_fraction(robot):
     """Two opposite servos outwards squeeze the legs until they snap."""
     statics = Statics(robot.build())
     statics.solve(np.zeros(4))
@@ -270,7 +270,7 @@ def test_a_command_without_equilibrium_says_how_far_it_came(robot):
     assert 0.0 < caught.value.fraction < 1.0
 
 
-def test_signature_and_options_that_change_it(robot):
+def test_mechanics_key_and_options_that_change_it(robot):
     assert robot.weights_name == "tetrapod"
     assert robot.mechanics_key == {"payload": 0.0, "elements": 6, "gravity": [0.0, 0.0, -9.81]}
     assert make_robot("tetrapod", payload=0.5).mechanics_key != robot.mechanics_key
