@@ -140,7 +140,7 @@ def robot_sections(name: str) -> dict[str, Callable[[], str]]:
 
     return {
         "Description": lambda: "",
-        "Published beside ours": lambda: "",
+        "Comparison with published values": lambda: "",
         "Design space": lambda: design_table(robot),
         "Actuators": lambda: actuator_table(robot),
         "Model": model,

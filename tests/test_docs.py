@@ -53,9 +53,11 @@ def test_every_environment_has_a_page_with_a_description(identifier):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_every_robot_has_a_page_with_a_description(name):
     page = DOCS / "robots" / f"{name}.md"
-    assert page.is_file(), f"write {page.relative_to(ROOT)}: a title, '## Description' and '## Published beside ours'"
+    assert page.is_file(), (
+        f"write {page.relative_to(ROOT)}: a title, '## Description' and '## Comparison with published values'"
+    )
     assert writing.describes(page.read_text())
-    assert dict(writing.split(page.read_text())).get("Published beside ours")
+    assert dict(writing.split(page.read_text())).get("Comparison with published values")
 
 
 def test_an_empty_description_is_detected():

@@ -148,7 +148,7 @@ class InverseQP:
     def _make_qp(self) -> Any:
         """Return a new solver; a solver that failed would warm-start from its bad result."""
         n = len(self.rates)
-        # One inequality per actuator (its effort) beside the box of displacements.
+        # One inequality per actuator (its effort), besides the box of displacements.
         qp = self._proxqp.dense.QP(n, 0, n, True)
         qp.settings.eps_abs = 1e-11  # with many actuators for one effector, 1e-9 is inaccurate by 5e-5 of their ranges
         qp.settings.eps_rel = 0.0

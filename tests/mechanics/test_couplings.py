@@ -40,7 +40,7 @@ def compliance_by_differences(statics, state, solve, steps):
 
 @pytest.fixture(params=["linear", "averaged"])
 def bonded(request, box):
-    """A soft column with a cable; beside it a rigid part that three bonds hold, with an effector and a contact."""
+    """A soft column with a cable and, held by three bonds, a rigid part with an effector and a contact."""
     nodes, tetrahedra = box((0.02, 0.02, 0.06), (2, 2, 5), jitter=0.2)
     body = ModelBuilder()
     body.add_solid(

@@ -39,7 +39,7 @@ def capped(box):
         plate = body.add_frame([0.012, 0.009, 0.034], turn)
         solid_rows = np.vstack(body._rows[:1])
         body.carry(plate, start + cap(solid_rows))
-        # A second rigid part beside the block, which only three bonds hold, and a beam from it into space.
+        # A second rigid part next to the block, held only by three bonds, and a beam from it into space.
         part = body.add_frame([0.03, 0.01, 0.015], np.eye(3)[:, [1, 2, 0]])
         chain = [part, *(body.add_frame([0.03, 0.01 + s, 0.015], np.eye(3)[:, [1, 2, 0]]) for s in (0.02, 0.04))]
         body.add_beam(chain, section=Section.circle(0.003), young_modulus=1e6, order=2)

@@ -111,10 +111,10 @@ def test_meshes_are_cached_and_damaged_ones_are_reproduced_bit_for_bit(cache, co
 
 
 def test_every_parameter_and_the_mesh_size_are_part_of_the_key(cache, monkeypatch):
-    asked = []
+    commands = []
 
     def stop(command, **_):
-        asked.append(command)
+        commands.append(command)
         raise meshing.subprocess.TimeoutExpired(command, 0.0)
 
     monkeypatch.setattr(meshing.subprocess, "run", stop)
@@ -126,7 +126,7 @@ def test_every_parameter_and_the_mesh_size_are_part_of_the_key(cache, monkeypatc
         mesh_geometry(draw_finger, GOOD | change, mesh_size=COARSE)
     mesh_geometry(draw_finger, GOOD, mesh_size=0.021)
     mesh_geometry(draw_finger, GOOD, mesh_size=COARSE)
-    assert not asked
+    assert not commands
     assert len(set(saved)) == 6
     assert saved[0] == saved[-1]
 

@@ -30,7 +30,7 @@ def robot(request):
 
 @pytest.fixture(scope="module")
 def remeshing(robot):
-    """The same robot, meshing every design anew."""
+    """The same robot, remeshing every design."""
     options = next(o for n, o in VARIANTS if make_robot(n, **o).weights_name == robot.weights_name)
     return make_robot(robot.name, **options, meshing="remesh")
 
