@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -14,6 +15,22 @@ UNUSABLE = 3
 """Exit status when gmsh is missing or does not load."""
 
 _SHARP_ANGLE = 40.0  # triangles that meet at a larger angle [degrees] form an edge of the shape
+
+
+def set_options(gmsh: ModuleType, size: float) -> None:
+    """Set options for reproducible meshes whose edges have one length, in the unit of the drawing."""
+    for option, value in (
+        ("General.Terminal", 0),
+        ("General.NumThreads", 1),
+        ("Mesh.RandomSeed", 1),
+        ("Mesh.MeshSizeExtendFromBoundary", 0),
+        ("Mesh.MeshSizeFromPoints", 0),
+        ("Mesh.MeshSizeFromCurvature", 0),
+        ("Mesh.OptimizeNetgen", 1),
+        ("Mesh.MeshSizeMax", size),
+        ("Mesh.MeshSizeMin", size),
+    ):
+        gmsh.option.setNumber(option, value)
 
 
 def _fill_shells(request: Path, output: Path) -> None:
@@ -25,18 +42,7 @@ def _fill_shells(request: Path, output: Path) -> None:
         size = float(data["mesh_size"])
     gmsh.initialize()
     try:
-        for option, value in (
-            ("General.Terminal", 0),
-            ("General.NumThreads", 1),
-            ("Mesh.RandomSeed", 1),
-            ("Mesh.MeshSizeExtendFromBoundary", 0),
-            ("Mesh.MeshSizeFromPoints", 0),
-            ("Mesh.MeshSizeFromCurvature", 0),
-            ("Mesh.OptimizeNetgen", 1),
-            ("Mesh.MeshSizeMax", size),
-            ("Mesh.MeshSizeMin", size),
-        ):
-            gmsh.option.setNumber(option, value)
+        set_options(gmsh, size)
         gmsh.model.add("body")
         for shell in range(len(parts)):
             corners, renumbered = np.unique(triangles[shells == shell], return_inverse=True)

@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
+from softgym_envs.mechanics.gmsh_process import set_options
 from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
 _FORMAT = 2
@@ -211,18 +212,7 @@ def _draw_here(request: dict) -> None:
     module, _, function = request["build"].partition(":")
     gmsh.initialize()
     try:
-        for option, value in (
-            ("General.Terminal", 0),
-            ("General.NumThreads", 1),
-            ("Mesh.RandomSeed", 1),
-            ("Mesh.MeshSizeExtendFromBoundary", 0),
-            ("Mesh.MeshSizeFromPoints", 0),
-            ("Mesh.MeshSizeFromCurvature", 0),
-            ("Mesh.OptimizeNetgen", 1),
-            ("Mesh.MeshSizeMax", request["mesh_size"] * 1e3),
-            ("Mesh.MeshSizeMin", request["mesh_size"] * 1e3),
-        ):
-            gmsh.option.setNumber(option, value)
+        set_options(gmsh, request["mesh_size"] * 1e3)
         gmsh.model.add("body")
         getattr(import_module(module), function)(**request["parameters"])
         gmsh.model.occ.synchronize()
