@@ -58,9 +58,9 @@ class Registry(Mapping[str, type]):
         else:
             cls = self._checked(cls)
             name = self._name_of(cls, name)
-        present = self._entries.get(name, cls)
-        if _path(present) != _path(cls):
-            raise ValueError(f"{self.kind} '{name}' is already registered: {_path(present)}")
+        existing = self._entries.get(name, cls)
+        if _path(existing) != _path(cls):
+            raise ValueError(f"{self.kind} '{name}' is already registered: {_path(existing)}")
         self._entries[name] = cls
         return cls
 
@@ -138,11 +138,11 @@ class Registry(Mapping[str, type]):
 
         self._discovered = True
         for point in entry_points(group=self._group):
-            present = self._entries.setdefault(point.name, point.value)
-            if _path(present) != point.value:
+            existing = self._entries.setdefault(point.name, point.value)
+            if _path(existing) != point.value:
                 warnings.warn(
                     f"{self.kind} '{point.name}' of the entry point {point.value} is ignored: "
-                    f"the name belongs to {_path(present)}",
+                    f"the name belongs to {_path(existing)}",
                     stacklevel=3,
                 )
 

@@ -196,22 +196,22 @@ class Coupled:
         return self.motion_map @ np.append(1.0, effort)
 
 
-def _side_by_side(
+def _stack_parts(
     models: Sequence[CondensedModel],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
     """Return block-diagonal W, delta_free and current efforts of the parts, and the rows of each role of each part."""
     if not models or any(model.free.ndim != 1 for model in models):
         raise ValueError("couple needs at least one model, and models without a batch dimension")
     starts = np.cumsum([0, *(len(model.free) for model in models)])
-    W, free, present = np.zeros((starts[-1], starts[-1])), np.zeros(starts[-1]), np.zeros(starts[-1])
+    W, free, current = np.zeros((starts[-1], starts[-1])), np.zeros(starts[-1]), np.zeros(starts[-1])
     rows = []
     for start, model in zip(starts, models, strict=False):
         here = slice(start, start + len(model.free))
-        W[here, here], free[here], present[here] = model.compliance, model.free, model.effort
+        W[here, here], free[here], current[here] = model.compliance, model.free, model.effort
         rows.append({role: start + np.arange(at.start, at.stop) for role, at in model.slices.items()})
-    if not (np.isfinite(W).all() and np.isfinite(free).all() and np.isfinite(present).all()):
+    if not (np.isfinite(W).all() and np.isfinite(free).all() and np.isfinite(current).all()):
         raise ValueError("a condensed model contains values that are not finite")
-    return W, free, present, rows
+    return W, free, current, rows
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,7 @@ def couple(
         ValueError: for malformed or non-finite input, an object that its points do not hold, or redundant ties that
             contradict each other.
     """
-    W, free, present, rows = _side_by_side(models)
+    W, free, current, rows = _stack_parts(models)
     actuators = np.concatenate([part["a"] for part in rows])
     C = np.zeros((0, len(free))) if ties is None else np.atleast_2d(np.asarray(ties, dtype=float))
     d = np.zeros(len(C)) if gap is None else np.asarray(gap, dtype=float).ravel()
@@ -296,7 +296,7 @@ def couple(
         if len(held) != body.points.size:
             raise ValueError(f"the object has {len(body.points)} points, but the parts have {len(held)} contact rows")
         C, d = np.concatenate([C, np.eye(len(free))[held]]), np.concatenate([d, body.contacts.ravel()])
-        J, K, load = np.concatenate([J, body.jacobian]), body.stiffness(present[held]), body.load
+        J, K, load = np.concatenate([J, body.jacobian]), body.stiffness(current[held]), body.load
         pose[:3] = body.position
         moving = np.flatnonzero(body.free)
     if len(C) == 0:
@@ -313,7 +313,7 @@ def couple(
     kept = np.concatenate([actuators, *(rows[part].get("e", actuators[:0]) for part in chosen)])
     count = 0 if body is None else 6 if orientation else 3
     forces = np.zeros((len(free), 1 + len(kept) + count))
-    forces[:, 0] = np.where(tied, 0.0, present)
+    forces[:, 0] = np.where(tied, 0.0, current)
     forces[actuators, 0] = 0.0
     forces[kept, np.arange(1, 1 + len(kept))] = 1.0
     loads = np.zeros((6, forces.shape[1]))
@@ -339,7 +339,7 @@ def couple(
     n_a, size = len(actuators), len(answer)
     order = np.concatenate([np.arange(n_a), np.arange(len(kept), size), np.arange(n_a, len(kept))])
     compliance = answer[:, 1:][np.ix_(order, order)]
-    effort = np.append(present[actuators], np.zeros(size - n_a))
+    effort = np.append(current[actuators], np.zeros(size - n_a))
     return Coupled(
         CondensedModel(0.5 * (compliance + compliance.T), answer[order, 0], effort, (("a", n_a), ("e", size - n_a))),
         condition=saddle.condition,

@@ -199,14 +199,14 @@ class CoupledFingers:
     def reset(self) -> None:
         """Return to the undeformed shape without load; `solve` applies the load."""
         self._point = _Point(np.zeros(self.count), self.centre.copy(), np.eye(3))
-        self._carried = np.zeros(POSE)
-        self._present: _Linear | None = None
+        self._current_load = np.zeros(POSE)
+        self._current: _Linear | None = None
 
     def restore(self, state: FingersState) -> None:
         """Start the next call of `solve` from an earlier state of these fingers."""
         self._point = _Point(state.displacement, state.position, state.rotation)
-        self._carried = self.load
-        self._present = None
+        self._current_load = self.load
+        self._current = None
 
     # -- one linearisation ------------------------------------------------------------------------------------------
 
@@ -336,10 +336,10 @@ class CoupledFingers:
         forced = mode == "effort"
         if forced and (command[self.unilateral] < 0.0).any():
             raise ValueError(f"tensions {command.tolist()} N must not be negative: the cables cannot push")
-        here = self._linearise(self._point) if self._present is None else self._present
+        here = self._linearise(self._point) if self._current is None else self._current
         if here is None:
             raise ConvergenceError("the model of the fingers has no equilibrium at the starting point")
-        start, start_load = (here.tension if forced else here.point.cables), self._carried
+        start, start_load = (here.tension if forced else here.point.cables), self._current_load
         done, size, iterations = 0.0, 1.0, 0
         while done < 1.0:
             level = min(1.0, done + size)
@@ -356,7 +356,7 @@ class CoupledFingers:
                     ) from None
                 continue
             done, size, iterations = level, 1.5 * size, iterations + spent
-        self._point, self._present, self._carried = here.point, here, self.load
+        self._point, self._current, self._current_load = here.point, here, self.load
         return self._state(here, C, command, tension, iterations, forced)
 
     def _state(

@@ -25,7 +25,7 @@ import numpy as np
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solvers.schemes import SCHEMES, GeneralisedAlpha, ImplicitEuler, Start
+from softgym_envs.mechanics.solvers.schemes import SCHEMES, GeneralisedAlpha, ImplicitEuler, StartingAcceleration
 from softgym_envs.mechanics.solvers.statics import AppliedLoads, Equilibrium, NewtonFailure, Statics
 
 
@@ -184,7 +184,7 @@ class Dynamics(Statics):
         """
         target = np.asarray(target, dtype=float)
         start = self.snapshot
-        first = self._present_command(mode)
+        first = self._current_command(mode)
         for cut in range(self.max_cuts + 1):
             count = 2**cut
             try:
@@ -218,7 +218,7 @@ class Dynamics(Statics):
         # Steps in time are short: warping them costs more than it saves.
         return self.model.kinematics.displacement(x, step)
 
-    def _present_command(self, mode: str | Sequence[str]) -> np.ndarray:
+    def _current_command(self, mode: str | Sequence[str]) -> np.ndarray:
         command, rows = self.effort[: self._actuators].copy(), self._displacement_rows(mode)
         command[rows] = self._values(self.x)[rows]
         return command
@@ -262,7 +262,7 @@ class Dynamics(Statics):
         drift = h * kinematics.equation_velocity(start, self.velocity)
         self.x = start + kinematics.displacement(start, drift)
         try:
-            with self._moving(inertia):
+            with self._inertia_added(inertia):
                 if not self._linearise():
                     self.x = start
                 return self.solve(target, mode, **applied)
@@ -271,9 +271,9 @@ class Dynamics(Statics):
             raise
 
     @contextmanager
-    def _moving(self, inertia: Inertia) -> Iterator[None]:
+    def _inertia_added(self, inertia: Inertia) -> Iterator[None]:
         """Add inertia to the equilibrium, and apply dead loads in full: only statics ramps them."""
-        self._carried = self.linearisation.loads = self.model.loads
+        self._current_loads = self.linearisation.loads = self.model.loads
         self.linearisation.inertia = inertia
         self.linearisation.current = False
         try:
@@ -299,7 +299,7 @@ class Dynamics(Statics):
         change = (before - 2.0 * delta + after) / (0.01 * self.step) ** 2
         goal = self.effort.copy()
         goal[driven] = -(h**2) * change[driven]
-        with self._moving(Start(kinematics, self.x, speed, h, self._mass_and_damping())):
+        with self._inertia_added(StartingAcceleration(kinematics, self.x, speed, h, self._mass_and_damping())):
             if not self._linearise():
                 raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
             try:

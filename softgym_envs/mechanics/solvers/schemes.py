@@ -24,7 +24,7 @@ class ImplicitEuler(Inertia):
         return velocity, (velocity - self._v) / self._h
 
 
-class Start(Inertia):
+class StartingAcceleration(Inertia):
     """Scheme that finds accelerations at rows ``x`` and velocities ``v`` (N,): a step is ``h^2`` times them."""
 
     def __init__(self, kinematics: Kinematics, x: np.ndarray, v: np.ndarray, h: float, body: MassAndDamping) -> None:
@@ -43,7 +43,7 @@ class GeneralisedAlpha(Inertia):
         kinematics: degrees of freedom of the body.
         x: rows at the start of the step [m], shape (n, 3).
         v: velocities of the equations, shape (N,).
-        true: their derivatives at the start, shape (N,).
+        acceleration: their derivatives at the start, shape (N,).
         a: auxiliary accelerations of the scheme, shape (N,).
         h: step [s].
         radius: spectral radius at infinite frequency, 0 to 1.
@@ -55,13 +55,14 @@ class GeneralisedAlpha(Inertia):
         kinematics: Kinematics,
         x: np.ndarray,
         v: np.ndarray,
-        true: np.ndarray,
+        acceleration: np.ndarray,
         a: np.ndarray,
         h: float,
         radius: float,
         body: MassAndDamping,
     ) -> None:
-        self._kinematics, self._x, self._v, self._true, self._a, self._h = kinematics, x, v, true, a, h
+        self._kinematics, self._x, self._v, self._a, self._h = kinematics, x, v, a, h
+        self._acceleration = acceleration
         self._am, self._af = (2.0 * radius - 1.0) / (radius + 1.0), radius / (radius + 1.0)
         self._gamma = 0.5 - self._am + self._af
         self._beta = 0.25 * (self._gamma + 0.5) ** 2
@@ -74,9 +75,9 @@ class GeneralisedAlpha(Inertia):
         h, step = self._h, self._kinematics.increment(self._x, x)
         a = ((step - h * self._v) / h**2 - (0.5 - self._beta) * self._a) / self._beta
         v = self._v + h * ((1.0 - self._gamma) * self._a + self._gamma * a)
-        true = ((1.0 - self._am) * a + self._am * self._a - self._af * self._true) / (1.0 - self._af)
-        return v, true, a
+        acceleration = ((1.0 - self._am) * a + self._am * self._a - self._af * self._acceleration) / (1.0 - self._af)
+        return v, acceleration, a
 
     def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        v, true, _ = self.equations(x)
-        return self._kinematics.row_velocity(x, v), self._kinematics.row_acceleration(x, v, true)
+        v, acceleration, _ = self.equations(x)
+        return self._kinematics.row_velocity(x, v), self._kinematics.row_acceleration(x, v, acceleration)

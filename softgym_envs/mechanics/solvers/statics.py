@@ -130,14 +130,14 @@ class Statics:
         """Go back to the undeformed shape with no effort. The equilibrium under loads is found by `solve`."""
         self.x = self.model.nodes.copy()
         self.effort = np.zeros(self._assembly.size)
-        self._carried = np.zeros_like(self.x)  # dead loads that the current state carries
+        self._current_loads = np.zeros_like(self.x)  # dead loads that the current state carries
         self.linearisation.current = False
 
     def restore(self, x: np.ndarray, effort: np.ndarray) -> None:
         """Start the next solve from node positions ``x`` (n, 3) and efforts (size,) of all rows."""
         self.x = x.copy()
         self.effort = effort.copy()
-        self._carried = self.model.loads
+        self._current_loads = self.model.loads
         self.linearisation.current = False
 
     # -- Newton -----------------------------------------------------------------------------------------------------
@@ -297,7 +297,7 @@ class Statics:
         if self._elasticity_version != self.model.elasticity_version:
             self._elasticity_version = self.model.elasticity_version
             linear.current = False
-        linear.loads = self._carried
+        linear.loads = self._current_loads
         if not linear.current and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
@@ -305,7 +305,7 @@ class Statics:
         start = self.effort.copy()
         start[driven] = linear.delta[driven]
         done, size, iterations, increments = 0.0, 1.0, 0, 0
-        loads, start_loads = self.model.loads, self._carried
+        loads, start_loads = self.model.loads, self._current_loads
         ramped = bool((loads != start_loads).any())
         while done < 1.0:
             level = min(1.0, done + size)
@@ -318,7 +318,7 @@ class Statics:
             except BaseException as problem:
                 # After any exception, even Ctrl-C, the last equilibrium is restored.
                 self.x, self.effort = kept
-                linear.loads = self._carried
+                linear.loads = self._current_loads
                 linear.current = False
                 if not isinstance(problem, NewtonFailure):
                     raise
@@ -333,7 +333,7 @@ class Statics:
                     ) from None
                 continue
             increments += 1
-            done, self._carried = level, linear.loads
+            done, self._current_loads = level, linear.loads
             size *= 1.5
         return self._state(target, driven, iterations, increments)
 
