@@ -7,10 +7,7 @@ from softgym_envs._lazy import lazy_exports
 if TYPE_CHECKING:
     from agents.config import EnvironmentConfig as EnvironmentConfig
     from agents.config import TrainConfig as TrainConfig
-    from agents.evaluation import Evaluation as Evaluation
     from agents.evaluation import evaluate as evaluate
-    from agents.evaluation import make_agent as make_agent
-    from agents.evaluation import sample_goals as sample_goals
     from agents.export import export_policy_onnx as export_policy_onnx
     from agents.policy import Policy as Policy
     from agents.training import train as train
@@ -20,7 +17,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "config": ["EnvironmentConfig", "TrainConfig"],
-        "evaluation": ["Evaluation", "evaluate", "make_agent", "sample_goals"],
+        "evaluation": ["evaluate"],
         "export": ["export_policy_onnx"],
         "policy": ["Policy"],
         "training": ["train"],

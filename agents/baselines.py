@@ -10,7 +10,8 @@ import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.backends.surrogate import SurrogateBackend
-from softgym_envs.control import InverseQP, PICorrection
+from softgym_envs.control.embedded import PICorrection
+from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.errors import ConvergenceError, WeightsError
 from softgym_envs.robots.base import Robot

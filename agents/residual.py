@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 
 from agents.baselines import InverseQPAgent, make_controller
-from softgym_envs.control import InverseQP
+from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 

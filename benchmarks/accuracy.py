@@ -21,7 +21,7 @@ def test_set(folder: str | Path = "results/test_set", workers: int = 2) -> dict[
     States that `stable_rows` excludes from training, because they are about to buckle, are reported separately.
     """
     from softgym_envs.config import load_config
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.data.dataset import generate_dataset
     from softgym_envs.surrogate.data.states import full_compliance, stable_rows
     from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
@@ -83,7 +83,7 @@ def positive_definite(count: int = 1_000_000) -> dict[str, object]:
     The derivative of the predicted state is taken by central differences in the last 10,000 states. Errors are relative
     to the largest entry of the same state; the network computes in single precision.
     """
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
 
     result: dict[str, object] = {}
@@ -133,7 +133,7 @@ def design_gradients(bodies: int = 12) -> dict[str, object]:
 
     from softgym_envs.errors import ConvergenceError, InfeasibleDesign
     from softgym_envs.mechanics.solvers.statics import Statics
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.features import learned_variables
     from softgym_envs.surrogate.potential.torch import TorchModel
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
@@ -190,8 +190,8 @@ def trajectories() -> dict[str, object]:
     """
     from softgym_envs.backends.fem import FEMBackend
     from softgym_envs.backends.surrogate import SurrogateBackend
-    from softgym_envs.control import InverseQP
-    from softgym_envs.robots import make_robot
+    from softgym_envs.control.inverse_qp import InverseQP
+    from softgym_envs.robots.registry import make_robot
 
     robot = make_robot("finger", cables=1)
     cases = [
@@ -232,7 +232,7 @@ def slack_states() -> dict[str, object]:
     """Both backends under 200 random commands of the two-cable finger over random designs, slack cables included."""
     from softgym_envs.backends.fem import FEMBackend
     from softgym_envs.backends.surrogate import SurrogateBackend
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
 
     robot = make_robot("finger")
     rng = np.random.default_rng(0)
@@ -260,7 +260,7 @@ def mesh_motion() -> dict[str, object]:
     The noise is the standard deviation of the third differences, which vanish for a smooth curve, over the mean.
     """
     from softgym_envs.backends.fem import FEMBackend
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
 
     result: dict[str, object] = {}
     for meshing in ("morph", "remesh"):

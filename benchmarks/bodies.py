@@ -7,7 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints import Cavity, EmbeddedPoints, Point
+from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.model import MechanicalModel

@@ -23,8 +23,6 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.storage import read_npz
 
-__all__ = ["build_diamond", "compare"]
-
 CABLES = ("north", "west", "south", "east")
 
 

@@ -13,8 +13,6 @@ import numpy as np
 
 from softgym_envs.storage import atomic_write
 
-__all__ = ["calibration", "optima", "sensor_front"]
-
 ROOT = Path(__file__).resolve().parent
 FRONT = ROOT / "data" / "sensorized_finger_front.csv"
 PUBLISHED = {
@@ -88,7 +86,7 @@ def calibration() -> dict[str, object]:
     from codesign.tools.config import CalibrationConfig
     from codesign.tools.measurements import measure
     from softgym_envs.config import check_config
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
 
     robot = make_robot("finger", cables=1)
 

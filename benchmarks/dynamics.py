@@ -18,7 +18,9 @@ from scipy.spatial.transform import Rotation
 from benchmarks.robot_dynamics import hanging, quasi_static, random_designs, robustness, tetrapod_at_rest, workspace
 from benchmarks.rows import Row, as_results, with_orders
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints import Bond, EmbeddedPoints, Point
+from softgym_envs.mechanics.constraints.bond import Bond
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel

@@ -206,7 +206,7 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
 
 def _compiled(model: Any, flags: list[str], folder: Path) -> ctypes.CDLL:
     """The header of a baseline body with `_SOURCE`, as a shared library."""
-    from softgym_envs.surrogate.export import export_c
+    from softgym_envs.surrogate.export.c import export_c
 
     compiler = shutil.which("cc") or shutil.which("gcc") or "cc"
     export_c(model, None, folder / "model.h")
@@ -255,7 +255,7 @@ def _goals(model: Any, context: Any, count: int) -> np.ndarray:
 
 def _onnx_speed(model: Any, displacement: np.ndarray, folder: Path) -> dict[str, object]:
     """Microseconds per state of the graph; it always computes W too."""
-    from softgym_envs.surrogate.export import export_onnx
+    from softgym_envs.surrogate.export.onnx import export_onnx
 
     try:
         import onnxruntime
@@ -277,7 +277,8 @@ def _onnx_speed(model: Any, displacement: np.ndarray, folder: Path) -> dict[str,
 
 def _control_speed(model: Any, context: Any, library: ctypes.CDLL, efforts: np.ndarray) -> dict[str, object]:
     """Rates of thesis, algorithm 2 along a path: controller in Python on either model, and all of it in C."""
-    from softgym_envs.control import EmbeddedLoop, InverseQP
+    from softgym_envs.control.embedded import EmbeddedLoop
+    from softgym_envs.control.inverse_qp import InverseQP
 
     count = model.count
     most = np.full(count, 1.5 * np.abs(efforts).max())
@@ -368,7 +369,7 @@ def _constant_bytes(header: Path) -> int:
 
 def deployed() -> dict[str, object]:
     """Exported models on one thread: microseconds per call of C and ONNX, and rates of embedded control."""
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.pretrained import pretrained_model
 
     result: dict[str, object] = {}

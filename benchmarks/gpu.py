@@ -17,8 +17,6 @@ from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.envs.torch_env import TorchVectorEnv
 from softgym_envs.storage import write_json
 
-__all__ = ["gpu", "gpu_step", "measure"]
-
 #: Compiling takes most of the time of a run, and one robot is enough to show its effect.
 COMPILED = "SoftGym/FingerReach-v0"
 

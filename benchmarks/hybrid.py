@@ -66,7 +66,7 @@ def hybrid() -> dict[str, object]:
     """
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.backends.fem import FEMBackend
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.weight_files import load_model
 
     robot = make_robot("finger")

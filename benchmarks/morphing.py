@@ -12,8 +12,6 @@ from pathlib import Path
 import click
 import numpy as np
 
-__all__ = ["LINES", "Line", "draw", "follow", "morphing"]
-
 MESHINGS = ("remesh", "morph")
 POINTS = 81
 COMMAND = 0.010  # of all cables [m]
@@ -39,7 +37,7 @@ LINES = (Line("finger", "length", 1), Line("diamond", "elbow_radius", 2))
 def follow(line: Line, meshing: str, points: int = POINTS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the values of the variable, W between the effector and the first cable, and the numbers of nodes."""
     from softgym_envs.mechanics.solvers.statics import Statics
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
 
     robot = make_robot(line.robot, meshing=meshing)
     variable = robot.design_space[line.variable]
@@ -84,7 +82,7 @@ def draw(curves: Curves, path: Path, lines: Sequence[Line] = LINES) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
 
     styles = {
         "remesh": {

@@ -21,8 +21,6 @@ import numpy as np
 from softgym_envs.config import provenance
 from softgym_envs.storage import write_json
 
-__all__ = ["networks", "standardised_loss"]
-
 KEPT = Path(__file__).parent / "data" / "networks.json"
 
 CASES: dict[str, dict[str, Any]] = {
@@ -164,7 +162,7 @@ def _data(folder: Path, case: str, workers: int) -> dict[str, dict[str, np.ndarr
 def _run(path: Path, case: str, name: str, data: dict[str, dict[str, np.ndarray]], size: int, seed: int) -> Path:
     import torch
 
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.data.states import training_states
     from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.networks import network_module
@@ -218,7 +216,7 @@ def _track(path: Path, case: str, data: dict[str, dict[str, np.ndarray]], size: 
     import torch
 
     from benchmarks.robots import predicted_path
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate import potential
     from softgym_envs.surrogate.data.sampling import select_states
     from softgym_envs.surrogate.data.states import stable_rows, training_states

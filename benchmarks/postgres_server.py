@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["PostgresServer", "find_programs", "temporary_server"]
-
 ACCOUNT = "postgres"
 """Account that runs the server if we are root, which PostgreSQL refuses. Debian's package creates the account."""
 

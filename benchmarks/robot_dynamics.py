@@ -14,7 +14,7 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
+from softgym_envs.robots.registry import make_robot
 
 
 def tetrapod_at_rest(design: dict[str, float] | None = None, **options) -> Dynamics:

@@ -74,8 +74,8 @@ def _follow(
         options: of the robot.
     """
     from softgym_envs.backends.fem import FEMBackend
-    from softgym_envs.control import InverseQP
-    from softgym_envs.robots import make_robot
+    from softgym_envs.control.inverse_qp import InverseQP
+    from softgym_envs.robots.registry import make_robot
 
     robot = make_robot(robot_name, **dict(options or {}))
     backend = FEMBackend(robot)
@@ -101,7 +101,7 @@ def _follow(
 def _finger_bending(cables: int) -> np.ndarray:
     """Tip of the finger at 25 equal cable displacements up to 20 mm: a quarter of a turn, all of it in reach."""
     from softgym_envs.backends.fem import FEMBackend
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
 
     backend = FEMBackend(make_robot("finger", cables=cables))
     return np.array([backend.step(np.full(cables, pull)).effector[0] for pull in np.linspace(0.0, 0.020, 25)])
@@ -120,8 +120,9 @@ def _embedded_trunk(
         calls: number of controller calls for each goal.
     """
     from softgym_envs.backends.fem import FEMBackend
-    from softgym_envs.control import EmbeddedLoop, InverseQP, PICorrection
-    from softgym_envs.robots import make_robot
+    from softgym_envs.control.embedded import EmbeddedLoop, PICorrection
+    from softgym_envs.control.inverse_qp import InverseQP
+    from softgym_envs.robots.registry import make_robot
 
     robot = make_robot("trunk")
     count = len(robot.actuators)
@@ -198,8 +199,8 @@ def predicted_path(
     """
     from softgym_envs.backends.fem import FEMBackend
     from softgym_envs.backends.surrogate import SurrogateBackend
-    from softgym_envs.control import InverseQP
-    from softgym_envs.robots import make_robot
+    from softgym_envs.control.inverse_qp import InverseQP
+    from softgym_envs.robots.registry import make_robot
 
     robot = make_robot(robot_name, **dict(options or {}))
     fem, surrogate = FEMBackend(robot), SurrogateBackend(robot, weights=weights)  # type: ignore[arg-type]
@@ -221,7 +222,7 @@ def predicted_path(
 
 def predicted_tracking() -> dict[str, object]:
     """Reference paths followed on the shipped surrogates with predicted states: distance of FEM from the prediction."""
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.pretrained import shipped_robots
 
     result: dict[str, object] = {}
@@ -241,9 +242,11 @@ def shared_finger(bodies: int = 5, commands: int = 12) -> dict[str, object]:
     fingers alone and replayed on FEM.
     """
     from softgym_envs.backends.fem import FEMBackend
-    from softgym_envs.control import CoupledFingers, InverseQP, SurrogateFingers
+    from softgym_envs.control.finger_models import SurrogateFingers
+    from softgym_envs.control.fingers import CoupledFingers
+    from softgym_envs.control.inverse_qp import InverseQP
     from softgym_envs.errors import ConvergenceError
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.pretrained import pretrained_model
 
     gripper, model = make_robot("three_finger_gripper"), pretrained_model(make_robot("contact_finger"))

@@ -32,8 +32,6 @@ from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, unknown_name
 from softgym_envs.storage import write_json
 
-__all__ = ["BENCHMARKS", "run"]
-
 BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "fem_step": speed.fem_step,
     "fem_profile": speed.fem_profile,

@@ -30,8 +30,6 @@ from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.sensorized_finger import SensorizedFinger
 from softgym_envs.storage import atomic_write, write_json
 
-__all__ = ["DESIGNS", "SourceFinger", "compare", "published", "statistics_of"]
-
 MM = 1e-3
 DESIGNS: dict[str, dict[str, float]] = {
     "baseline": {},

@@ -112,7 +112,7 @@ class _Shares:
 def fem_profile() -> dict[str, object]:
     """How the time of a FEM step is spent (milliseconds per step, default finger, increments up to 1 mm)."""
     from softgym_envs.mechanics.solvers.statics import Statics
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
 
     robot = make_robot("finger")
     statics = Statics(robot.build())
@@ -195,7 +195,7 @@ def fem_speed() -> dict[str, object]:
     """
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.envs.registration import ENVIRONMENTS
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
 
     result: dict[str, object] = {}
     for identifier, row in ENVIRONMENTS.items():
@@ -286,7 +286,7 @@ def inference() -> dict[str, object]:
     """Microseconds per call of the shipped networks: state, condensed model, and the torch model for comparison."""
     import torch
 
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.potential.torch import TorchModel
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
 

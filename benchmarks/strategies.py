@@ -27,8 +27,6 @@ from softgym_envs.config import load_config, provenance
 from softgym_envs.errors import DataError
 from softgym_envs.storage import write_json
 
-__all__ = ["strategies"]
-
 KEPT = Path(__file__).parent / "data" / "strategies.json"
 QUESTION = Path(__file__).parent.parent / "configs" / "codesign" / "finger_reach.yaml"
 VARIABLES = ("length", "height", "joint_height")

@@ -17,7 +17,7 @@ from benchmarks.bodies import clamped_beam, halved, linear_response, solid, sphe
 from benchmarks.rows import MeshRow as Row
 from benchmarks.rows import as_results, with_orders
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints import Chamber
+from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.solids import SOLIDS
@@ -367,7 +367,7 @@ def finger(halvings: int = 1, ratios: Sequence[float] = (0.3, 0.47, 0.499)) -> l
     On the robot's own mesh and on the same mesh with halved elements: its faceted shape stays as it is. Reference:
     quadratic elements on the finest one.
     """
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.robots.soft_finger import in_flange
 
     robot = make_robot("finger", cables=1)

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from codesign.objectives import Objective as Objective
     from codesign.objectives import Outcome as Outcome
     from codesign.report.page import write_report as write_report
-    from codesign.report.results import StudyResults as StudyResults
-    from codesign.snapshot import StudySnapshot as StudySnapshot
     from codesign.snapshot import load_study as load_study
     from codesign.study import run_study as run_study
     from codesign.tools.calibration import calibrate as calibrate
@@ -23,8 +21,6 @@ if TYPE_CHECKING:
     from codesign.tools.config import SensitivityConfig as SensitivityConfig
     from codesign.tools.gradient import optimise as optimise
     from codesign.tools.measurements import measure as measure
-    from codesign.tools.measurements import read_measurements as read_measurements
-    from codesign.tools.metrics import Metric as Metric
     from codesign.tools.metrics import design_metric as design_metric
     from codesign.tools.search import search as search
     from codesign.tools.sensitivity import analyse_sensitivity as analyse_sensitivity
@@ -35,14 +31,13 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "config": ["StudyConfig"],
         "objectives": ["Objective", "Outcome"],
         "report.page": ["write_report"],
-        "report.results": ["StudyResults"],
-        "snapshot": ["StudySnapshot", "load_study"],
+        "snapshot": ["load_study"],
         "study": ["run_study"],
         "tools.calibration": ["calibrate"],
         "tools.config": ["CalibrationConfig", "OptimiseConfig", "SensitivityConfig"],
         "tools.gradient": ["optimise"],
-        "tools.measurements": ["measure", "read_measurements"],
-        "tools.metrics": ["Metric", "design_metric"],
+        "tools.measurements": ["measure"],
+        "tools.metrics": ["design_metric"],
         "tools.search": ["search"],
         "tools.sensitivity": ["analyse_sensitivity"],
     },

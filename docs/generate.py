@@ -20,7 +20,7 @@ from site_environments import environment_sections, environment_top
 from site_robots import model_facts, robot_of, robot_sections
 from site_writing import DOCS, HERE, code, compose, describes, environment_pages, first_sentence, picture, summary
 
-from softgym_envs.envs import ENVIRONMENTS
+from softgym_envs import ENVIRONMENTS
 from softgym_envs.robots import ROBOTS
 
 

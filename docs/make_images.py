@@ -23,7 +23,8 @@ from PIL import Image
 from site_writing import DOCS, environment_pages
 
 from agents.evaluation import make_agent
-from softgym_envs.robots import ROBOTS, make_robot
+from softgym_envs import make_robot
+from softgym_envs.robots import ROBOTS
 from softgym_envs.viewer.image import ImageRenderer, render_bodies
 
 # Share of the range of each actuator, for the actuated half of a robot's picture.

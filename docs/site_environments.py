@@ -12,8 +12,9 @@ from site_robots import EFFORT, MOVES, design_table, groups_of, robot_of
 from site_writing import code, options_of, page_name, picture, quantity, span, table
 
 import softgym_envs  # noqa: F401 - registers the environments
-from softgym_envs.backends import BACKENDS
-from softgym_envs.envs import ENVIRONMENTS, SoftRobotEnv, Task
+from softgym_envs import ENVIRONMENTS
+from softgym_envs.backends.registry import BACKENDS
+from softgym_envs.envs import SoftRobotEnv, Task
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.registry import TASKS
 from softgym_envs.robots import Robot

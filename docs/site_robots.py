@@ -11,11 +11,12 @@ from typing import Any
 
 from site_writing import code, environment_pages, first_sentence, number, options_of, quantity, span, summary, table
 
+from softgym_envs import make_robot
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock
-from softgym_envs.robots import ROBOTS, Actuator, Robot, make_robot
+from softgym_envs.robots import ROBOTS, Actuator, Robot
 from softgym_envs.surrogate.pretrained import pretrained_folder
 
 EFFORT = {"m": "N", "m3": "Pa", "rad": "N m"}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import softgym_envs  # noqa: F401 - registers the environments
-from softgym_envs.envs import ENVIRONMENTS
+from softgym_envs import ENVIRONMENTS
 from softgym_envs.envs.tasks.registry import TASKS
 
 DOCS = Path(__file__).resolve().parent

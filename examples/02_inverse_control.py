@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
 from softgym_envs.control import InverseQP
-from softgym_envs.robots import make_robot
 
 robot = make_robot("finger")
 fem = make_backend("fem", robot, design={"joint_height": 0.007})

@@ -9,20 +9,14 @@ from softgym_envs._lazy import lazy_exports
 from softgym_envs.envs.registration import register_environments
 
 if TYPE_CHECKING:
-    from softgym_envs.designs import Design as Design
     from softgym_envs.designs import DesignSpace as DesignSpace
     from softgym_envs.designs import DesignVariable as DesignVariable
     from softgym_envs.envs.registration import ENVIRONMENTS as ENVIRONMENTS
     from softgym_envs.envs.registration import register_environment as register_environment
     from softgym_envs.envs.tasks.registry import register_task as register_task
-    from softgym_envs.errors import ConfigError as ConfigError
     from softgym_envs.errors import ConvergenceError as ConvergenceError
-    from softgym_envs.errors import DataError as DataError
-    from softgym_envs.errors import DesignError as DesignError
     from softgym_envs.errors import InfeasibleDesign as InfeasibleDesign
-    from softgym_envs.errors import MeshingError as MeshingError
     from softgym_envs.errors import SoftGymError as SoftGymError
-    from softgym_envs.errors import WeightsError as WeightsError
     from softgym_envs.robots.registry import make_robot as make_robot
     from softgym_envs.robots.registry import register_robot as register_robot
     from softgym_envs.version import __version__ as __version__
@@ -30,19 +24,10 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
-        "designs": ["Design", "DesignSpace", "DesignVariable"],
+        "designs": ["DesignSpace", "DesignVariable"],
         "envs.registration": ["ENVIRONMENTS", "register_environment"],
         "envs.tasks.registry": ["register_task"],
-        "errors": [
-            "ConfigError",
-            "ConvergenceError",
-            "DataError",
-            "DesignError",
-            "InfeasibleDesign",
-            "MeshingError",
-            "SoftGymError",
-            "WeightsError",
-        ],
+        "errors": ["ConvergenceError", "InfeasibleDesign", "SoftGymError"],
         "robots.registry": ["make_robot", "register_robot"],
         "version": ["__version__"],
     },

@@ -12,11 +12,11 @@ import pytest
 from _pytest.faulthandler import fault_handler_stderr_fd_key
 from hypothesis import settings
 
+from softgym_envs import make_robot
 from softgym_envs.cli import main
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
 from softgym_envs.testing import box_mesh, train_small_surrogate
 from tests.hang_guard import end_if_hung
 

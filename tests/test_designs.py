@@ -11,9 +11,10 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from softgym_envs import make_robot
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import DesignError, SoftGymError
-from softgym_envs.robots import ROBOTS, make_robot
+from softgym_envs.robots import ROBOTS
 
 SPACE = DesignSpace(
     DesignVariable("length", 0.038, 0.042, 0.040, "m", "length of a segment"),

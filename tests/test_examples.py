@@ -31,5 +31,5 @@ def test_example(path, tmp_path):
 
 
 def test_from_an_stl_to_the_compliance_takes_15_lines():
-    lines = (ROOT / "examples" / "05_stl_to_compliance.py").read_text().splitlines()
+    lines = (ROOT / "examples" / "04_stl_to_compliance.py").read_text().splitlines()
     assert sum(bool(line.strip()) for line in lines) <= 15

@@ -6,8 +6,10 @@ import sys
 
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.registry import Registry
-from softgym_envs.robots import ROBOTS, SoftFinger, make_robot
+from softgym_envs.robots import ROBOTS
+from softgym_envs.robots.soft_finger import SoftFinger
 
 
 class Shape:

@@ -15,10 +15,10 @@ import softgym_envs  # noqa: F401 - registers the environments
 from agents.config import TrainConfig
 from codesign.config import StudyConfig
 from codesign.tools.config import CalibrationConfig, OptimiseConfig
+from softgym_envs import make_robot
 from softgym_envs.config import load_config
 from softgym_envs.errors import SoftGymError
 from softgym_envs.mechanics import MechanicalModel
-from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.training import FitConfig
 from softgym_envs.testing import box_mesh
 

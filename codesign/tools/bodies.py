@@ -11,11 +11,11 @@ from torch import Tensor
 
 from codesign.tools.metrics import Course, Metric, find_metrics
 from codesign.variables import split_values
-from softgym_envs.backends import make_backend
 from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.backends.registry import make_backend
 from softgym_envs.errors import ConfigError
-from softgym_envs.mechanics.constraints import Cavity
+from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import TorchModel

@@ -14,8 +14,8 @@ from codesign.tools.metrics import METRICS, Metric, find_metric
 from codesign.tools.nuisance import ContactConfig, OffsetConfig, check_nuisances
 from codesign.variables import OptionRange, change_options
 from softgym_envs.config import Config
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.base import Robot
+from softgym_envs.robots.registry import make_robot
 
 
 def _metric_name(value: Any) -> Any:

@@ -17,10 +17,10 @@ AGENT_HELP = "qp, qp_static, qp_model, qp_pi, random, or a policy (a file or the
 @click.command("list")
 def list_() -> None:
     """List environments, robots, backends and tasks."""
-    from softgym_envs.backends import BACKENDS
+    from softgym_envs.backends.registry import BACKENDS
     from softgym_envs.envs.registration import ENVIRONMENTS
     from softgym_envs.envs.tasks.registry import TASKS
-    from softgym_envs.robots import ROBOTS
+    from softgym_envs.robots.registry import ROBOTS
 
     click.echo("environments:")
     for identifier, row in ENVIRONMENTS.items():

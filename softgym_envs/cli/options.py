@@ -75,7 +75,7 @@ def robot_of(name: str, pairs: tuple[str, ...]) -> Robot:
         ValueError: for an unknown robot or a wrong option.
     """
     from softgym_envs.config import read_value
-    from softgym_envs.robots import make_robot
+    from softgym_envs.robots.registry import make_robot
 
     return make_robot(name, **{key: read_value(text) for key, text in _split("option", pairs)})
 

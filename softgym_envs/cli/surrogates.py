@@ -67,7 +67,9 @@ def deploy(
 
     FILES end with .h (a C header of one body) or .onnx (a graph that takes the design as an input).
     """
-    from softgym_envs.surrogate.export import FORMATS, export_c, export_onnx
+    from softgym_envs.surrogate.export.c import export_c
+    from softgym_envs.surrogate.export.common import FORMATS
+    from softgym_envs.surrogate.export.onnx import export_onnx
     from softgym_envs.surrogate.pretrained import pretrained_model
 
     for file in files:

@@ -6,13 +6,8 @@ from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from softgym_envs.control.coupling import HeldObject as HeldObject
-    from softgym_envs.control.coupling import couple as couple
-    from softgym_envs.control.coupling import rotate as rotate
-    from softgym_envs.control.coupling import tie_points as tie_points
     from softgym_envs.control.embedded import EmbeddedLoop as EmbeddedLoop
     from softgym_envs.control.embedded import PICorrection as PICorrection
-    from softgym_envs.control.embedded import follow as follow
-    from softgym_envs.control.finger_models import FEMFingers as FEMFingers
     from softgym_envs.control.finger_models import SurrogateFingers as SurrogateFingers
     from softgym_envs.control.fingers import CoupledFingers as CoupledFingers
     from softgym_envs.control.inverse_qp import InverseQP as InverseQP
@@ -21,9 +16,9 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
-        "coupling": ["HeldObject", "couple", "rotate", "tie_points"],
-        "embedded": ["EmbeddedLoop", "PICorrection", "follow"],
-        "finger_models": ["FEMFingers", "SurrogateFingers"],
+        "coupling": ["HeldObject"],
+        "embedded": ["EmbeddedLoop", "PICorrection"],
+        "finger_models": ["SurrogateFingers"],
         "fingers": ["CoupledFingers"],
         "inverse_qp": ["InverseQP"],
         "manipulation": ["Manipulation"],

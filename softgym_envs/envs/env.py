@@ -10,8 +10,8 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import EzPickle
 
-from softgym_envs.backends import make_backend
 from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.registry import make_backend
 from softgym_envs.designs import Design
 from softgym_envs.envs.options import EnvironmentOptions, check_reset_options, set_up
 from softgym_envs.errors import ConvergenceError

@@ -8,18 +8,14 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.builder import ModelBuilder as ModelBuilder
     from softgym_envs.mechanics.condensation import CondensedModel as CondensedModel
     from softgym_envs.mechanics.constraints.bond import Bond as Bond
-    from softgym_envs.mechanics.constraints.cable import Cable as Cable
-    from softgym_envs.mechanics.constraints.cavity import Cavity as Cavity
     from softgym_envs.mechanics.constraints.chamber import Chamber as Chamber
     from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints as EmbeddedPoints
     from softgym_envs.mechanics.constraints.point import Point as Point
     from softgym_envs.mechanics.constraints.servo import Servo as Servo
     from softgym_envs.mechanics.elements.beams import Section as Section
     from softgym_envs.mechanics.io import read_mesh as read_mesh
-    from softgym_envs.mechanics.materials import Material as Material
     from softgym_envs.mechanics.model import MechanicalModel as MechanicalModel
     from softgym_envs.mechanics.solvers.dynamics import Dynamics as Dynamics
-    from softgym_envs.mechanics.solvers.statics import Equilibrium as Equilibrium
     from softgym_envs.mechanics.solvers.statics import Statics as Statics
 
 __getattr__, __dir__, __all__ = lazy_exports(
@@ -28,17 +24,14 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "builder": ["ModelBuilder"],
         "condensation": ["CondensedModel"],
         "constraints.bond": ["Bond"],
-        "constraints.cable": ["Cable"],
-        "constraints.cavity": ["Cavity"],
         "constraints.chamber": ["Chamber"],
         "constraints.embedding": ["EmbeddedPoints"],
         "constraints.point": ["Point"],
         "constraints.servo": ["Servo"],
         "elements.beams": ["Section"],
         "io": ["read_mesh"],
-        "materials": ["Material"],
         "model": ["MechanicalModel"],
         "solvers.dynamics": ["Dynamics"],
-        "solvers.statics": ["Equilibrium", "Statics"],
+        "solvers.statics": ["Statics"],
     },
 )

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from scipy.sparse import coo_matrix, csr_matrix
 
-from softgym_envs.mechanics.constraints import Constraint
+from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.frames import KinematicMap
 from softgym_envs.mechanics.kinematics import Kinematics

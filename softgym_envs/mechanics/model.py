@@ -9,7 +9,11 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.mechanics.assembly import Assembly
-from softgym_envs.mechanics.constraints import Cable, Cavity, Constraint, EmbeddedPoints, Point
+from softgym_envs.mechanics.constraints.cable import Cable
+from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.mechanics.constraints.constraint import Constraint
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, quadratic_triangles
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, check_nodes

@@ -14,7 +14,7 @@ import numpy as np
 
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.errors import SoftGymError
-from softgym_envs.mechanics.constraints import EmbeddedPoints
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.geometry.meshing import BodyMesh

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.mechanics.constraints import Point, Pose
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator
 from softgym_envs.robots.grippers import STRAIGHT, FingerRobot

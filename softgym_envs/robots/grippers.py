@@ -15,7 +15,9 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints import Bond, EmbeddedPoints, Point
+from softgym_envs.mechanics.constraints.bond import Bond
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.base import Actuator, Robot

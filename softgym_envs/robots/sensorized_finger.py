@@ -16,7 +16,7 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import InfeasibleDesign
-from softgym_envs.mechanics.constraints import Cavity
+from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Actuator, MeshedRobot

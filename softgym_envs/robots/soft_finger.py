@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.mechanics.constraints import Point
+from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
 from softgym_envs.robots.geometry.finger_shape import check_finger, draw_finger, finger_features, in_flange

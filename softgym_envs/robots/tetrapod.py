@@ -13,7 +13,9 @@ from scipy.optimize import brentq
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints import EmbeddedPoints, Point, Servo
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.rigid import sphere_inertia
 from softgym_envs.mechanics.frames import frame_rows

@@ -5,26 +5,22 @@ from typing import TYPE_CHECKING
 from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from softgym_envs.surrogate.data.dataset import load_dataset as load_dataset
-    from softgym_envs.surrogate.export import export_c as export_c
-    from softgym_envs.surrogate.export import export_onnx as export_onnx
+    from softgym_envs.surrogate.export.c import export_c as export_c
+    from softgym_envs.surrogate.export.onnx import export_onnx as export_onnx
     from softgym_envs.surrogate.model import SurrogateModel as SurrogateModel
     from softgym_envs.surrogate.potential.torch import TorchModel as TorchModel
     from softgym_envs.surrogate.pretrained import pretrained_model as pretrained_model
     from softgym_envs.surrogate.training import FitConfig as FitConfig
     from softgym_envs.surrogate.training import fit as fit
-    from softgym_envs.surrogate.training import generate_datasets as generate_datasets
-    from softgym_envs.surrogate.weight_files import load_model as load_model
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
-        "data.dataset": ["load_dataset"],
-        "export": ["export_c", "export_onnx"],
+        "export.c": ["export_c"],
+        "export.onnx": ["export_onnx"],
         "model": ["SurrogateModel"],
         "potential.torch": ["TorchModel"],
         "pretrained": ["pretrained_model"],
-        "training": ["FitConfig", "fit", "generate_datasets"],
-        "weight_files": ["load_model"],
+        "training": ["FitConfig", "fit"],
     },
 )

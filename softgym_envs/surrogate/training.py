@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from softgym_envs.config import Config, save_resolved
-from softgym_envs.robots import make_robot
+from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.data.dataset import generate_dataset
 from softgym_envs.surrogate.data.sampling import SamplingPlan

@@ -9,8 +9,8 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
-from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.potential.model import Model
 
 

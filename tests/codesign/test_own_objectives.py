@@ -8,7 +8,9 @@ import pytest
 from agents.evaluation import Evaluation
 from codesign import Objective, StudyConfig, load_study, run_study, write_report
 from codesign.objectives import OBJECTIVES, Outcome, find_objective, objective_name
-from softgym_envs.robots import SoftFinger, Tetrapod, make_robot
+from softgym_envs import make_robot
+from softgym_envs.robots.soft_finger import SoftFinger
+from softgym_envs.robots.tetrapod import Tetrapod
 
 ROBOT = make_robot("finger")
 

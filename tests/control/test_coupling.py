@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.control import HeldObject, couple, rotate, tie_points
+from softgym_envs import make_robot
+from softgym_envs.control import HeldObject
+from softgym_envs.control.coupling import couple, rotate, tie_points
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
 from softgym_envs.testing import random_condensed_model
 
 TURN = np.diag([-1.0, -1.0, 1.0])  # half a turn about z

@@ -7,11 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.control import EmbeddedLoop, InverseQP, PICorrection, follow
+from softgym_envs.control import EmbeddedLoop, InverseQP, PICorrection
+from softgym_envs.control.embedded import follow
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
-from softgym_envs.robots import make_robot
 
 VOLUME, PRESSURE = 3e-8, 1e5  # typical of the chambers of a small trunk [m3, Pa]
 

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from softgym_envs import make_robot
 from softgym_envs.backends.surrogate import SurrogateBackend
-from softgym_envs.control import CoupledFingers, FEMFingers, InverseQP, SurrogateFingers
+from softgym_envs.control import CoupledFingers, InverseQP, SurrogateFingers
+from softgym_envs.control.finger_models import FEMFingers
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
-from softgym_envs.surrogate.export import export_c
+from softgym_envs.surrogate.export.c import export_c
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_model
 

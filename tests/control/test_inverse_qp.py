@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.control import InverseQP
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
-from softgym_envs.robots import make_robot
 
 
 class LinearRobot:

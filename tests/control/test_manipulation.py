@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.control import HeldObject, InverseQP, Manipulation, rotate
+from softgym_envs import make_robot
+from softgym_envs.control import HeldObject, InverseQP, Manipulation
+from softgym_envs.control.coupling import rotate
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
 
 TURN = np.diag([-1.0, -1.0, 1.0])
 PLACES = ((np.eye(3), np.zeros(3)), (TURN, np.array([0.03, 0.07, 0.0])), (TURN, np.array([-0.03, 0.07, 0.0])))

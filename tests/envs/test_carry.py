@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import softgym_envs  # noqa: F401  (registers the environments)
+from softgym_envs import make_robot
 from softgym_envs.envs.tasks.registry import make_task
-from softgym_envs.robots import make_robot
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import softgym_envs
-from softgym_envs.backends import BACKENDS
+from softgym_envs import make_robot
+from softgym_envs.backends.registry import BACKENDS
 from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.errors import ConvergenceError, DesignError
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.base import Robot
 
 # Weights ship for the robots whose environments run on the surrogate unless told otherwise.

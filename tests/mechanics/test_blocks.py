@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints import Point
+from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements import averaged, beams, quadratic, tetrahedra
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.beams import Beam, Section

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints import Bond, EmbeddedPoints, Point
+from softgym_envs.mechanics.constraints.bond import Bond
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.model import MechanicalModel

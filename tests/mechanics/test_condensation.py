@@ -14,7 +14,12 @@ import numpy as np
 import pytest
 
 from softgym_envs.mechanics.condensation import CondensedModel, effort_unit
-from softgym_envs.mechanics.constraints import Bond, Cable, Cavity, Chamber, Point, Servo
+from softgym_envs.mechanics.constraints.bond import Bond
+from softgym_envs.mechanics.constraints.cable import Cable
+from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.mechanics.constraints.chamber import Chamber
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 

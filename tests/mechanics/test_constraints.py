@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import inspect
+from importlib import import_module
+from pkgutil import iter_modules
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.mechanics import constraints
-from softgym_envs.mechanics.constraints import (
-    Bond,
-    Cable,
-    Cavity,
-    Chamber,
-    Constraint,
-    EmbeddedPoints,
-    Point,
-    Pose,
-    Servo,
-)
-from softgym_envs.mechanics.constraints.cavity import enclosed_volume
+from softgym_envs.mechanics.constraints.bond import Bond
+from softgym_envs.mechanics.constraints.cable import Cable
+from softgym_envs.mechanics.constraints.cavity import Cavity, enclosed_volume
+from softgym_envs.mechanics.constraints.chamber import Chamber
+from softgym_envs.mechanics.constraints.constraint import Constraint
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.constraints.pose import Pose
+from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.frames import frame_rows
 
+MODULES = [import_module(f"{constraints.__name__}.{info.name}") for info in iter_modules(constraints.__path__)]
 CLASSES = {
     name: cls
-    for name, cls in vars(constraints).items()
+    for module in MODULES
+    for name, cls in vars(module).items()
     if inspect.isclass(cls) and issubclass(cls, Constraint) and not inspect.isabstract(cls)
 }
 

@@ -8,7 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints import Bond, Cavity, Chamber, EmbeddedPoints, Point
+from softgym_envs.mechanics.constraints.bond import Bond
+from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.mechanics.constraints.chamber import Chamber
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.quadratic import quadratic_triangles
 from softgym_envs.mechanics.frames import rotation_of

@@ -7,7 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints import Bond, Cable, Cavity, Chamber, EmbeddedPoints, Point, Servo
+from softgym_envs.mechanics.constraints.bond import Bond
+from softgym_envs.mechanics.constraints.cable import Cable
+from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.mechanics.constraints.chamber import Chamber
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.frames import Frames, frame_rows, rotation_of, rotation_vector_matrix
 from softgym_envs.mechanics.materials import MATERIALS

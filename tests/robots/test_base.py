@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.control import InverseQP
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots import ROBOTS, Actuator, Robot, make_robot
+from softgym_envs.robots import ROBOTS, Actuator, Robot
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 1.0]])
 

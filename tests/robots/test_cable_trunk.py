@@ -8,10 +8,10 @@ import json
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
 from softgym_envs.control import InverseQP
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.cable_trunk import octagonal_bar
 from softgym_envs.robots.geometry.morphing import mean_ratio
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.mechanics.constraints import Pose
+from softgym_envs import make_robot
+from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.frames import frame_rows, rotation_of
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.soft_finger import SoftFinger
 
 MESH_SIZE = 12e-3

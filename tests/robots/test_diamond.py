@@ -7,10 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
 from softgym_envs.control import InverseQP
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import mean_ratio
 from softgym_envs.robots.geometry.symmetry import mirrored

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.geometry.export import export_body, write_drawing
 from softgym_envs.robots.geometry.finger_shape import draw_finger
 from softgym_envs.robots.geometry.moulds import MOULD_PARTS, WALL, WIRE_RADIUS, export_moulds, mould_parts

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import ROBOTS, make_robot
+from softgym_envs.robots import ROBOTS
 from softgym_envs.robots.geometry import meshing
 from softgym_envs.robots.geometry.finger_shape import draw_finger
 from softgym_envs.robots.geometry.morphing import mean_ratio

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.geometry import meshing
 from softgym_envs.robots.geometry.finger_shape import check_finger
 from softgym_envs.robots.geometry.meshing import BodyMesh

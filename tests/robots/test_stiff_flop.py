@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from benchmarks.robots import PUBLISHED_COMPLIANCE
+from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.control import InverseQP
 from softgym_envs.errors import DesignError
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.stiff_flop import StiffFlop
 
 UL = 1e-9  # a microlitre, mm3 [m3]

@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks import robot_dynamics as cases
+from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError, DesignError
 from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.tetrapod import CENTRE_MASS
 
 

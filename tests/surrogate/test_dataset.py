@@ -15,8 +15,8 @@ from filelock import FileLock
 from hypothesis import given
 from hypothesis import strategies as st
 
+from softgym_envs import make_robot
 from softgym_envs.errors import DataError, DesignError, InfeasibleDesign
-from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.data import dataset
 from softgym_envs.surrogate.data.dataset import COLUMNS, generate_dataset, load_dataset
 from softgym_envs.surrogate.data.sampling import (

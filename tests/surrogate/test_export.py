@@ -12,9 +12,10 @@ import sys
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.errors import DesignError
-from softgym_envs.robots import make_robot
-from softgym_envs.surrogate.export import export_c, export_onnx
+from softgym_envs.surrogate.export.c import export_c
+from softgym_envs.surrogate.export.onnx import export_onnx
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from softgym_envs.robots import make_robot
+from softgym_envs import make_robot
 from softgym_envs.surrogate.potential.torch import TorchModel
 from softgym_envs.testing import random_states, untrained_potential
 from tests.surrogate.test_model import untrained_residual

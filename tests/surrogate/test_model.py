@@ -11,10 +11,10 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
+from softgym_envs import make_robot
 from softgym_envs.config import load_config
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.mechanics.solvers import complementarity
-from softgym_envs.robots import make_robot
 from softgym_envs.surrogate import online
 from softgym_envs.surrogate.baselines import residual
 from softgym_envs.surrogate.model import Context, SurrogateModel

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.errors import DataError, WeightsError
-from softgym_envs.robots import make_robot
 from softgym_envs.surrogate.data.dataset import COLUMNS
 from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_tuned_from, rehearsal_states
 from softgym_envs.surrogate.potential.model import Model

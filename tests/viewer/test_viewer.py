@@ -7,9 +7,9 @@ import gymnasium
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.robots import make_robot
 from softgym_envs.viewer.image import ImageRenderer, render_bodies, render_body
 from softgym_envs.viewer.recording import record_comparison, record_rollout
 from softgym_envs.viewer.scene import COLORS, tension_color

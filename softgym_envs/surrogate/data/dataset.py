@@ -11,8 +11,8 @@ import numpy as np
 
 from softgym_envs.errors import DataError
 from softgym_envs.executors import parallel_map
-from softgym_envs.robots import make_robot
 from softgym_envs.robots.base import Robot
+from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write, read_npz, write_json
 from softgym_envs.surrogate.data.sampling import SamplingPlan, sample_group
 from softgym_envs.version import __version__

@@ -13,9 +13,9 @@ from codesign.tools.config import CalibrationConfig
 from codesign.tools.measurements import Measurements, measure, read_measurements, write_measurements
 from codesign.tools.misfit import LearnedMisfit, Misfit
 from codesign.tools.parameters import Parameters
+from softgym_envs import make_robot
 from softgym_envs.config import check_config
 from softgym_envs.errors import ConfigError, DataError
-from softgym_envs.robots import make_robot
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ import torch
 from codesign.tools.bodies import Evaluator, LearnedBodies, full_command
 from codesign.tools.box import Box
 from codesign.tools.metrics import METRICS
+from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConfigError, DesignError
-from softgym_envs.robots import make_robot
 
 STATES = tuple(name for name, metric in METRICS.items() if metric.needs == "states")
 PULL = 0.01

@@ -17,10 +17,10 @@ from codesign.tools.measurements import measure, write_measurements
 from codesign.tools.misfit import LearnedMisfit
 from codesign.tools.nuisance import ContactConfig, OffsetConfig
 from codesign.tools.parameters import Parameters
+from softgym_envs import make_robot
 from softgym_envs.cli.codesign import calibrate as calibrate_command
 from softgym_envs.config import check_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
-from softgym_envs.robots import make_robot
 
 MODULUS, ZERO = 2.2e6, 0.8
 COMMANDS = [[0.002], [0.004], [0.006], [0.008], [0.010]]

@@ -11,9 +11,9 @@ from codesign.tools.config import BodiesConfig, ObjectiveConfig, OptimiseConfig,
 from codesign.tools.metrics import METRICS, Metric, design_metric, find_metric
 from codesign.tools.search import search
 from codesign.tools.sensitivity import analyse_sensitivity
+from softgym_envs import make_robot
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError
-from softgym_envs.robots import make_robot
 
 BODIES = {
     "robot": "finger",

@@ -12,9 +12,9 @@ from codesign.tools.box import Box
 from codesign.tools.config import CalibrationConfig, OptimiseConfig, SensitivityConfig
 from codesign.tools.search import search
 from codesign.tools.sensitivity import analyse_sensitivity, morris, one_at_a_time, sample, sobol
+from softgym_envs import make_robot
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
-from softgym_envs.robots import make_robot
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "design"
 BODIES = {

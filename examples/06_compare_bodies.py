@@ -1,12 +1,12 @@
-"""Draw two bodies under the same command, side by side: ``python examples/04_compare_bodies.py [file.png]``."""
+"""Draw two bodies under the same command, side by side: ``python examples/06_compare_bodies.py [file.png]``."""
 
 import sys
 
 import numpy as np
 from PIL import Image
 
-from softgym_envs.robots import make_robot
-from softgym_envs.viewer.image import render_bodies
+from softgym_envs import make_robot
+from softgym_envs.viewer import render_bodies
 
 robot = make_robot("finger")
 designs = [{}, {"length": 0.03807, "height": 0.02161, "joint_height": 0.00745}]
