@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from codesign.tools.config import SensitivityConfig as SensitivityConfig
     from codesign.tools.gradient import optimise as optimise
     from codesign.tools.measurements import measure as measure
+    from codesign.tools.metrics import Course as Course
+    from codesign.tools.metrics import Metric as Metric
     from codesign.tools.metrics import design_metric as design_metric
     from codesign.tools.search import search as search
     from codesign.tools.sensitivity import analyse_sensitivity as analyse_sensitivity
@@ -37,7 +39,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "tools.config": ["CalibrationConfig", "OptimiseConfig", "SensitivityConfig"],
         "tools.gradient": ["optimise"],
         "tools.measurements": ["measure"],
-        "tools.metrics": ["design_metric"],
+        "tools.metrics": ["Course", "Metric", "design_metric"],
         "tools.search": ["search"],
         "tools.sensitivity": ["analyse_sensitivity"],
     },

@@ -13,32 +13,37 @@ from site_writing import code, first_sentence, table
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 PACKAGES = {
-    "softgym_envs": "Registries, design spaces, errors",
+    "softgym_envs": "Registries and design spaces",
+    "softgym_envs.errors": "Errors",
     "softgym_envs.envs": "Environments",
     "softgym_envs.robots": "Robots",
     "softgym_envs.mechanics": "Mechanics",
     "softgym_envs.surrogate": "Surrogates",
     "softgym_envs.backends": "Backends",
     "softgym_envs.control": "Control",
+    "softgym_envs.viewer": "Pictures",
     "agents": "Agents",
     "codesign": "Co-design",
 }
-"""Packages that export public names, and the titles of their pages."""
+"""Packages that export public names and the module of the exceptions, with the titles of their pages."""
 
 
 def public_names(package: str) -> list[str]:
-    """Names that a package exports, dunder names left out."""
-    return [name for name in getattr(import_module(package), "__all__", []) if not name.startswith("__")]
+    """Names that a package exports, dunder names left out; of the module of the exceptions, these."""
+    module = import_module(package)
+    if not hasattr(module, "__all__"):
+        return [name for name, value in vars(module).items() if inspect.isclass(value) and value.__module__ == package]
+    return [name for name in module.__all__ if not name.startswith("__")]
 
 
 def defining_module(package: str, name: str) -> str:
     """Module in which a public name is defined, read from the imports of the package."""
     path = REPOSITORY / package.replace(".", "/") / "__init__.py"
+    if not path.is_file():
+        return package
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module and name in {a.asname or a.name for a in node.names}:
-            found = node.module
-            inner = REPOSITORY / found.replace(".", "/") / "__init__.py"
-            return defining_module(found, name) if inner.is_file() else found
+            return defining_module(node.module, name)
     return package
 
 
@@ -57,7 +62,10 @@ def api_page(package: str) -> str:
     """Reference of a package, drawn from the docstrings."""
     parts = [f"# {PACKAGES[package]}\n\nImport these names from `{package}`."]
     for name in public_names(package):
-        parts.append(f"## {name} {{ #{name} }}\n\n::: {defining_module(package, name)}.{name}")
+        home = defining_module(package, name)
+        elsewhere = home in PACKAGES and home != package
+        text = f"See [`{home}.{name}`]({home}.md#{name})." if elsewhere else f"::: {home}.{name}"
+        parts.append(f"## {name} {{ #{name} }}\n\n{text}")
     return "\n\n".join(parts) + "\n"
 
 
@@ -65,8 +73,9 @@ def api_index() -> str:
     """All public names with links."""
     parts = [
         "# API reference",
-        "These names are public: they keep their meaning within a minor version. All other modules are implementation. "
-        "Units are SI.",
+        "Public is what these packages export, and the exceptions in `softgym_envs.errors`. These names keep their "
+        "meaning within a minor version; every other module and name may change without notice. Import each name from "
+        "the package under which it stands. Units are SI.",
     ]
     for package, title in PACKAGES.items():
         rows = [[f"[`{name}`]({package}.md#{name})", described(package, name)] for name in public_names(package)]

@@ -1,6 +1,10 @@
 """softgym-envs: Gymnasium environments in which a soft robot's body and its controller are optimised together.
 
 Importing this package registers every environment ID and imports nothing heavy.
+
+Public is what the packages `softgym_envs`, `softgym_envs.envs`, `.robots`, `.mechanics`, `.surrogate`, `.backends`,
+`.control` and `.viewer`, `agents` and `codesign` export, and the exceptions in `softgym_envs.errors`. Every other
+module and name may change without notice.
 """
 
 from typing import TYPE_CHECKING
