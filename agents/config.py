@@ -28,13 +28,28 @@ class EnvironmentConfig(Config):
     A robot and a task are registered names or paths such as ``my_module:MyRobot``; in Python they may be classes, which
     are stored as their paths. With ``residual_scale`` the agent corrects the inverse QP: the executed action is
     ``clip(QP action + residual_scale * agent action, -1, 1)``.
+
+    Attributes:
+        id: ID of an environment, in place of robot and task.
+        robot: registered name or ``module:class``, in place of ``id``.
+        task: registered name or ``module:class``, in place of ``id``.
+        max_episode_steps: time limit; default that of the ID or the task.
+        backend: ``"surrogate"``, ``"fem"`` or ``"hybrid"``; default that of the ID, or the surrogate if weights ship.
+        design: body of every episode; missing variables take their baseline.
+        sample_design: draw the body at each reset: True for all variables, or their names.
+        design_in_observation: include the body in the observation: True for all variables, or their names.
+        action_mode: ``"increment"`` or ``"absolute"``.
+        robot_options: options of the robot.
+        task_options: options of the task.
+        backend_options: options of the backend.
+        residual_scale: factor of the agent's action when it is added to that of the QP; 0 for no QP.
     """
 
-    id: str | None = Field(default=None, description="ID of an environment, in place of robot and task")
-    robot: str | None = Field(default=None, description="registered name or module:class, in place of id")
-    task: str | None = Field(default=None, description="registered name or module:class, in place of id")
-    max_episode_steps: int | None = Field(default=None, gt=0, description="default that of the ID or the task")
-    backend: str = Field(default="surrogate", description="default that of the ID, or surrogate if weights ship")
+    id: str | None = None
+    robot: str | None = None
+    task: str | None = None
+    max_episode_steps: int | None = Field(default=None, gt=0)
+    backend: str = "surrogate"
     design: dict[str, float] | None = None
     sample_design: bool | list[str] = False
     design_in_observation: bool | list[str] = False
@@ -42,9 +57,7 @@ class EnvironmentConfig(Config):
     robot_options: dict[str, Any] = {}
     task_options: dict[str, Any] = {}
     backend_options: dict[str, Any] = {}
-    residual_scale: float = Field(
-        default=0.0, ge=0, le=2, description="factor of the agent's action when it is added to the QP's; 0: no QP"
-    )
+    residual_scale: float = Field(default=0.0, ge=0, le=2)
 
     @model_validator(mode="before")
     @classmethod
@@ -200,16 +213,27 @@ class SACConfig(Config):
 
 
 class TrainConfig(Config):
-    """One SAC training run."""
+    """One SAC training run.
+
+    Attributes:
+        environment: what the policy is trained in.
+        sac: hyper-parameters of SAC.
+        steps: environment steps, over all sub-environments.
+        num_envs: number of sub-environments.
+        seed: seed of everything random.
+        initial: initial policy: a file or the name of a shipped one.
+        evaluation_episodes: number of episodes of each evaluation.
+        report_every: environment steps between evaluations.
+    """
 
     environment: EnvironmentConfig
     sac: SACConfig = SACConfig()
-    steps: int = Field(default=40_000, gt=0, description="environment steps, over all sub-environments")
+    steps: int = Field(default=40_000, gt=0)
     num_envs: int = Field(default=16, gt=0)
     seed: int = Field(default=0, ge=0)
-    initial: str | None = Field(default=None, description="initial policy: a file or the name of a shipped one")
+    initial: str | None = None
     evaluation_episodes: int = Field(default=64, gt=0)
-    report_every: int = Field(default=4_000, gt=0, description="environment steps between evaluations")
+    report_every: int = Field(default=4_000, gt=0)
 
     @model_validator(mode="after")
     def _consistent(self) -> TrainConfig:

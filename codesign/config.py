@@ -220,10 +220,10 @@ class StudyConfig(Config):
         environment: robot, task and backend of the trials. Its ``design`` (default: the robot's baseline) is the
             baseline body of the study and gives the design variables that are not optimised.
         variables: names of what is optimised: design variables, and options of robot or task as ``robot.<option>`` and
-            ``task.<option>``; see `codesign.variables`.
+            ``task.<option>``.
         ranges: bounds of those options.
-        objective: what is optimised: a name in `codesign.objectives.OBJECTIVES`, or one of your own as
-            ``module:attribute``; in Python also the function or `Objective` itself.
+        objective: what is optimised: the name of an objective, or one of your own as ``module:attribute``; in
+            Python also the function or `Objective` itself.
         secondary_objectives: further objectives; the study then looks for the Pareto front of all of them.
         constraints: largest allowed values of objectives that are minimised, smallest of those that are maximised [SI];
             a body that violates one cannot win.

@@ -47,7 +47,8 @@ def run_study(
     """Run a study, or continue it: finished work is kept, and nothing runs twice.
 
     Several calls may work on one folder at the same time and, with a database as storage, on many machines. A folder
-    keeps its study; only the keys `codesign.folder.EXTENSIBLE` may change from call to call.
+    keeps its study: from call to call only its name and title, the number of trials, how workers run, and most settings
+    of the finalists may change.
 
     Args:
         config: the study.

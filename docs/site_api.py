@@ -47,6 +47,12 @@ def defining_module(package: str, name: str) -> str:
     return package
 
 
+def link(package: str, name: str) -> tuple[str, str]:
+    """Page and anchor of a public name: of a public module if one defines it, else of the package that exports it."""
+    home = defining_module(package, name)
+    return f"{home if home in PACKAGES else package}.md", f"{home}.{name}"
+
+
 def described(package: str, name: str) -> str:
     """First sentence of what documents a public name."""
     value = getattr(import_module(package), name)
@@ -62,10 +68,13 @@ def api_page(package: str) -> str:
     """Reference of a package, drawn from the docstrings."""
     parts = [f"# {PACKAGES[package]}\n\nImport these names from `{package}`."]
     for name in public_names(package):
-        home = defining_module(package, name)
-        elsewhere = home in PACKAGES and home != package
-        text = f"See [`{home}.{name}`]({home}.md#{name})." if elsewhere else f"::: {home}.{name}"
-        parts.append(f"## {name} {{ #{name} }}\n\n{text}")
+        page, anchor = link(package, name)
+        here = page == f"{package}.md"
+        text = f"::: {anchor}" if here else f"## {name}\n\nSee [`{anchor}`]({page}#{anchor})."
+        value = getattr(import_module(package), name)
+        if not (isinstance(value, type) or inspect.isfunction(value)):  # a registry, whose source says little
+            text += "\n    options:\n      show_attribute_values: false"
+        parts.append(text)
     return "\n\n".join(parts) + "\n"
 
 
@@ -78,7 +87,9 @@ def api_index() -> str:
         "the package under which it stands. Units are SI.",
     ]
     for package, title in PACKAGES.items():
-        rows = [[f"[`{name}`]({package}.md#{name})", described(package, name)] for name in public_names(package)]
+        rows = [
+            [f"[`{name}`]({'#'.join(link(package, name))})", described(package, name)] for name in public_names(package)
+        ]
         if rows:
             parts += [f"## {title}\n\n`from {package} import ...`", table(["name", ""], rows)]
     return "\n\n".join(parts) + "\n"

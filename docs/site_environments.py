@@ -15,6 +15,7 @@ import softgym_envs  # noqa: F401 - registers the environments
 from softgym_envs import ENVIRONMENTS
 from softgym_envs.backends.registry import BACKENDS
 from softgym_envs.envs import SoftRobotEnv, Task
+from softgym_envs.envs.options import EnvironmentOptions
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.registry import TASKS
 from softgym_envs.robots import Robot
@@ -144,7 +145,8 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         fixed = {name: value for name, value in spec.kwargs.items() if name != "defaults"}
         fixed |= {name: getattr(row, name) for name in ("robot_options", "task_options", "backend_options")}
         given = {name: value for name, value in fixed.items() if value not in (None, {})}
-        shown = [line for line in options_of(SoftRobotEnv, given) if "`defaults`" not in line[0]]
+        options = options_of(SoftRobotEnv, given) + options_of(EnvironmentOptions, given)
+        shown = [line for line in options if "`defaults`" not in line[0]]
         parts = [table(["argument", "default", "meaning"], shown)]
         for argument, kind, cls in (
             ("task_options", f"task `{row.task}`", task_class),

@@ -145,14 +145,16 @@ def picture(*names: str, alt: str) -> str:
 
 
 def described_arguments(cls: type) -> dict[str, str]:
-    """Return the texts of the ``Args:`` of a class and its bases, by argument."""
+    """Return the texts of the ``Args:`` of a class and its bases (or ``Attributes:``, of records), by argument."""
     texts: dict[str, str] = {}
     for base in cls.__mro__:
-        found = re.search(r"^Args:\n((?:[ ]+.*\n?|\n)+)", inspect.cleandoc(base.__doc__ or ""), flags=re.MULTILINE)
+        found = re.search(
+            r"^(?:Args|Attributes):\n((?:[ ]+.*\n?|\n)+)", inspect.cleandoc(base.__doc__ or ""), flags=re.MULTILINE
+        )
         if base is object or found is None:
             continue
-        for name, text in re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", found[1], flags=re.MULTILINE):
-            texts.setdefault(name, code(" ".join(text.split())))
+        for name, words in re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", found[1], flags=re.MULTILINE):
+            texts.setdefault(name, code(" ".join(words.split())))
     return texts
 
 

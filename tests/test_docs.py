@@ -5,6 +5,7 @@ import importlib.util
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import yaml
 
 from codesign.config import StudyConfig
 from softgym_envs.config import check_config
+from softgym_envs.envs.options import EnvironmentOptions
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.robots import ROBOTS
@@ -79,6 +81,8 @@ def test_pages_of_environments_are_completed(identifier):
     robot = robots.robot_of(ENVIRONMENTS[identifier].robot)
     for name in robot.design_space.names:
         assert f"`{name}`" in page
+    for field in fields(EnvironmentOptions):
+        assert f"\n| `{field.name}` |" in page or field.name == "defaults"
 
 
 @pytest.mark.parametrize("identifier", ENVIRONMENTS)
@@ -105,14 +109,13 @@ def test_the_printed_size_of_the_observation_is_the_real_one(identifier):
 @pytest.mark.parametrize("package", api.PACKAGES)
 def test_names_of_the_reference_can_be_imported(package):
     """Every name that the reference links to is imported from the package under which it stands."""
-    links = re.findall(rf"\[`(\w+)`\]\({re.escape(package)}\.md#(\w+)\)", api.api_index())
-    page = api.api_page(package)
-    for name, anchor in links:
-        assert name == anchor and f"{{ #{name} }}" in page
-        value = getattr(importlib.import_module(package), name)
-        module = re.search(rf"^::: ([\w.]+)\.{name}$", page, flags=re.MULTILINE)[1]
-        assert getattr(importlib.import_module(module), name) is value
-    assert [name for name, _ in links] == api.public_names(package)
+    section = api.api_index().partition(f"`from {package} import ...`")[2].partition("\n## ")[0]
+    links = re.findall(r"\[`(\w+)`\]\(([\w.]+)\.md#([\w.]+)\.(\w+)\)", section)
+    for name, page, module, anchor in links:
+        assert name == anchor and page in (package, module)
+        assert f"\n::: {module}.{name}\n" in api.api_page(page)
+        assert getattr(importlib.import_module(module), name) is getattr(importlib.import_module(package), name)
+    assert [name for name, *_ in links] == api.public_names(package)
 
 
 def test_sections_written_in_a_page_take_precedence():

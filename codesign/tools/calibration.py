@@ -35,8 +35,8 @@ def calibrate(
         data: measurements, instead of those of the configuration's file.
 
     Raises:
-        ConfigError: for a parameter that changes nothing that was measured; if the folder cannot be used, see
-            `codesign.tools.folder.run_folder`.
+        ConfigError: for a parameter that changes nothing that was measured; if the folder holds results of another
+            configuration or tool, or another process uses it.
         DataError: for a malformed file of measurements.
         ConvergenceError: if a body has no equilibrium under a measured command.
     """

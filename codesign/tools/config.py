@@ -280,9 +280,9 @@ class CalibrationConfig(RobotConfig):
         name: name of the results' folder.
         fit: design variables to fit, and robot options as ``robot.<option>``.
         nuisances: unknowns of the measurement that are fitted too, by name: offsets of columns and the distance of an
-            object, see `codesign.tools.nuisance`.
-        data: CSV or JSON file of measurements, see `codesign.tools.measurements.read_measurements`. The command line
-            also looks for it beside the configuration file.
+            object.
+        data: CSV or JSON file of measurements, with a column for each actuator and effector coordinate. The command
+            line also looks for it beside the configuration file.
         method: ``"gradient"`` (least squares) or ``"tpe"`` (Optuna).
         starts: first values ``{name: value}`` of variables and nuisance parameters, one fit from each; default: the
             reference design.

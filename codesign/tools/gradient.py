@@ -120,8 +120,8 @@ def optimise(config: OptimiseConfig, folder: str | Path | None = None) -> Gradie
         folder: where ``result.json``, the resolved configuration and a picture go; None to write nothing.
 
     Raises:
-        ConfigError: if the weights have no exact gradients, or the folder cannot be used, see
-            `codesign.tools.folder.run_folder`.
+        ConfigError: if the weights have no exact gradients, the folder holds results of another
+            configuration or tool, or another process uses it.
         WeightsError: if there are no weights.
         InfeasibleDesign: if the best design cannot be built for the check on FEM.
         ConvergenceError: if the best design has no equilibrium on FEM.

@@ -235,11 +235,12 @@ def design_metric(unit: str, direction: Direction) -> Callable[[Callable[[Any], 
     """Return a decorator that makes a metric of a function of the design.
 
     The decorated function takes ``{variable: value}`` [SI], with all variables of the body, and returns a number. Name
-    it in a configuration as ``my_module:my_function``::
+    it in a configuration as ``my_module:my_function``.
 
-        @design_metric(unit="kg", direction="minimize")
-        def mass(design):
-            return 1.1e3 * design["length"] * design["height"] ** 2
+    Examples:
+        >>> @design_metric(unit="kg", direction="minimize")
+        ... def mass(design):
+        ...     return 1.1e3 * design["length"] * design["height"] ** 2
     """
     return lambda function: Metric(getattr(function, "__name__", "metric"), function, unit, direction, needs="design")
 

@@ -37,7 +37,7 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
         progress: show a progress bar.
 
     Raises:
-        ConfigError: if the folder cannot be used, see `codesign.tools.folder.run_folder`.
+        ConfigError: if the folder holds results of another configuration or tool, or another process uses it.
         ConvergenceError: if no design is feasible.
     """
     with run_folder(folder, config, "a search", may_change=("name", "workers", "solver.trials")) as place:

@@ -191,8 +191,8 @@ def analyse_sensitivity(config: SensitivityConfig, folder: str | Path, *, progre
         progress: show a progress bar.
 
     Raises:
-        ConfigError: if SALib is not installed (``morris``, ``sobol``), or the folder cannot be used, see
-            `codesign.tools.folder.run_folder`.
+        ConfigError: if SALib is not installed (``morris``, ``sobol``), the folder holds results of another
+            configuration or tool, or another process uses it.
         DataError: if a line of ``evaluations.jsonl`` is damaged.
         ConvergenceError: if too few designs are feasible.
     """

@@ -34,7 +34,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             robot, else FEM.
         render_mode: None or ``"rgb_array"``.
         render_size: width and height of an image [pixels].
-        **options: see `EnvironmentOptions`.
+        **options: ``design``, ``action_mode`` and the other arguments that the page of each environment ID lists.
 
     Raises:
         ValueError: for a wrong option.

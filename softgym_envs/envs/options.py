@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from softgym_envs.envs.registration import RobotSource, TaskSource
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EnvironmentOptions:
     """Keyword options of `SoftRobotEnv`, `SoftRobotVectorEnv` and `TorchVectorEnv`.
 

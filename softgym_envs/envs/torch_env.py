@@ -53,7 +53,7 @@ class TorchVectorEnv:
         max_episode_steps: time limit; default that of the ID.
         robot: replaces that of the ID; see `SoftRobotEnv`.
         task: replaces that of the ID; its methods must take tensors, see `Task`.
-        **options: see `EnvironmentOptions`.
+        **options: ``design``, ``action_mode`` and the other arguments that the page of each environment ID lists.
 
     Raises:
         ValueError: for an unsupported ID, task, network, device or option.

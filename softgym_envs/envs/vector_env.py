@@ -34,7 +34,8 @@ class SoftRobotVectorEnv(VectorEnv):
         max_episode_steps: time limit; default none.
         backend: ``"surrogate"``; ``gymnasium.make_vec(..., vectorization_mode="sync")`` steps other backends.
         render_mode: must be None; batches are not rendered.
-        **options: see `EnvironmentOptions`; every sub-environment samples its own design.
+        **options: ``design``, ``action_mode`` and the other arguments that the page of each environment ID lists;
+            every sub-environment samples its own design.
 
     Raises:
         ValueError: for a wrong option, or a robot without a surrogate.

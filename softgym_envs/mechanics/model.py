@@ -101,7 +101,7 @@ class MechanicalModel:
         self.set_gravity(gravity)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the factorisations of warping, which cannot be copied and are recomputed when needed."""
+        # The factorisations of warping cannot be copied and are recomputed when needed.
         return {**self.__dict__, "_warping": None}
 
     # -- construction -----------------------------------------------------------------------------------------------

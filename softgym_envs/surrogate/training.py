@@ -91,7 +91,17 @@ else:
 
 
 class FitConfig(Config):
-    """Configuration of a surrogate: robot, data and network."""
+    """Configuration of a surrogate: robot, data and network.
+
+    Attributes:
+        robot: registered name, or path ``module:class``.
+        robot_options: options of the robot.
+        data: the states that are solved on FEM, for training, validation and test.
+        network: kind of the network and its hyper-parameters.
+        workers: number of processes that solve FEM states.
+        executor: ``"loky"`` for processes of this machine, or ``"ray"`` for tasks of a cluster.
+        seed: seed of the training.
+    """
 
     robot: str
     robot_options: dict[str, Any] = {}
