@@ -68,8 +68,8 @@ class StaticQPAgent(InverseQPAgent):
 class ModelQPAgent(InverseQPAgent):
     """Inverse QP on the surrogate, which only sees the commands: open loop, or closed by a PI controller.
 
-    On FEM, as on a physical robot, the model then differs from the plant. For robots without a surrogate, it is
-    replaced by the static equilibrium of the plant.
+    On FEM, as on a physical robot, the model then differs from the plant. For robots without a surrogate, the model is
+    the static equilibrium of the plant.
 
     Args:
         closed: shift the goal by a PI controller on the measured effector (thesis, algorithm 2).

@@ -83,7 +83,7 @@ class HindsightBuffer(ReplayBuffer):
         following = self.next_observations[batch_inds, columns]
         rewards = self.rewards[batch_inds, columns].copy()
 
-        # A reward of exactly zero marks a step without an equilibrium, which is zero for every goal.
+        # A reward of exactly zero marks a step without an equilibrium, whose reward is zero for every goal.
         chosen = np.flatnonzero((draws[1] < self.share) & (rewards != 0.0))
         goals = self.spaces.observed_effector(self.next_observations[later[chosen], columns[chosen]])
         observations[chosen] = self.spaces.with_goal(observations[chosen], goals)

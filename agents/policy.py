@@ -65,7 +65,7 @@ class Policy:
     """Policy that takes the mean action of a trained SAC actor.
 
     Args:
-        path: ``policy.safetensors``, with its card beside it, or the name of a shipped policy.
+        path: ``policy.safetensors``, with its card next to it, or the name of a shipped policy.
 
     Attributes:
         path: file of the policy.

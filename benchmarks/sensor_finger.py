@@ -236,7 +236,7 @@ def compare(trials: str | Path, output: str | Path) -> dict[str, object]:
 
     Args:
         trials: CSV of the recorded designs.
-        output: CSV of ours, one row per design, written after each.
+        output: CSV of our results, one row per design, written after each evaluation.
 
     Raises:
         DataError: if the trials cannot be read.

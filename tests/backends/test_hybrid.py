@@ -49,11 +49,11 @@ def test_finite_elements_answer_where_the_surrogate_is_not_trusted(robot, weight
     assert state.trusted and state.uncertainty == 0.0 and state.nodes is not None
     assert backend.fem_calls == 2  # the body at rest, and this state
     assert_same(backend.step(np.array([0.015])), state)  # holding the command needs no new solution
-    beside, expected = backend.step(np.array([0.015015])), fem.step(np.array([0.015015]))
+    nearby, expected = backend.step(np.array([0.015015])), fem.step(np.array([0.015015]))
     assert backend.fem_calls == 2
-    np.testing.assert_allclose(beside.effector, expected.effector, atol=2e-7)
-    np.testing.assert_allclose(beside.effort, expected.effort, rtol=1e-5)
-    assert beside.displacement == pytest.approx(0.015015) and not beside.slack.any()
+    np.testing.assert_allclose(nearby.effector, expected.effector, atol=2e-7)
+    np.testing.assert_allclose(nearby.effort, expected.effort, rtol=1e-5)
+    assert nearby.displacement == pytest.approx(0.015015) and not nearby.slack.any()
     back = backend.step(np.array([0.004]))
     assert back.nodes is None and back.slack.tolist() == [False]
     np.testing.assert_allclose(back.effector, fem.step(np.array([0.004])).effector, atol=3e-4)
@@ -97,9 +97,9 @@ def test_efforts(robot, weights, fem):
     state = backend.step(strong, "effort")
     assert state.nodes is not None and np.abs(state.displacement - 0.015).max() < 1e-6
     calls = backend.fem_calls
-    beside, expected = backend.step(1.0005 * strong, "effort"), fem.step(1.0005 * strong, "effort")
-    assert backend.fem_calls == calls and not beside.slack.any()
-    np.testing.assert_allclose(beside.displacement, expected.displacement, atol=1e-8)
+    nearby, expected = backend.step(1.0005 * strong, "effort"), fem.step(1.0005 * strong, "effort")
+    assert backend.fem_calls == calls and not nearby.slack.any()
+    np.testing.assert_allclose(nearby.displacement, expected.displacement, atol=1e-8)
     with pytest.raises(ValueError, match="negative"):
         backend.step(-strong, "effort")
 
