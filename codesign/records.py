@@ -15,8 +15,15 @@ from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json, write_json
 
 
+def plain(value: Any) -> Any:
+    """Return a value of a record as plain data."""
+    if isinstance(value, list):
+        return [plain(item) for item in value]
+    return value.to_json() if hasattr(value, "to_json") else value
+
+
 class Record:
-    """Base of the records: plain data both ways. Fields named in ``EVALUATIONS`` hold an `Evaluation` or None."""
+    """Base of records: plain data both ways. Fields named in ``EVALUATIONS`` hold an `Evaluation` or None."""
 
     EVALUATIONS: ClassVar[tuple[str, ...]] = ()
 
@@ -27,8 +34,7 @@ class Record:
 
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        data = {item.name: getattr(self, item.name) for item in fields(self)}  # type: ignore[arg-type]
-        return {key: value.to_json() if isinstance(value, Evaluation) else value for key, value in data.items()}
+        return {item.name: plain(getattr(self, item.name)) for item in fields(self)}  # type: ignore[arg-type]
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
@@ -61,53 +67,30 @@ class Record:
 
 @dataclass(eq=False)
 class TrialResult(Record):
-    """Result of one trial.
-
-    Attributes:
-        number: number of the trial.
-        origin: where its body comes from: ``"baseline"``, ``"screen 3"``, ``"joint 0"`` or ``"sampler 7"``.
-        process: ``host:pid`` of the worker.
-        design: complete design [SI].
-        options: values of the variables that are options of robot or task, by their full names [SI].
-        sampler_seed: seed of the sampler that proposed the body, if one did.
-        state: ``"pruned"`` and ``"infeasible"`` trials have no scores.
-        reason: why a trial was pruned or is infeasible.
-        values: value of each objective that the study names, constraints included [SI].
-        scores: scores of objective and secondary objectives; larger is better.
-        violations: by how much each constraint is violated [SI]; not positive where it is satisfied.
-        controller: ``"qp"``, or the file of the policy, relative to the folder of the study.
-        evaluation: evaluation of the controller on the selection goals.
-        qp: evaluation of the inverse QP on the same goals.
-        qp_value: value of the objective with the inverse QP [SI].
-        curve: environment steps and score of each report during training.
-        training_steps: environment steps of training.
-        seconds: wall-clock time [s].
-        cpu_seconds: CPU time, that of earlier workers of the trial included [s].
-        finished_at: time of the end [s since 1970].
-    """
+    """Result of one trial."""
 
     EVALUATIONS = ("evaluation", "qp")
 
     number: int
-    origin: str
-    process: str
-    design: dict[str, float]
-    options: dict[str, float] = field(default_factory=dict)
-    sampler_seed: int | None = None
+    origin: str  # of its body: "baseline", "screen 3", "joint 0" or "sampler 7"
+    process: str  # "host:pid" of the worker
+    design: dict[str, float]  # complete [SI]
+    options: dict[str, float] = field(default_factory=dict)  # variables that are options, by their full names [SI]
+    sampler_seed: int | None = None  # of the sampler that proposed the body, if one did
     state: Literal["complete", "pruned", "infeasible"] = "complete"
-    reason: str | None = None
-    values: dict[str, float] = field(default_factory=dict)
-    scores: list[float] | None = None
-    violations: dict[str, float] = field(default_factory=dict)
-    controller: str = "qp"
-    evaluation: Evaluation | None = None
-    qp: Evaluation | None = None
-    qp_value: float | None = None
-    curve: list[list[float]] = field(default_factory=list)
+    reason: str | None = None  # why the trial is not complete
+    values: dict[str, float] = field(default_factory=dict)  # of each objective that the study names [SI]
+    scores: list[float] | None = None  # of objective and secondary objectives, larger is better; complete trials only
+    violations: dict[str, float] = field(default_factory=dict)  # of each constraint [SI]; positive if it is violated
+    controller: str = "qp"  # or the file of the policy, relative to the folder of the study
+    evaluation: Evaluation | None = None  # of the controller on the selection goals
+    qp: Evaluation | None = None  # of the inverse QP on the same goals
+    qp_value: float | None = None  # of the objective with the inverse QP [SI]
+    curve: list[list[float]] = field(default_factory=list)  # environment steps and score of each report in training
     training_steps: int = 0
-    seconds: float = 0.0
-    cpu_seconds: float = 0.0
-    finished_at: float = 0.0
+    seconds: float = 0.0  # wall-clock time [s]
+    cpu_seconds: float = 0.0  # CPU time, that of earlier workers of the trial included [s]
+    finished_at: float = 0.0  # time of the end [s since 1970]
 
     @property
     def score(self) -> float | None:
@@ -128,128 +111,76 @@ class TrialResult(Record):
 
 @dataclass(eq=False)
 class ScreenResult(Record):
-    """Score of one candidate of the screen.
-
-    Attributes:
-        index: number of the candidate.
-        values: value of each optimised variable [SI].
-        evaluation: evaluation of the inverse QP, or None if the body is infeasible.
-        score: score of the objective, larger is better, or None.
-        error: why the body is infeasible.
-    """
+    """Score of one candidate of the screen."""
 
     EVALUATIONS = ("evaluation",)
 
     index: int
-    values: dict[str, float]
-    evaluation: Evaluation | None = None
-    score: float | None = None
-    error: str | None = None
+    values: dict[str, float]  # of each optimised variable [SI]
+    evaluation: Evaluation | None = None  # of the inverse QP; None for an infeasible body
+    score: float | None = None  # larger is better
+    error: str | None = None  # why the body is infeasible
 
 
 @dataclass(eq=False)
 class SharedPolicy(Record):
-    """The policy that scores every body, and what it cost.
+    """The policy that scores every body, and what it cost."""
 
-    Attributes:
-        policy: its file, relative to the folder of the study.
-        bodies: values [SI] of the optimised variables of the bodies that joint training found best.
-        training_steps: environment steps of joint training.
-        report_steps: environment steps of the points of its learning curve.
-        seconds: wall-clock time [s].
-        cpu_seconds: CPU time [s].
-    """
-
-    policy: str
-    bodies: list[dict[str, float]] = field(default_factory=list)
+    policy: str  # its file, relative to the folder of the study
+    bodies: list[dict[str, float]] = field(default_factory=list)  # values [SI] of the best bodies of joint training
     training_steps: int = 0
-    report_steps: int = 0
-    seconds: float = 0.0
+    report_steps: int = 0  # environment steps of the points of the learning curve
+    seconds: float = 0.0  # wall-clock time [s]
     cpu_seconds: float = 0.0
 
 
 @dataclass(eq=False)
 class FinalistTraining(Record):
-    """A policy that was trained anew for a finalist.
-
-    Attributes:
-        trial: trial of the finalist.
-        seed: seed of the training.
-        steps: environment steps.
-        report_steps: environment steps of the points of the learning curve.
-        cpu_seconds: CPU time [s].
-        curve: environment steps and score of each report; empty if training does not report the objective.
-    """
+    """A policy that was trained anew for a finalist."""
 
     trial: int
     seed: int
     steps: int
-    report_steps: int
+    report_steps: int  # environment steps of the points of the learning curve
     cpu_seconds: float
-    curve: list[list[float]]
+    curve: list[list[float]]  # environment steps and score of each report; empty if they do not measure the objective
 
 
 @dataclass(eq=False)
 class FinalistTest(Record):
-    """Evaluation of one finalist with one controller on one backend.
-
-    Attributes:
-        trial: trial of the finalist.
-        agent: ``"sac"`` or ``"qp"``.
-        backend: ``"fem"`` or ``"surrogate"``.
-        goals: ``"unseen"`` or ``"selection"``.
-        seed: training seed of the policy; 0 for the policy of the trial itself.
-        evaluation: the evaluation, or None if the body cannot be simulated.
-        values: value of each objective that the study names [SI].
-        goal_values: value of the objective for each goal [SI], if it has such values.
-        error: why the body cannot be simulated.
-    """
+    """Evaluation of one finalist with one controller on one backend."""
 
     EVALUATIONS = ("evaluation",)
 
     trial: int
-    agent: str
-    backend: str
-    goals: str
-    seed: int = 0
-    evaluation: Evaluation | None = None
-    values: dict[str, float] = field(default_factory=dict)
-    goal_values: list[float] | None = None
-    error: str | None = None
+    agent: str  # "sac" or "qp"
+    backend: str  # "fem" or "surrogate"
+    goals: str  # "unseen" or "selection"
+    seed: int = 0  # of the training of the policy; 0 for the policy of the trial itself
+    evaluation: Evaluation | None = None  # None if the body cannot be simulated
+    values: dict[str, float] = field(default_factory=dict)  # of each objective that the study names [SI]
+    goal_values: list[float] | None = None  # of the objective for each goal [SI], if it has such values
+    error: str | None = None  # why the body cannot be simulated
 
 
 @dataclass(eq=False)
 class Account(Record):
-    """Time that a study took.
+    """Time that a study took."""
 
-    Attributes:
-        command: command that last ran it.
-        wall_seconds: wall-clock time of each phase, over all calls [s].
-    """
-
-    command: str = ""
-    wall_seconds: dict[str, float] = field(default_factory=dict)
+    command: str = ""  # that last ran it
+    wall_seconds: dict[str, float] = field(default_factory=dict)  # of each phase, over all calls [s]
 
 
-@dataclass(frozen=True)
-class Finalist:
-    """A body in the final test.
+@dataclass(frozen=True, eq=False)
+class Finalist(Record):
+    """A body in the final test."""
 
-    Args:
-        number: its trial.
-        role: ``"baseline"`` or ``"finalist"``.
-        design: complete design [SI].
-        options: values of the variables that are options of robot or task [SI].
-        score: score of its trial; larger is better.
-        policy: policy of its trial relative to the folder, or None if the strategy has none.
-    """
-
-    number: int
+    trial: int
     role: Literal["baseline", "finalist"]
-    design: dict[str, float]
-    options: dict[str, float]
-    score: float
-    policy: str | None
+    design: dict[str, float]  # complete [SI]
+    options: dict[str, float]  # variables that are options of robot or task [SI]
+    score: float  # of its trial; larger is better
+    policy: str | None  # of its trial, relative to the folder of the study; None if the strategy has none
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -271,7 +202,7 @@ class PlannedTest:
     def file(self) -> str:
         """Path of the result, relative to the folder of the study."""
         seed = f"-seed{self.seed}" if self.seed else ""
-        return f"finalists/trial{self.finalist.number:04d}-{self.agent}{seed}-{self.backend}-{self.goals}.json"
+        return f"finalists/trial{self.finalist.trial:04d}-{self.agent}{seed}-{self.backend}-{self.goals}.json"
 
 
 class TestGroup:
@@ -335,12 +266,7 @@ class TestGroup:
 
 @dataclass(frozen=True)
 class Job:
-    """One result file and how to make it.
-
-    Args:
-        path: the JSON file.
-        make: returns its content.
-    """
+    """One JSON file of results and the function that makes its content."""
 
     path: Path
     make: Callable[[], Record]
@@ -348,12 +274,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Assessment:
-    """An evaluation on one body and what it says about the objectives of a study.
-
-    Attributes:
-        evaluation: one episode per goal.
-        measurements: objectives by name.
-    """
+    """An evaluation on one body, and the objectives of a study by name."""
 
     evaluation: Evaluation
     measurements: dict[str, Measurement]

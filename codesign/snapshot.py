@@ -164,7 +164,7 @@ class StudySnapshot:
     @cached_property
     def tests(self) -> list[TestGroup]:
         """Finished tests of the present finalists, those with several training seeds together."""
-        planned = {(p.finalist.number, p.agent, p.backend, p.goals, p.seed) for p in self.planned_tests}
+        planned = {(p.finalist.trial, p.agent, p.backend, p.goals, p.seed) for p in self.planned_tests}
         groups: dict[tuple[int, str, str, str], list[FinalistTest]] = {}
         for test in self.all_tests:
             key = (test.trial, test.agent, test.backend, test.goals)
@@ -180,7 +180,7 @@ class StudySnapshot:
     @property
     def trainings(self) -> list[FinalistTraining]:
         """Policies trained anew for the present finalists."""
-        numbers = [finalist.number for finalist in self.finalists]
+        numbers = [finalist.trial for finalist in self.finalists]
         return [training for training in self.all_trainings if training.trial in numbers]
 
     @cached_property
@@ -194,7 +194,7 @@ class StudySnapshot:
             return Verdict(None, f"no body satisfies the constraints; nearest: {self.violations_text(complete[0])}")
         if not self.config.finalists.count:
             return Verdict(None, f"no finalists were requested (finalists.count = 0); best: trial {feasible[0]}")
-        bodies = {finalist.number: finalist for finalist in self.finalists if finalist.number in feasible}
+        bodies = {finalist.trial: finalist for finalist in self.finalists if finalist.trial in feasible}
         tests = [g for g in self.tests if g.goals == "selection" and g.error is None and g.trial in bodies]
         if self.config.finalists.choose == "fem" and tests:
             return self._verdict_on_fem(bodies, tests)
@@ -242,7 +242,7 @@ class StudySnapshot:
 def _finalist(trial: TrialResult) -> Finalist:
     assert trial.score is not None
     return Finalist(
-        number=trial.number,
+        trial=trial.number,
         role="baseline" if trial.origin == "baseline" else "finalist",
         design=trial.design,
         options=trial.options,

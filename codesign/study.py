@@ -22,7 +22,8 @@ from codesign.phases.screen import kept_bodies, screen_jobs
 from codesign.phases.shared_policy import promising_bodies, shared_policy_jobs
 from codesign.progress import Progress
 from codesign.records import Account, Job
-from codesign.report.results import StudyResults, write_results
+from codesign.report.files import write_results
+from codesign.report.results import StudyResults
 from codesign.sampling import make_sampler
 from codesign.scheduling.jobs import missing_jobs
 from codesign.scheduling.optuna_study import distributions, make_pruner

@@ -67,7 +67,7 @@ def _test(folder: StudyFolder, plan: PlannedTest) -> FinalistTest:
     controller: str | Path = plan.agent
     if plan.agent == "sac" and finalist.policy:
         controller = _trained_policy(folder, finalist, plan.seed) if plan.seed else folder.path / finalist.policy
-    test = FinalistTest(finalist.number, plan.agent, plan.backend, plan.goals, plan.seed)
+    test = FinalistTest(finalist.trial, plan.agent, plan.backend, plan.goals, plan.seed)
     environment = _environment(config, plan.backend, finalist.options)
     try:
         found = assess(controller, config, environment, folder.goals[plan.goals], finalist.design)
@@ -91,7 +91,7 @@ def _trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
         sac = sac.model_copy(update={"net_arch": card["config"]["sac"]["net_arch"]})
     update = {"sac": sac, "seed": training.seed + seed, "steps": steps}
     training = training.model_copy(update={**update, "report_every": min(training.report_every, steps)})
-    name = f"trial{finalist.number:04d}-seed{seed}"
+    name = f"trial{finalist.trial:04d}-seed{seed}"
     place = folder.path / "finalists" / name
     with folder.lock(f"training-{name}"):
         policy = train(training, place, initial=initial, progress=False)
@@ -100,7 +100,7 @@ def _trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
             card = read_json(policy.with_suffix(".json"))
             curve = card["curve"]
             FinalistTraining(
-                trial=finalist.number,
+                trial=finalist.trial,
                 seed=training.seed,
                 steps=steps,
                 report_steps=len(curve) * training.evaluation_episodes * config.episode_steps,

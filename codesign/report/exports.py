@@ -21,7 +21,7 @@ def write_exports(snapshot: StudySnapshot) -> list[tuple[str, str]]:
     winner, baseline, folder = snapshot.winner, snapshot.baseline, snapshot.folder
     if winner is None:
         return []
-    stem = f"winner-trial{winner.number:04d}"
+    stem = f"winner-trial{winner.trial:04d}"
     files = [(f"{stem}.stl", "the winner's body at rest, in millimetres")]
     if not (folder.path / files[0][0]).exists():
         from softgym_envs.robots.geometry.export import export_body

@@ -11,8 +11,10 @@ import yaml
 
 from codesign.objectives import OBJECTIVES
 from codesign.report import plots, tables
+from codesign.report.collect import FEW_GOALS
 from codesign.report.exports import write_exports
-from codesign.report.results import FEW_GOALS, Comparison, StudyResults, write_results
+from codesign.report.files import write_results
+from codesign.report.results import Comparison, StudyResults
 from codesign.report.statistics import MIN_GOALS, rank_correlation
 from codesign.report.tables import AGENTS, BACKENDS, SHOWN_ALWAYS, millimetres, percent
 from codesign.report.units import present

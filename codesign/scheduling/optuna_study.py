@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from codesign.config import PRUNERS, StudyConfig
+from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
+from codesign.parts import PRUNERS
 from codesign.sampling import construct, make_sampler
 from codesign.scheduling.storage import StudyStorage
 from softgym_envs.errors import DataError

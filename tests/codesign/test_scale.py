@@ -17,7 +17,7 @@ from benchmarks.codesign_scale import Sweep, faults
 from codesign.config import StudyConfig
 from codesign.folder import StudyFolder
 from codesign.phases.trial import give_up
-from codesign.report.results import write_results
+from codesign.report.files import write_results
 from codesign.scheduling import worker
 from codesign.scheduling.optuna_study import open_study
 from codesign.scheduling.processes import WorkerError, run_workers

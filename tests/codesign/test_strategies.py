@@ -175,7 +175,7 @@ def test_report_opens_in_a_browser(run, tmp_path, require_program):
 
 
 def test_every_strategy_is_described():
-    from codesign.config import STRATEGIES
+    from codesign.parts import STRATEGIES
     from codesign.report.page import CONTROLLERS
 
     assert set(CONTROLLERS) == set(STRATEGIES)
@@ -185,9 +185,9 @@ def test_a_body_that_was_proposed_twice_is_one_finalist(run):
     folder, _ = run(trials=5, finalists={"count": 3})
     before = load_study(folder).finalists
     assert len({tuple(body.design.values()) for body in before}) == len(before) == 4
-    best = folder.result(before[1].number)
-    replace(best, number=before[3].number).write(folder.trial(before[3].number) / "result.json")
+    best = folder.result(before[1].trial)
+    replace(best, number=before[3].trial).write(folder.trial(before[3].trial) / "result.json")
     after = load_study(folder).finalists
     assert len({tuple(body.design.values()) for body in after}) == len(after) == 4
-    first = min(before[1].number, before[3].number)
-    assert [body.number for body in after[:2]] == [0, first]
+    first = min(before[1].trial, before[3].trial)
+    assert [body.trial for body in after[:2]] == [0, first]

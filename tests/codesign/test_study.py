@@ -199,7 +199,7 @@ def test_what_decides_who_wins(choose, winner, study):
         write_trial(folder, number, searched)
         write_test(folder, number, tested)
     snapshot = load_study(folder)
-    assert snapshot.winner.number == winner
+    assert snapshot.winner.trial == winner
     goals = {plan.goals for plan in snapshot.planned_tests}
     assert goals == ({"unseen", "selection"} if choose == "fem" else {"unseen"})
 
@@ -288,10 +288,10 @@ def test_constraints_decide_before_scores(study):
     found = [(3e-3, 0.5, 0.5), (2e-3, 0.9, 1.2), (1e-3, 1.5, 1.5)]  # distance, effort in the search, effort on FEM
     for number, (distance, effort, _) in enumerate(found):
         write_trial(folder, number, distance, effort)
-    assert load_study(folder).winner.number == 1  # trial 2 violates the constraint in the search
+    assert load_study(folder).winner.trial == 1  # trial 2 violates the constraint in the search
     for number, (distance, _, effort) in enumerate(found):
         write_test(folder, number, distance, effort)
-    assert load_study(folder).winner.number == 0  # trial 1 violates it on FEM
+    assert load_study(folder).winner.trial == 0  # trial 1 violates it on FEM
     assert load_study(folder).best.number == 1
 
 

@@ -1,0 +1,157 @@
+"""Parts of the configuration of a study; quantities are in SI units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from agents.config import SACConfig
+from codesign.sampling import check_options
+from softgym_envs.config import Config
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """How a body gets its score."""
+
+    trains: bool = False  # each trial trains a policy of its own
+    policy: bool = False  # the study needs a given policy: as the start of trainings, else as shared policy
+    proposer: str | None = None  # name in `agents.joint.PROPOSERS` if bodies and a shared policy are trained together
+
+    @property
+    def shares_policy(self) -> bool:
+        """Whether one policy scores all bodies: the given one, or that of the joint training."""
+        return not self.trains and (self.policy or bool(self.proposer))
+
+
+STRATEGIES: dict[str, Strategy] = {
+    "scratch": Strategy(trains=True),
+    "warm_start": Strategy(trains=True, policy=True),
+    "policy": Strategy(policy=True),
+    "critic": Strategy(proposer="critic"),
+    "distribution": Strategy(proposer="distribution"),
+    "qp": Strategy(),
+}
+"""Registry: name to strategy."""
+
+PRUNERS: dict[str, str] = {
+    "none": "NopPruner",
+    "median": "MedianPruner",
+    "percentile": "PercentilePruner",
+    "hyperband": "HyperbandPruner",
+    "successive_halving": "SuccessiveHalvingPruner",
+    "threshold": "ThresholdPruner",
+    "wilcoxon": "WilcoxonPruner",
+}
+"""Registry: name to class of `optuna.pruners`. They count environment steps of training; ``"wilcoxon"``, for strategies
+without training in a trial, counts goals and compares each with the same goal of the best body.
+"""
+
+
+class PrunerConfig(Config):
+    """Algorithm that stops hopeless trials: a key of `PRUNERS`, and further arguments of its class."""
+
+    name: Literal["none", "median", "percentile", "hyperband", "successive_halving", "threshold", "wilcoxon"] = "none"
+    options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _known_options(self) -> PrunerConfig:
+        import optuna
+
+        check_options("pruner", self.name, getattr(optuna.pruners, PRUNERS[self.name]), self.options)
+        return self
+
+
+class ZoneConfig(Config):
+    """A box [m] over which goals are spread evenly."""
+
+    center: tuple[float, float, float]
+    half_size: tuple[float, float, float]
+
+    @field_validator("half_size")
+    @classmethod
+    def _positive(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not all(size >= 0.0 for size in value):
+            raise ValueError("must be three lengths of 0 m or more")
+        return value
+
+
+class GoalsConfig(Config):
+    """Three disjoint sets of goals: for training, for scoring bodies, and unseen ones for the final test.
+
+    Goals come from a ``source``. ``"family"``: effector positions that random bodies reach under random commands, the
+    same for every body. ``"zone"``: points in a box, the work zone of the designer, reachable or not. ``"task"``: as
+    the task draws them for the baseline body; for tasks whose goals are paths.
+    """
+
+    source: Literal["family", "zone", "task"] = "family"
+    zone: ZoneConfig | None = None
+    vary: tuple[str, ...] | None = Field(
+        default=None, min_length=1, description="what differs among the random bodies; default the optimised variables"
+    )
+    count: int = Field(default=40, ge=1, description="goals that every trial is scored on")
+    unseen_count: int = Field(default=30, ge=2, description="goals that only finalists are tested on")
+    training_count: int = Field(default=300, ge=1, description="goals for training episodes; not used by 'task'")
+    seed: int = Field(default=0, ge=0)
+    command_low: float = Field(
+        default=0.0, ge=0.0, lt=1.0, description="smallest random command of 'family' as a fraction of the range"
+    )
+
+    @model_validator(mode="after")
+    def _zone_where_needed(self) -> GoalsConfig:
+        if (self.source == "zone") != (self.zone is not None):
+            raise ValueError("'zone' (center, half_size) must be given with source 'zone', and only with it")
+        return self
+
+
+class TrainingConfig(Config):
+    """Training for one body, in a trial or as a finalist; see `agents.config.TrainConfig`."""
+
+    steps: int = Field(default=2_500, ge=1, description="environment steps of one trial")
+    report_every: int = Field(default=500, ge=1, description="environment steps between two reports to the pruner")
+    evaluation_episodes: int = Field(default=32, ge=1, description="episodes of each report")
+    num_envs: int = Field(default=16, ge=1)
+    seed: int = Field(default=0, ge=0, description="the same in all trials, which then differ by their bodies only")
+    sac: SACConfig = Field(default_factory=SACConfig)
+
+
+class JointConfig(TrainingConfig):
+    """Training of bodies and policy together, before the trials; for the strategies ``"critic"``, ``"distribution"``.
+
+    The critic proposes bodies at each report.
+    """
+
+    steps: int = Field(default=40_000, ge=1)
+    report_every: int = Field(default=4_000, ge=1)
+    keep: int = Field(default=4, ge=1, le=32, description="number of the most promising bodies that become trials")
+    options: dict[str, int | float] = Field(default_factory=dict, description="of the proposer, see agents.joint")
+
+
+class ScreenConfig(Config):
+    """Screen before the trials: the inverse QP scores many bodies, and the best become trials."""
+
+    enabled: bool = False
+    candidates: int = Field(default=32, ge=2, description="bodies to score, spread evenly over the design box")
+    keep: float = Field(default=0.15, gt=0.0, le=1.0, description="fraction of the candidates that become trials")
+    goals: int = Field(default=10, ge=1, description="goals per candidate: the first of the selection goals")
+
+    @property
+    def kept(self) -> int:
+        """Number of candidates that become trials."""
+        return max(1, round(self.keep * self.candidates)) if self.enabled else 0
+
+
+class FinalistsConfig(Config):
+    """The check on FEM.
+
+    The winner has the best score on the selection goals, by the ``"surrogate"`` in its trial or by ``"fem"`` in the
+    check. The unseen goals never decide.
+    """
+
+    count: int = Field(default=3, ge=0, description="best bodies to test besides the baseline; 0: no check")
+    choose: Literal["surrogate", "fem"] = "surrogate"
+    fem_options: dict[str, Any] = Field(default_factory=dict, description="options of the FEM backend")
+    seeds: int = Field(default=0, ge=0, description="policies to train anew per body; 0: test that of its trial")
+    steps: int | None = Field(default=None, ge=1, description="of each of these trainings; default those of a trial")

@@ -1,0 +1,87 @@
+"""Files of a study's results: ``results.json``, ``trials.csv``, ``finalists.csv``."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from agents.evaluation import Evaluation
+from codesign.config import StudyConfig
+from codesign.records import Finalist, TestGroup, TrialResult
+from codesign.report.collect import collect
+from codesign.report.results import StudyResults
+from codesign.snapshot import StudySnapshot
+from softgym_envs.storage import atomic_write
+
+
+def write_results(snapshot: StudySnapshot) -> StudyResults:
+    """Write ``results.json``, ``trials.csv`` and ``finalists.csv``; return what is in the first."""
+    results = collect(snapshot)
+    folder = snapshot.folder.path
+    results.write(folder / "results.json")
+    units = {variable.name: variable.unit for variable in results.variables}
+    _write_csv(folder / "trials.csv", (_trial_row(trial, snapshot.config, units) for trial in snapshot.trials))
+    bodies = {body.trial: body for body in results.finalists}
+    _write_csv(folder / "finalists.csv", (_test_row(group, bodies[group.trial], units) for group in results.tests))
+    return results
+
+
+def _write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    rows = list(rows)
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    with atomic_write(path, "w") as stream:
+        writer = csv.DictWriter(stream, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _field(evaluation: Evaluation | None, name: str) -> float | None:
+    return None if evaluation is None else getattr(evaluation, name)
+
+
+def _trial_row(trial: TrialResult, config: StudyConfig, units: Mapping[str, str]) -> dict[str, Any]:
+    evaluation, qp = trial.evaluation, trial.qp
+    named = {
+        name: trial.values.get(name) for name in config.objectives if name not in ("success_rate", "mean_distance")
+    }
+    return {
+        "trial": trial.number,
+        "state": trial.state,
+        "feasible": trial.feasible,
+        "origin": trial.origin,
+        **{f"{name} [{units[name]}]": value for name, value in {**trial.design, **trial.options}.items()},
+        "score": trial.score,
+        "success_rate": _field(evaluation, "success_rate"),
+        "mean_distance [m]": _field(evaluation, "mean_distance"),
+        "mean_return": _field(evaluation, "mean_return"),
+        **{f"{name} [SI]": value for name, value in named.items()},
+        **{f"violation of {name} [SI]": trial.violations.get(name) for name in config.constraints},
+        "qp_success_rate": _field(qp, "success_rate"),
+        "qp_mean_distance [m]": _field(qp, "mean_distance"),
+        "training_steps": trial.training_steps,
+        "seconds": round(trial.seconds, 3),
+        "cpu_seconds": round(trial.cpu_seconds, 3),
+        "sampler_seed": trial.sampler_seed,
+        "reason": trial.reason or config.violations_text(trial.values, config.constraints) or None,
+    }
+
+
+def _test_row(group: TestGroup, body: Finalist, units: Mapping[str, str]) -> dict[str, Any]:
+    mean = group.mean if group.error is None else None
+    return {
+        "trial": group.trial,
+        "role": body.role,
+        **{f"{name} [{units[name]}]": value for name, value in {**body.design, **body.options}.items()},
+        "agent": group.agent,
+        "backend": group.backend,
+        "goals": group.goals,
+        "success_rate": _field(mean, "success_rate"),
+        "mean_distance [m]": _field(mean, "mean_distance"),
+        "worst_distance [m]": None if mean is None else group.worst_distance,
+        "mean_return": _field(mean, "mean_return"),
+        "mean_effort": _field(mean, "mean_effort"),
+        "steps": _field(mean, "steps"),
+        "error": group.error,
+    }
