@@ -299,6 +299,11 @@ class StudyConfig(Config):
         return self.objectives[self.objective]
 
     @property
+    def directions(self) -> list[Literal["maximize"]]:
+        """Direction of each score in Optuna's studies: all are maximised."""
+        return ["maximize" for _ in (self.objective, *self.secondary_objectives)]
+
+    @property
     def controller_constraints(self) -> dict[str, float]:
         """Constraints that depend on the controller, and therefore on the backend [SI]."""
         return {name: limit for name, limit in self.constraints.items() if not self.objectives[name].of_body}

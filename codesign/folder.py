@@ -63,12 +63,7 @@ class StudyFolder:
 
     @classmethod
     def create(cls, path: str | Path, config: StudyConfig, *, wait: bool = False) -> StudyFolder:
-        """Make the folder of a study, or open it to continue.
-
-        Args:
-            path: the folder.
-            config: the study.
-            wait: whether to wait for a database that does not answer; by default a wrong address is an error at once.
+        """Make the folder of a study, or open it to continue; ``wait`` for a database that does not answer.
 
         Raises:
             ConfigError: if the folder, or the study of this name in the database, belongs to another study.
@@ -130,11 +125,7 @@ class StudyFolder:
         return TEST_SETTINGS[:1] if any(self.path.glob("finalists/*/")) else ()
 
     def open_storage(self) -> StudyStorage:
-        """Open the storage of the trials.
-
-        Raises:
-            ConfigError: if the database cannot be opened.
-        """
+        """Open the storage of the trials."""
         return open_storage(self.path, self.config)
 
     @cached_property
@@ -160,10 +151,9 @@ class StudyFolder:
         return file_lock(self.path, name)
 
     def policy(self, name: str) -> Path:
-        """Return the file of a policy; one made on another machine is copied from the storage, with its card.
+        """Return the file of a policy, from its path in the folder.
 
-        Args:
-            name: its path in the folder.
+        A policy that was made on another machine is copied from the storage, with its card.
 
         Raises:
             DataError: if the policy is in neither.
@@ -201,14 +191,9 @@ class StudyFolder:
 
 
 def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str, fixed: tuple[str, ...]) -> None:
-    """Raise ConfigError unless a study can continue with a new configuration.
+    """Raise ConfigError unless the study at ``where`` can continue with a new configuration.
 
-    Args:
-        old: its configuration so far.
-        new: the requested configuration.
-        where: the folder or storage that has the study.
-        use: what to change to start another one.
-        fixed: keys of `EXTENSIBLE` that must stay.
+    The keys ``fixed`` of `EXTENSIBLE` must stay. To start another study, the message says to use another ``use``.
     """
     fixed = fixed if new.storage == JOURNAL else ("name", *fixed)
     extensible = [key for key in EXTENSIBLE if key not in fixed] + ["storage"] * (new.storage != JOURNAL)

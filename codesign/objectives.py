@@ -49,15 +49,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Measurement:
-    """Value of an objective.
+    """Value of an objective [SI]."""
 
-    Attributes:
-        value: mean over the goals [SI].
-        per_goal: value for each goal [SI], or None if the objective has no such values.
-    """
-
-    value: float
-    per_goal: list[float] | None = None
+    value: float  # mean over the goals
+    per_goal: list[float] | None = None  # for each goal, if the objective has such values
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,7 @@ from codesign.report.units import present
 
 
 class Progress:
-    """Prints the progress of a study.
-
-    Args:
-        study: the folder of the study.
-        enabled: whether to print at all.
-    """
+    """Prints the progress of a study, if ``enabled``."""
 
     def __init__(self, study: StudyFolder, *, enabled: bool) -> None:
         self.study = study

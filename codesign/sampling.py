@@ -26,13 +26,7 @@ SAMPLERS: dict[str, str] = {
 
 
 class SamplerConfig(Config):
-    """Algorithm that proposes designs.
-
-    Attributes:
-        name: key of `SAMPLERS`.
-        seed: seed of the sampler; see `trial_seed`.
-        options: further arguments of its class.
-    """
+    """Algorithm that proposes designs: a key of `SAMPLERS`, its seed (`trial_seed`) and further arguments."""
 
     name: Literal["tpe", "cmaes", "gp", "nsgaii", "qmc", "random"] = "tpe"
     seed: int = Field(default=0, ge=0)
@@ -57,18 +51,12 @@ def trial_seed(config: SamplerConfig, number: int) -> int:
     return int(np.random.SeedSequence([config.seed, number]).generate_state(1)[0])
 
 
-def make_sampler(config: SamplerConfig, number: int, **options: Any) -> optuna.samplers.BaseSampler:
-    """Return the sampler for one trial.
-
-    Args:
-        config: the sampler.
-        number: number of the trial.
-        **options: further arguments of the sampler's class, such as ``constraints_func``.
-    """
+def make_sampler(config: SamplerConfig, number: int) -> optuna.samplers.BaseSampler:
+    """Return the sampler for one trial."""
     import optuna
 
     cls = getattr(optuna.samplers, SAMPLERS[config.name])
-    return construct(cls, {"seed": trial_seed(config, number), **config.options, **options})
+    return construct(cls, {"seed": trial_seed(config, number), **config.options})
 
 
 def construct(cls: type, options: dict[str, Any]) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,15 +29,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Who won.
+    """Who won."""
 
-    Attributes:
-        winner: the best body that satisfies the constraints; it may be the baseline. None if there is none.
-        reason: why there is no winner, with the nearest miss; empty with one.
-    """
-
-    winner: Finalist | None
-    reason: str = ""
+    winner: Finalist | None  # the best body that satisfies the constraints; it may be the baseline
+    reason: str = ""  # why there is no winner, with the nearest miss
 
 
 @dataclass(frozen=True)
@@ -75,14 +70,17 @@ class StudySnapshot:
     @cached_property
     def ranked(self) -> list[TrialResult]:
         """Complete trials, best first: those that satisfy the constraints, then those that violate them least."""
-        limits = self.config.constraints
 
         def key(trial: TrialResult) -> tuple[float, ...]:
-            excess = sum(max(0.0, value) / (abs(limits[name]) or 1.0) for name, value in trial.violations.items())
             assert trial.score is not None and trial.evaluation is not None
-            return (-excess, trial.score, -trial.evaluation.mean_distance, -trial.number)
+            return (-self._excess(trial.violations), trial.score, -trial.evaluation.mean_distance, -trial.number)
 
         return sorted((trial for trial in self.trials if trial.state == "complete"), key=key, reverse=True)
+
+    def _excess(self, violations: Mapping[str, float]) -> float:
+        """Return the sum of all violations, each relative to its limit."""
+        limits = self.config.constraints
+        return sum(max(0.0, value) / (abs(limits[name]) or 1.0) for name, value in violations.items())
 
     @property
     def best(self) -> TrialResult | None:
@@ -97,22 +95,18 @@ class StudySnapshot:
         from codesign.scheduling.optuna_study import distributions
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        directions = [optuna.study.StudyDirection.MAXIMIZE] * (1 + len(self.config.secondary_objectives))
-        study = optuna.create_study(directions=directions)
+        study = optuna.create_study(directions=self.config.directions)
         space = distributions(self.config)
         for trial in self.trials:
             if trial.state == "complete":
-                params = {name: {**trial.design, **trial.options}[name] for name in space}
-                attributes = {"number": trial.number}
-                study.add_trial(
-                    optuna.create_trial(
-                        params=params,
-                        distributions=space,
-                        values=trial.scores,
-                        user_attrs=attributes,
-                        constraints=trial.violations,
-                    )
+                stored = optuna.create_trial(
+                    params={name: {**trial.design, **trial.options}[name] for name in space},
+                    distributions=space,
+                    values=trial.scores,
+                    user_attrs={"number": trial.number},
+                    constraints=trial.violations,
                 )
+                study.add_trial(stored)
         return study
 
     @cached_property
@@ -201,14 +195,10 @@ class StudySnapshot:
         return Verdict(next(bodies[number] for number in feasible if number in bodies))
 
     def _verdict_on_fem(self, bodies: dict[int, Finalist], tests: Sequence[TestGroup]) -> Verdict:
-        objective, limits = self.objective, self.config.controller_constraints
+        objective, limits, objectives = self.objective, self.config.controller_constraints, self.config.objectives
 
         def excess(group: TestGroup) -> float:
-            amounts = (
-                self.config.objectives[name].excess(group.value(name), limit) / (abs(limit) or 1.0)
-                for name, limit in limits.items()
-            )
-            return sum(max(0.0, amount) for amount in amounts)
+            return self._excess({name: objectives[name].excess(group.value(name), limits[name]) for name in limits})
 
         def key(group: TestGroup) -> tuple[float, ...]:
             score = objective.score(group.value(objective.name))
@@ -252,10 +242,7 @@ def _finalist(trial: TrialResult) -> Finalist:
 
 
 def load_study(folder: str | Path | StudyFolder) -> StudySnapshot:
-    """Read all that a study has found so far.
-
-    Args:
-        folder: the folder of a study, finished or not.
+    """Read all that a study has found so far; it need not be finished.
 
     Raises:
         DataError: if the folder has no study, or a file is damaged.

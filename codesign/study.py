@@ -142,8 +142,7 @@ def _try_sampler(config: StudyConfig) -> None:
     space, rng = distributions(config), np.random.default_rng(0)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
-        directions = [optuna.study.StudyDirection.MAXIMIZE] * (1 + len(config.secondary_objectives))
-        study = optuna.create_study(directions=directions, sampler=make_sampler(sampler, 0))
+        study = optuna.create_study(directions=config.directions, sampler=make_sampler(sampler, 0))
         for _ in range(sampler.options.get("n_startup_trials", 10) + 1):
             params = {name: float(rng.uniform(v.low, v.high)) for name, v in config.optimised.items()}
             values = rng.random(len(study.directions)).tolist()

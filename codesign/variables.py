@@ -19,23 +19,14 @@ _OPTION = re.compile(r"(robot|task)\.([A-Za-z_]\w*)(?:\[(\d+)\])?")
 
 
 class OptionRange(Config):
-    """Bounds of an option that is optimised like a design variable.
-
-    Attributes:
-        low: smallest value [unit].
-        high: largest value [unit].
-        baseline: value of the baseline [unit].
-        unit: SI unit, ``"1"`` for a pure number.
-        log: whether to sample on a logarithmic scale.
-        description: what the option means, for reports.
-    """
+    """Bounds and baseline [unit] of an option that is optimised like a design variable."""
 
     low: float
     high: float
     baseline: float
-    unit: str = "1"
-    log: bool = Field(default=False)
-    description: str = ""
+    unit: str = Field(default="1", description="SI unit, 1 for a pure number")
+    log: bool = Field(default=False, description="whether to sample on a logarithmic scale")
+    description: str = Field(default="", description="meaning of the option, for reports")
 
     def variable(self, name: str) -> DesignVariable:
         """Return the option as a variable."""

@@ -34,14 +34,9 @@ def assess(
     goals: np.ndarray,
     design: Mapping[str, float],
 ) -> Assessment:
-    """Evaluate an agent on a body, and measure the objectives of a study.
+    """Evaluate an agent (``"qp"``, ``"random"`` or a policy file), and measure the objectives of a study.
 
-    Args:
-        agent: ``"qp"``, ``"random"`` or a policy file.
-        config: names the objectives.
-        environment: where to evaluate.
-        goals: goals [m], shape (k, p, 3).
-        design: complete design [SI].
+    Goals [m] have the shape (k, p, 3), and the design is complete [SI].
 
     Raises:
         InfeasibleDesign: if the body cannot exist.

@@ -138,42 +138,35 @@ def pareto(snapshot: StudySnapshot, results: StudyResults) -> str | None:
 
 def curves(snapshot: StudySnapshot, results: StudyResults) -> str | None:
     """Learning curve of each trial; None without training."""
-    trained = [trial for trial in snapshot.trials if trial.curve]
-    if not trained:
-        return None
-    objective = snapshot.objective
-    roles = results.roles
-    with _figure(6.2, 3.2) as (_, (ax,), out):
-        for trial in sorted(trained, key=lambda t: t.number in roles):
-            steps, scores = np.array(trial.curve, dtype=float).T
-            role = roles.get(trial.number)
-            colour = COLOURS.get(role or "", OTHER)
-            style = {"marker": ".", "markersize": 4, "linestyle": "--" if trial.state == "pruned" else "-"}
-            ax.plot(steps, objective.shown(scores), color=colour, label=role, linewidth=2.2 if role else 1.1, **style)
-        ax.set(xlabel="environment steps of training", ylabel=f"{objective.axis} in training")
-        if roles:
-            ax.legend(fontsize=8)
-    return out[0]
+    trials = [trial for trial in snapshot.trials if trial.curve]
+    return _curves(snapshot, results, [(t.number, t.curve, "--" if t.state == "pruned" else "-") for t in trials])
 
 
 def finalist_curves(snapshot: StudySnapshot, results: StudyResults) -> str | None:
     """Learning curves of the policies that were trained anew for the finalists; None without them."""
-    trained = [training for training in results.trainings if training.curve]
-    if not trained:
+    return _curves(snapshot, results, [(t.trial, t.curve, "-") for t in results.trainings if t.curve])
+
+
+def _curves(
+    snapshot: StudySnapshot, results: StudyResults, drawn: Sequence[tuple[int, list[list[float]], str]]
+) -> str | None:
+    """Learning curves: trial, environment steps with scores, and line style of each."""
+    if not drawn:
         return None
     objective, roles = snapshot.objective, results.roles
     labelled: set[str] = set()
     with _figure(6.2, 3.2) as (_, (ax,), out):
-        for training in sorted(trained, key=lambda training: training.trial in roles):
-            steps, scores = np.array(training.curve, dtype=float).T
-            role = roles.get(training.trial, "")
-            label = role or "other finalists"
+        for number, curve, line in sorted(drawn, key=lambda row: row[0] in roles):
+            steps, scores = np.array(curve, dtype=float).T
+            role = roles.get(number, "")
+            label = role or "other bodies"
             ax.plot(
                 steps,
                 objective.shown(scores),
+                line,
                 color=COLOURS.get(role, OTHER),
                 label=None if label in labelled else label,
-                linewidth=1.8 if role else 1.1,
+                linewidth=2.2 if role else 1.1,
                 marker=".",
                 markersize=4,
             )

@@ -9,15 +9,9 @@ from codesign.scheduling.storage import StudyStorage
 
 
 def open_storage(folder: Path, config: StudyConfig, *, wait: bool = True) -> StudyStorage:
-    """Open the storage of a study.
+    """Open the storage that the configuration of a study names.
 
-    Args:
-        folder: the folder of the study.
-        config: names the storage.
-        wait: whether to wait for a database that does not answer; otherwise a wrong address is reported at once.
-
-    Raises:
-        ConfigError: if the database cannot be opened.
+    Without ``wait``, a database that does not answer is a ConfigError at once, as for a wrong address.
     """
     if config.storage == JOURNAL:
         from codesign.scheduling.journal import JournalStorage

@@ -19,11 +19,7 @@ T = TypeVar("T")
 
 
 class JournalStorage(StudyStorage):
-    """Optuna's journal in the folder of a study.
-
-    Args:
-        folder: the folder of the study.
-    """
+    """Optuna's journal in the folder of a study."""
 
     study = "codesign"
     shared = False

@@ -38,12 +38,7 @@ def distributions(config: StudyConfig) -> dict[str, optuna.distributions.BaseDis
 
 
 def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number: int = 0) -> optuna.Study:
-    """Open the Optuna study of a folder; it always maximises scores, see `codesign.objectives`.
-
-    Args:
-        folder: the study.
-        storage: its storage; opened by default.
-        number: trial that the sampler will propose.
+    """Open the Optuna study of a folder, with a sampler that proposes the trial ``number``.
 
     Raises:
         DataError: if the database no longer has the study.
@@ -58,7 +53,10 @@ def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number:
     except KeyError:
         if storage.shared:
             raise DataError(f"storage '{folder.config.storage}' has no study '{storage.study}'") from None
-    directions = [optuna.study.StudyDirection.MAXIMIZE] * (1 + len(folder.config.secondary_objectives))
     return optuna.create_study(
-        study_name=storage.study, storage=storage.optuna, directions=directions, sampler=sampler, pruner=pruner
+        study_name=storage.study,
+        storage=storage.optuna,
+        directions=folder.config.directions,
+        sampler=sampler,
+        pruner=pruner,
     )

@@ -30,13 +30,11 @@ def file_lock(folder: Path, name: str) -> BaseFileLock:
 class StudyStorage(ABC):
     """The trials of one study, and what its workers must agree on.
 
-    Attributes:
-        study: name of the Optuna study.
-        shared: whether workers may run on other machines, each with a folder of its own. Everything that they need from
-            each other is then kept here: results of trials, and files (`publish`).
+    A ``shared`` storage has workers on several machines, each with a folder of its own. It keeps everything that they
+    need from each other: results of trials, and files (`publish`).
     """
 
-    study: str
+    study: str  # name of the Optuna study
     shared: bool
 
     @property
@@ -87,15 +85,10 @@ class SharedStorage(StudyStorage):
 
     @abstractmethod
     def agree(self, accept: Callable[[dict[str, Any] | None], dict[str, Any]], objectives: int = 1) -> dict[str, Any]:
-        """Find or make the study, and return what all its machines share.
+        """Find or make the study, and return what all its machines share, with the ``id`` of the study.
 
-        Args:
-            accept: takes what is shared so far (None for a new study) and returns what to share from now on, as plain
-                data. If it raises, nothing changes.
-            objectives: number of scores of a trial, all to be maximised.
-
-        Returns:
-            What is shared, with the ``id`` of the study.
+        ``accept`` takes what is shared so far (None for a new study) and returns what to share from now on, as plain
+        data. If it raises, nothing changes. Each trial has a score for each of the ``objectives``, all to be maximised.
         """
 
     @abstractmethod

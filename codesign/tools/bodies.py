@@ -153,14 +153,8 @@ def _compliance(state: State) -> np.ndarray:
 class LearnedBodies:
     """Metrics of a batch of designs on a surrogate, with gradients.
 
-    Actuators are where they are commanded to be: no cable hangs slack. Rest is zero displacement.
-
-    Args:
-        robot: the robot.
-        metrics: metrics, or their names or paths.
-        actuation: full command: displacements of the actuators, shape (n_a,); default: half of their upper limits.
-        steps: states beyond rest along the actuation, evenly spaced.
-        weights: folder of the surrogate's weights; default: the pretrained ones.
+    Actuators are where they are commanded to be: no cable hangs slack. Rest is zero displacement. The arguments are
+    those of `Evaluator`.
 
     Raises:
         ConfigError: as for `Evaluator`, for metrics without gradients, and for weights of another kind of network.

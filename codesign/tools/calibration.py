@@ -85,12 +85,7 @@ def _calibrate(config: CalibrationConfig, data: Measurements | None) -> Calibrat
 
 
 def make_misfit(config: CalibrationConfig, data: Measurements, backend: str) -> Misfit:
-    """Return the residuals of a configuration on a backend.
-
-    Raises:
-        ConfigError: for weights whose network has no derivatives, or an offset of a column that was not measured.
-        DataError: for too few measured numbers.
-    """
+    """Return the residuals of a configuration on a backend; raises as `Misfit`."""
     robot = config.make_robot()
     parameters = Parameters(robot, config.box(), config.nuisances)
     if backend == "fem":
@@ -99,15 +94,9 @@ def make_misfit(config: CalibrationConfig, data: Measurements, backend: str) -> 
 
 
 def fit_gradient(misfit: Misfit, start: Mapping[str, float]) -> Fit:
-    """Return the least-squares fit within the bounds (trust-region reflective) from one start.
+    """Return the least-squares fit within the bounds (trust-region reflective); raises as `calibrate`.
 
-    Args:
-        misfit: the residuals.
-        start: first values ``{name: value}``; missing ones are those of the reference.
-
-    Raises:
-        ConfigError: for a parameter that changes nothing that was measured.
-        ConvergenceError: if a body has no equilibrium under a measured command.
+    Values that the start ``{name: value}`` lacks are those of the reference.
     """
     began, before = time.perf_counter(), misfit.evaluations
     parameters = misfit.parameters
@@ -132,11 +121,8 @@ def fit_gradient(misfit: Misfit, start: Mapping[str, float]) -> Fit:
 def fit_tpe(misfit: Misfit, start: Mapping[str, float], *, trials: int = 250, seed: int = 0) -> Fit:
     """Return the best of many trials of the tree-structured Parzen estimator (thesis, sec. 3.4.5).
 
-    Args:
-        misfit: the residuals.
-        start: first values ``{name: value}``, evaluated first; missing ones are those of the reference.
-        trials: number of evaluations; designs that cannot be built or have no equilibrium count.
-        seed: seed of the sampler.
+    The start ``{name: value}`` is the first trial; values that it lacks are those of the reference. Designs that cannot
+    be built or have no equilibrium count as trials.
 
     Raises:
         ConvergenceError: if no trial had an equilibrium.
@@ -173,13 +159,7 @@ def profile_interval(misfit: Misfit, values: Mapping[str, float], name: str, lev
     For noise of one unknown size, the interval contains the values for which the least sum of squares over all other
     parameters, nuisance parameters included, is at most ``S (1 + F(1, m - p; level) / (m - p))``, with S at the
     optimum, m residuals and p parameters. It ends at a bound of the parameter if that is reached first. Errors of the
-    model count as noise.
-
-    Args:
-        misfit: the residuals.
-        values: the optimum: values of all parameters.
-        name: the parameter.
-        level: probability that the interval covers the truth.
+    model count as noise. ``values`` are those of all parameters at the optimum.
     """
     from scipy.optimize import brentq
     from scipy.stats import f

@@ -44,24 +44,18 @@ FolderName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 class RobotConfig(Config):
     """A robot, the designs under consideration, and the backend.
 
-    Attributes:
-        robot: registered name, or path ``"my_module:MyRobot"``.
-        robot_options: options of the robot.
-        ranges: bounds of free robot options, ``{"robot.<option>": {low, high, baseline, unit}}``.
-        bounds: narrower bounds of free design variables, ``{name: [low, high]}``.
-        design: values of the other design variables, and reference values of the free ones; the rest keeps the robot's
-            baseline.
-        backend: ``"fem"`` or ``"surrogate"``.
-        weights: folder of the surrogate's weights; default: the pretrained ones.
+    The reference design has the values of ``design``, and the robot's baseline for other variables.
     """
 
-    robot: str
+    robot: str = Field(description="registered name, or path my_module:MyRobot")
     robot_options: dict[str, Any] = Field(default_factory=dict)
-    ranges: dict[str, OptionRange] = Field(default_factory=dict)
-    bounds: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    ranges: dict[str, OptionRange] = Field(default_factory=dict, description="bounds of free robot.<option>s")
+    bounds: dict[str, tuple[float, float]] = Field(
+        default_factory=dict, description="narrower bounds of free design variables, {name: [low, high]}"
+    )
     design: dict[str, float] = Field(default_factory=dict)
     backend: Literal["fem", "surrogate"] = "surrogate"
-    weights: str | None = None
+    weights: str | None = Field(default=None, description="folder of the surrogate's weights; default pretrained ones")
 
     @model_validator(mode="after")
     def _makes_a_robot(self) -> RobotConfig:
@@ -74,17 +68,15 @@ class RobotConfig(Config):
 
 
 class BodiesConfig(RobotConfig):
-    """The bodies of a search or a sensitivity study, and how they are actuated; see also `RobotConfig`.
+    """The bodies of a search or a sensitivity study, and how they are actuated; see also `RobotConfig`."""
 
-    Attributes:
-        variables: free design variables, and free robot options as ``robot.<option>``; default: all design variables.
-        actuation: full command, a displacement for each actuator; default: half of their upper limits.
-        steps: states beyond rest along the actuation.
-    """
-
-    variables: tuple[str, ...] | None = Field(default=None, min_length=1)
-    actuation: tuple[float, ...] | None = None
-    steps: int = Field(default=1, ge=1)
+    variables: tuple[str, ...] | None = Field(
+        default=None, min_length=1, description="free variables, also robot.<option>; default all design variables"
+    )
+    actuation: tuple[float, ...] | None = Field(
+        default=None, description="full command: a displacement per actuator; default half of their upper limits"
+    )
+    steps: int = Field(default=1, ge=1, description="states beyond rest along the actuation")
 
     @model_validator(mode="after")
     def _consistent(self) -> BodiesConfig:
@@ -117,17 +109,13 @@ class BodiesConfig(RobotConfig):
 
 
 class ObjectiveConfig(Config):
-    """One objective. In a file, the metric alone is enough.
-
-    Attributes:
-        metric: name of a metric, or path of one of your own, ``"my_module:my_metric"``.
-        goal: ``"maximize"``, ``"minimize"``, or a target value [SI]; default: the direction of the metric.
-        weight: gamma of eq. 4.18 of the thesis, for solvers that add objectives up.
-    """
+    """One objective. In a file, the metric alone is enough."""
 
     metric: MetricName
-    goal: Literal["maximize", "minimize"] | float | None = None
-    weight: float = Field(default=1.0, gt=0.0)
+    goal: Literal["maximize", "minimize"] | float | None = Field(
+        default=None, description="or a target value [SI]; default the direction of the metric"
+    )
+    weight: float = Field(default=1.0, gt=0.0, description="gamma of eq. 4.18 of the thesis, for solver 'gradient'")
 
     @model_validator(mode="before")
     @classmethod
@@ -149,21 +137,15 @@ class ObjectiveConfig(Config):
 class SearchConfig(Config):
     """Search without gradients (Optuna). Several objectives give a Pareto front.
 
-    Attributes:
-        method: ``"search"``.
-        sampler: algorithm that proposes designs.
-        trials: designs to evaluate, infeasible ones included.
-        batch: designs that are proposed together; for NSGA-II, the population. The result depends on it, but not on the
-            number of workers.
-        starts: designs to evaluate first, ``{name: value}`` each; missing variables take the reference, moved into the
-            bounds.
+    The result depends on the size of a batch, but not on the number of workers. Variables that ``starts`` do not name
+    take the reference, moved into the bounds.
     """
 
     method: Literal["search"]
     sampler: SamplerConfig = Field(default_factory=SamplerConfig)
-    trials: int = Field(default=100, ge=1)
-    batch: int = Field(default=1, ge=1)
-    starts: tuple[dict[str, float], ...] = ()
+    trials: int = Field(default=100, ge=1, description="designs to evaluate, infeasible ones included")
+    batch: int = Field(default=1, ge=1, description="designs proposed together; for NSGA-II, the population")
+    starts: tuple[dict[str, float], ...] = Field(default=(), description="designs to evaluate first, {name: value}")
 
     @model_validator(mode="after")
     def _whole_generations(self) -> SearchConfig:
@@ -178,23 +160,19 @@ class SearchConfig(Config):
 class GradientConfig(Config):
     """Descent along gradients of the surrogate, within the box, from several starts.
 
-    Attributes:
-        method: ``"gradient"``.
-        starts: ``"corners"`` of the box, the ``"reference"`` design, or ``"grid"``: the best designs of a grid.
-        count: number of starts, for ``"grid"``.
-        grid: number of designs on the grid that normalises the objectives and from which starts are chosen.
-        iterations: largest number of iterations of a descent.
-        tolerance: a descent ends when no component of the projected gradient of the normalised cost is larger.
-        check: also evaluate the best design on FEM.
+    It starts from the ``"corners"`` of the box, the ``"reference"`` design, or the best designs of a ``"grid"``. The
+    same grid normalises the objectives.
     """
 
     method: Literal["gradient"]
     starts: Literal["corners", "grid", "reference"] = "corners"
-    count: int = Field(default=4, ge=1)
-    grid: int = Field(default=600, ge=2)
-    iterations: int = Field(default=100, ge=1)
-    tolerance: float = Field(default=1e-6, gt=0.0)
-    check: bool = True
+    count: int = Field(default=4, ge=1, description="number of starts from the grid")
+    grid: int = Field(default=600, ge=2, description="number of designs on the grid")
+    iterations: int = Field(default=100, ge=1, description="largest number of iterations of a descent")
+    tolerance: float = Field(
+        default=1e-6, gt=0.0, description="largest component of the projected gradient at the end of a descent"
+    )
+    check: bool = Field(default=True, description="also evaluate the best design on FEM")
 
 
 class OptimiseConfig(Config):

@@ -17,29 +17,17 @@ GAP_TOLERANCE = 1e-9  # [m]
 
 @dataclass(frozen=True)
 class Plane:
-    """A rigid, frictionless plane in the way of the first effector.
+    """A rigid, frictionless plane in the way of the first effector."""
 
-    Attributes:
-        distance: from the effector at rest, along the normal [m].
-        normal: direction towards the plane, shape (3,); need not have length 1.
-    """
-
-    distance: float
-    normal: Sequence[float] | np.ndarray
+    distance: float  # from the effector at rest, along the normal [m]
+    normal: Sequence[float] | np.ndarray  # direction towards the plane, of any length, shape (3,)
 
 
 def step_towards_plane(backend: FEMBackend, command: np.ndarray, driven: str, plane: Plane, rest: np.ndarray) -> State:
-    """Return the state under a command, with a plane in the way of the first effector.
+    """Return the state under a command (n_a,), with a plane in the way of the first effector.
 
     The contact force f and the gap g satisfy ``f >= 0, g >= 0, f g = 0``. Newton's method with the condensed compliance
-    of the effector finds them.
-
-    Args:
-        backend: static finite elements.
-        command: imposed displacements or efforts, shape (n_a,).
-        driven: ``"displacement"`` or ``"effort"``.
-        plane: the plane.
-        rest: position of the effector at rest [m], shape (3,).
+    of the effector finds them. ``rest`` is the position of the effector at rest [m], shape (3,).
 
     Raises:
         ConvergenceError: if an equilibrium is not found.

@@ -4,40 +4,29 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from codesign.records import Record
 from codesign.tools.bodies import Evaluator
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.executors import parallel_map
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """Metrics of one design, or the reason why it has none.
+class Evaluation(Record):
+    """Metrics of one design, or the reason why it has none."""
 
-    Attributes:
-        metrics: values [SI] by name; empty for an infeasible design.
-        infeasible: why the design has no metrics, or None.
-        seconds: time of the evaluation.
-        repeated: the sampler had proposed the same design before, and nothing was computed again.
-    """
-
-    metrics: dict[str, float] = field(default_factory=dict)
-    infeasible: str | None = None
+    metrics: dict[str, float] = field(default_factory=dict)  # by name [SI]
+    infeasible: str | None = None  # why the design has no metrics
     seconds: float = 0.0
-    repeated: bool = False
+    repeated: bool = False  # the sampler had proposed the same design before, and nothing was computed again
 
     @property
     def feasible(self) -> bool:
         """Whether the design has metrics."""
         return self.infeasible is None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain data for `Evaluation(**data)`."""
-        return asdict(self)
 
 
 def evaluate(evaluator: Evaluator, design: Mapping[str, float]) -> Evaluation:

@@ -71,13 +71,9 @@ class WeightedCost:
 
 
 def descend(cost: WeightedCost, start: np.ndarray, *, iterations: int = 100, tolerance: float = 1e-6) -> Descent:
-    """Minimise a cost within the box from one start (L-BFGS-B).
+    """Minimise a cost within the box from one start (d,) in unit coordinates (L-BFGS-B).
 
-    Args:
-        cost: the cost.
-        start: unit coordinates, shape (d,).
-        iterations: largest number of iterations.
-        tolerance: largest component of the projected gradient at the end.
+    It ends when no component of the projected gradient exceeds the tolerance.
     """
     from scipy.optimize import minimize
 

@@ -24,19 +24,12 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class Measurements:
-    """N states of one body. Columns that were not measured are NaN.
+    """N states of one body. Columns that were not measured are NaN."""
 
-    Attributes:
-        driven: which quantity of the actuators was imposed: ``"displacement"`` or ``"effort"``.
-        displacement: of the actuators [m, ...], shape (N, n_a).
-        effort: of the actuators [N, ...], shape (N, n_a).
-        effector: positions [m], shape (N, 3 k) for k effectors.
-    """
-
-    driven: Literal["displacement", "effort"]
-    displacement: np.ndarray
-    effort: np.ndarray
-    effector: np.ndarray
+    driven: Literal["displacement", "effort"]  # what was imposed on the actuators
+    displacement: np.ndarray  # of the actuators [m, ...], shape (N, n_a)
+    effort: np.ndarray  # of the actuators [N, ...], shape (N, n_a)
+    effector: np.ndarray  # positions [m], shape (N, 3 k) for k effectors
 
     def __len__(self) -> int:
         return len(self.effector)
@@ -49,10 +42,8 @@ class Measurements:
     def with_noise(self, relative: float, rng: np.random.Generator) -> Measurements:
         """Return a copy with Gaussian noise on the measured columns, not on the imposed ones.
 
-        Args:
-            relative: standard deviation, relative to the root mean square of the effectors' distances from their mean,
-                and of the efforts.
-            rng: generator of the noise.
+        The standard deviation is relative to the root mean square of the efforts, and of the distances of the effectors
+        from their mean.
         """
         away = self.effector - self.effector.mean(axis=0)
         spread = np.sqrt(np.nanmean(away**2)) if np.isfinite(away).any() else 0.0
@@ -131,7 +122,6 @@ def measure(
 
     Raises:
         ValueError: for a plane on a surrogate.
-        DesignError: for a malformed design.
         InfeasibleDesign: if the geometry cannot exist.
         ConvergenceError: if an equilibrium is not found.
     """

@@ -22,25 +22,15 @@ Direction = Literal["maximize", "minimize"]
 
 @dataclass(frozen=True)
 class Course:
-    """States of B bodies along one actuation, K of them: the first at rest, the last at the full command.
+    """States of B bodies along one actuation, K of them: the first at rest, the last at the full command."""
 
-    Attributes:
-        displacement: actuator displacements [m, ...], shape (K, B, n_a).
-        effort: actuator efforts [N, ...], shape (K, B, n_a).
-        effector: effector positions [m], shape (K, B, n_e).
-        compliance: W, actuators before effectors, shape (K, B, n_a + n_e, n_a + n_e).
-        axis: coordinate along which the body lies at rest: 0, 1 or 2.
-        sensor: volumes of the cavities [m3], shape (K, B, n_s), if the body has cavities.
-        material: volume of the solid [m3], shape (B,), on FEM.
-    """
-
-    displacement: Tensor
-    effort: Tensor
-    effector: Tensor
-    compliance: Tensor
-    axis: int
-    sensor: Tensor | None = None
-    material: Tensor | None = None
+    displacement: Tensor  # of the actuators [m, ...], shape (K, B, n_a)
+    effort: Tensor  # of the actuators [N, ...], shape (K, B, n_a)
+    effector: Tensor  # positions [m], shape (K, B, n_e)
+    compliance: Tensor  # W, actuators before effectors, shape (K, B, n_a + n_e, n_a + n_e)
+    axis: int  # coordinate along which the body lies at rest: 0, 1 or 2
+    sensor: Tensor | None = None  # volumes of the cavities [m3], shape (K, B, n_s), if the body has cavities
+    material: Tensor | None = None  # volume of the solid [m3], shape (B,), on FEM
 
     @property
     def travel(self) -> Tensor:

@@ -25,20 +25,11 @@ class Misfit(ABC):
     """Residuals of a body against measurements, each relative to the size of what was measured.
 
     Effector coordinates are divided by the root mean square of their distances from their mean, efforts by their own
-    root mean square.
-
-    Args:
-        robot: the robot.
-        parameters: the fitted quantities.
-        data: measured states.
+    root mean square. There are ``count`` residuals, which were computed ``evaluations`` times so far.
 
     Raises:
         ConfigError: for an offset of a column that was not measured.
         DataError: if there are not more measured numbers than parameters, or they do not vary at all.
-
-    Attributes:
-        count: number of residuals.
-        evaluations: number of computations of the residuals so far.
     """
 
     def __init__(self, robot: Robot, parameters: Parameters, data: Measurements) -> None:
@@ -106,15 +97,8 @@ class Misfit(ABC):
 class LearnedMisfit(Misfit):
     """Residuals of a surrogate, with exact derivatives, also for actuators driven in effort and for slack cables.
 
-    Args:
-        robot: the robot.
-        parameters: the fitted quantities, without robot options.
-        data: measured states.
-        weights: folder of the surrogate's weights; default: the pretrained ones.
-
     Raises:
         ConfigError: as for `Misfit`, and if the network of the weights has no exact derivatives.
-        DataError: as for `Misfit`.
     """
 
     def __init__(
@@ -195,14 +179,7 @@ class LearnedMisfit(Misfit):
 
 
 class FEMMisfit(Misfit):
-    """Residuals of finite elements, with derivatives by finite differences.
-
-    Args:
-        robot: the robot.
-        parameters: the fitted quantities.
-        data: measured states.
-        make_robot: makes the robot with other values of fitted options.
-    """
+    """Residuals of finite elements, with derivatives by finite differences."""
 
     difference = 1e-4  # in coordinates
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
-from pydantic import field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from codesign.tools.measurements import columns_of
 from softgym_envs.config import Config
@@ -22,16 +22,10 @@ EFFORT_UNITS = {"m": "N", "m3": "Pa"}
 
 
 class NuisanceConfig(Config):
-    """A nuisance parameter.
-
-    Attributes:
-        bounds: smallest and largest value [unit].
-        start: first value [unit]; default: the middle of the bounds.
-        unit: its SI unit.
-    """
+    """A nuisance parameter; its values are in its own ``unit``, an SI unit."""
 
     bounds: tuple[float, float]
-    start: float | None = None
+    start: float | None = Field(default=None, description="first value; default the middle of the bounds")
     unit: str
 
     @model_validator(mode="after")
@@ -57,15 +51,10 @@ class NuisanceConfig(Config):
 
 
 class OffsetConfig(NuisanceConfig):
-    """A sensor whose reading is the true value plus an offset.
-
-    Attributes:
-        kind: ``"offset"``.
-        column: column of the measurements: imposed or measured.
-    """
+    """A sensor whose reading is the true value plus an offset."""
 
     kind: Literal["offset"]
-    column: str
+    column: str = Field(description="column of the measurements: imposed or measured")
 
 
 class ContactConfig(NuisanceConfig):
@@ -73,14 +62,10 @@ class ContactConfig(NuisanceConfig):
 
     On FEM the contact force is exact. On a surrogate it comes from the compliance of the free state (thesis, eq. 4.16),
     so ``refine`` the fit on FEM.
-
-    Attributes:
-        kind: ``"contact"``.
-        normal: direction in which the effector moves towards the plane; need not have length 1.
     """
 
     kind: Literal["contact"]
-    normal: tuple[float, float, float]
+    normal: tuple[float, float, float] = Field(description="direction towards the plane, of any length")
 
     @field_validator("normal")
     @classmethod

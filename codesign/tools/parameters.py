@@ -17,17 +17,11 @@ from softgym_envs.robots.base import Robot
 
 @dataclass(frozen=True)
 class Quantities:
-    """What B points stand for, as tensors.
+    """What B points stand for, as tensors."""
 
-    Attributes:
-        design: complete designs without robot options, shape (B, len(space)).
-        offsets: offset of each column of the measurements: displacements, efforts, effectors, shape (B, 2 n_a + n_e).
-        distance: distance of the plane of contact [m], shape (B,), or None without contact.
-    """
-
-    design: Tensor
-    offsets: Tensor
-    distance: Tensor | None
+    design: Tensor  # complete designs without robot options, shape (B, len(space))
+    offsets: Tensor  # of the columns of displacements, efforts and effectors, shape (B, 2 n_a + n_e)
+    distance: Tensor | None  # of the plane of contact [m], shape (B,)
 
 
 class Parameters:
@@ -36,11 +30,6 @@ class Parameters:
     Poisson's ratio nu has the coordinate ``-log(0.5 - nu)``, scaled: thesis, eq. 3.14, with ``nu_inf = 0.5`` instead of
     0.501. Close to 0.5, a body depends on ``1 - 2 nu`` over orders of magnitude. Other variables are scaled as in
     `softgym_envs.designs.DesignVariable.to_unit`, nuisance parameters linearly.
-
-    Args:
-        robot: the robot.
-        box: fitted variables within their bounds.
-        nuisances: nuisance parameters by name.
     """
 
     def __init__(self, robot: Robot, box: Box, nuisances: Nuisances | None = None) -> None:

@@ -33,10 +33,7 @@ def figure(path: str | Path, columns: int = 1, width: float = 5.2, height: float
 def draw_calibration(path: str | Path, units: Mapping[str, str], result: CalibrationResult) -> None:
     """Draw the cost and each parameter against the evaluations, one line per start, with intervals and refined fit.
 
-    Args:
-        path: PNG to write.
-        units: SI units of the fitted parameters by name.
-        result: the calibration.
+    ``units`` are the SI units of the fitted parameters by name.
     """
     with figure(path, 1 + len(units)) as axes:
         for number, fit in enumerate(result.fits, start=1):
@@ -67,12 +64,7 @@ def draw_descents(
 ) -> None:
     """Draw the cost of every descent and, for two or more metrics, the first two on the grid and at all ends.
 
-    Args:
-        path: PNG to write.
-        metrics: the metrics.
-        histories: cost of each descent after each iteration.
-        grid: metrics on the grid [SI], shape (n, m).
-        ends: metrics at the ends [SI], shape (k, m).
+    The metrics [SI] have the shape (n, m) on the grid and (k, m) at the ends.
     """
     with figure(path, 1 + (len(metrics) > 1)) as axes:
         for history in histories:
@@ -99,12 +91,8 @@ def draw_front(
 ) -> None:
     """Draw all evaluated designs with the Pareto front of the first two metrics; for one metric, all its values.
 
-    Args:
-        path: PNG to write.
-        metrics: the metrics.
-        values: metrics of all designs [SI], shape (n, m), in the order of evaluation.
-        front: indices of the non-dominated designs.
-        references: metrics [SI] of designs to compare with, by name.
+    The values [SI] have the shape (n, m), in the order of evaluation, ``front`` has indices into them, and
+    ``references`` has metrics [SI] of designs to compare with, by name.
     """
     scale = np.array([metric.display_scale for metric in metrics])
     shown = scale * values
@@ -129,14 +117,7 @@ def draw_front(
 def draw_sensitivity(
     path: str | Path, method: str, metrics: Sequence[Metric], indices: Mapping[str, Mapping[str, Any]]
 ) -> None:
-    """Draw one panel per metric, with one bar per variable.
-
-    Args:
-        path: PNG to write.
-        method: ``"oat"``, ``"morris"`` or ``"sobol"``.
-        metrics: the metrics.
-        indices: ``{metric: {variable: {index: value}}}``.
-    """
+    """Draw one panel per metric, with one bar per variable; ``indices`` is that of `SensitivityResult`."""
     with figure(path, len(metrics), width=4.6, height=3.4) as axes:
         for axis, metric in zip(axes, metrics, strict=True):
             table = indices[metric.name]

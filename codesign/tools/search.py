@@ -200,4 +200,4 @@ class _Search:
 
 
 def _evaluation(trial: optuna.trial.FrozenTrial) -> Evaluation:
-    return Evaluation(**trial.user_attrs["evaluation"])
+    return Evaluation.from_json(trial.user_attrs["evaluation"])
