@@ -60,7 +60,7 @@ def make_sampler(config: SamplerConfig, number: int) -> optuna.samplers.BaseSamp
 
 
 def construct(cls: type, options: dict[str, Any]) -> Any:
-    """Return a sampler or pruner of Optuna. Naming one in a configuration is consent to its being experimental."""
+    """Return a sampler or pruner of Optuna, without its warning that a class is experimental."""
     from optuna.exceptions import ExperimentalWarning
 
     with warnings.catch_warnings():

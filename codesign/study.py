@@ -158,27 +158,27 @@ def _try_sampler(config: StudyConfig) -> None:
         raise ConfigError(f"pruner '{pruner.name}' with pruner.options = {pruner.options}: {error}") from None
 
 
-def _run_jobs(study: StudyFolder, phase: str, jobs: list[Job], workers: int, tick: Callable[[], None]) -> None:
-    stopped = run_workers(study, phase, workers, tick)
-    _require(all(job.path.exists() for job in jobs), phase, stopped)
+def _run_jobs(
+    study: StudyFolder, phase: str, missing: list[Job], workers: int, tick: Callable[[], None] = lambda: None
+) -> None:
+    stopped = run_workers(study, phase, min(workers, len(missing)), tick)
+    _require(all(job.path.exists() for job in missing), phase, stopped)
 
 
 def _run_screen(study: StudyFolder, workers: int, output: Progress) -> None:
     jobs = screen_jobs(study)
-    missing = missing_jobs(study, jobs)
-    if missing:
+    if missing := missing_jobs(study, jobs):
         output.say(f"screen: scoring {len(missing)} bodies by the inverse QP")
-        _run_jobs(study, "screen", jobs, min(workers, len(missing)), lambda: None)
+        _run_jobs(study, "screen", missing, workers)
     output.say(f"screen: kept {len(kept_bodies(study))} of {len(jobs)} bodies")
 
 
 def _make_shared_policy(study: StudyFolder, output: Progress) -> None:
-    jobs = shared_policy_jobs(study)
-    if missing_jobs(study, jobs):
+    if missing := missing_jobs(study, shared_policy_jobs(study)):
         if study.config.plan.proposer:
             steps = study.config.joint.steps
             output.say(f"shared policy: training bodies and policy together, {steps:,} steps")
-        _run_jobs(study, "shared_policy", jobs, 1, lambda: None)
+        _run_jobs(study, "shared_policy", missing, 1)
 
 
 def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
@@ -212,13 +212,11 @@ def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
 
 def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
     snapshot = load_study(study)
-    jobs = finalist_jobs(snapshot)
-    missing = missing_jobs(study, jobs)
-    if missing:
+    if missing := missing_jobs(study, finalist_jobs(snapshot)):
         backends = " and ".join(study.config.test_backends)
         output.say(f"test: {len(snapshot.finalists)} bodies on {len(study.goals['unseen'])} test goals, {backends}")
         output.tests(quiet=True)
-        _run_jobs(study, "finalists", jobs, min(workers, len(missing)), output.tests)
+        _run_jobs(study, "finalists", missing, workers, output.tests)
 
 
 def _require(done: bool, phase: str, stopped: str | None) -> None:

@@ -33,13 +33,7 @@ IMAGE_SIZE = (420, 420)
 
 
 def write_report(folder: str | Path) -> Path:
-    """Write ``report.html`` of a study; write ``results.json``, ``trials.csv`` and ``finalists.csv`` again.
-
-    Args:
-        folder: folder of a study, finished or not.
-
-    Returns:
-        The report.
+    """Write ``report.html`` and the tables of results of a study, finished or not, and return the path of the report.
 
     Raises:
         DataError: if the folder holds no study.
@@ -79,7 +73,9 @@ def _context(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
         "design": [tables.design_row(variable) for variable in results.variables],
         "comparison_columns": tables.comparison_columns(objective),
         "comparison": [tables.comparison_row(row, objective) for row in results.comparison],
-        "goals_note": _goals_note(snapshot),
+        "goals_note": "The goals are those of the search, because the task has no others."
+        if _same_goals(snapshot)
+        else "These goals were used neither to train the controllers nor to choose the winner.",
         "interval_note": _interval_note(snapshot, results),
         "figures": {
             "reached": plots.reached(results),
@@ -100,12 +96,6 @@ def _context(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
 def _same_goals(snapshot: StudySnapshot) -> bool:
     """Return whether the task has one path, so that the final test uses the goals of the search."""
     return np.array_equal(snapshot.folder.goals["unseen"], snapshot.folder.goals["selection"])
-
-
-def _goals_note(snapshot: StudySnapshot) -> str:
-    if _same_goals(snapshot):
-        return "The goals are those of the search, because the task has no others."
-    return "These goals were used neither to train the controllers nor to choose the winner."
 
 
 def _headline(snapshot: StudySnapshot, results: StudyResults) -> str:
@@ -222,7 +212,10 @@ def _question(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str,
         rows.append(("Training", f"{config.training.steps:,} environment steps in each trial"))
     if config.plan.proposer:
         rows.append(("Training", f"{config.joint.steps:,} environment steps on many bodies, none in the trials"))
-    rows.append(("Search", f"sampler {config.sampler.name}, pruner {config.pruner.name}{_screen_text(snapshot)}"))
+    rows.append(("Search", f"sampler {config.sampler.name}, pruner {config.pruner.name}"))
+    if (screen := config.screen).enabled:
+        scored = f"{screen.candidates} bodies on {screen.goals} goals"
+        rows.append(("Screen", f"before the search, the inverse QP scored {scored}; {screen.kept} became trials"))
     if config.finalists.seeds:
         steps = config.finalists.steps or config.training.steps
         rows.append(("Final test", f"{config.finalists.seeds} policies trained anew for each body, {steps:,} steps"))
@@ -240,15 +233,6 @@ def _origin_of_goals(snapshot: StudySnapshot) -> str:
         half = ", ".join(f"{1e3 * v:g}" for v in goals.zone.half_size)
         return f"spread over a work zone around ({center}) mm, half size ({half}) mm, the same for every body"
     return "drawn by the task for the baseline body, the same for every body"
-
-
-def _screen_text(snapshot: StudySnapshot) -> str:
-    screen = snapshot.config.screen
-    if not screen.enabled:
-        return ""
-    return (
-        f"; before it, the inverse QP scored {screen.candidates} bodies on {screen.goals} goals and kept {screen.kept}"
-    )
 
 
 def _poses(snapshot: StudySnapshot) -> list[tuple[str, np.ndarray | None]]:
@@ -318,7 +302,7 @@ def _interval_note(snapshot: StudySnapshot, results: StudyResults) -> str:
         )
     else:
         note += ", over goals, for the controllers as trained: they do not include the effect of another training seed."
-    return f"{note} If a few goals decide the mean they cover less than 95 %: with a dozen goals 75 %."
+    return f"{note} If a few goals dominate the mean, they cover less than 95 %: 75 % with a dozen goals."
 
 
 def _search(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, str]]:
@@ -348,7 +332,7 @@ def _search_notes(snapshot: StudySnapshot, results: StudyResults) -> list[str]:
     if results.importance:
         notes.append(
             "Importance by PED-ANOVA: how differently the best quarter of the bodies and all bodies are distributed "
-            "along a variable. With few trials it is a hint, not a measurement."
+            "along a variable. With few trials this is only a hint."
         )
     return notes
 

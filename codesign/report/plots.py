@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 BASELINE, WINNER, OTHER, MUTED, VIOLATES = "#64748b", "#0f766e", "#cbd5e1", "#94a3b8", "#dc2626"
 COLOURS = {"baseline": BASELINE, "winner": WINNER}
 AGENTS = {"sac": ("SAC", "o"), "qp": ("inverse QP", "s")}
+SILHOUETTE_HEIGHT = 700  # pixels
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 9.5,
@@ -225,19 +226,15 @@ def parallel(snapshot: StudySnapshot, results: StudyResults) -> str:
     return out[0]
 
 
-def silhouette(nodes: np.ndarray, triangles: np.ndarray, extent: np.ndarray, pixels: int = 700) -> np.ndarray:
+def _silhouette(nodes: np.ndarray, triangles: np.ndarray, extent: np.ndarray) -> np.ndarray:
     """Return the shadow of a body on the plane of its last two coordinates, as an image (h, w) of 0 and 1.
 
-    Args:
-        nodes: [m], shape (n, 3).
-        triangles: its boundary, shape (t, 3).
-        extent: lower and upper corner of the image [m], shape (2, 2).
-        pixels: height of the image.
+    The body has nodes [m] (n, 3) and boundary triangles (t, 3). ``extent`` holds two corners of the image [m], (2, 2).
     """
     from PIL import Image, ImageDraw
 
-    scale = pixels / (extent[1, 1] - extent[0, 1])
-    image = Image.new("L", (round(scale * (extent[1, 0] - extent[0, 0])), pixels))
+    scale = SILHOUETTE_HEIGHT / (extent[1, 1] - extent[0, 1])
+    image = Image.new("L", (round(scale * (extent[1, 0] - extent[0, 0])), SILHOUETTE_HEIGHT))
     draw = ImageDraw.Draw(image)
     for corners in (nodes[:, 1:][triangles] - extent[0]) * scale:
         draw.polygon([(float(y), float(z)) for y, z in corners], fill=1)
@@ -247,9 +244,7 @@ def silhouette(nodes: np.ndarray, triangles: np.ndarray, extent: np.ndarray, pix
 def overlay(shapes: Sequence[tuple[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]]]) -> str:
     """Overlaid side views of baseline and winner, to scale.
 
-    Args:
-        shapes: for each pose its caption and, by role, nodes [m] (n, 3), boundary triangles (t, 3) and effectors [m]
-            (k, 3).
+    Each pose has its caption and, by role, nodes [m] (n, 3), boundary triangles (t, 3) and effectors [m] (k, 3).
     """
     with _figure(9.4, 4.4, len(shapes)) as (_, axes, out):
         for ax, (caption, bodies) in zip(axes, shapes, strict=True):
@@ -258,7 +253,7 @@ def overlay(shapes: Sequence[tuple[str, Mapping[str, tuple[np.ndarray, np.ndarra
             extent = np.array([points.min(axis=0) - margin, points.max(axis=0) + margin])
             for role, (nodes, triangles, effectors) in bodies.items():
                 colour = WINNER if role == "winner" else BASELINE
-                image = silhouette(nodes, triangles, extent)
+                image = _silhouette(nodes, triangles, extent)
                 grid = [1e3 * np.linspace(extent[0, k], extent[1, k], n) for k, n in enumerate(reversed(image.shape))]
                 ax.contourf(*grid, image, levels=[0.5, 1.5], colors=[colour], alpha=0.16)
                 ax.contour(*grid, image, levels=[0.5], colors=[colour], linewidths=1.3)

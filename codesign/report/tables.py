@@ -7,7 +7,7 @@ from typing import Any
 
 from codesign.objectives import OBJECTIVES, Objective
 from codesign.records import TrialResult
-from codesign.report.results import BodyStatistics, Comparison, Cost, StudyResults, Transfer, VariableResult
+from codesign.report.results import Comparison, Cost, StudyResults, Transfer, VariableResult
 from codesign.report.units import present, shown_unit
 from codesign.snapshot import StudySnapshot
 
@@ -71,21 +71,16 @@ def comparison_columns(objective: Objective) -> list[str]:
 def comparison_row(row: Comparison, objective: Objective) -> dict[str, Any]:
     """Return the comparison for one controller and backend."""
     cells: list[dict[str, Any]] = []
-
-    def add(
-        measure: Objective, value: str, interval: str, change: float, change_interval: Sequence[float] | None
-    ) -> None:
-        bodies: tuple[BodyStatistics, ...] = (row.baseline, row.winner)
-        for body in bodies:
-            cells.append(_cell(measure.text(getattr(body, value)), getattr(body, interval), _ends(measure)))
-        text = measure.text(change, "+")
-        cells.append(_cell(text, change_interval, _ends(measure, "+"), measure.sign))
-
-    if objective.name not in SHOWN_ALWAYS:
-        add(objective, "objective", "objective_interval", row.objective_change, row.objective_change_interval)
-    success, distance = OBJECTIVES["success_rate"], OBJECTIVES["mean_distance"]
-    add(success, "success_rate", "success_interval", row.success_change, row.success_change_interval)
-    add(distance, "mean_distance", "distance_interval", row.distance_change, row.distance_change_interval)
+    # Measure, its mean, and the prefix of its other fields in the comparison.
+    shown = [(objective, "objective", "objective")] if objective.name not in SHOWN_ALWAYS else []
+    shown += [(OBJECTIVES["success_rate"], "success_rate", "success")]
+    shown += [(OBJECTIVES["mean_distance"], "mean_distance", "distance")]
+    for measure, mean, prefix in shown:
+        for body in (row.baseline, row.winner):
+            text, interval = measure.text(getattr(body, mean)), getattr(body, f"{prefix}_interval")
+            cells.append(_cell(text, interval, _ends(measure)))
+        change, interval = getattr(row, f"{prefix}_change"), getattr(row, f"{prefix}_change_interval")
+        cells.append(_cell(measure.text(change, "+"), interval, _ends(measure, "+"), measure.sign))
     return {
         "backend": BACKENDS[row.backend],
         "agent": AGENTS[row.agent],

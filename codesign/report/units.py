@@ -10,7 +10,7 @@ def shown_unit(unit: str) -> tuple[str, float, int]:
     return SHOWN.get(unit, (unit, 1.0, 3))
 
 
-def present(value: float, unit: str, sign: str = "") -> str:
+def present(value: float, unit: str) -> str:
     """Return a quantity [unit] as people read it: ``"41.50 mm"``."""
     name, factor, decimals = shown_unit(unit)
-    return f"{value * factor:{sign}.{decimals}f}{' ' + name if name else ''}"
+    return f"{value * factor:.{decimals}f}{' ' + name if name else ''}"

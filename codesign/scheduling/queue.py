@@ -5,9 +5,9 @@ one worker, which shows that it is alive (`codesign.scheduling.storage`). If the
 the trial is recovered: its result is used if it was already written, otherwise its body is queued again.
 
 A body counts as the cause of its worker's death if the call that started the worker is still alive. It does not if the
-call ended as well: Ctrl-C, ``kill -9`` of all processes and a power cut say nothing about a body. A body that takes its
-call down too (all memory of the machine) cannot be distinguished from these; whoever restarts the call will notice. A
-worker that dies while it claims a trial has not looked at the body yet, so the body is not to blame either. Exceptions
+call ended as well: Ctrl-C, ``kill -9`` of all processes and a power cut say nothing about a body. A body that also ends
+its call, for example because it fills the memory of the machine, looks the same; whoever restarts the call will notice.
+A worker that dies while it claims a trial has not used the body yet, so the body is not to blame either. Exceptions
 are bugs: they end the study with their traceback, and its next call runs the body again.
 """
 
@@ -235,8 +235,8 @@ class TrialQueue:
                 self._publish(result)
                 self._tell(study, trial, result)
                 continue
-            # Queue it before it is marked as failed: a crash in between does not lose it, and ``replaces`` prevents
-            # that it is queued twice.
+            # Queue it before it is marked as failed: a crash in between does not lose it, and ``replaces`` keeps it
+            # from being queued twice.
             if trial.number not in replaced:
                 complete = set(trial.params) == set(self.folder.config.variables)
                 values = trial.params if complete else trial.system_attrs.get("fixed_params")
@@ -271,7 +271,7 @@ class TrialQueue:
     # ---------------------------------------------------------------------------------------------------------------
 
     def _inherit_folder(self, trial: optuna.Trial) -> None:
-        """Move the training files of the trials that this one repeats to its folder."""
+        """Move the training files of the trials that this one repeats into its folder."""
         new, marks = self.folder.trial(trial.number), trial.user_attrs
         if "replaces" not in marks:
             return

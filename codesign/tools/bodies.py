@@ -26,11 +26,7 @@ RobotMaker = Callable[[Mapping[str, float]], Robot]
 
 
 def full_command(robot: Robot, actuation: Sequence[float] | None) -> np.ndarray:
-    """Return a checked actuation (n_a,); default: half of the upper limit of each actuator.
-
-    Raises:
-        ConfigError: for a wrong length, or a displacement out of range.
-    """
+    """Return an actuation (n_a,), or a ConfigError if it is out of range; default: half of the upper limits."""
     command = np.array(0.5 * robot.upper if actuation is None else actuation, dtype=float)
     if command.shape != robot.lower.shape or not ((command >= robot.lower) & (command <= robot.upper)).all():
         allowed = ", ".join(f"{a.name} {a.low:g} to {a.high:g} {a.unit}" for a in robot.actuators)
@@ -39,11 +35,7 @@ def full_command(robot: Robot, actuation: Sequence[float] | None) -> np.ndarray:
 
 
 def check_metrics(robot: Robot, metrics: Sequence[str | Metric], backend: str) -> tuple[Metric, ...]:
-    """Return metrics by name.
-
-    Raises:
-        ConfigError: for no metric, an unknown or repeated one, or one that the backend or the robot does not provide.
-    """
+    """Return metrics by name; a ConfigError for none, or one that is unknown, repeated or not provided."""
     try:
         found = find_metrics(tuple(metrics))
     except ValueError as error:
@@ -100,12 +92,7 @@ class Evaluator:
         self._options: dict[str, float] = {}
 
     def course(self, design: Mapping[str, float]) -> Course:
-        """Return the states of one design.
-
-        Raises:
-            InfeasibleDesign: if the geometry cannot exist.
-            ConvergenceError: if an equilibrium is not found.
-        """
+        """Return the states of one design; raises `InfeasibleDesign` and `ConvergenceError`."""
         variables, options = split_values(design)
         if options != self._options:
             assert self._make_robot is not None
@@ -198,12 +185,7 @@ class LearnedBodies:
 
 
 def learned_model(robot: Robot, weights: str | Path | None = None) -> TorchModel:
-    """Return a robot's surrogate in torch.
-
-    Raises:
-        ConfigError: if its network has no exact gradients.
-        WeightsError: if there are no weights.
-    """
+    """Return a robot's surrogate in torch; a ConfigError if its network has no exact gradients."""
     model = pretrained_model(robot, weights)
     if not isinstance(model, Model):
         raise ConfigError(f"gradients need weights of a 'potential' network, got '{model.network}'")

@@ -18,15 +18,8 @@ class Box:
     """Free variables within bounds, as a box in unit coordinates [-1, 1]^d.
 
     Logarithmic variables are uniform in their logarithm. A *design* here also has the values of free robot options, as
-    ``robot.<option>``.
-
-    Args:
-        space: all design variables of the robot.
-        variables: names of the free variables; default: all design variables.
-        bounds: narrower bounds of free design variables, ``{name: (low, high)}`` [SI].
-        design: values of the other design variables, and reference values of the free ones; the rest keeps the robot's
-            baseline.
-        ranges: bounds of free robot options.
+    ``robot.<option>``. The arguments after ``space`` are keys of
+    `codesign.tools.config.BodiesConfig`.
 
     Raises:
         DesignError: for an unknown name, or a value or a bound outside the robot's own bounds.
@@ -100,7 +93,7 @@ class Box:
 
     def corners(self) -> np.ndarray:
         """Return all corners in unit coordinates, shape (2^d, d)."""
-        return np.stack(np.meshgrid(*[[-1.0, 1.0]] * len(self), indexing="ij"), axis=-1).reshape(-1, len(self))
+        return self.grid(2 ** len(self))
 
     def grid(self, count: int) -> np.ndarray:
         """Return a regular grid of about ``count`` points, corners included, shape (m, d) with m >= count."""

@@ -259,11 +259,7 @@ def find_metric(name: str | Metric) -> Metric:
 
 
 def find_metrics(names: tuple[str | Metric, ...]) -> tuple[Metric, ...]:
-    """Return several metrics; see `find_metric`.
-
-    Raises:
-        ValueError: also for two metrics with the same name.
-    """
+    """Return several metrics, as `find_metric`; two of the same name are a ValueError."""
     metrics = tuple(find_metric(name) for name in names)
     shown = [metric.name for metric in metrics]
     repeated = [name for name in shown if shown.count(name) > 1]

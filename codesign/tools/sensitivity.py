@@ -37,10 +37,8 @@ GROUP_SIZES: dict[str, Callable[[int], int]] = {
 def one_at_a_time(points: np.ndarray, values: np.ndarray, box: Box) -> Table:
     """Return the range of a metric along each variable, in percent of its range over all samples (thesis, eq. 3.1).
 
-    Args:
-        points: unit coordinates (n, d): the reference first, then ``levels`` points along each variable.
-        values: the metric there, shape (n,); NaN where a design is infeasible.
-        box: the designs.
+    Points (n, d) in unit coordinates are the reference, then equally many along each variable. Values (n,) are NaN
+    where a design is infeasible.
 
     Returns:
         For each variable, ``share`` [%], ``low`` and ``high`` (extremes of the metric along the variable, the reference
@@ -65,13 +63,8 @@ def one_at_a_time(points: np.ndarray, values: np.ndarray, box: Box) -> Table:
 def morris(points: np.ndarray, values: np.ndarray, box: Box, levels: int, confidence: float, seed: int) -> Table:
     """Return Morris' elementary effects: changes of a metric when a variable changes by its whole range.
 
-    Args:
-        points: unit coordinates (n, d): trajectories of d + 1 points. Those with an infeasible design are left out.
-        values: the metric there, shape (n,); NaN where a design is infeasible.
-        box: the designs.
-        levels: number of levels of the grid.
-        confidence: level of the intervals.
-        seed: seed of their bootstrap.
+    Points (n, d) in unit coordinates form trajectories of d + 1 points; those with an infeasible design, whose value is
+    NaN, are left out. The seed is that of the bootstrap of the intervals.
 
     Returns:
         For each variable, ``mu`` (mean), ``mu_star`` (mean of the absolute values), ``sigma`` (standard deviation,
@@ -90,13 +83,9 @@ def morris(points: np.ndarray, values: np.ndarray, box: Box, levels: int, confid
 def sobol(values: np.ndarray, box: Box, confidence: float, seed: int) -> Table:
     """Return Sobol's indices: shares of the variance of a metric over the box.
 
-    Args:
-        values: the metric at Saltelli's samples, shape (n (d + 2),); NaN where a design is infeasible. Blocks with an
-            infeasible design are left out. The variables of the other blocks are no longer independent, which biases
-            the shares, more so the fewer blocks are left.
-        box: the designs.
-        confidence: level of the intervals.
-        seed: seed of their bootstrap.
+    Values are those at Saltelli's samples, shape (n (d + 2),). Blocks with an infeasible design (NaN) are left
+    out. The variables of the other blocks are no longer independent, which biases the shares, more so the fewer
+    blocks are left. The seed is that of the bootstrap of the intervals.
 
     Returns:
         For each variable, ``first`` (effect of the variable alone), ``total`` (with all its interactions), and the half
@@ -151,14 +140,7 @@ def evaluate_all(
     workers: int = 1,
     progress: bool = True,
 ) -> list[Evaluation]:
-    """Return the evaluations of designs; those that a file holds already are not computed again.
-
-    Args:
-        evaluator: evaluates one design.
-        designs: complete designs [SI].
-        path: file with one evaluation per line.
-        workers: number of processes.
-        progress: show a progress bar.
+    """Return the evaluations of complete designs [SI]; those that a file of JSON lines holds are not computed again.
 
     Raises:
         DataError: if a line of the file is damaged.
