@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import product
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from agents.config import EnvironmentConfig, check_hindsight, check_start
+from agents.config import check_hindsight, check_start
 from agents.joint import PROPOSERS
-from codesign.objectives import OBJECTIVES, Objective, find_objective, objective_name
 from codesign.parts import (
     PRUNERS,
     STRATEGIES,
@@ -23,24 +21,16 @@ from codesign.parts import (
     Strategy,
     TrainingConfig,
 )
+from codesign.problem import StudyProblem, refuse
 from codesign.sampling import SamplerConfig
-from codesign.variables import OptionRange, is_option, make_variables, split_values, with_options
-from softgym_envs.config import Config
-from softgym_envs.designs import DesignSpace, DesignVariable
+from codesign.variables import is_option
 from softgym_envs.envs.tasks.reach import Reach
-from softgym_envs.envs.tasks.registry import make_task
-from softgym_envs.robots.base import Robot
 
 JOURNAL = "journal"
 """``storage`` of a study whose folder keeps the trials."""
 
 
-def _refuse(wrong: bool, message: str) -> None:
-    if wrong:
-        raise ValueError(message)
-
-
-class StudyConfig(Config):
+class StudyConfig(StudyProblem):
     """A co-design study.
 
     Attributes:
@@ -80,14 +70,6 @@ class StudyConfig(Config):
         finalists: check on FEM.
     """
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
-    title: str = ""
-    environment: EnvironmentConfig
-    variables: tuple[str, ...] = Field(min_length=1)
-    ranges: dict[str, OptionRange] = Field(default_factory=dict)
-    objective: str = "mean_distance"
-    secondary_objectives: tuple[str, ...] = ()
-    constraints: dict[str, float] = Field(default_factory=dict)
     strategy: Literal["policy", "warm_start", "scratch", "critic", "distribution", "qp"] = "policy"
     policy: str | None = None
     joint: JointConfig = Field(default_factory=JointConfig)
@@ -123,78 +105,47 @@ class StudyConfig(Config):
             raise ValueError(f"allowed: {JOURNAL}, postgresql://user@host:port/database")
         return storage
 
-    @field_validator("environment")
-    @classmethod
-    def _comparable(cls, environment: EnvironmentConfig) -> EnvironmentConfig:
-        if environment.sample_design:
-            raise ValueError("sample_design must be false: a trial has one body, and 'variables' names what varies")
-        environment.make_robot().design_space.complete(environment.design)
-        return environment
-
-    @field_validator("objective", mode="before")
-    @classmethod
-    def _importable(cls, objective: Any) -> str:
-        return objective_name(objective)
-
-    @field_validator("secondary_objectives", mode="before")
-    @classmethod
-    def _all_importable(cls, objectives: Any) -> Any:
-        return [objective_name(o) for o in objectives] if isinstance(objectives, list | tuple) else objectives
-
     @model_validator(mode="after")
     def _consistent(self) -> StudyConfig:
-        make_variables(self.variables, self.ranges, self.space)
         for name in self.goals.vary or ():
             self.space[name]
-        self._check_objectives()
         self._check_goals()
         self._check_strategy()
         self._check_pruner()
         self._check_trainings()
+        refuse(
+            bool(self.secondary_objectives or self.constraints) and self.sampler.name == "cmaes",
+            "sampler 'cmaes' supports neither secondary objectives nor constraints; allowed: tpe, gp, nsgaii",
+        )
         first = self.screen.kept + (self.joint.keep if self.plan.proposer else 0)
-        _refuse(
+        refuse(
             1 + first > self.trials,
             f"trials = {self.trials} is too few for the baseline and {first} bodies found before the trials",
         )
-        _refuse(
+        refuse(
             self.finalists.count >= self.trials > 1,
             f"finalists.count = {self.finalists.count} must be below trials = {self.trials}",
         )
         return self
 
-    def _check_objectives(self) -> None:
-        objectives = (self.objective, *self.secondary_objectives)
-        for name in objectives:
-            _refuse(objectives.count(name) > 1, f"objective '{name}' is named twice")
-        allowed = ", ".join(name for name, objective in OBJECTIVES.items() if not objective.of_body)
-        _refuse(
-            self.primary.of_body,  # looking it up also refuses unknown names
-            f"objective '{self.objective}' does not depend on the controller; use it in 'secondary_objectives' or "
-            f"'constraints', or run a design search; allowed: {allowed}",
-        )
-        _refuse(
-            bool(self.secondary_objectives or self.constraints) and self.sampler.name == "cmaes",
-            "sampler 'cmaes' supports neither secondary objectives nor constraints; allowed: tpe, gp, nsgaii",
-        )
-
     def _check_goals(self) -> None:
         goals, row, trains = self.goals, self.environment.row, self.plan.trains or self.plan.proposer
-        _refuse(
+        refuse(
             goals.source == "family" and not self.environment.has_surrogate,
             f"goals.source = 'family' needs a surrogate, and robot '{row.robot}' has none; allowed: task, zone",
         )
-        _refuse(
+        refuse(
             goals.source != "task"
             and bool(trains or self.finalists.seeds)
             and not issubclass(self.environment.task_class, Reach),
             f"goals.source = '{goals.source}' makes points, but task '{row.task}' trains on paths; allowed: task",
         )
-        _refuse(
+        refuse(
             self.screen.enabled and self.screen.goals > goals.count,
             f"screen.goals = {self.screen.goals} exceeds goals.count = {goals.count}",
         )
         for name in self.variables:
-            _refuse(
+            refuse(
                 goals.source == "task" and name.startswith("task."),
                 f"goals.source = 'task' depends on '{name}', so bodies would have different goals",
             )
@@ -205,27 +156,27 @@ class StudyConfig(Config):
 
     def _check_strategy(self) -> None:
         plan, strategy = self.plan, f"strategy '{self.strategy}'"
-        _refuse(plan.policy and not self.policy, f"{strategy} needs 'policy': a trained design-conditioned policy")
-        _refuse(not plan.policy and bool(self.policy), f"{strategy} does not use policy = '{self.policy}'; remove it")
+        refuse(plan.policy and not self.policy, f"{strategy} needs 'policy': a trained design-conditioned policy")
+        refuse(not plan.policy and bool(self.policy), f"{strategy} does not use policy = '{self.policy}'; remove it")
         for name in filter(is_option, self.variables):
-            _refuse(
+            refuse(
                 plan.policy or bool(plan.proposer),
                 f"{strategy} uses a policy that was trained with fixed options, so '{name}' cannot vary; "
                 "allowed: qp, scratch",
             )
-        _refuse(
+        refuse(
             bool(self.finalists.seeds) and self.strategy == "qp",
             f"finalists.seeds = {self.finalists.seeds} trains policies, but strategy 'qp' has none; allowed: 0",
         )
         shown = self.environment.design_in_observation
-        _refuse(
+        refuse(
             plan.shares_policy and shown is not True and not set(self.variables) <= set(shown or ()),
             f"{strategy} needs a policy that observes the body: add {', '.join(self.variables)} to "
             "environment.design_in_observation",
         )
         if plan.proposer:
             backend = self.environment.backend
-            _refuse(
+            refuse(
                 backend != "surrogate",
                 f"joint training does not run on environment.backend = '{backend}'; allowed: surrogate",
             )
@@ -236,16 +187,16 @@ class StudyConfig(Config):
 
     def _check_pruner(self) -> None:
         pruner, trains = self.pruner.name, self.plan.trains
-        _refuse(
+        refuse(
             bool(self.secondary_objectives) and pruner != "none",
             f"pruner '{pruner}' supports one objective only; allowed: none",
         )
-        _refuse(
+        refuse(
             not trains and pruner not in ("none", "wilcoxon"),
             f"pruner '{pruner}' stops trainings, but trials of strategy '{self.strategy}' do not train; "
             "allowed: none, wilcoxon",
         )
-        _refuse(
+        refuse(
             trains and pruner == "wilcoxon",
             f"pruner 'wilcoxon' compares goals, but strategy '{self.strategy}' reports its training; "
             f"allowed: {', '.join(name for name in PRUNERS if name != 'wilcoxon')}",
@@ -258,7 +209,7 @@ class StudyConfig(Config):
         runs += [("joint", self.joint)] * bool(self.plan.proposer)
         for key, run in runs:
             check_hindsight(run.sac, self.environment)
-            _refuse(
+            refuse(
                 run.report_every > run.steps,
                 f"{key}.report_every = {run.report_every} exceeds {key}.steps = {run.steps}",
             )
@@ -271,86 +222,3 @@ class StudyConfig(Config):
     def plan(self) -> Strategy:
         """What the strategy does."""
         return STRATEGIES[self.strategy]
-
-    @property
-    def robot(self) -> Robot:
-        """The family of bodies."""
-        return self.environment.make_robot()
-
-    @property
-    def space(self) -> DesignSpace:
-        """All design variables of the robot."""
-        return self.robot.design_space
-
-    @property
-    def optimised(self) -> dict[str, DesignVariable]:
-        """What is optimised, by name: design variables, and options of robot or task."""
-        return make_variables(self.variables, self.ranges, self.space)
-
-    @property
-    def objectives(self) -> dict[str, Objective]:
-        """All objectives that the study names, by name: objective, secondary objectives and constraints."""
-        names = (self.objective, *self.secondary_objectives, *self.constraints)
-        return {name: find_objective(name, self.robot) for name in names}
-
-    @property
-    def primary(self) -> Objective:
-        """The objective that decides who wins."""
-        return self.objectives[self.objective]
-
-    @property
-    def directions(self) -> list[Literal["maximize"]]:
-        """Direction of each score in Optuna's studies: all are maximised."""
-        return ["maximize" for _ in (self.objective, *self.secondary_objectives)]
-
-    @property
-    def controller_constraints(self) -> dict[str, float]:
-        """Constraints that depend on the controller, and therefore on the backend [SI]."""
-        return {name: limit for name, limit in self.constraints.items() if not self.objectives[name].of_body}
-
-    def violations_text(self, values: Mapping[str, float], constraints: Mapping[str, float]) -> str:
-        """Return the constraints [SI] that values [SI] violate, in words; empty if there are none."""
-        broken = (
-            self.objectives[name].violation_text(values[name], limit)
-            for name, limit in constraints.items()
-            if name in values and self.objectives[name].excess(values[name], limit) > 0.0
-        )
-        return "; ".join(broken)
-
-    @property
-    def success_distance(self) -> float:
-        """Distance within which a goal counts as reached [m]."""
-        row = self.environment.row
-        options = {**row.task_options, **self.environment.task_options}
-        return make_task(row.task, self.robot, **options).success_distance
-
-    @property
-    def test_backends(self) -> tuple[str, ...]:
-        """Backends that finalists are tested on, the slow one first."""
-        # Surrogate weights are for fixed options of the robot.
-        varies = any(name.startswith("robot.") for name in self.variables)
-        return ("fem", "surrogate") if self.environment.has_surrogate and not varies else ("fem",)
-
-    @property
-    def episode_steps(self) -> int:
-        """Environment steps of an episode."""
-        return self.environment.row.max_episode_steps
-
-    @property
-    def baseline(self) -> dict[str, float]:
-        """The complete baseline design [SI]."""
-        return dict(self.space.complete(self.environment.design))
-
-    @property
-    def baseline_values(self) -> dict[str, float]:
-        """Value of each optimised variable in the baseline [SI]."""
-        return {n: self.baseline.get(n, variable.baseline) for n, variable in self.optimised.items()}
-
-    def body(self, values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
-        """Return the complete design [SI] and the options [SI] of values of the optimised variables."""
-        design, options = split_values(values)
-        return dict(self.space.complete(design, self.baseline)), options
-
-    def environment_of(self, options: Mapping[str, float]) -> EnvironmentConfig:
-        """Return the environment with other values of options [SI]."""
-        return with_options(self.environment, options)

@@ -1,0 +1,150 @@
+"""The problem that a study solves: which bodies it compares, and by which objectives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from agents.config import EnvironmentConfig
+from codesign.objectives import OBJECTIVES, Objective, find_objective, objective_name
+from codesign.variables import OptionRange, make_variables, split_values, with_options
+from softgym_envs.config import Config
+from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.envs.tasks.registry import make_task
+from softgym_envs.robots.base import Robot
+
+
+def refuse(wrong: bool, message: str) -> None:
+    """Raise ValueError with a message if something is wrong."""
+    if wrong:
+        raise ValueError(message)
+
+
+class StudyProblem(Config):
+    """Bodies and objectives of a study; `codesign.config.StudyConfig` documents the keys."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    title: str = ""
+    environment: EnvironmentConfig
+    variables: tuple[str, ...] = Field(min_length=1)
+    ranges: dict[str, OptionRange] = Field(default_factory=dict)
+    objective: str = "mean_distance"
+    secondary_objectives: tuple[str, ...] = ()
+    constraints: dict[str, float] = Field(default_factory=dict)
+
+    @field_validator("environment")
+    @classmethod
+    def _comparable(cls, environment: EnvironmentConfig) -> EnvironmentConfig:
+        if environment.sample_design:
+            raise ValueError("sample_design must be false: a trial has one body, and 'variables' names what varies")
+        environment.make_robot().design_space.complete(environment.design)
+        return environment
+
+    @field_validator("objective", mode="before")
+    @classmethod
+    def _importable(cls, objective: Any) -> str:
+        return objective_name(objective)
+
+    @field_validator("secondary_objectives", mode="before")
+    @classmethod
+    def _all_importable(cls, objectives: Any) -> Any:
+        return [objective_name(o) for o in objectives] if isinstance(objectives, list | tuple) else objectives
+
+    @model_validator(mode="after")
+    def _well_posed(self) -> Self:
+        make_variables(self.variables, self.ranges, self.space)
+        objectives = (self.objective, *self.secondary_objectives)
+        for name in objectives:
+            refuse(objectives.count(name) > 1, f"objective '{name}' is named twice")
+        allowed = ", ".join(name for name, objective in OBJECTIVES.items() if not objective.of_body)
+        refuse(
+            self.primary.of_body,  # looking it up also refuses unknown names
+            f"objective '{self.objective}' does not depend on the controller; use it in 'secondary_objectives' or "
+            f"'constraints', or run a design search; allowed: {allowed}",
+        )
+        return self
+
+    @property
+    def robot(self) -> Robot:
+        """The family of bodies."""
+        return self.environment.make_robot()
+
+    @property
+    def space(self) -> DesignSpace:
+        """All design variables of the robot."""
+        return self.robot.design_space
+
+    @property
+    def optimised(self) -> dict[str, DesignVariable]:
+        """What is optimised, by name: design variables, and options of robot or task."""
+        return make_variables(self.variables, self.ranges, self.space)
+
+    @property
+    def objectives(self) -> dict[str, Objective]:
+        """All objectives that the study names, by name: objective, secondary objectives and constraints."""
+        names = (self.objective, *self.secondary_objectives, *self.constraints)
+        return {name: find_objective(name, self.robot) for name in names}
+
+    @property
+    def primary(self) -> Objective:
+        """The objective that decides who wins."""
+        return self.objectives[self.objective]
+
+    @property
+    def directions(self) -> list[Literal["maximize"]]:
+        """Direction of each score in Optuna's studies: all are maximised."""
+        return ["maximize" for _ in (self.objective, *self.secondary_objectives)]
+
+    @property
+    def controller_constraints(self) -> dict[str, float]:
+        """Constraints that depend on the controller, and therefore on the backend [SI]."""
+        return {name: limit for name, limit in self.constraints.items() if not self.objectives[name].of_body}
+
+    def violations_text(self, values: Mapping[str, float], constraints: Mapping[str, float]) -> str:
+        """Return the constraints [SI] that values [SI] violate, in words; empty if there are none."""
+        broken = (
+            self.objectives[name].violation_text(values[name], limit)
+            for name, limit in constraints.items()
+            if name in values and self.objectives[name].excess(values[name], limit) > 0.0
+        )
+        return "; ".join(broken)
+
+    @property
+    def success_distance(self) -> float:
+        """Distance within which a goal counts as reached [m]."""
+        row = self.environment.row
+        options = {**row.task_options, **self.environment.task_options}
+        return make_task(row.task, self.robot, **options).success_distance
+
+    @property
+    def test_backends(self) -> tuple[str, ...]:
+        """Backends that finalists are tested on, the slow one first."""
+        # Surrogate weights are for fixed options of the robot.
+        varies = any(name.startswith("robot.") for name in self.variables)
+        return ("fem", "surrogate") if self.environment.has_surrogate and not varies else ("fem",)
+
+    @property
+    def episode_steps(self) -> int:
+        """Environment steps of an episode."""
+        return self.environment.row.max_episode_steps
+
+    @property
+    def baseline(self) -> dict[str, float]:
+        """The complete baseline design [SI]."""
+        return dict(self.space.complete(self.environment.design))
+
+    @property
+    def baseline_values(self) -> dict[str, float]:
+        """Value of each optimised variable in the baseline [SI]."""
+        return {n: self.baseline.get(n, variable.baseline) for n, variable in self.optimised.items()}
+
+    def body(self, values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
+        """Return the complete design [SI] and the options [SI] of values of the optimised variables."""
+        design, options = split_values(values)
+        return dict(self.space.complete(design, self.baseline)), options
+
+    def environment_of(self, options: Mapping[str, float]) -> EnvironmentConfig:
+        """Return the environment with other values of options [SI]."""
+        return with_options(self.environment, options)
