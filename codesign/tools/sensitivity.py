@@ -151,7 +151,8 @@ def evaluate_all(
     found: dict[int, Evaluation] = {}
     for record in lines.read():
         try:
-            found[record.pop("number")] = Evaluation.from_json(record)
+            number = record.pop("number")
+            found[number] = Evaluation.from_json(record)
         except (KeyError, DataError) as error:
             raise DataError(f"'{path}' holds a line that is not an evaluation: {error}") from None
     missing = [(k, design) for k, design in enumerate(designs) if k not in found]
