@@ -247,32 +247,34 @@ def main(folder: Path, workers: int = 1) -> None:
     from softgym_envs.executors import parallel_map
 
     runs = folder / "runs"
-    jobs: list[tuple[Any, tuple]] = []
+    tracks: list[tuple] = []
+    trainings: list[tuple] = []
     data = {case: _data(folder / "data", case, workers) for case in CASES}
     for case, given in CASES.items():
         if given["tracking"]:
             path = runs / f"{case}_tracking.json"
-            jobs.append((_track, (path, case, data[case], given["tracking"], folder / "models" / case)))
+            tracks.append((path, case, data[case], given["tracking"], folder / "models" / case))
     for name, row in NETWORKS.items():
         for case in CASES:
             stem = f"{case.replace(' ', '')}_{name.replace(' ', '').replace(',', '_')}"
-            jobs += [
+            trainings += [
                 (runs / f"{stem}_{size}_{seed}.json", case, name, data[case], size, seed)
                 for size, seed in row.runs(case)
             ]
     try:
-        for path in parallel_map(_run, [job for job in jobs if not job[0].exists()], workers):
-            last = json.loads(path.read_text())
-            if "network" in last:
-                print(
-                    f"{last['case']:8s} {last['network']:14s} {last['states']:5d} states, seed {last['seed']}: "
-                    f"effector {1e3 * last['effector_mean']:.4f} mm, loss {last['loss']:.2e}",
-                    flush=True,
-                )
+        for function, rows in ((_track, tracks), (_run, trainings)):
+            for path in parallel_map(function, [row for row in rows if not row[0].exists()], workers):
+                last = json.loads(path.read_text())
+                if "network" in last:
+                    print(
+                        f"{last['case']:8s} {last['network']:14s} {last['states']:5d} states, seed {last['seed']}: "
+                        f"effector {1e3 * last['effector_mean']:.4f} mm, loss {last['loss']:.2e}",
+                        flush=True,
+                    )
     finally:
         found = [json.loads(path.read_text()) for path in sorted(runs.glob("*.json"))]
-        trained, tracks = [r for r in found if "network" in r], [r for r in found if "network" not in r]
-        write_json(KEPT, {**provenance(), "runs": trained, "tracking": tracks})
+        trained, tracked = [r for r in found if "network" in r], [r for r in found if "network" not in r]
+        write_json(KEPT, {**provenance(), "runs": trained, "tracking": tracked})
 
 
 def networks() -> dict[str, object]:

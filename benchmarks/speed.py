@@ -70,13 +70,14 @@ class _Shares:
     """
 
     def __init__(self) -> None:
-        from softgym_envs.mechanics.model import MechanicalModel
+        from softgym_envs.mechanics.assembly import Assembly
         from softgym_envs.mechanics.solvers.linear import CholmodSolver, SuperLUSolver
+        from softgym_envs.mechanics.warping import Warping
 
         solvers = (CholmodSolver, SuperLUSolver)
         self.parts: list[tuple[Any, str, str]] = [
-            (MechanicalModel, "assemble", "assembly"),
-            (MechanicalModel, "warp", "warping"),
+            (Assembly, "evaluate", "assembly"),
+            (Warping, "displacement", "warping"),
             *((solver, "factorise", "factorisation") for solver in solvers),
             *((solver, verb, "solves") for solver in solvers for verb in ("solve", "condense", "expand")),
         ]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from softgym_envs.mechanics.assembly import Assembly
 from softgym_envs.mechanics.constraints.cable import Cable
@@ -205,7 +206,7 @@ class MechanicalModel:
         return [block for block in self.blocks if isinstance(block, SolidBlock)]
 
     def embed(
-        self, points: np.ndarray, hint: np.ndarray | None = None, *, block: int = 0, name: str = "point"
+        self, points: ArrayLike, hint: np.ndarray | None = None, *, block: int = 0, name: str = "point"
     ) -> EmbeddedPoints:
         """Embed points in a solid block.
 
@@ -219,8 +220,9 @@ class MechanicalModel:
             ValueError: if a point is farther from the body than the body's size.
         """
         solid = self._solid(block)
-        check_distance(points, self._solid_nodes, name, 1.0)
-        return solid.embed(points, self.nodes, hint)
+        places = np.asarray(points, dtype=float)
+        check_distance(places, self._solid_nodes, name, 1.0)
+        return solid.embed(places, self.nodes, hint)
 
     def _solid(self, block: int) -> SolidBlock:
         solids = self.solids
@@ -244,8 +246,8 @@ class MechanicalModel:
     def add_cable(
         self,
         name: str,
-        points: np.ndarray,
-        pull_point: np.ndarray,
+        points: ArrayLike,
+        pull_point: ArrayLike,
         *,
         unilateral: bool = True,
         hint: np.ndarray | None = None,
@@ -264,9 +266,10 @@ class MechanicalModel:
         Raises:
             ValueError: if a guide is farther from the body than its size, or the pull point than ten times its size.
         """
-        check_distance(pull_point, self._solid_nodes, f"the pull point of cable '{name}'", 10.0)
+        origin = np.asarray(pull_point, dtype=float)
+        check_distance(origin, self._solid_nodes, f"the pull point of cable '{name}'", 10.0)
         embedding = self.embed(points, hint, block=block, name=f"a guide of cable '{name}'")
-        cable = Cable(name, embedding, pull_point, unilateral=unilateral)
+        cable = Cable(name, embedding, origin, unilateral=unilateral)
         self.add("a", cable)
         return cable
 
@@ -303,13 +306,13 @@ class MechanicalModel:
         self.add("a", cavity)
         return cavity
 
-    def add_effector(self, name: str, point: np.ndarray, *, hint: np.ndarray | None = None, block: int = 0) -> Point:
+    def add_effector(self, name: str, point: ArrayLike, *, hint: np.ndarray | None = None, block: int = 0) -> Point:
         """Add an effector at a material point [m] (3,) of a solid."""
         effector = Point(name, self.embed(point, hint, block=block, name=f"effector '{name}'"))
         self.add("e", effector)
         return effector
 
-    def add_contact(self, name: str, point: np.ndarray, *, hint: np.ndarray | None = None, block: int = 0) -> Point:
+    def add_contact(self, name: str, point: ArrayLike, *, hint: np.ndarray | None = None, block: int = 0) -> Point:
         """Add a contact point at a material point [m] (3,) of a solid."""
         contact = Point(name, self.embed(point, hint, block=block, name=f"contact '{name}'"))
         self.add("c", contact)
