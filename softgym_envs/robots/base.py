@@ -29,6 +29,9 @@ LARGEST = 10.0
 """Largest allowed robot, stroke or dimension [m]; larger ones were probably given in millimetres."""
 
 
+_REQUIRED = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
+
+
 @dataclass(frozen=True)
 class Actuator:
     """One actuator of a robot.
@@ -73,6 +76,13 @@ def _recording_options(init: F) -> F:
             self._check_attributes()
 
     return wrapper  # type: ignore[return-value]
+
+
+def _check_defined(holder: object, cls: type) -> None:
+    """Raise TypeError if an attribute that every robot needs is missing in a class, or in a new robot of it."""
+    missing = [name for name in _REQUIRED if not hasattr(holder, name)]
+    if missing:
+        raise TypeError(f"robot class '{cls.__name__}' does not define: {', '.join(missing)} (see Robot)")
 
 
 class Robot(ABC):
@@ -121,6 +131,11 @@ class Robot(ABC):
         super().__init_subclass__(**options)
         if "__init__" in vars(cls):
             cls.__init__ = _recording_options(cls.__init__)  # type: ignore[method-assign]
+        # Attributes that a constructor may set are checked after it; those of classes without one are checked now.
+        own_constructor = any("__init__" in vars(base) for base in cls.__mro__[:-1] if base.__module__ != __name__)
+        abstract = any(getattr(getattr(cls, name, None), "__isabstractmethod__", False) for name in dir(cls))
+        if not (own_constructor or abstract):
+            _check_defined(cls, cls)
 
     @_recording_options
     def __init__(self, *, gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
@@ -247,10 +262,7 @@ class Robot(ABC):
             TypeError: naming the attributes that the class does not define.
             ValueError: for arrays of a wrong shape, or lengths that are probably not in metres.
         """
-        required = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
-        missing = [name for name in required if not hasattr(self, name)]
-        if missing:
-            raise TypeError(f"robot class '{type(self).__name__}' does not define: {', '.join(missing)} (see Robot)")
+        _check_defined(self, type(self))
         if isinstance(self.effectors, str):
             raise TypeError(f"robot '{self.name}': effectors must be a tuple of names, got {self.effectors!r}")
         if not hasattr(self, "workspace_scale"):

@@ -89,9 +89,9 @@ def test_a_robot_object_is_used_as_it_is():
     assert env.robot is robot and env.task.command_low == 0.5
     with pytest.raises(ValueError, match="task 'reach' was made for another robot"):
         SoftRobotEnv(Spike(), Reach(robot))
-    with pytest.raises(ValueError, match=r"already made: it cannot take gravity"):
+    with pytest.raises(ValueError, match=r"already an object: it cannot take gravity"):
         SoftRobotEnv(robot, robot_options={"gravity": (0.0, 0.0, 1.0)})
-    with pytest.raises(ValueError, match=r"already made: it cannot take spread"):
+    with pytest.raises(ValueError, match=r"already an object: it cannot take spread"):
         SoftRobotEnv(robot, Reach(robot), task_options={"spread": 0.01})
 
 

@@ -117,17 +117,38 @@ def test_every_option_of_the_suite_is_in_the_key_or_left_out_on_purpose(name):
 # -- missing and malformed attributes -------------------------------------------------------------------------------
 
 
-def test_missing_attributes_are_named():
+MISSING = r"'Bar' does not define: effectors, size, design_space, .*effort_scale \(see Robot\)"
+
+
+def test_missing_attributes_are_named_when_the_class_is_made():
+    with pytest.raises(TypeError, match=MISSING):
+
+        class Bar(Robot):
+            name = "bar"
+
+            def assemble(self, design):
+                raise NotImplementedError
+
+
+def test_missing_attributes_are_named_after_a_constructor_that_may_set_them():
     class Bar(Robot):
         name = "bar"
+
+        def __init__(self):
+            super().__init__()
 
         def assemble(self, design):
             raise NotImplementedError
 
-    with pytest.raises(
-        TypeError, match=r"'Bar' does not define: effectors, size, design_space, .*effort_scale \(see Robot\)"
-    ):
+    with pytest.raises(TypeError, match=MISSING):
         Bar()
+
+
+def test_an_abstract_robot_may_leave_attributes_to_its_subclasses():
+    class Family(Robot):
+        name = "family"
+
+    assert not hasattr(Family, "effectors")
 
 
 def test_attributes_may_be_set_after_the_base_constructor():
