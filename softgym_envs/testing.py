@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,11 +13,12 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.base import Robot
+from softgym_envs.robots.base import Actuator, Robot
 
 if TYPE_CHECKING:
     from softgym_envs.surrogate.potential.model import Model
@@ -103,6 +104,26 @@ def clamped_beam(order: int = 1, shape: str = "straight", elements: int = 3, **o
         **options,
     )
     return builder.build()
+
+
+class Spike(Robot):
+    """One tetrahedron that a cable bends."""
+
+    name = "spike"
+    effectors = ("tip",)
+    size = 0.05
+    effector_rest = np.array([0.0, 0.0, 0.05])
+    effort_scale = np.array([1.0])
+    design_space = DesignSpace(DesignVariable("length", 0.03, 0.07, 0.05, "m", "height of the spike"))
+    actuators = (Actuator("cable", 0.0, 0.005, 0.001),)
+
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        nodes = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, design["length"]]])
+        fixed = np.array([True, True, True, False])
+        model = MechanicalModel.from_mesh(nodes, np.array([[0, 1, 2, 3]]), fixed=fixed, young_modulus=1e5)
+        model.add_cable("cable", nodes[3:], pull_point=np.array([0.02, 0.0, 0.0]))
+        model.add_effector("tip", nodes[3])
+        return model
 
 
 # -- derivatives --------------------------------------------------------------------------------------------------

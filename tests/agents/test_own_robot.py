@@ -16,30 +16,12 @@ from softgym_envs.errors import ConfigError
 from softgym_envs.robots.soft_finger import SoftFinger
 
 MODULE = """
-import numpy as np
-
-from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs import testing
 from softgym_envs.envs.tasks.reach import Reach
-from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.base import Actuator, Robot
 
 
-class Spike(Robot):
-    name = "spike"
-    effectors = ("tip",)
-    size = 0.05
-    effector_rest = np.array([0.0, 0.0, 0.05])
-    effort_scale = np.array([1.0])
-    design_space = DesignSpace(DesignVariable("length", 0.03, 0.07, 0.05, "m", "height of the spike"))
-    actuators = (Actuator("cable", 0.0, 0.005, 0.001),)
-
-    def assemble(self, design):
-        nodes = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, design["length"]]])
-        fixed = np.array([True, True, True, False])
-        model = MechanicalModel.from_mesh(nodes, np.array([[0, 1, 2, 3]]), fixed=fixed, young_modulus=1e5)
-        model.add_cable("cable", nodes[3:], pull_point=np.array([0.02, 0.0, 0.0]))
-        model.add_effector("tip", nodes[3])
-        return model
+class Spike(testing.Spike):
+    pass
 
 
 class Dip(Reach):

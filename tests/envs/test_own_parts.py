@@ -10,38 +10,16 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import softgym_envs
-from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.envs import registration
 from softgym_envs.envs.env import SoftRobotEnv
 from softgym_envs.envs.registration import register_environment
 from softgym_envs.envs.tasks.reach import Reach
 from softgym_envs.envs.tasks.registry import TASKS, register_task
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
-from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.soft_finger import SoftFinger
+from softgym_envs.testing import Spike
 
-ROBOT = f"{__name__}:Spike"
-
-
-class Spike(Robot):
-    """One tetrahedron that a cable bends."""
-
-    name = "spike"
-    effectors = ("tip",)
-    size = 0.05
-    effector_rest = np.array([0.0, 0.0, 0.05])
-    effort_scale = np.array([1.0])
-    design_space = DesignSpace(DesignVariable("length", 0.03, 0.07, 0.05, "m", "height of the spike"))
-    actuators = (Actuator("cable", 0.0, 0.005, 0.001),)
-
-    def assemble(self, design):
-        nodes = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, design["length"]]])
-        fixed = np.array([True, True, True, False])
-        model = MechanicalModel.from_mesh(nodes, np.array([[0, 1, 2, 3]]), fixed=fixed, young_modulus=1e5)
-        model.add_cable("cable", nodes[3:], pull_point=np.array([0.02, 0.0, 0.0]))
-        model.add_effector("tip", nodes[3])
-        return model
+ROBOT = "softgym_envs.testing:Spike"
 
 
 class Approach(Reach):
