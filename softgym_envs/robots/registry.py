@@ -18,6 +18,7 @@ ROBOTS = Registry(
         "sensorized_finger": "softgym_envs.robots.sensorized_finger:SensorizedFinger",
         "trunk": "softgym_envs.robots.stiff_flop:StiffFlop",
         "contact_finger": "softgym_envs.robots.contact_finger:ContactFinger",
+        "contact_aided_finger": "softgym_envs.robots.contact_aided_finger:ContactAidedFinger",
         "press_finger": "softgym_envs.robots.grippers:PressFinger",
         "two_finger_gripper": "softgym_envs.robots.grippers:TwoFingerGripper",
         "tetrapod": "softgym_envs.robots.tetrapod:Tetrapod",
