@@ -11,6 +11,7 @@ import numpy as np
 
 from softgym_envs.designs import Design
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.contact.contact import ContactMemory, Contacts
 from softgym_envs.mechanics.solvers.dynamics import Motion
 from softgym_envs.robots.base import Robot
 
@@ -49,6 +50,8 @@ class State:
         uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM.
         trusted: the state lies where the learned model may be trusted; always True for FEM.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
+        contacts: where the body touches, with forces and gaps; None if it cannot touch anything.
+        memory: what friction remembers; None without finite elements or contact.
     """
 
     command: np.ndarray
@@ -64,6 +67,8 @@ class State:
     stable: bool = True
     uncertainty: float = 0.0
     trusted: bool = True
+    contacts: Contacts | None = None
+    memory: ContactMemory | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy holds the condensed model itself, not the learned model that evaluates it.

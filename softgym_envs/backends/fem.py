@@ -144,9 +144,10 @@ class FEMBackend(Backend):
         if state.nodes is None:
             raise ValueError("the state has no deformed nodes; finite elements can only restore their own states")
         effort = np.concatenate([state.condensed.effort, state.bonds])
-        self._statics.restore(state.nodes, effort)
+        self._statics.restore(state.nodes, effort, memory=state.memory)
         if self._dynamics is not None:
-            self._dynamics.restore(state.nodes, effort, None if state.motion is None else state.motion.velocity)
+            velocity = None if state.motion is None else state.motion.velocity
+            self._dynamics.restore(state.nodes, effort, velocity, memory=state.memory)
         self.state = state
 
     @property
@@ -184,7 +185,7 @@ class FEMBackend(Backend):
             # A saturated actuator is released when its command asks for less than it has reached.
             target = np.where(saturated, sign * self._max_effort, command)
             modes = ["effort" if s else "displacement" for s in saturated]
-            kept = (solver.x, solver.effort, getattr(solver, "snapshot", None))
+            kept = (solver.x, solver.effort, solver.memory, getattr(solver, "snapshot", None))
             found = go(target, modes, effector_force=load)
             equilibrium = found.equilibrium if isinstance(found, Motion) else found
             effort, reached = equilibrium.effort[: len(command)], equilibrium.delta[: len(command)]
@@ -196,10 +197,10 @@ class FEMBackend(Backend):
             sign = np.where(over, np.sign(effort), sign)
             saturated = (saturated | over) & ~back
             if isinstance(solver, Dynamics):
-                assert kept[2] is not None
-                solver.snapshot = kept[2]
+                assert kept[3] is not None
+                solver.snapshot = kept[3]
             else:
-                solver.restore(kept[0], kept[1])
+                solver.restore(kept[0], kept[1], memory=kept[2])
         return found
 
     def _state(
@@ -223,4 +224,6 @@ class FEMBackend(Backend):
             motion=motion,
             bonds=equilibrium.effort[len(condensed.effort) :],
             stable=equilibrium.stable,
+            contacts=equilibrium.contacts,
+            memory=equilibrium.memory,
         )

@@ -66,12 +66,14 @@ class Assembled(NamedTuple):
         tangent: lower-triangle values of its derivative, a buffer that the next call overwrites.
         gradients: constraint gradients ``H``, shape (N, size), Fortran order.
         delta: constraint values, shape (size,).
+        energy: elastic energy [J].
     """
 
     residual: np.ndarray
     tangent: np.ndarray
     gradients: np.ndarray
     delta: np.ndarray
+    energy: float
 
 
 class MassMatrix(NamedTuple):
@@ -207,8 +209,8 @@ class Assembly:
         self._block_maps = [[next(following) for _ in parts] for parts in stencils]
         self._hessian_maps = [next(following) if c in curved else None for c, _ in self._rows]
         self._bond_maps = [next(following) for _ in self._bonds]
-        self._keys = np.concatenate([direct, extra])
-        self._low, self._high = self._keys // total, self._keys % total
+        self.keys = np.concatenate([direct, extra])
+        self._low, self._high = self.keys // total, self.keys % total
 
     def _plan_expansion(self, kinematic_map: KinematicMap, direct: np.ndarray, extra: np.ndarray) -> np.ndarray:
         """Return the keys of direct entries and of those to which carried rows contribute; keep where the latter go."""
@@ -219,7 +221,7 @@ class Assembly:
         held = spins[:, 0] < 0
         direct = _distinct(np.concatenate([direct, expanded_keys, spin_keys[~held]]))
         self._expansion_target = np.searchsorted(direct, expanded_keys)
-        self._spin_target = np.where(held, -1, np.searchsorted(direct, spin_keys))
+        self.spin_target = np.where(held, -1, np.searchsorted(direct, spin_keys))
         return direct
 
     def evaluate(
@@ -236,9 +238,12 @@ class Assembly:
         gradient, values = self._gradient, self._values
         np.negative(loads, out=gradient)
         values[:] = 0.0
+        energy = 0.0
         for block, scatter in zip(self.blocks, self._block_maps, strict=True):
-            if block.add(x, gradient, values, scatter)[1]:
+            stored, inverted = block.add(x, gradient, values, scatter)
+            if inverted:
                 return None
+            energy += stored
         if inertia is not None:
             self._add_inertia(inertia, x, gradient, values)
         kinematics = self.kinematics
@@ -269,10 +274,10 @@ class Assembly:
             residual += turning @ gradient[carried].ravel()
             H = np.asfortranarray(H[:n] + turning @ H[n:])
             kinematics.map.expand(values, self._entries, self._expansion, self._expansion_target)
-            kinematics.map.add_curvature(values, arms, pull, self._spin_target)
+            kinematics.map.add_curvature(values, arms, pull, self.spin_target)
         if effort.any():
             residual -= H @ effort
-        return Assembled(residual, values[: self._entries], H, delta)
+        return Assembled(residual, values[: self._entries], H, delta, energy)
 
     # -- dynamics ---------------------------------------------------------------------------------------------------
 
@@ -295,11 +300,11 @@ class Assembly:
             first, second = number[3 * rows + axis], number[3 * columns + axis]
             keep = (first >= 0) & (second >= 0)
             low, high = np.minimum(first, second)[keep], np.maximum(first, second)[keep]
-            key, direct = low * total + high, self._keys[: self._entries]
+            key, direct = low * total + high, self.keys[: self._entries]
             place = np.where(
                 high < self.kinematics.equations,
                 np.searchsorted(direct, key),
-                self._entries + np.searchsorted(self._keys[self._entries :], key),
+                self._entries + np.searchsorted(self.keys[self._entries :], key),
             )
             entries += np.bincount(place, weights=values[keep], minlength=len(entries))
         return MassMatrix(matrix, entries)
@@ -325,12 +330,17 @@ class Assembly:
         out.ravel()[self._known_dofs] = body.stiffness_damping * force[numbers]
         return out
 
-    def _add_inertia(self, inertia: Inertia, x: np.ndarray, gradient: np.ndarray, values: np.ndarray) -> None:
+    def inertia_force(self, inertia: Inertia, x: np.ndarray) -> np.ndarray:
+        """Return the derivative of the energy that a time step adds [N], shape (n, 3), at rows ``x`` (n, 3)."""
         body = inertia.body
         velocity, acceleration = inertia.motion(x)
-        gradient += body.mass.rows @ (acceleration + body.mass_damping * velocity)
+        force = body.mass.rows @ (acceleration + body.mass_damping * velocity)
+        return force + self.damping_force(body, velocity) if body.stiffness_damping else force
+
+    def _add_inertia(self, inertia: Inertia, x: np.ndarray, gradient: np.ndarray, values: np.ndarray) -> None:
+        body = inertia.body
+        gradient += self.inertia_force(inertia, x)
         values += (inertia.acceleration_factor + body.mass_damping * inertia.velocity_factor) * body.mass.entries
         if body.stiffness_damping:
             assert body.viscosity is not None
             values += (body.stiffness_damping * inertia.velocity_factor) * body.viscosity
-            gradient += self.damping_force(body, velocity)

@@ -15,6 +15,9 @@ from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.contact.contact import Contact
+from softgym_envs.mechanics.contact.obstacles import Obstacle
+from softgym_envs.mechanics.contact.surface import surface_of
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, quadratic_triangles
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, check_nodes
@@ -52,7 +55,8 @@ class MechanicalModel:
         constraints: constraint objects by role letter: ``"a"`` actuators, ``"e"`` effectors, ``"c"`` contacts,
             ``"s"`` sensors (measured, never loaded), ``"b"`` bonds (held at zero, not part of the condensed model).
         nodal_loads: dead loads on the rows besides gravity [N], shape (n, 3); change them in place.
-        skins: surfaces of beams and rigid parts, for pictures only.
+        skins: surfaces of beams and rigid parts, for pictures and contact.
+        contact: what the surface of the body touches, or None; see `set_contact`.
         kinematics: degrees of freedom, and the motions that belong to them.
         solver: name of the linear solver.
     """
@@ -95,6 +99,7 @@ class MechanicalModel:
         self.solver = solver
         self.constraints: dict[str, list[Constraint]] = {"a": [], "e": [], "c": [], "s": [], "b": []}
         self.skins: list[Skin] = []
+        self.contact: Contact | None = None
         self.nodal_loads = np.zeros_like(self.nodes)
         self._gravity_forces = np.zeros_like(self.nodes)
         self._assembly: Assembly | None = None
@@ -318,6 +323,50 @@ class MechanicalModel:
         self.add("c", contact)
         return contact
 
+    def set_contact(
+        self,
+        *,
+        obstacles: Sequence[Obstacle] = (),
+        self_contact: bool = False,
+        self_friction: float = 0.0,
+        excluded: Sequence[int] | np.ndarray = (),
+        distance: float = 5e-4,
+        stiffness: float | None = None,
+        stick: float | None = None,
+    ) -> Contact:
+        """Let the surface of the body touch obstacles and itself; solvers made afterwards include it.
+
+        Call it when all parts and skins have been added.
+
+        Args:
+            obstacles: what the body touches, each with its coefficient of friction.
+            self_contact: whether surfaces of the body touch each other.
+            self_friction: coefficient of friction between them.
+            excluded: rows whose triangles touch nothing, e.g. nodes clamped inside a mount that is not modelled.
+            distance: gap below which there are forces [m]. It must be smaller than the thinnest wall.
+            stiffness: of the barrier [Pa], about the pressure at 0.4 of the distance; default a tenth of the largest
+                Young's modulus of a solid. It is never adapted to the load.
+            stick: stiffness of friction before sliding, per area [Pa/m]; default 5 ``stiffness / distance``.
+
+        Raises:
+            ValueError: for a value that is not positive, or if there is no Young's modulus to choose a stiffness from.
+        """
+        if stiffness is None:
+            moduli = [block.largest_young_modulus for block in self.solids]
+            if not moduli:
+                raise ValueError("a body without solids needs the 'stiffness' [Pa] of its contact")
+            stiffness = 0.1 * max(moduli)
+        self.contact = Contact(
+            surface_of(self.nodes, self.blocks, self.skins, excluded),
+            obstacles=obstacles,
+            self_contact=self_contact,
+            self_friction=self_friction,
+            distance=distance,
+            stiffness=stiffness,
+            stick=stick,
+        )
+        return self.contact
+
     # -- loads ------------------------------------------------------------------------------------------------------
 
     def set_gravity(self, gravity: Sequence[float]) -> None:
@@ -400,11 +449,14 @@ class MechanicalModel:
         """A number that grows with every change of a block's elasticity."""
         return sum(block.elasticity_version for block in self.blocks)
 
+    def elastic_energy(self, x: np.ndarray) -> float:
+        """Elastic energy [J] at positions ``x`` (n, 3); inf if inverted."""
+        gradient = np.zeros_like(self.nodes)
+        return sum(block.add(x, gradient, None, None)[0] for block in self.blocks)
+
     def energy(self, x: np.ndarray) -> float:
         """Elastic energy plus potential of the dead loads [J] at positions ``x`` (n, 3); inf if inverted."""
-        gradient = np.zeros_like(self.nodes)
-        total = sum(block.add(x, gradient, None, None)[0] for block in self.blocks)
-        return total - float(np.vdot(self.loads, x - self.nodes))
+        return self.elastic_energy(x) - float(np.vdot(self.loads, x - self.nodes))
 
 
 def _nodes_in_box(nodes: np.ndarray, box: Sequence[float]) -> np.ndarray:

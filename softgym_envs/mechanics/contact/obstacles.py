@@ -1,9 +1,8 @@
-"""Rigid obstacles, most with closed formulas for gap, normal and curvature.
+"""Rigid obstacles with closed formulas for gap, normal and curvature.
 
-Such an obstacle is a convex solid, or the half-space behind a plane. Its *gap* is the distance of a point to its
-surface, positive outside. The normal is the gradient of the gap, the curvature its second derivative; both are exact.
-The gap of a rounded prism is continuously differentiable: only its curvature jumps, where a flat face meets a rounded
-edge.
+An obstacle is a convex solid, or the half-space behind a plane. Its *gap* is the distance of a point to its surface,
+positive outside. The normal is the gradient of the gap, the curvature its second derivative; both are exact. The gap of
+a rounded prism is continuously differentiable: only its curvature jumps, where a flat face meets a rounded edge.
 
 An obstacle stands still in space, or a frame of the model carries it: then all its coordinates are along the frame's
 directors, from the frame's origin.
@@ -13,7 +12,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -29,8 +28,8 @@ Geometry = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RigidShape(ABC):
-    """A rigid solid that bodies may touch but not enter: what all kinds have in common.
+class Obstacle(ABC):
+    """A rigid solid that bodies may touch but not enter.
 
     Attributes:
         name: name in messages and results.
@@ -45,8 +44,7 @@ class RigidShape(ABC):
 
     def __post_init__(self) -> None:
         self._store("friction", self.friction, (), at_least=0.0)
-        whole = isinstance(self.frame, int | np.integer) and not isinstance(self.frame, bool)
-        if self.frame is not None and (not whole or self.frame < 0):
+        if self.frame is not None and (not isinstance(self.frame, int | np.integer) or self.frame < 0):
             raise ValueError(f"{self._label}: frame must be None or a row >= 0, got {self.frame!r}")
 
     @property
@@ -73,14 +71,14 @@ class RigidShape(ABC):
             above: value that must be exceeded.
             unit: whether to scale a vector to length one.
         """
-        wanted = "a finite number" if not shape else f"finite numbers of shape {shape}".replace("-1", "m")
+        wanted = "a number" if not shape else f"numbers of shape {shape}".replace("-1", "m")
         try:
             array = np.asarray(value, dtype=float)
         except (TypeError, ValueError):
             array = np.full(1, np.nan)
         fits = array.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
         if not fits or not np.isfinite(array).all():
-            raise ValueError(f"{self._label}: {field} must be {wanted}, got {value!r}")
+            raise ValueError(f"{self._label}: {field} must be {wanted}, all finite, got {value!r}")
         if at_least is not None and (array < at_least).any():
             raise ValueError(f"{self._label}: {field} must be at least {at_least:g}, got {value!r}")
         if above is not None and (array <= above).any():
@@ -95,6 +93,14 @@ class RigidShape(ABC):
         object.__setattr__(self, field, tuple(stored) if array.ndim == 1 else stored)
 
     @abstractmethod
+    def gap(self, points: np.ndarray) -> np.ndarray:
+        """Distance [m] (k,) of points [m] (k, 3) to the surface, negative inside."""
+
+    @abstractmethod
+    def geometry(self, points: np.ndarray) -> Geometry:
+        """Gap [m] (k,), its gradient (k, 3) and its second derivative [1/m] (k, 3, 3) at points [m] (k, 3)."""
+
+    @abstractmethod
     def skin(self, extent: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
         """Surface for pictures: vertices [m] (v, 3) and triangles (t, 3), counter-clockwise from outside.
 
@@ -105,18 +111,6 @@ class RigidShape(ABC):
     def as_dict(self) -> dict[str, Any]:
         """The record from which `obstacle_from` makes an equal obstacle; it can be stored as JSON."""
         return {"kind": self.kind, **{field.name: getattr(self, field.name) for field in fields(self)}}
-
-
-class Obstacle(RigidShape):
-    """A rigid solid with a closed formula for the gap."""
-
-    @abstractmethod
-    def gap(self, points: np.ndarray) -> np.ndarray:
-        """Distance [m] (k,) of points [m] (k, 3) to the surface, negative inside."""
-
-    @abstractmethod
-    def geometry(self, points: np.ndarray) -> Geometry:
-        """Gap [m] (k,), its gradient (k, 3) and its second derivative [1/m] (k, 3, 3) at points [m] (k, 3)."""
 
 
 @dataclass(frozen=True)
@@ -290,10 +284,10 @@ class RoundedPrism(Obstacle):
         if len(polygon) < 3:
             raise ValueError(f"{self._label}: polygon must have at least 3 corners, got {len(polygon)}")
         size = np.ptp(polygon, axis=0).max()
-        start, lengths, _, outward = self._edges
+        _, lengths, _, outward = self._edges
         if lengths.min() <= 1e-9 * size:
             raise ValueError(f"{self._label}: two consecutive corners of polygon must not be equal, got {self.polygon}")
-        heights = (start[None] - start[:, None]) @ outward[:, :, None]
+        heights = (polygon[None] - polygon[:, None]) @ outward[:, :, None]
         if heights.max() > 1e-9 * size or heights.min() > -1e-9 * size:
             raise ValueError(f"{self._label}: polygon must be convex and not flat, got {self.polygon}")
 
@@ -460,48 +454,6 @@ def _prism_geometry(points, start, length, direction, outward, half_height, radi
                 curvature[k, i, j] = (curvature[k, i, j] - normal[k, i] * normal[k, j]) / distance
 
 
-@dataclass(frozen=True)
-class MeshObstacle(RigidShape):
-    """A solid bounded by triangles.
-
-    It has no formula for its gap: bodies touch it by their surfaces, see `SelfContact.with_obstacles`. Only its surface
-    keeps them out, so no part of a body may lie inside at the start.
-
-    Attributes:
-        vertices: [m], shape (m, 3).
-        triangles: vertex numbers, counter-clockwise from outside, shape (t, 3).
-    """
-
-    kind: ClassVar[str] = "mesh"
-    vertices: Sequence[Sequence[float]]
-    triangles: Sequence[Sequence[int]]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._store("vertices", self.vertices, (-1, 3))
-        self._store("triangles", self.triangles, (-1, 3), at_least=0.0)
-        numbers = np.asarray(self.triangles)
-        if len(numbers) == 0:
-            raise ValueError(f"{self._label}: triangles must not be empty")
-        if (numbers % 1.0 != 0.0).any() or numbers.max() >= len(self.vertices):
-            raise ValueError(f"{self._label}: triangles must be whole numbers below {len(self.vertices)}")
-        object.__setattr__(self, "triangles", tuple(map(tuple, numbers.astype(int).tolist())))
-
-    @cached_property
-    def _arms(self) -> np.ndarray:
-        return np.column_stack([np.ones(len(self.vertices)), np.asarray(self.vertices)])
-
-    def placed(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Vertices in space [m] (m, 3), where the rows (4, 3) of its frame are if it has one.
-
-        They are linear in the rows: ``[1, X, Y, Z] @ rows``.
-        """
-        return np.asarray(self.vertices) if rows is None else self._arms @ rows
-
-    def skin(self, extent: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
-        return np.asarray(self.vertices), np.asarray(self.triangles)
-
-
 # -- surfaces for pictures ----------------------------------------------------------------------------------------
 
 
@@ -535,12 +487,10 @@ def convex_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 # -- records ------------------------------------------------------------------------------------------------------
 
-KINDS: Mapping[str, type[Obstacle] | type[MeshObstacle]] = {
-    each.kind: each for each in (Plane, Sphere, Cylinder, RoundedPrism, MeshObstacle)
-}
+KINDS: Mapping[str, type[Obstacle]] = {each.kind: each for each in (Plane, Sphere, Cylinder, RoundedPrism)}
 
 
-def obstacle_from(record: Mapping[str, Any] | Obstacle | MeshObstacle) -> Obstacle | MeshObstacle:
+def obstacle_from(record: Mapping[str, Any] | Obstacle) -> Obstacle:
     """Make an obstacle from a plain record such as ``{"kind": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}``.
 
     Args:
@@ -549,19 +499,19 @@ def obstacle_from(record: Mapping[str, Any] | Obstacle | MeshObstacle) -> Obstac
     Raises:
         ValueError: the kind or a key does not exist, a key is missing, or a value is not allowed.
     """
-    if isinstance(record, Obstacle | MeshObstacle):
+    if isinstance(record, Obstacle):
         return record
     if not isinstance(record, Mapping) or "kind" not in record:
         raise ValueError(f"an obstacle needs a record with a kind ({', '.join(KINDS)}), got {record!r}")
     values = dict(record)
     kind = values.pop("kind")
-    if not isinstance(kind, str) or kind not in KINDS:
+    if kind not in KINDS:
         raise ValueError(unknown_name("kind of obstacle", kind, KINDS))
-    allowed = fields(KINDS[kind])
+    allowed = [field.name for field in fields(KINDS[kind])]
     for key in values:
-        if key not in [field.name for field in allowed]:
-            raise ValueError(unknown_name(f"key of obstacle '{kind}'", key, [field.name for field in allowed]))
-    missing = [field.name for field in allowed if field.default is MISSING and field.name not in values]
-    if missing:
-        raise ValueError(f"obstacle '{kind}': missing {', '.join(missing)}")
-    return KINDS[kind](**values)
+        if key not in allowed:
+            raise ValueError(unknown_name(f"key of obstacle '{kind}'", key, allowed))
+    try:
+        return KINDS[kind](**values)
+    except TypeError as error:
+        raise ValueError(f"obstacle '{kind}': {error}") from None

@@ -323,6 +323,11 @@ class SolidBlock(ElementBlock):
         self.mu, self.lame = np.ascontiguousarray(parameters[:, 0]), np.ascontiguousarray(parameters[:, 1])
         self.elasticity_version += 1
 
+    @property
+    def largest_young_modulus(self) -> float:
+        """Young's modulus [Pa] of the stiffest element."""
+        return float((self.mu * (3.0 * self.lame + 2.0 * self.mu) / (self.lame + self.mu)).max())
+
     def embed(self, points: np.ndarray, nodes: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
         """Embed points [m] (p, 3) of the rest shape ``nodes`` [m] (n, 3) in the elements."""
         return EmbeddedPoints(points, nodes, self.connectivity, hint)

@@ -24,6 +24,7 @@ import numpy as np
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
+from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.schemes import SCHEMES, GeneralisedAlpha, ImplicitEuler, StartingAcceleration
 from softgym_envs.mechanics.solvers.statics import AppliedLoads, Equilibrium, NewtonFailure, Statics
@@ -38,9 +39,9 @@ class Motion:
         velocity: of the rows [m/s], shape (n, 3).
         time: [s].
         kinetic: kinetic energy [J].
-        potential: elastic energy and potential of the dead loads [J].
+        potential: elastic energy, of contacts too, and potential of the dead loads [J].
         work: done by actuators and driven contacts since the start [J].
-        dissipated: by Rayleigh damping since the start [J].
+        dissipated: by Rayleigh damping, and by friction with obstacles, since the start [J].
         substeps: time steps that were needed; more than one if the step had to be divided.
     """
 
@@ -103,6 +104,11 @@ class Dynamics(Statics):
         for name, value in (("mass_damping", mass_damping), ("stiffness_damping", stiffness_damping)):
             if not (np.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name} = {value} must be finite and not negative")
+        if model.contact is not None and scheme != "euler":
+            raise ValueError(
+                f"scheme = {scheme!r} does not damp the fast motions that barriers of contact cause, which grow; with "
+                "contact use 'euler'"
+            )
         self.step = float(step)
         if not 0.0 <= spectral_radius <= 1.0:
             raise ValueError(f"spectral_radius = {spectral_radius} is out of bounds; allowed: [0, 1]")
@@ -125,9 +131,16 @@ class Dynamics(Statics):
         self._history: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._work = self._dissipated = 0.0
 
-    def restore(self, x: np.ndarray, effort: np.ndarray, velocity: np.ndarray | None = None) -> None:
-        """Start from rows ``x`` (n, 3), efforts (size,) and velocities (n, 3), by default at rest."""
-        super().restore(x, effort)
+    def restore(
+        self,
+        x: np.ndarray,
+        effort: np.ndarray,
+        velocity: np.ndarray | None = None,
+        *,
+        memory: ContactMemory | None = None,
+    ) -> None:
+        """Start from rows ``x`` (n, 3), efforts (size,) and velocities (n, 3), by default at rest; see `Statics`."""
+        super().restore(x, effort, memory=memory)
         self.rest()
         if velocity is not None:
             self.velocity = velocity.copy()
@@ -152,12 +165,13 @@ class Dynamics(Statics):
             self._history,
             self._work,
             self._dissipated,
+            None if self.linearisation.contact is None else self.linearisation.contact.memory,
         )
 
     @snapshot.setter
     def snapshot(self, kept: tuple) -> None:
-        self.x, self.effort, self.velocity, self.time, self._history, self._work, self._dissipated = kept
-        self.linearisation.current = False
+        self.x, self.effort, self.velocity, self.time, self._history, self._work, self._dissipated, memory = kept
+        self._remember(memory)
 
     def effector_velocity(self) -> np.ndarray:
         """Velocity of the effector rows [m/s], shape (n_e,)."""
@@ -166,7 +180,10 @@ class Dynamics(Statics):
 
     def energies(self) -> tuple[float, float]:
         """Kinetic and potential energy [J] of the current state."""
-        return 0.5 * float(np.vdot(self.velocity, self._mass.rows @ self.velocity)), self.model.energy(self.x)
+        potential = self.model.energy(self.x)
+        if self.linearisation.contact is not None:
+            potential += self.linearisation.contact.stored_energy(self.x)
+        return 0.5 * float(np.vdot(self.velocity, self._mass.rows @ self.velocity)), potential
 
     def advance(
         self,
@@ -261,6 +278,8 @@ class Dynamics(Statics):
         # Start from where the current velocity leads, unless that inverts an element.
         drift = h * kinematics.equation_velocity(start, self.velocity)
         self.x = start + kinematics.displacement(start, drift)
+        if self.linearisation.contact is not None and self.linearisation.contact.free_path(start, self.x) < 1.0:
+            self.x = start
         try:
             with self._inertia_added(inertia):
                 if not self._linearise():
@@ -310,6 +329,9 @@ class Dynamics(Statics):
                 raise ConvergenceError("the starting state has no unique acceleration", fraction=0.0) from None
         return step / h**2
 
-    def _values(self, x: np.ndarray) -> np.ndarray:
-        """Values of all constraints (size,) at rows ``x`` (n, 3)."""
-        return np.concatenate([np.zeros(0), *(c.value(x) for c, _ in self.model.rows)])
+    def _accept(self) -> ContactMemory:
+        contact = self.linearisation.contact
+        assert contact is not None
+        self._dissipated += contact.commit(self.x)
+        self.linearisation.current = False
+        return contact.memory

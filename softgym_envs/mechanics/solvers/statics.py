@@ -6,18 +6,23 @@ monotonicity test of Deuflhard (Newton Methods for Nonlinear Problems, 2004, alg
 when the simplified Newton correction that follows it is smaller, which needs no scaling between forces and
 displacements. Displacement-driven cables are unilateral: each correction solves a small linear complementarity problem.
 Bonds are driven rows that are always held at zero.
+
+With contact, steps stop before anything passes through anything (continuous collision detection along the way that is
+taken), and their lengths follow an exact penalty function instead: the energy less the work of given efforts, plus the
+violation of driven rows. A barrier grows too fast for the monotonicity test.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypedDict
 
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.condensation import CondensedModel, Row
+from softgym_envs.mechanics.contact.contact import ContactMemory, Contacts
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
@@ -37,6 +42,8 @@ class Equilibrium:
             otherwise it can still be stable while they are driven in displacement.
         iterations: Newton iterations spent, over all load increments.
         increments: load increments used.
+        contacts: where the body touches; None if it cannot.
+        memory: what friction remembers, for `Statics.restore`; None without contact.
     """
 
     x: np.ndarray
@@ -47,6 +54,8 @@ class Equilibrium:
     stable: bool
     iterations: int
     increments: int
+    contacts: Contacts | None = None
+    memory: ContactMemory | None = None
 
 
 class AppliedLoads(TypedDict, total=False):
@@ -124,6 +133,9 @@ class Statics:
         self._bonds = self._assembly.size - sizes.get("b", 0) + np.arange(sizes.get("b", 0))
         self.unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
         self._elasticity_version = model.elasticity_version
+        extent = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+        self._longest_step = 0.2 * extent  # with contact
+        self._round_off = 1e-6 * extent  # steps this short no longer change the energy
         self.reset()
 
     def reset(self) -> None:
@@ -131,20 +143,41 @@ class Statics:
         self.x = self.model.nodes.copy()
         self.effort = np.zeros(self._assembly.size)
         self._current_loads = np.zeros_like(self.x)  # dead loads that the current state carries
-        self.linearisation.current = False
+        self._remember(None)
 
-    def restore(self, x: np.ndarray, effort: np.ndarray) -> None:
-        """Start the next solve from node positions ``x`` (n, 3) and efforts (size,) of all rows."""
+    def restore(self, x: np.ndarray, effort: np.ndarray, *, memory: ContactMemory | None = None) -> None:
+        """Start the next solve from node positions ``x`` (n, 3) and efforts (size,) of all rows.
+
+        Args:
+            x: node positions [m].
+            effort: efforts of all rows.
+            memory: what friction remembers at this state; by default there are no friction forces.
+        """
         self.x = x.copy()
         self.effort = effort.copy()
         self._current_loads = self.model.loads
+        self._remember(memory)
+
+    @property
+    def memory(self) -> ContactMemory | None:
+        """What friction remembers at the current state; None without contact."""
+        contact = self.linearisation.contact
+        return None if contact is None else contact.memory
+
+    def _remember(self, memory: ContactMemory | None) -> None:
+        """Set the memory of friction; without one, friction starts anew at the current state."""
+        contact = self.linearisation.contact
+        if contact is not None and memory is not None:
+            contact.memory = memory
+        elif contact is not None:
+            contact.begin(self.x)
         self.linearisation.current = False
 
     # -- Newton -----------------------------------------------------------------------------------------------------
 
-    def _linearise(self) -> bool:
+    def _linearise(self, *, exact: bool = False) -> bool:
         """Linearise at the current state. False if elements are inverted or the tangent is singular."""
-        return self.linearisation.update(self.x, self.effort)
+        return self.linearisation.update(self.x, self.effort, exact=exact)
 
     def _correction(
         self, Ar: np.ndarray, delta: np.ndarray, effort: np.ndarray, target: np.ndarray, driven: np.ndarray
@@ -197,6 +230,8 @@ class Statics:
         linear = self.linearisation
         if not linear.current and not self._linearise():
             raise NewtonFailure
+        if linear.contact is not None:
+            return self._newton_in_contact(target, driven)
         step_q, step_effort = self._correction(linear.correction, linear.delta, self.effort, target, driven)
         length = 1.0
         for iteration in range(1, self.max_iterations + 1):
@@ -228,13 +263,75 @@ class Statics:
                     assembled = linear.assemble(x, effort)
                     assert assembled is not None
             self.x, self.effort = x, effort
-            if not linear.factorise(assembled):
+            if not linear.factorise(assembled, x):
                 raise NewtonFailure
             step_q, step_effort = self._correction(linear.correction, linear.delta, effort, target, driven)
             if length == 1.0 and self._norm(step_q) <= self.tolerance:
                 return iteration
             length = min(1.0, 2.0 * length)
         raise NewtonFailure
+
+    def _newton_in_contact(self, target: np.ndarray, driven: np.ndarray) -> int:
+        """Converge as `_newton` does, on the way that contact leaves free."""
+        linear = self.linearisation
+        assert linear.contact is not None
+        forced = np.setdiff1d(np.arange(len(target)), driven)
+        loose = np.zeros(len(target), dtype=bool)
+        loose[: self._actuators] = self.unilateral
+        weight = np.zeros(len(driven))
+
+        def violation(delta: np.ndarray) -> np.ndarray:
+            gap = (delta - target)[driven]
+            return np.abs(np.where(loose[driven], np.minimum(gap, 0.0), gap))
+
+        def penalty(delta: np.ndarray) -> float:
+            return float(weight @ violation(delta)) - float(target[forced] @ delta[forced])
+
+        full = False
+        for iteration in range(self.max_iterations + 1):
+            step_q, step_effort = self._correction(linear.correction, linear.delta, self.effort, target, driven)
+            norm = self._norm(step_q)
+            if not np.isfinite(norm):
+                raise NewtonFailure
+            if full and norm <= self.tolerance:
+                if not linear.exact and not self._linearise(exact=True):
+                    raise NewtonFailure
+                return iteration
+            if norm > self._longest_step:
+                step_q = step_q * (self._longest_step / norm)
+                norm = self._longest_step
+            weight = np.maximum(weight, 1.5 * np.abs((self.effort + step_effort)[driven]) + 1e-9)
+            before = linear.current_energy(self.x) + penalty(linear.delta)
+            pull = linear.residual + linear.H @ self.effort  # derivative of the energy
+            slope = float((pull - linear.H[:, forced] @ target[forced]) @ step_q)
+            slope -= float(weight @ violation(linear.delta))
+            length = 1.0
+            while True:
+                x = self.x + self._displacement(self.x, length * step_q)
+                part = linear.contact.free_path(self.x, x)
+                if part < 1.0:
+                    length *= max(part, 0.05)  # the way bends, so it is tested again
+                else:
+                    after = linear.energy(x) + linear.inertial_work(self.x, x) + penalty(self._values(x))
+                    allowed = before + 1e-4 * length * min(slope, 0.0) + 1e-12 * abs(before) + 1e-14
+                    if after <= allowed or (norm < self._round_off and np.isfinite(after)):
+                        break
+                    length *= 0.5
+                if length < 1e-6:
+                    raise NewtonFailure
+            effort = self.effort + step_effort * (1.0 if length > 0.1 else length)
+            assembled = linear.assemble(x, effort)
+            if assembled is None:
+                raise NewtonFailure
+            self.x, self.effort = x, effort
+            if not linear.factorise(assembled, x):
+                raise NewtonFailure
+            full = length == 1.0
+        raise NewtonFailure
+
+    def _values(self, x: np.ndarray) -> np.ndarray:
+        """Values of all constraints (size,) at rows ``x`` (n, 3)."""
+        return np.concatenate([np.zeros(0), *(c.value(x) for c, _ in self.model.rows)])
 
     def solve(
         self,
@@ -335,7 +432,66 @@ class Statics:
             increments += 1
             done, self._current_loads = level, linear.loads
             size *= 1.5
-        return self._state(target, driven, iterations, increments)
+            found = self._state(target, driven, iterations, increments)
+            if linear.contact is not None and linear.contact.rubs:
+                found = replace(found, memory=self._accept())
+        return found
+
+    def contact_model(self, *, each_point: bool = False) -> CondensedModel:
+        """Return the condensed model with the openings of contacts as further rows ``c``.
+
+        The opening of a contact is zero while it presses, and otherwise the gap less the distance of contact. So
+        forces ``0 <= effort.c`` and openings ``0 <= delta.c`` are complementary, and they predict how contacts close
+        and open. Each obstacle has one row: the mean over the points that press, weighted with their forces, or the
+        nearest point. Or each point that presses has one; eliminating these gives back ``W``. ``W.cc`` includes the
+        compliance of the barrier. Friction is left out, and contacts between surfaces of the body stay as they are.
+
+        Raises:
+            ConvergenceError: if the body has no equilibrium without its contacts, e.g. because they alone hold it.
+            ValueError: if the body has no contact.
+        """
+        contact = self.linearisation.contact
+        if contact is None:
+            raise ValueError("the model has no contact; call its 'set_contact' before making the solver")
+        rows = contact.rows(self.x, each_point=each_point)
+        gradients = [np.empty((self.model.equations, 0)), *(row.gradient[:, None] for row in rows)]
+        found = self.linearisation.without_contact(self.x, self.effort, np.hstack(gradients))
+        self.linearisation.current = False
+        if found is None:
+            raise ConvergenceError("the body has no stable equilibrium without its contacts", fraction=0.0)
+        W, delta = found
+        bonds = self._bonds
+        size = len(self.effort)
+        keep = np.delete(np.arange(size + len(rows)), bonds)
+        if len(bonds):
+            W = W - W[:, bonds] @ np.linalg.solve(W[np.ix_(bonds, bonds)], W[bonds])
+        effort = np.concatenate([self.effort, [row.force for row in rows]])
+        delta = np.concatenate([delta, [row.opening for row in rows]])
+        W[range(size, len(effort)), range(size, len(effort))] += [row.compliance for row in rows]
+        # Rows of contacts come before those of sensors.
+        sensors = dict(self.model.roles).get("s", 0)
+        first = size - len(bonds) - sensors
+        order = np.concatenate([keep[:first], keep[first + sensors :], keep[first : first + sensors]])
+        labels = list(self._labels)
+        labels[first:first] = [Row(row.name, "m", "N") for row in rows]
+        sizes = dict(self._roles)
+        sizes["c"] = sizes.get("c", 0) + len(rows)
+        W = W[np.ix_(order, order)]
+        return CondensedModel(
+            compliance=0.5 * (W + W.T),
+            free=delta[order] - W @ effort[order],
+            effort=effort[order],
+            roles=tuple((role, sizes[role]) for role in "aecs" if role in sizes),
+            rows=tuple(labels),
+        )
+
+    def _accept(self) -> ContactMemory:
+        """Let friction remember the current state, at which the next increment starts."""
+        contact = self.linearisation.contact
+        assert contact is not None
+        contact.commit(self.x)
+        self.linearisation.current = False
+        return contact.memory
 
     def _state(self, target: np.ndarray, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
         effort, delta, W = self.effort.copy(), self.linearisation.delta, self.linearisation.W.copy()
@@ -346,9 +502,10 @@ class Statics:
         slack[rows] = (effort[rows] <= 0.0) & (delta[rows] > target[rows] + 1e-9)
         count = len(effort) - len(self._bonds)
         if len(self._bonds):
-            across = W[:count, count:]
-            W = W[:count, :count] - across @ np.linalg.solve(W[count:, count:], across.T)
-            W = 0.5 * (W + W.T)
+            W = W[:count, :count] - W[:count, count:] @ np.linalg.solve(W[count:, count:], W[count:, :count])
+            if not self.linearisation.sliding:
+                W = 0.5 * (W + W.T)
+        contact = self.linearisation.contact
         condensed = CondensedModel(
             compliance=W,
             free=delta[:count] - W @ effort[:count],
@@ -365,6 +522,8 @@ class Statics:
             stable=self.linearisation.positive_definite,
             iterations=iterations,
             increments=increments,
+            contacts=None if contact is None else contact.contacts(self.x),
+            memory=self.memory,
         )
 
 

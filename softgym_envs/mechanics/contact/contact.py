@@ -1,0 +1,418 @@
+"""Contact of a model with obstacles, with itself, and between its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+
+from softgym_envs.mechanics.contact.obstacle_contact import ObstacleContact, Touch
+from softgym_envs.mechanics.contact.obstacles import Obstacle
+from softgym_envs.mechanics.contact.self_contact import SelfContact, SelfContactMemory
+from softgym_envs.mechanics.contact.surface import Mapping, Surface
+from softgym_envs.mechanics.kinematics import Kinematics
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Where a model touches at one state: one entry for each point of its surface that an obstacle presses on.
+
+    Attributes:
+        obstacles: names of the obstacles.
+        obstacle: number of the obstacle, shape (k,).
+        point: [m], shape (k, 3).
+        gap: [m], shape (k,).
+        force: on the model [N], shape (k, 3).
+        pressing: normal forces [N], shape (k,).
+        sliding: whether the friction force has reached its limit, shape (k,).
+        self_force: sum of the normal forces between surfaces of the model [N].
+        smallest_gap: to any obstacle or between surfaces of the model [m]; inf beyond the distance of contact.
+    """
+
+    obstacles: tuple[str, ...]
+    obstacle: np.ndarray
+    point: np.ndarray
+    gap: np.ndarray
+    force: np.ndarray
+    pressing: np.ndarray
+    sliding: np.ndarray
+    self_force: float
+    smallest_gap: float
+
+    @property
+    def count(self) -> int:
+        """Number of points in contact with obstacles."""
+        return len(self.gap)
+
+    @property
+    def total(self) -> np.ndarray:
+        """Force of each obstacle on the model [N], shape (o, 3)."""
+        out = np.zeros((len(self.obstacles), 3))
+        np.add.at(out, self.obstacle, self.force)
+        return out
+
+
+class ContactMemory(NamedTuple):
+    """What friction remembers.
+
+    Attributes:
+        anchors: of the friction springs for each obstacle [m], shape (p, 3), along the axes of its frame.
+        surfaces: memory of the friction between surfaces of the model.
+    """
+
+    anchors: tuple[np.ndarray | None, ...]
+    surfaces: SelfContactMemory | None
+
+
+class ContactTerms(NamedTuple):
+    """Contributions of contact to the equations, at one state.
+
+    Attributes:
+        gradient: derivative of the energy by the rows [N], shape (n, 3).
+        tangent: its derivative by the equations, while limits of friction are held; shape (N, N), both halves.
+        directions: derivatives of the stretch of sliding springs, shape (N, s).
+        loading: derivatives of their limits, shape (N, s). The exact tangent adds ``directions loading^T``.
+    """
+
+    gradient: np.ndarray
+    tangent: csr_matrix
+    directions: np.ndarray
+    loading: np.ndarray
+
+
+class ContactRow(NamedTuple):
+    """The opening of the contact with one obstacle, as a row of a condensed model.
+
+    Attributes:
+        name: of the obstacle.
+        opening: zero while the obstacle is pressed, else the smallest gap less the distance of contact [m].
+        force: sum of the normal forces [N].
+        gradient: derivative of the gap by the equations, shape (N,).
+        compliance: of the barrier [m/N]; zero while open.
+    """
+
+    name: str
+    opening: float
+    force: float
+    gradient: np.ndarray
+    compliance: float
+
+
+class Contact:
+    """What a model touches.
+
+    Args:
+        surface: of the model.
+        obstacles: what the model touches, each with its coefficient of friction.
+        self_contact: whether the surfaces of the model touch each other.
+        self_friction: coefficient of friction between them.
+        distance: gap below which there are forces [m]. It must be smaller than the thinnest wall.
+        stiffness: of the barrier [Pa]. It is never adapted.
+        stick: stiffness of friction before sliding, per area [Pa/m]; default 5 ``stiffness / distance``.
+
+    Raises:
+        ValueError: for a value that is not positive.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        *,
+        obstacles: Sequence[Obstacle] = (),
+        self_contact: bool = False,
+        self_friction: float = 0.0,
+        distance: float = 5e-4,
+        stiffness: float,
+        stick: float | None = None,
+    ) -> None:
+        if stick is None:
+            stick = 5.0 * stiffness / distance
+        for name, value, unit in (
+            ("distance", distance, "m"),
+            ("stiffness", stiffness, "Pa"),
+            ("stick", stick, "Pa/m"),
+        ):
+            if not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} = {value} {unit} of contact must be positive and finite")
+        if not (np.isfinite(self_friction) and self_friction >= 0.0):
+            raise ValueError(f"self_friction = {self_friction} must be finite and not negative")
+        self.obstacles = tuple(obstacles)
+        self.self_contact = self_contact
+        self.self_friction = float(self_friction)
+        self.distance = float(distance)
+        self.stiffness = float(stiffness)
+        self.stick = float(stick)
+        self.surface = surface
+
+    def intersections(self, x: np.ndarray) -> str | None:
+        """Return what crosses what at rows ``x`` (n, 3), or None."""
+        for number, obstacle in enumerate(self.obstacles):
+            points = self.surface.points[0] @ x
+            if obstacle.frame is not None:
+                points = (points - x[obstacle.frame]) @ x[obstacle.frame + 1 : obstacle.frame + 4].T
+            own = self.not_carried(obstacle)
+            if not (obstacle.gap(points[own]) > 0.0).all():
+                return f"the body is inside obstacle {obstacle.name or number + 1}"
+        if self.self_contact and self.between_surfaces().intersects(self.surface.weights @ x):
+            return "surfaces of the body cross each other"
+        return None
+
+    def not_carried(self, obstacle: Obstacle) -> np.ndarray:
+        """Return which points of the surface can touch an obstacle: those that do not move with it, mask (p,)."""
+        weights = self.surface.points[0]
+        if obstacle.frame is None:
+            return np.ones(weights.shape[0], dtype=bool)
+        touches = weights[:, obstacle.frame : obstacle.frame + 4]
+        return np.diff(touches.tocsr().indptr) == 0
+
+    def between_surfaces(self) -> SelfContact:
+        """Return the contact between the surfaces of the model."""
+        return SelfContact(
+            self.surface.rest,
+            self.surface.triangles,
+            distance=self.distance,
+            stiffness=self.stiffness,
+            friction=self.self_friction,
+        )
+
+
+class ContactState:
+    """Contact of one solver: forces, derivatives, and the memory of friction.
+
+    Args:
+        contact: what touches what.
+        kinematics: degrees of freedom of the model.
+        nodes: its rest rows [m], shape (n, 3).
+    """
+
+    def __init__(self, contact: Contact, kinematics: Kinematics, nodes: np.ndarray) -> None:
+        self.contact = contact
+        self._kinematics = kinematics
+        self._shape = nodes.shape
+        weights, area = contact.surface.points
+        n = len(nodes)
+        self.pairs = []
+        for obstacle in contact.obstacles:
+            own = contact.not_carried(obstacle)
+            frame = None
+            if obstacle.frame is not None:
+                rows = obstacle.frame + np.arange(4)
+                frame = Mapping(csr_matrix((np.ones(4), (np.arange(4), rows)), shape=(4, n)), kinematics)
+            self.pairs.append(
+                ObstacleContact(
+                    obstacle,
+                    weights[own],
+                    area[own],
+                    Mapping(weights[own], kinematics),
+                    frame,
+                    distance=contact.distance,
+                    stiffness=contact.stiffness,
+                    stick=contact.stick,
+                )
+            )
+        self._surfaces = contact.between_surfaces() if contact.self_contact else None
+        self._vertices = Mapping(contact.surface.weights, kinematics)
+        self._limits: list[np.ndarray | None] = [None] * len(self.pairs)
+        self._touches: list[Touch] = []
+        self.begin(nodes)
+
+    # -- memory -----------------------------------------------------------------------------------------------------
+
+    @property
+    def rubs(self) -> bool:
+        """Whether there is friction, so that forces depend on the path."""
+        return any(pair.obstacle.friction > 0.0 for pair in self.pairs) or self.contact.self_friction > 0.0
+
+    def begin(self, x: np.ndarray) -> None:
+        """Forget the past: all friction springs are relaxed at rows ``x`` (n, 3)."""
+        self._anchors = [pair.local(x) if pair.obstacle.friction > 0.0 else None for pair in self.pairs]
+        if self._surfaces is not None:
+            self._surfaces.begin_increment(self._corners(x))
+
+    @property
+    def memory(self) -> ContactMemory:
+        """What friction remembers; assign it to go back."""
+        surfaces = self._surfaces.memory if self._surfaces is not None else None
+        return ContactMemory(tuple(self._anchors), surfaces)
+
+    @memory.setter
+    def memory(self, kept: ContactMemory) -> None:
+        self._anchors = list(kept.anchors)
+        if self._surfaces is not None and kept.surfaces is not None:
+            self._surfaces.memory = kept.surfaces
+
+    def commit(self, x: np.ndarray) -> float:
+        """Let springs that slid at the accepted rows ``x`` (n, 3) catch up; return the dissipated energy [J]."""
+        dissipated = 0.0
+        for number, pair in enumerate(self.pairs):
+            anchors = self._anchors[number]
+            if anchors is None:
+                continue
+            touch = pair.touch(x, anchors)
+            new = pair.local(x)
+            new[touch.points] -= touch.elastic
+            slip = new[touch.points] - anchors[touch.points]
+            dissipated -= float(np.vdot(touch.rubbing, slip))
+            self._anchors[number] = new
+        if self._surfaces is not None:
+            self._surfaces.begin_increment(self._corners(x))
+        return dissipated
+
+    # -- energy and derivatives ---------------------------------------------------------------------------------------
+
+    def _corners(self, x: np.ndarray) -> np.ndarray:
+        return self.contact.surface.weights @ x
+
+    def energy(self, x: np.ndarray) -> float:
+        """Return the potential [J] at rows ``x`` (n, 3), with the limits of friction of the last `evaluate`."""
+        total = 0.0
+        for pair, anchors, limits in zip(self.pairs, self._anchors, self._limits, strict=True):
+            total += pair.energy(x, anchors, limits)
+            if not np.isfinite(total):
+                return np.inf
+        return total if self._surfaces is None else total + self._surfaces.energy(self._corners(x))
+
+    def stored_energy(self, x: np.ndarray) -> float:
+        """Return the energy [J] stored in barriers and friction springs at accepted rows ``x`` (n, 3)."""
+        total = 0.0
+        for pair, anchors in zip(self.pairs, self._anchors, strict=True):
+            touch = pair.touch(x, anchors)
+            total += pair.energy(x, None, None) - 0.5 * float(np.vdot(touch.rubbing, touch.elastic))
+        return total if self._surfaces is None else total + self._surfaces.energy(self._corners(x))
+
+    def evaluate(self, x: np.ndarray, *, convex: bool = False) -> ContactTerms:
+        """Return the terms of the equations at rows ``x`` (n, 3).
+
+        Args:
+            x: rows.
+            convex: leave out what can make the tangent indefinite.
+        """
+        if self._kinematics.map is not None:
+            self._kinematics.map.linearise(x)
+        n = self._kinematics.equations
+        gradient = np.zeros(self._shape)
+        tangent = csr_matrix((n, n))
+        directions, loading = [np.empty((n, 0))], [np.empty((n, 0))]
+        self._touches = []
+        for number, (pair, anchors) in enumerate(zip(self.pairs, self._anchors, strict=True)):
+            touch = pair.touch(x, anchors, convex=convex)
+            self._touches.append(touch)
+            if anchors is not None:
+                limits = np.zeros(len(anchors))
+                limits[touch.points] = pair.obstacle.friction * touch.pressing
+                self._limits[number] = limits
+            if not len(touch.points):
+                continue
+            pair.add_to_rows(touch, gradient)
+            tangent = tangent + touch.hessian()
+            if touch.sliding.any():
+                directions.append(touch.columns(touch.direction, touch.sliding))
+                loading.append(touch.columns(touch.loading, touch.sliding))
+        if self._surfaces is not None:
+            slope, curvature = self._surfaces.derivatives(self._corners(x), project=convex)
+            if curvature.nnz:
+                gradient += self.contact.surface.weights.T @ slope
+                tangent = tangent + self._to_equations(curvature)
+        return ContactTerms(gradient, tangent.tocsr(), np.hstack(directions), np.hstack(loading))
+
+    def forces_held(self, x: np.ndarray) -> csr_matrix:
+        """Return the tangent (N, N) at rows ``x`` (n, 3) if the normal forces of obstacles did not change."""
+        n = self._kinematics.equations
+        tangent = csr_matrix((n, n))
+        for pair in self.pairs:
+            touch = pair.touch(x, None, held=True)
+            if len(touch.points):
+                tangent = tangent + touch.hessian()
+        if self._surfaces is not None:
+            curvature = self._surfaces.derivatives(self._corners(x))[1]
+            if curvature.nnz:
+                tangent = tangent + self._to_equations(curvature)
+        return tangent.tocsr()
+
+    def rows(self, x: np.ndarray, *, each_point: bool = False) -> list[ContactRow]:
+        """Return the openings at rows ``x`` (n, 3): one for each obstacle, or for each point that presses."""
+        found = []
+        for name, pair in zip(self._names(), self.pairs, strict=True):
+            touch = pair.touch(x, None)
+            loaded, opening = bool(touch.pressing.any()), 0.0
+            if loaded and not each_point:
+                shares = [touch.pressing / touch.pressing.sum()]
+            elif loaded:
+                shares = list(np.eye(len(touch.points))[touch.pressing > 0.0])
+            elif not each_point:
+                gaps = pair.gaps(x)
+                nearest = int(gaps.argmin())
+                touch = pair.touch(x, None, points=np.array([nearest]))
+                opening, shares = float(gaps[nearest]) - self.contact.distance, [np.ones(1)]
+            else:
+                shares = []
+            for number, share in enumerate(shares):
+                used = share > 0.0
+                compliance = float((share[used] ** 2 / touch.stiffness[used]).sum()) if loaded else 0.0
+                found.append(
+                    ContactRow(
+                        f"{name} point {number + 1}" if each_point else name,
+                        opening,
+                        float(touch.pressing[used].sum()) if loaded else 0.0,
+                        touch.jacobian.T @ (share[:, None] * touch.gaps).ravel(),
+                        compliance,
+                    )
+                )
+        return found
+
+    def _names(self) -> tuple[str, ...]:
+        return tuple(pair.obstacle.name or f"obstacle {k + 1}" for k, pair in enumerate(self.pairs))
+
+    def _to_equations(self, curvature: csr_matrix) -> csr_matrix:
+        """Return the tangent (N, N) of a tangent over the components of the vertices (3 v, 3 v)."""
+        entries = coo_matrix(curvature)
+        touched = np.zeros(curvature.shape[0] // 3, dtype=bool)
+        touched[entries.row // 3] = touched[entries.col // 3] = True
+        used = np.flatnonzero(touched)
+        places = np.full(len(touched), -1)
+        places[used] = np.arange(len(used))
+        row, col = (3 * places[index // 3] + index % 3 for index in (entries.row, entries.col))
+        small = csr_matrix((entries.data, (row, col)), shape=(3 * len(used), 3 * len(used)))
+        jacobian = self._vertices.jacobian(used)
+        return (jacobian.T @ (small @ jacobian)).tocsr()
+
+    # -- motion -------------------------------------------------------------------------------------------------------
+
+    def free_path(self, start: np.ndarray, end: np.ndarray) -> float:
+        """Return the part, in (0, 1], of the straight way between rows (n, 3) on which nothing collides."""
+        part = min((pair.free_path(start, end) for pair in self.pairs), default=1.0)
+        if self._surfaces is not None:
+            part = min(part, self._surfaces.max_step(self._corners(start), self._corners(end)))
+        return part
+
+    def contacts(self, x: np.ndarray) -> Contacts:
+        """Return where the model touches at rows ``x`` (n, 3)."""
+        touches = [pair.touch(x, anchors) for pair, anchors in zip(self.pairs, self._anchors, strict=True)]
+        return self._record(x, touches)
+
+    def _record(self, x: np.ndarray, touches: list[Touch]) -> Contacts:
+        places = [pair.weights[touch.points] @ x for pair, touch in zip(self.pairs, touches, strict=True)]
+        smallest = min((float(touch.gap.min(initial=np.inf)) for touch in touches), default=np.inf)
+        self_force = 0.0
+        if self._surfaces is not None:
+            corners = self._corners(x)
+            smallest = min(smallest, self._surfaces.minimum_distance(corners))
+            self_force = 0.5 * float(np.linalg.norm(self._surfaces.forces(corners), axis=1).sum())
+
+        def joined(parts: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+            return np.concatenate([np.empty((0, *shape)), *parts])
+
+        return Contacts(
+            obstacles=self._names(),
+            obstacle=np.repeat(np.arange(len(touches)), [len(touch.points) for touch in touches]),
+            point=joined(places, (3,)),
+            gap=joined([touch.gap for touch in touches], ()),
+            force=joined([touch.force for touch in touches], (3,)),
+            pressing=joined([touch.pressing for touch in touches], ()),
+            sliding=joined([touch.sliding for touch in touches], ()).astype(bool),
+            self_force=self_force,
+            smallest_gap=smallest,
+        )
