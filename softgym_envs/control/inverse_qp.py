@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,22 @@ if TYPE_CHECKING:
 
 #: A bound that is never active in a problem scaled to order one.
 UNBOUNDED = 1e6
+
+
+class StepLimits(NamedTuple):
+    """What one step may change, from the state of the model, and the commands that may follow; each of shape (n_a,).
+
+    Attributes:
+        displacement: lowest and highest changes of the displacements; they allow standing still.
+        effort: lowest and highest changes of the efforts.
+        commanded_displacement: lowest and highest commands of actuators that are commanded in displacement.
+        commanded_effort: lowest and highest commands of actuators that are commanded in effort.
+    """
+
+    displacement: tuple[np.ndarray, np.ndarray]
+    effort: tuple[np.ndarray, np.ndarray]
+    commanded_displacement: tuple[np.ndarray, np.ndarray]
+    commanded_effort: tuple[np.ndarray, np.ndarray]
 
 
 class InverseQP:
@@ -156,6 +172,61 @@ class InverseQP:
         qp.settings.initial_guess = self._proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
         return qp
 
+    def checked(
+        self, condensed: CondensedModel, goal: np.ndarray, command: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return goal (n_e,) and command (n_a,) as arrays.
+
+        Raises:
+            ValueError: if goal, command or model has a wrong shape or is not finite.
+        """
+        goal = np.asarray(goal, dtype=float).ravel()
+        command = np.asarray(command, dtype=float)
+        delta, effort = condensed.delta, condensed.lambda_.a
+        if goal.shape != delta.e.shape or not np.isfinite(goal).all():
+            raise ValueError(f"goal must be {delta.e.size} finite coordinates, got {goal.tolist()}")
+        if command.shape != self.rates.shape or effort.shape != self.rates.shape or not np.isfinite(command).all():
+            raise ValueError(
+                f"command must be {len(self.rates)} finite numbers, got {command.tolist()} for {len(effort)} actuators"
+            )
+        if not (np.isfinite(condensed.compliance).all() and np.isfinite(delta.array).all()):
+            raise ValueError("the condensed model contains values that are not finite")
+        if self.goal_weights is not None and self.goal_weights.shape != goal.shape:
+            raise ValueError(f"goal_weights must be {goal.size} numbers, got {self.goal_weights.tolist()}")
+        return goal, command
+
+    def limits(self, condensed: CondensedModel, command: np.ndarray, slack: np.ndarray | None = None) -> StepLimits:
+        """Return what the next step may change.
+
+        Args:
+            condensed: model at the current state.
+            command: current command, shape (n_a,).
+            slack: actuators that are slack, shape (n_a,): the command does not bound the displacement of a slack cable.
+        """
+        displacement, effort = condensed.delta.a, condensed.lambda_.a
+        start = np.where(self.by_effort, displacement, command)
+        low, high = np.maximum(self.lower, start - self.rates), np.minimum(self.upper, start + self.rates)
+        # Standing still is allowed (unless it exceeds max_effort), so round-off cannot make the problem infeasible.
+        box_low, box_high = np.minimum(low - displacement, 0.0), np.maximum(high - displacement, 0.0)
+        if slack is not None:
+            box_high = np.where(slack, np.inf, box_high)
+        effort_low = np.maximum(-np.maximum(effort - self.min_effort, 0.0), -self.effort_rates)
+        effort_high = np.minimum(self.max_effort - effort, self.effort_rates)
+        # Steps of commanded efforts start from the last command, which may differ from the effort of the model.
+        least = np.clip(command - self.effort_rates, self.min_effort, self.max_effort)
+        most = np.clip(command + self.effort_rates, self.min_effort, self.max_effort)
+        effort_low = np.where(self.by_effort, least - effort, effort_low)
+        effort_high = np.where(self.by_effort, most - effort, effort_high)
+        return StepLimits((box_low, box_high), (effort_low, effort_high), (low, high), (least, most))
+
+    def command(self, limits: StepLimits) -> np.ndarray:
+        """Return the command, shape (n_a,), for the predicted displacements and efforts."""
+        return np.where(
+            self.by_effort,
+            np.clip(self.effort, *limits.commanded_effort),
+            np.clip(self.displacement, *limits.commanded_displacement),
+        )
+
     def solve(
         self, condensed: CondensedModel, goal: np.ndarray, command: np.ndarray, slack: np.ndarray | None = None
     ) -> np.ndarray:
@@ -172,20 +243,8 @@ class InverseQP:
             ConvergenceError: if ProxQP does not reach its tolerance, for example because no step within the rates
                 brings an effort back below ``max_effort``.
         """
-        goal = np.asarray(goal, dtype=float).ravel()
-        command = np.asarray(command, dtype=float)
+        goal, command = self.checked(condensed, goal, command)
         delta, effort = condensed.delta, condensed.lambda_.a
-        if goal.shape != delta.e.shape or not np.isfinite(goal).all():
-            raise ValueError(f"goal must be {delta.e.size} finite coordinates, got {goal.tolist()}")
-        if command.shape != self.rates.shape or effort.shape != self.rates.shape or not np.isfinite(command).all():
-            raise ValueError(
-                f"command must be {len(self.rates)} finite numbers, got {command.tolist()} for {len(effort)} actuators"
-            )
-        if not (np.isfinite(condensed.compliance).all() and np.isfinite(delta.array).all()):
-            raise ValueError("the condensed model contains values that are not finite")
-        if self.goal_weights is not None and self.goal_weights.shape != goal.shape:
-            raise ValueError(f"goal_weights must be {goal.size} numbers, got {self.goal_weights.tolist()}")
-        slack = np.zeros(len(command), dtype=bool) if slack is None else slack
         root = np.ones(goal.size) if self.goal_weights is None else np.sqrt(self.goal_weights)
         Waa, Wea = condensed.W.aa, root[:, None] * condensed.W.ea
         try:
@@ -212,22 +271,14 @@ class InverseQP:
         # Scale to order one: displacements by the rate, the objective by its curvature.
         norm = float(np.trace(hessian)) or float(scale.mean()) ** 2
 
-        start = np.where(self.by_effort, delta.a, command)
-        low, high = np.maximum(self.lower, start - self.rates), np.minimum(self.upper, start + self.rates)
-        # Standing still is allowed (unless it exceeds max_effort), so round-off cannot make the problem infeasible.
-        box_low = np.maximum(np.minimum(low - delta.a, 0.0) / scale, -UNBOUNDED)
-        # The command does not bound the displacement of a slack cable.
-        box_high = np.where(slack, 1e3, np.minimum(np.maximum(high - delta.a, 0.0) / scale, UNBOUNDED))
+        limits = self.limits(condensed, command, slack)
+        box_low = np.maximum(limits.displacement[0] / scale, -UNBOUNDED)
+        box_high = np.minimum(limits.displacement[1] / scale, UNBOUNDED)
+        if slack is not None:
+            box_high = np.where(slack, 1e3, box_high)
         effort_scale = np.abs(to_effort).sum(axis=1)
-        effort_low = np.maximum(-np.maximum(effort - self.min_effort, 0.0), -self.effort_rates)
-        effort_high = np.minimum(self.max_effort - effort, self.effort_rates)
-        # Steps of commanded efforts start from the last command, which may differ from the effort of the model.
-        least = np.clip(command - self.effort_rates, self.min_effort, self.max_effort)
-        most = np.clip(command + self.effort_rates, self.min_effort, self.max_effort)
-        effort_low = np.where(self.by_effort, least - effort, effort_low)
-        effort_high = np.where(self.by_effort, most - effort, effort_high)
-        effort_low = np.maximum(effort_low / effort_scale, -UNBOUNDED)
-        effort_high = np.clip(effort_high / effort_scale, effort_low, UNBOUNDED)
+        effort_low = np.maximum(limits.effort[0] / effort_scale, -UNBOUNDED)
+        effort_high = np.clip(limits.effort[1] / effort_scale, effort_low, UNBOUNDED)
         arguments = (
             hessian / norm,
             gradient / norm,
@@ -255,4 +306,4 @@ class InverseQP:
             raise ConvergenceError(f"ProxQP stopped with {results.info.status} for goal {goal.tolist()} m")
         self.displacement = delta.a + results.x * scale
         self.effort = effort + to_effort @ results.x
-        return np.where(self.by_effort, np.clip(self.effort, least, most), np.clip(self.displacement, low, high))
+        return self.command(limits)

@@ -1,0 +1,176 @@
+"""Inverse control with contact: random problems against the enumeration of all sets of closed contacts.
+
+``python -m benchmarks.contact_control`` prints one JSON object.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from dataclasses import dataclass
+
+import click
+import numpy as np
+
+from softgym_envs.control import ContactQP, ForceGoal
+from softgym_envs.control.qpcc import ComplementarityQP
+from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics import CondensedModel
+from softgym_envs.mechanics.condensation import Row, point_rows
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One random step of a controller.
+
+    Attributes:
+        controller: with limits of displacements and efforts.
+        model: condensed model at a state where every contact is either closed or open.
+        goal: of the effector [m].
+        command: of the actuators [m].
+        forces: goals of contact forces.
+    """
+
+    controller: ContactQP
+    model: CondensedModel
+    goal: np.ndarray
+    command: np.ndarray
+    forces: tuple[ForceGoal, ...]
+
+
+def random_problem(rng: np.random.Generator, contacts: int, actuators: int | None = None) -> Problem:
+    """Return a problem of the size of a real finger: compliances of 1 mm/N, gaps of millimetres, forces of newtons.
+
+    Args:
+        rng: random numbers.
+        contacts: number of contacts.
+        actuators: number of actuators; 1 to 4 by default.
+    """
+    a = int(rng.integers(1, 5)) if actuators is None else actuators
+    size = a + 3 + contacts
+    half = rng.normal(size=(size, size + 2))
+    W = 1e-3 * half @ half.T / size
+    closed = rng.random(contacts) < 0.5
+    pressing = np.where(closed, rng.uniform(0.0, 2.0, contacts), 0.0)
+    effort = np.concatenate([rng.uniform(0.0, 3.0, a), np.zeros(3), pressing])
+    opening = np.where(closed, 0.0, rng.uniform(0.0, 3e-3, contacts))
+    command = rng.uniform(0.0, 0.02, a)
+    delta = np.concatenate([command, rng.normal(scale=0.02, size=3), opening])
+    rows = [Row(f"actuator {k + 1}", "m", "N") for k in range(a)] + point_rows("tip")
+    rows += [Row(f"contact {k + 1}", "m", "N") for k in range(contacts)]
+    roles = (("a", a), ("e", 3), ("c", contacts))
+    model = CondensedModel(W, delta - W @ effort, effort, roles, tuple(rows))
+    controller = ContactQP(
+        np.zeros(a), np.full(a, 0.02), np.full(a, 5e-3), rng.random(a) < 0.5, max_effort=np.full(a, 10.0)
+    )
+    forces = ()
+    if contacts and rng.random() < 0.5:
+        name = rows[-int(rng.integers(1, contacts + 1))].name
+        forces = (ForceGoal({name: 1.0}, float(rng.uniform(0.0, 3.0))),)
+    return Problem(controller, model, delta[a : a + 3] + rng.normal(scale=4e-3, size=3), command, forces)
+
+
+def enumerated_optimum(problem: ComplementarityQP) -> float:
+    """Return the smallest objective over all sets of closed contacts, with other solvers; inf if no set is feasible.
+
+    ProxQP does not tell infeasible sets reliably from feasible ones, so HiGHS does this first.
+
+    Raises:
+        RuntimeError: if ProxQP does not solve a feasible set.
+    """
+    from proxsuite import proxqp
+    from scipy.optimize import linprog
+
+    n, k = len(problem.gradient), len(problem.pairs)
+    force = np.eye(n)[problem.pairs]
+    best = np.inf
+    for closed in itertools.product((False, True), repeat=k):
+        zero = np.array(closed)
+        equal = np.where(zero[:, None], problem.pair_rows, force)
+        to = np.where(zero, -problem.pair_offset, 0.0)
+        rows = np.concatenate([problem.rows, np.where(zero[:, None], force, problem.pair_rows)])
+        low = np.concatenate([problem.rows_lower, np.where(zero, 0.0, -problem.pair_offset)])
+        high = np.concatenate([problem.rows_upper, np.full(k, 1e6)])
+        box = np.column_stack([problem.lower, problem.upper])
+        limits = (np.concatenate([rows, -rows]), np.concatenate([high, -low]))
+        if linprog(np.zeros(n), *limits, equal, to, box).status == 2:
+            continue
+        qp = proxqp.dense.QP(n, k, len(rows), True)
+        qp.settings.eps_abs, qp.settings.eps_rel, qp.settings.max_iter = 1e-11, 0.0, 10000
+        qp.settings.eps_primal_inf = 1e-14
+        qp.init(problem.hessian, problem.gradient, equal, to, rows, low, high, problem.lower, problem.upper)
+        qp.solve()
+        if qp.results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
+            raise RuntimeError(f"ProxQP stopped with {qp.results.info.status}")
+        best = min(best, problem.value(qp.results.x))
+    return best
+
+
+def random_problems(count: int = 1000, most: int = 5, seed: int = 0) -> dict[str, object]:
+    """Controller with 1 to ``most`` contacts: how often it finds the enumerated optimum, and its time."""
+    rng = np.random.default_rng(seed)
+    # The first call imports the solver.
+    warm = random_problem(rng, 1)
+    warm.controller.solve(warm.model, warm.goal, warm.command)
+    hits, infeasible, seconds, programs, closures = 0, 0, [], [], 0
+    for _ in range(count):
+        case = random_problem(rng, int(rng.integers(1, most + 1)))
+        before = case.model.lambda_.c > 0.0
+        started = time.perf_counter()
+        try:
+            case.controller.solve(case.model, case.goal, case.command, forces=case.forces)
+        except ConvergenceError:
+            found = np.inf
+        else:
+            found = case.controller.optimum.value
+            programs.append(case.controller.optimum.programs)
+            closures += int((case.controller.optimum.closed != before).any())
+        seconds.append(time.perf_counter() - started)
+        problem, _ = case.controller.problem(case.model, case.goal, case.command, forces=case.forces)
+        best = enumerated_optimum(problem)
+        infeasible += int(np.isinf(best))
+        hits += int(found == best or found <= best + 1e-6 * abs(best) + 1e-9)
+    milliseconds = 1e3 * np.array(seconds)
+    return {
+        "problems": count,
+        "contacts": f"1 to {most}",
+        "hit_rate": hits / count,
+        "infeasible": infeasible,
+        "share_with_contacts_opened_or_closed": closures / max(1, len(programs)),
+        "median_ms": float(np.median(milliseconds)),
+        "p95_ms": float(np.percentile(milliseconds, 95)),
+        "median_programs": float(np.median(programs)),
+    }
+
+
+def many_contacts(counts: tuple[int, ...] = (8, 12, 16), problems: int = 20, seed: int = 1) -> dict[str, object]:
+    """Controller with more contacts: time, and how often the optimum is proven."""
+    rng = np.random.default_rng(seed)
+    results: dict[str, object] = {}
+    for count in counts:
+        seconds, proven = [], 0
+        for _ in range(problems):
+            case = random_problem(rng, count, actuators=4)
+            started = time.perf_counter()
+            case.controller.solve(case.model, case.goal, case.command, forces=case.forces)
+            seconds.append(time.perf_counter() - started)
+            proven += int(case.controller.optimum.proven)
+        results[f"{count}_contacts"] = {"median_ms": 1e3 * float(np.median(seconds)), "proven": proven / problems}
+    return results
+
+
+def contact_control() -> dict[str, object]:
+    """Inverse control with contact: random problems against enumeration, and larger ones."""
+    return {"random_problems": random_problems(), "many_contacts": many_contacts()}
+
+
+@click.command(help=__doc__)
+@click.option("--count", default=1000, show_default=True, help="Random problems of up to 5 contacts.")
+def main(count: int) -> None:
+    """Print the results."""
+    click.echo(json.dumps({"random_problems": random_problems(count), "many_contacts": many_contacts()}, indent=2))
+
+
+if __name__ == "__main__":
+    main()
