@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -44,7 +44,8 @@ class Obstacle(ABC):
 
     def __post_init__(self) -> None:
         self._store("friction", self.friction, (), at_least=0.0)
-        if self.frame is not None and (not isinstance(self.frame, int | np.integer) or self.frame < 0):
+        whole = isinstance(self.frame, int | np.integer) and not isinstance(self.frame, bool)
+        if self.frame is not None and (not whole or self.frame < 0):
             raise ValueError(f"{self._label}: frame must be None or a row >= 0, got {self.frame!r}")
 
     @property
@@ -71,14 +72,14 @@ class Obstacle(ABC):
             above: value that must be exceeded.
             unit: whether to scale a vector to length one.
         """
-        wanted = "a number" if not shape else f"numbers of shape {shape}".replace("-1", "m")
+        wanted = "a finite number" if not shape else f"finite numbers of shape {shape}".replace("-1", "m")
         try:
             array = np.asarray(value, dtype=float)
         except (TypeError, ValueError):
             array = np.full(1, np.nan)
         fits = array.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
         if not fits or not np.isfinite(array).all():
-            raise ValueError(f"{self._label}: {field} must be {wanted}, all finite, got {value!r}")
+            raise ValueError(f"{self._label}: {field} must be {wanted}, got {value!r}")
         if at_least is not None and (array < at_least).any():
             raise ValueError(f"{self._label}: {field} must be at least {at_least:g}, got {value!r}")
         if above is not None and (array <= above).any():
@@ -284,10 +285,10 @@ class RoundedPrism(Obstacle):
         if len(polygon) < 3:
             raise ValueError(f"{self._label}: polygon must have at least 3 corners, got {len(polygon)}")
         size = np.ptp(polygon, axis=0).max()
-        _, lengths, _, outward = self._edges
+        start, lengths, _, outward = self._edges
         if lengths.min() <= 1e-9 * size:
             raise ValueError(f"{self._label}: two consecutive corners of polygon must not be equal, got {self.polygon}")
-        heights = (polygon[None] - polygon[:, None]) @ outward[:, :, None]
+        heights = (start[None] - start[:, None]) @ outward[:, :, None]
         if heights.max() > 1e-9 * size or heights.min() > -1e-9 * size:
             raise ValueError(f"{self._label}: polygon must be convex and not flat, got {self.polygon}")
 
@@ -505,13 +506,13 @@ def obstacle_from(record: Mapping[str, Any] | Obstacle) -> Obstacle:
         raise ValueError(f"an obstacle needs a record with a kind ({', '.join(KINDS)}), got {record!r}")
     values = dict(record)
     kind = values.pop("kind")
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise ValueError(unknown_name("kind of obstacle", kind, KINDS))
-    allowed = [field.name for field in fields(KINDS[kind])]
+    allowed = fields(KINDS[kind])
     for key in values:
-        if key not in allowed:
-            raise ValueError(unknown_name(f"key of obstacle '{kind}'", key, allowed))
-    try:
-        return KINDS[kind](**values)
-    except TypeError as error:
-        raise ValueError(f"obstacle '{kind}': {error}") from None
+        if key not in [field.name for field in allowed]:
+            raise ValueError(unknown_name(f"key of obstacle '{kind}'", key, [field.name for field in allowed]))
+    missing = [field.name for field in allowed if field.default is MISSING and field.name not in values]
+    if missing:
+        raise ValueError(f"obstacle '{kind}': missing {', '.join(missing)}")
+    return KINDS[kind](**values)
