@@ -1,8 +1,9 @@
-"""Rigid obstacles with closed formulas for gap, normal and curvature.
+"""Rigid obstacles, most with closed formulas for gap, normal and curvature.
 
-An obstacle is a convex solid, or the half-space behind a plane. Its *gap* is the distance of a point to its surface,
-positive outside. The normal is the gradient of the gap, the curvature its second derivative; both are exact. The gap of
-a rounded prism is continuously differentiable: only its curvature jumps, where a flat face meets a rounded edge.
+Such an obstacle is a convex solid, or the half-space behind a plane. Its *gap* is the distance of a point to its
+surface, positive outside. The normal is the gradient of the gap, the curvature its second derivative; both are exact.
+The gap of a rounded prism is continuously differentiable: only its curvature jumps, where a flat face meets a rounded
+edge.
 
 An obstacle stands still in space, or a frame of the model carries it: then all its coordinates are along the frame's
 directors, from the frame's origin.
@@ -28,8 +29,8 @@ Geometry = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Obstacle(ABC):
-    """A rigid solid that bodies may touch but not enter.
+class RigidShape(ABC):
+    """A rigid solid that bodies may touch but not enter: what all kinds have in common.
 
     Attributes:
         name: name in messages and results.
@@ -94,14 +95,6 @@ class Obstacle(ABC):
         object.__setattr__(self, field, tuple(stored) if array.ndim == 1 else stored)
 
     @abstractmethod
-    def gap(self, points: np.ndarray) -> np.ndarray:
-        """Distance [m] (k,) of points [m] (k, 3) to the surface, negative inside."""
-
-    @abstractmethod
-    def geometry(self, points: np.ndarray) -> Geometry:
-        """Gap [m] (k,), its gradient (k, 3) and its second derivative [1/m] (k, 3, 3) at points [m] (k, 3)."""
-
-    @abstractmethod
     def skin(self, extent: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
         """Surface for pictures: vertices [m] (v, 3) and triangles (t, 3), counter-clockwise from outside.
 
@@ -112,6 +105,18 @@ class Obstacle(ABC):
     def as_dict(self) -> dict[str, Any]:
         """The record from which `obstacle_from` makes an equal obstacle; it can be stored as JSON."""
         return {"kind": self.kind, **{field.name: getattr(self, field.name) for field in fields(self)}}
+
+
+class Obstacle(RigidShape):
+    """A rigid solid with a closed formula for the gap."""
+
+    @abstractmethod
+    def gap(self, points: np.ndarray) -> np.ndarray:
+        """Distance [m] (k,) of points [m] (k, 3) to the surface, negative inside."""
+
+    @abstractmethod
+    def geometry(self, points: np.ndarray) -> Geometry:
+        """Gap [m] (k,), its gradient (k, 3) and its second derivative [1/m] (k, 3, 3) at points [m] (k, 3)."""
 
 
 @dataclass(frozen=True)
@@ -455,6 +460,48 @@ def _prism_geometry(points, start, length, direction, outward, half_height, radi
                 curvature[k, i, j] = (curvature[k, i, j] - normal[k, i] * normal[k, j]) / distance
 
 
+@dataclass(frozen=True)
+class MeshObstacle(RigidShape):
+    """A solid bounded by triangles.
+
+    It has no formula for its gap: bodies touch it by their surfaces, see `SelfContact.with_obstacles`. Only its surface
+    keeps them out, so no part of a body may lie inside at the start.
+
+    Attributes:
+        vertices: [m], shape (m, 3).
+        triangles: vertex numbers, counter-clockwise from outside, shape (t, 3).
+    """
+
+    kind: ClassVar[str] = "mesh"
+    vertices: Sequence[Sequence[float]]
+    triangles: Sequence[Sequence[int]]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._store("vertices", self.vertices, (-1, 3))
+        self._store("triangles", self.triangles, (-1, 3), at_least=0.0)
+        numbers = np.asarray(self.triangles)
+        if len(numbers) == 0:
+            raise ValueError(f"{self._label}: triangles must not be empty")
+        if (numbers % 1.0 != 0.0).any() or numbers.max() >= len(self.vertices):
+            raise ValueError(f"{self._label}: triangles must be whole numbers below {len(self.vertices)}")
+        object.__setattr__(self, "triangles", tuple(map(tuple, numbers.astype(int).tolist())))
+
+    @cached_property
+    def _arms(self) -> np.ndarray:
+        return np.column_stack([np.ones(len(self.vertices)), np.asarray(self.vertices)])
+
+    def placed(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """Vertices in space [m] (m, 3), where the rows (4, 3) of its frame are if it has one.
+
+        They are linear in the rows: ``[1, X, Y, Z] @ rows``.
+        """
+        return np.asarray(self.vertices) if rows is None else self._arms @ rows
+
+    def skin(self, extent: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+        return np.asarray(self.vertices), np.asarray(self.triangles)
+
+
 # -- surfaces for pictures ----------------------------------------------------------------------------------------
 
 
@@ -488,10 +535,12 @@ def convex_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 # -- records ------------------------------------------------------------------------------------------------------
 
-KINDS: Mapping[str, type[Obstacle]] = {each.kind: each for each in (Plane, Sphere, Cylinder, RoundedPrism)}
+KINDS: Mapping[str, type[Obstacle] | type[MeshObstacle]] = {
+    each.kind: each for each in (Plane, Sphere, Cylinder, RoundedPrism, MeshObstacle)
+}
 
 
-def obstacle_from(record: Mapping[str, Any] | Obstacle) -> Obstacle:
+def obstacle_from(record: Mapping[str, Any] | Obstacle | MeshObstacle) -> Obstacle | MeshObstacle:
     """Make an obstacle from a plain record such as ``{"kind": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}``.
 
     Args:
@@ -500,7 +549,7 @@ def obstacle_from(record: Mapping[str, Any] | Obstacle) -> Obstacle:
     Raises:
         ValueError: the kind or a key does not exist, a key is missing, or a value is not allowed.
     """
-    if isinstance(record, Obstacle):
+    if isinstance(record, Obstacle | MeshObstacle):
         return record
     if not isinstance(record, Mapping) or "kind" not in record:
         raise ValueError(f"an obstacle needs a record with a kind ({', '.join(KINDS)}), got {record!r}")

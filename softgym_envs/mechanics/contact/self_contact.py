@@ -8,6 +8,7 @@ library of the authors.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
@@ -15,6 +16,8 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.sparse import csc_matrix
+
+from softgym_envs.mechanics.contact.obstacles import MeshObstacle
 
 Pairs = Literal["IPC", "IMPROVED_MAX_APPROX"]
 MAX_CCD_STEPS = 10_000
@@ -35,6 +38,12 @@ def load_ipctk() -> ModuleType:
     ipctk.set_num_threads(1)
     ipctk.set_logger_level(ipctk.error)
     return ipctk
+
+
+def _friction_of_pair(first: float, second: float) -> float:
+    """Coefficient of friction of two parts: that of the obstacle among them, marked by -1 - friction."""
+    mark = min(first, second)
+    return -1.0 - mark if mark < 0.0 else max(first, second)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +77,8 @@ class SelfContact:
         edges: edges, shape (e, 2); by default those of the faces.
         groups: group of each vertex, shape (m,). Vertices of one group do not touch each other; the vertices with a
             negative number touch all. By default all touch all.
+        obstacle_friction: coefficient of friction between bodies and each vertex of an obstacle, NaN for the vertices
+            of bodies, shape (m,). By default no vertex belongs to an obstacle.
         smoothing: sliding distance [m] in an increment over which friction grows to its full value.
         reach: distance [m] that vertices may move before the pairs that can meet are searched anew; a larger one
             searches less often, but among more pairs.
@@ -84,6 +95,7 @@ class SelfContact:
         pairs: Pairs = "IPC",
         edges: np.ndarray | None = None,
         groups: np.ndarray | None = None,
+        obstacle_friction: np.ndarray | None = None,
         smoothing: float = 1e-5,
         reach: float = 5e-4,
     ) -> None:
@@ -112,7 +124,15 @@ class SelfContact:
             labels = np.where(groups < 0, own, groups).astype(np.int32)
             self.mesh.can_collide = ipctk.make_vertex_patches_filter(labels)
         self.distance = distance
-        self.friction = friction
+        self.friction = np.full(len(rest), float(friction))
+        if obstacle_friction is not None:
+            given = np.asarray(obstacle_friction, dtype=float)
+            if given.shape != (len(rest),) or not ((given >= 0.0) & (given < np.inf) | np.isnan(given)).all():
+                raise ValueError(
+                    f"self-contact: obstacle_friction must be NaN or a number >= 0 per vertex, shape ({len(rest)},)"
+                )
+            # The marks of obstacles are negative, so that `_friction_of_pair` can tell them from bodies.
+            self.friction = np.where(np.isnan(given), self.friction, -1.0 - given)
         self.reach = reach
         self._kind = getattr(ipctk.NormalCollisions.CollisionSetType, pairs)
         self._barrier = ipctk.BarrierPotential(distance, stiffness, use_physical_barrier=True)
@@ -125,6 +145,40 @@ class SelfContact:
         self._at = np.empty((0, 3))
         self._memory = SelfContactMemory()
         self._tangential: Any = None
+
+    @classmethod
+    def with_obstacles(
+        cls,
+        rest: np.ndarray,
+        faces: np.ndarray,
+        obstacles: Sequence[MeshObstacle],
+        *,
+        groups: np.ndarray | None = None,
+        **options: Any,
+    ) -> SelfContact:
+        """Contact of bodies with meshed obstacles, and with each other.
+
+        The vertices of the obstacles follow those of the bodies, in order. Obstacles do not touch each other.
+
+        Args:
+            rest: rest positions [m] of the vertices of the bodies, shape (m, 3).
+            faces: triangles of the bodies, shape (f, 3).
+            obstacles: the obstacles.
+            groups: group of each vertex of the bodies, shape (m,), as in the constructor.
+            options: further arguments of the constructor.
+        """
+        skins = [each.skin() for each in obstacles]
+        starts = len(rest) + np.cumsum([0, *(len(vertices) for vertices, _ in skins)])
+        count = int(starts[-1]) - len(rest)
+        own = np.full(len(rest), -1) if groups is None else np.asarray(groups)
+        frictions = [np.full(len(each.vertices), each.friction) for each in obstacles]
+        return cls(
+            np.concatenate([rest, *(vertices for vertices, _ in skins)]),
+            np.concatenate([faces, *(triangles + start for (_, triangles), start in zip(skins, starts, strict=False))]),
+            groups=np.concatenate([own, np.full(count, own.max(initial=-1) + 1)]),
+            obstacle_friction=np.concatenate([np.full(len(rest), np.nan), *frictions]),
+            **options,
+        )
 
     @staticmethod
     def _indices(name: str, values: np.ndarray, columns: int, count: int) -> np.ndarray:
@@ -235,13 +289,14 @@ class SelfContact:
         if memory is self._memory:
             return
         self._memory, self._tangential = memory, None
-        if memory.start is None or self.friction == 0.0:
+        if memory.start is None or np.isin(self.friction, (0.0, -1.0)).all():
             return
         start = np.asfortranarray(memory.start)
         collisions = self._collisions_at(start)
         if len(collisions):
             self._tangential = self._ipctk.TangentialCollisions()
-            self._tangential.build(self.mesh, start, collisions, self._barrier, self.friction)
+            marks = self.friction
+            self._tangential.build(self.mesh, start, collisions, self._barrier, marks, marks, _friction_of_pair)
 
     def begin_increment(self, v: np.ndarray) -> None:
         """Start a load increment: friction opposes motion from these positions, under their normal forces."""

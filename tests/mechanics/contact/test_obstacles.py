@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from softgym_envs.mechanics.contact.obstacles import (
     KINDS,
     Cylinder,
+    MeshObstacle,
     Plane,
     RoundedPrism,
     Sphere,
@@ -180,7 +181,10 @@ def test_a_record_needs_only_what_has_no_default():
 @pytest.mark.parametrize(
     ("record", "message"),
     [
-        ({"radius": 1}, r"an obstacle needs a record with a kind \(plane, sphere, cylinder, rounded_prism\), got"),
+        (
+            {"radius": 1},
+            r"needs a record with a kind \(plane, sphere, cylinder, rounded_prism, mesh\), got",
+        ),
         ("plane", "an obstacle needs a record with a kind"),
         ({"kind": "spere"}, "unknown kind of obstacle 'spere'; did you mean 'sphere'"),
         ({"kind": ["plane"]}, "unknown kind of obstacle"),
@@ -191,6 +195,17 @@ def test_a_record_needs_only_what_has_no_default():
 def test_wrong_records(record, message):
     with pytest.raises(ValueError, match=message):
         obstacle_from(record)
+
+
+def test_mesh_obstacles():
+    vertices, triangles = Sphere([0.0, 0.0, 0.0], 0.02).skin()
+    ball = MeshObstacle(vertices.tolist(), triangles.tolist(), friction=0.3, frame=8)
+    assert obstacle_from(json.loads(json.dumps(ball.as_dict()))) == ball
+    np.testing.assert_array_equal(ball.skin()[0], vertices)
+    np.testing.assert_array_equal(ball.skin()[1], triangles)
+    np.testing.assert_array_equal(ball.placed(), vertices)
+    rows = np.vstack([[0.1, 0.2, 0.3], np.transpose(TURN)])
+    np.testing.assert_allclose(ball.placed(rows), vertices @ np.transpose(TURN) + rows[0], atol=1e-15)
 
 
 def test_every_kind_has_its_name():
@@ -215,6 +230,9 @@ def test_every_kind_has_its_name():
         (lambda: RoundedPrism([(0, 0), (1, 0), (2, 0)], 1.0, 0.1), "must be convex and not flat"),
         (lambda: RoundedPrism(TRIANGLE, 1.0, 0.1, rotation=np.diag([1, 1, 2])), "rotation must be an orthonormal"),
         (lambda: RoundedPrism(TRIANGLE, 1.0, 0.1, rotation=np.diag([1, 1, -1])), "must be right-handed"),
+        (lambda: MeshObstacle(np.eye(3), [(0, 1, 3)]), "triangles must be whole numbers below 3"),
+        (lambda: MeshObstacle(np.eye(3), [(0, 1, 1.5)]), "triangles must be whole numbers below 3"),
+        (lambda: MeshObstacle(np.eye(3), np.empty((0, 3))), "triangles must not be empty"),
         (lambda: RoundedPrism.box([0.1, 0.1, 0.01], 0.02), "half_extents of a box must be 3 numbers > radius 0.02"),
         (lambda: RoundedPrism.hexagonal(0.1, 0.01, 0.02), "must be > radius 0.02, got 0.1 and 0.01"),
     ],
