@@ -23,6 +23,9 @@ Pairs = Literal["IPC", "IMPROVED_MAX_APPROX"]
 MAX_CCD_STEPS = 10_000
 """Steps of the collision detection along the path of one pair; where they end, the path is taken to end, too."""
 
+CCD_SHARE = 0.9
+"""Share of a distance that a step may use up."""
+
 
 @cache
 def load_ipctk() -> ModuleType:
@@ -38,6 +41,16 @@ def load_ipctk() -> ModuleType:
     ipctk.set_num_threads(1)
     ipctk.set_logger_level(ipctk.error)
     return ipctk
+
+
+def _relative_motion(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Motion [m] (m, 3) of the vertices less a common translation, which changes no distance."""
+    moved = end - start
+    return moved - 0.5 * (moved.min(axis=0) + moved.max(axis=0))
+
+
+def _longest(vectors: np.ndarray) -> float:
+    return float(np.sqrt(np.einsum("ki,ki->k", vectors, vectors).max(initial=0.0)))
 
 
 def _friction_of_pair(first: float, second: float) -> float:
@@ -61,7 +74,8 @@ class SelfContact:
     """Barrier and friction between the vertices of triangle surfaces.
 
     All methods take the positions ``v`` [m] (m, 3) of the vertices. The surfaces must not intersect; `max_step` limits
-    a step so that they never do.
+    a step so that they never do. Parts of one surface that do not share a vertex are pairs, too: edges should be longer
+    than ``distance``, and walls thicker.
 
     Friction is Coulomb's, smoothed over a sliding distance, with the normal forces and tangent planes of the beginning
     of an increment (Li et al. 2020, sec. 5). It has no memory beyond the increment: a contact that sticks creeps by
@@ -80,8 +94,8 @@ class SelfContact:
         obstacle_friction: coefficient of friction between bodies and each vertex of an obstacle, NaN for the vertices
             of bodies, shape (m,). By default no vertex belongs to an obstacle.
         smoothing: sliding distance [m] in an increment over which friction grows to its full value.
-        reach: distance [m] that vertices may move before the pairs that can meet are searched anew; a larger one
-            searches less often, but among more pairs.
+        reach: the pairs closer than twice this [m] are kept, and searched anew when vertices have moved farther than it
+            exceeds half of ``distance``; by default a twentieth of the mean edge. It affects the speed only.
     """
 
     def __init__(
@@ -97,12 +111,12 @@ class SelfContact:
         groups: np.ndarray | None = None,
         obstacle_friction: np.ndarray | None = None,
         smoothing: float = 1e-5,
-        reach: float = 5e-4,
+        reach: float | None = None,
     ) -> None:
         for name, value in (("distance", distance), ("stiffness", stiffness), ("smoothing", smoothing)):
             if not (np.isfinite(value) and value > 0.0):
                 raise ValueError(f"self-contact: {name} must be a positive number, got {value!r}")
-        if not (np.isfinite(reach) and reach > 0.5 * distance):
+        if reach is not None and not (np.isfinite(reach) and reach > 0.5 * distance):
             raise ValueError(f"self-contact: reach must be more than half of distance {distance!r}, got {reach!r}")
         if not (np.isfinite(friction) and friction >= 0.0):
             raise ValueError(f"self-contact: friction must be a number >= 0, got {friction!r}")
@@ -133,12 +147,14 @@ class SelfContact:
                 )
             # The marks of obstacles are negative, so that `_friction_of_pair` can tell them from bodies.
             self.friction = np.where(np.isnan(given), self.friction, -1.0 - given)
-        self.reach = reach
+        ends = rest[lines]
+        span = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean()) if len(lines) else distance
+        self.reach = 0.5 * distance + 0.05 * span if reach is None else reach
         self._kind = getattr(ipctk.NormalCollisions.CollisionSetType, pairs)
         self._barrier = ipctk.BarrierPotential(distance, stiffness, use_physical_barrier=True)
         self._friction = ipctk.FrictionPotential(smoothing)
         self._broad_phase = ipctk.LBVH()
-        self._ccd = ipctk.AdditiveCCD(max_iterations=MAX_CCD_STEPS)
+        self._ccd = ipctk.AdditiveCCD(MAX_CCD_STEPS, CCD_SHARE)
         self._candidates: Any = None
         self._centre = rest
         self._collisions: Any = None
@@ -198,12 +214,10 @@ class SelfContact:
     def _near(self, v: np.ndarray) -> bool:
         """Whether every pair closer than ``distance`` is among the candidates.
 
-        Boxes grown by ``reach`` hold all pairs closer than twice that; distances shrink by at most twice the largest
-        motion. Common translations do not count.
+        Boxes grown by ``reach`` hold all pairs closer than twice that, and a distance shrinks by at most twice the
+        largest motion.
         """
-        moved = v - self._centre
-        moved -= 0.5 * (moved.min(axis=0) + moved.max(axis=0))
-        return float(np.einsum("ki,ki->k", moved, moved).max(initial=0.0)) <= (self.reach - 0.5 * self.distance) ** 2
+        return _longest(_relative_motion(self._centre, v)) <= self.reach - 0.5 * self.distance
 
     def _candidates_at(self, v: np.ndarray) -> Any:
         """Pairs that can meet while no vertex moves farther than ``reach`` less half of ``distance``."""
@@ -306,9 +320,13 @@ class SelfContact:
 
     def max_step(self, v0: np.ndarray, v1: np.ndarray) -> float:
         """Part of the straight step from ``v0`` to ``v1`` that can be taken without an intersection, in [0, 1]."""
-        v0, v1 = np.asfortranarray(v0), np.asfortranarray(v1)
-        candidates = self._candidates_at(v0)
-        if not self._near(v1):
+        v0 = np.asfortranarray(v0)
+        motion = _relative_motion(v0, v1)
+        if 2.0 * _longest(motion) <= CCD_SHARE * min(self.minimum_distance(v0), self.distance):
+            return 1.0
+        v1 = np.asfortranarray(v0 + motion)
+        candidates = self._candidates
+        if candidates is None or not (self._near(v0) and self._near(v1)):
             candidates = self._ipctk.Candidates()
             candidates.build(self.mesh, v0, v1, 0.0, self._broad_phase)
         return float(candidates.compute_collision_free_stepsize(self.mesh, v0, v1, 0.0, self._ccd))
