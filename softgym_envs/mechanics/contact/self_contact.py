@@ -20,7 +20,7 @@ from scipy.sparse import csc_matrix
 from softgym_envs.mechanics.contact.obstacles import MeshObstacle
 
 Pairs = Literal["IPC", "IMPROVED_MAX_APPROX"]
-MAX_CCD_STEPS = 10_000
+MAX_CCD_STEPS = 1_000
 """Steps of the collision detection along the path of one pair; where they end, the path is taken to end, too."""
 
 CCD_SHARE = 0.9
