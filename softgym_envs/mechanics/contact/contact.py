@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, hstack
 
 from softgym_envs.mechanics.contact.obstacle_contact import ObstacleContact, Touch
 from softgym_envs.mechanics.contact.obstacles import Obstacle
@@ -75,12 +75,14 @@ class ContactTerms(NamedTuple):
         tangent: its derivative by the equations, while limits of friction are held; shape (N, N), both halves.
         directions: derivatives of the stretch of sliding springs, shape (N, s).
         loading: derivatives of their limits, shape (N, s). The exact tangent adds ``directions loading^T``.
+        limits: of the friction forces of the points of each obstacle [N], shape (p,); None without friction.
     """
 
     gradient: np.ndarray
     tangent: csr_matrix
-    directions: np.ndarray
-    loading: np.ndarray
+    directions: csc_matrix
+    loading: csc_matrix
+    limits: tuple[np.ndarray | None, ...]
 
 
 class ContactRow(NamedTuple):
@@ -215,8 +217,7 @@ class ContactState:
             )
         self._surfaces = contact.between_surfaces() if contact.self_contact else None
         self._vertices = Mapping(contact.surface.weights, kinematics)
-        self._limits: list[np.ndarray | None] = [None] * len(self.pairs)
-        self._touches: list[Touch] = []
+        self._limits: tuple[np.ndarray | None, ...] = (None,) * len(self.pairs)
         self.begin(nodes)
 
     # -- memory -----------------------------------------------------------------------------------------------------
@@ -267,13 +268,17 @@ class ContactState:
         return self.contact.surface.weights @ x
 
     def energy(self, x: np.ndarray) -> float:
-        """Return the potential [J] at rows ``x`` (n, 3), with the limits of friction of the last `evaluate`."""
+        """Return the potential [J] at rows ``x`` (n, 3), with the limits of friction that are held; see `hold`."""
         total = 0.0
         for pair, anchors, limits in zip(self.pairs, self._anchors, self._limits, strict=True):
             total += pair.energy(x, anchors, limits)
             if not np.isfinite(total):
                 return np.inf
         return total if self._surfaces is None else total + self._surfaces.energy(self._corners(x))
+
+    def hold(self, terms: ContactTerms) -> None:
+        """Hold the limits of friction of a state in `energy`."""
+        self._limits = terms.limits
 
     def stored_energy(self, x: np.ndarray) -> float:
         """Return the energy [J] stored in barriers and friction springs at accepted rows ``x`` (n, 3)."""
@@ -295,15 +300,11 @@ class ContactState:
         n = self._kinematics.equations
         gradient = np.zeros(self._shape)
         tangent = csr_matrix((n, n))
-        directions, loading = [np.empty((n, 0))], [np.empty((n, 0))]
-        self._touches = []
-        for number, (pair, anchors) in enumerate(zip(self.pairs, self._anchors, strict=True)):
+        directions, loading = [csc_matrix((n, 0))], [csc_matrix((n, 0))]
+        limits: list[np.ndarray | None] = []
+        for pair, anchors in zip(self.pairs, self._anchors, strict=True):
             touch = pair.touch(x, anchors, convex=convex)
-            self._touches.append(touch)
-            if anchors is not None:
-                limits = np.zeros(len(anchors))
-                limits[touch.points] = pair.obstacle.friction * touch.pressing
-                self._limits[number] = limits
+            limits.append(None if anchors is None else pair.limits(touch))
             if not len(touch.points):
                 continue
             pair.add_to_rows(touch, gradient)
@@ -316,7 +317,9 @@ class ContactState:
             if curvature.nnz:
                 gradient += self.contact.surface.weights.T @ slope
                 tangent = tangent + self._to_equations(curvature)
-        return ContactTerms(gradient, tangent.tocsr(), np.hstack(directions), np.hstack(loading))
+        return ContactTerms(
+            gradient, tangent.tocsr(), hstack(directions, format="csc"), hstack(loading, format="csc"), tuple(limits)
+        )
 
     def forces_held(self, x: np.ndarray) -> csr_matrix:
         """Return the tangent (N, N) at rows ``x`` (n, 3) if the normal forces of obstacles did not change."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import bsr_matrix, csr_matrix, vstack
+from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, vstack
 
 from softgym_envs.mechanics.contact.law import barrier, friction, friction_energy
 from softgym_envs.mechanics.contact.obstacles import Obstacle
@@ -55,13 +55,15 @@ class Touch(NamedTuple):
         blocks = bsr_matrix((self.tangent, np.arange(count), np.arange(count + 1))) if count else csr_matrix((0, 0))
         return (self.jacobian.T @ (blocks.tocsr() @ self.jacobian)).tocsr()
 
-    def columns(self, values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    def columns(self, values: np.ndarray, chosen: np.ndarray) -> csc_matrix:
         """Return derivatives (k, m) of chosen points as columns over the equations, shape (N, c)."""
-        out = np.zeros((int(chosen.sum()), values.size))
         rows = np.flatnonzero(chosen)
         m = values.shape[1]
-        out[np.arange(len(rows))[:, None], m * rows[:, None] + np.arange(m)] = values[rows]
-        return np.asfortranarray(self.jacobian.T @ out.T)
+        places = (m * rows[:, None] + np.arange(m)).ravel()
+        pointers = m * np.arange(len(rows) + 1)
+        return self.jacobian.T.tocsc() @ csc_matrix(
+            (values[rows].ravel(), places, pointers), shape=(values.size, len(rows))
+        )
 
 
 class ObstacleContact:
@@ -207,6 +209,12 @@ class ObstacleContact:
             points, gap, normal, -first, rubbing, sliding, elastic, force, jacobian, pull, tangent, direction, loading,
             gaps, second,
         )  # fmt: skip
+
+    def limits(self, touch: Touch) -> np.ndarray:
+        """Return the largest friction force of each point [N], shape (p,)."""
+        limits = np.zeros(len(self.area))
+        limits[touch.points] = self.obstacle.friction * touch.pressing
+        return limits
 
     def _with_frame(self, jacobian: csr_matrix, count: int) -> csr_matrix:
         """Interleave the derivatives of points (3 k, N) with those of the frame's four rows, shape (15 k, N)."""

@@ -322,9 +322,7 @@ class Dynamics(Statics):
             if not self._linearise():
                 raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
             try:
-                step, _ = self._correction(
-                    self.linearisation.correction, np.zeros_like(delta), self.effort, goal, driven
-                )
+                step, _ = self._correction(None, np.zeros_like(delta), self.effort, goal, driven)
             except NewtonFailure:
                 raise ConvergenceError("the starting state has no unique acceleration", fraction=0.0) from None
         return step / h**2
@@ -333,5 +331,4 @@ class Dynamics(Statics):
         contact = self.linearisation.contact
         assert contact is not None
         self._dissipated += contact.commit(self.x)
-        self.linearisation.current = False
         return contact.memory

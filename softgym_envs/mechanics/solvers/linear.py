@@ -41,8 +41,13 @@ class LinearSolver(ABC):
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Solve for the columns of ``rhs``, shape (n, k), with the last factorisation."""
 
-    def condense(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``H^T A^-1 H`` (k, k) for columns ``H`` (n, k), and an array ``half`` (n, k) for `expand`."""
+    def condense(self, columns: np.ndarray, extra: csc_matrix | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``H^T A^-1 H`` (k, k) for columns ``H`` (n, k), and an array ``half`` (n, k) for `expand`.
+
+        ``H`` consists of dense columns, followed by sparse ones if ``extra`` is given.
+        """
+        if extra is not None:
+            columns = np.hstack([columns, extra.toarray()])
         solved = self.solve(columns)
         return columns.T @ solved, solved
 
@@ -60,7 +65,7 @@ class CholmodSolver(LinearSolver):
         super().__init__(indptr, indices)
         from cvxopt import cholmod, matrix, spmatrix
 
-        self._cholmod, self._matrix = cholmod, matrix
+        self._cholmod, self._matrix, self._spmatrix = cholmod, matrix, spmatrix
         columns = np.repeat(np.arange(self.size), np.diff(indptr))
         diagonal = (indices == columns).astype(float)
         self._lower = spmatrix(matrix(diagonal), matrix(indices.astype(np.int64)), matrix(columns.astype(np.int64)))
@@ -83,12 +88,19 @@ class CholmodSolver(LinearSolver):
         self._cholmod.solve(self._factor, solution)
         return np.asarray(solution)
 
-    def condense(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def condense(self, columns: np.ndarray, extra: csc_matrix | None = None) -> tuple[np.ndarray, np.ndarray]:
         # With P A P^T = L L^T half of the work suffices: H^T A^-1 H = Y^T Y, L Y = P H.
         half = self._matrix(np.asfortranarray(columns))
         self._cholmod.solve(self._factor, half, sys=7)  # P
         self._cholmod.solve(self._factor, half, sys=4)  # L
         solved = np.asarray(half)
+        if extra is not None:
+            entries = extra.tocoo()
+            rows, places = (self._matrix(index.astype(np.int64)) for index in (entries.row, entries.col))
+            sparse = self._spmatrix(self._matrix(entries.data), rows, places, size=entries.shape)
+            for system in (7, 4):  # about twice as fast as with dense columns
+                sparse = self._cholmod.spsolve(self._factor, sparse, sys=system)
+            solved = np.hstack([solved, np.asarray(self._matrix(sparse))])
         return solved.T @ solved, solved
 
     def expand(self, vector: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import hstack
 
 from softgym_envs.mechanics.assembly import Assembled, Inertia
 from softgym_envs.mechanics.contact.contact import ContactState, ContactTerms
@@ -27,16 +28,18 @@ class Linearisation:
         exact: whether the factorised tangent is exact. Away from an equilibrium, terms of contact that make it
             indefinite are left out.
         residual: of the equilibrium, shape (N,).
-        correction: ``A^-1 residual``, shape (N,).
+        shift: ``H^T A^-1 residual``, shape (size,).
         H: gradients of the constraints, shape (N, size).
         delta: values of the constraints, shape (size,).
+        elastic: elastic energy [J].
         W: their compliance ``H^T A^-1 H``, shape (size, size); symmetric unless points slide.
     """
 
     residual: np.ndarray
-    correction: np.ndarray
+    shift: np.ndarray
     H: np.ndarray
     delta: np.ndarray
+    elastic: float
     W: np.ndarray
 
     def __init__(self, model: MechanicalModel) -> None:
@@ -81,7 +84,7 @@ class Linearisation:
             x: rows at which they were assembled, shape (n, 3).
             exact: do not leave out terms of contact.
         """
-        self.residual, tangent, self.H, self.delta, self._elastic = assembled
+        self.residual, tangent, self.H, self.delta, self.elastic = assembled
         terms = self._terms
         extra = None if terms is None else terms.tangent
         self.exact = self._tangent.factorise(tangent, extra, fallback=exact or terms is None)
@@ -93,24 +96,30 @@ class Linearisation:
                 return False
         count = self.H.shape[1]
         self._slips = 0 if terms is None else terms.directions.shape[1]
-        columns = self.H
-        if self._slips:
-            assert terms is not None
-            self._loading = terms.loading
-            columns = np.asfortranarray(np.hstack([self.H, terms.directions, terms.loading]))
-        gram, self._half = self._tangent.solver.condense(columns)
+        extra = None
+        if terms is not None:
+            assert self.contact is not None
+            self.contact.hold(terms)
+            if self._slips:
+                self._loading = terms.loading
+                extra = hstack([terms.directions, terms.loading], format="csc")
+        columns = np.asfortranarray(np.column_stack([self.H, self.residual]))
+        gram, self._half = self._tangent.solver.condense(columns, extra)
         if not np.isfinite(gram).all():
             return False
-        self.W = 0.5 * (gram[:count, :count] + gram[:count, :count].T)
+        known = slice(0, count + 1)  # columns of the constraints and of the residual
+        response = gram[known, known]
         if self._slips:
-            slide, load = slice(count, count + self._slips), slice(count + self._slips, None)
+            slide, load = slice(count + 1, count + 1 + self._slips), slice(count + 1 + self._slips, None)
             self._core = np.eye(self._slips) + gram[load, slide]
             try:
-                self._slip_of_effort = np.linalg.solve(self._core, gram[load, :count])
+                self._slip = np.linalg.solve(self._core, gram[load, known])
             except np.linalg.LinAlgError:
                 return False
-            self.W = self.W - gram[:count, slide] @ self._slip_of_effort
-        self.correction = self.solve(self.residual)
+            response = response - gram[known, slide] @ self._slip
+        W = response[:count, :count]
+        self.W = W if self._slips else 0.5 * (W + W.T)
+        self.shift = response[:count, count]
         self.current = True
         return True
 
@@ -118,18 +127,28 @@ class Linearisation:
         """Return ``A^-1 residual``, shape (N,)."""
         solution = self._tangent.solver.solve(residual[:, None])[:, 0]
         if self._slips:
-            count = self.H.shape[1]
             slip = np.linalg.solve(self._core, self._loading.T @ solution)
-            solution = solution - self._tangent.solver.expand(self._half[:, count : count + self._slips] @ slip)
+            solution = solution - self._tangent.solver.expand(self._half[:, self._slide] @ slip)
         return solution
 
-    def response(self, effort: np.ndarray) -> np.ndarray:
-        """Return ``A^-1 H effort``, the step of the equations (N,) that efforts (size,) cause."""
-        count = len(effort)
-        half = self._half[:, :count] @ effort
+    def response(self, effort: np.ndarray, residual: float = 0.0) -> np.ndarray:
+        """Return ``A^-1 (H effort - r)``, the step of the equations (N,) that efforts (size,) cause.
+
+        Args:
+            effort: efforts.
+            residual: multiple of the residual of this linearisation to be corrected.
+        """
+        combined = np.append(effort, -residual)
+        half = self._half[:, : len(combined)] @ combined
         if self._slips:
-            half = half - self._half[:, count : count + self._slips] @ (self._slip_of_effort @ effort)
+            half = half - self._half[:, self._slide] @ (self._slip @ combined)
         return self._tangent.solver.expand(half)
+
+    @property
+    def _slide(self) -> slice:
+        """Columns of the directions of sliding points."""
+        first = self.H.shape[1] + 1
+        return slice(first, first + self._slips)
 
     def without_contact(
         self, x: np.ndarray, effort: np.ndarray, columns: np.ndarray
@@ -151,20 +170,9 @@ class Linearisation:
         gram, _ = self._tangent.solver.condense(np.asfortranarray(np.hstack([assembled.gradients, columns])))
         return (gram, assembled.delta) if np.isfinite(gram).all() else None
 
-    def energy(self, x: np.ndarray) -> float:
-        """Return the energy [J] at rows ``x`` (n, 3) with the loads that act and limits of friction held; or inf."""
-        energy = 0.0 if self.contact is None else self.contact.energy(x)
-        if not np.isfinite(energy):
-            return np.inf
-        return energy + self._model.elastic_energy(x) - self._work_of_loads(x)
-
-    def current_energy(self, x: np.ndarray) -> float:
-        """Return `energy` at the rows ``x`` (n, 3) of this linearisation."""
-        energy = 0.0 if self.contact is None else self.contact.energy(x)
-        return energy + self._elastic - self._work_of_loads(x)
-
-    def _work_of_loads(self, x: np.ndarray) -> float:
-        return float(np.vdot(self.loads, x - self._model.nodes))
+    def energy(self, x: np.ndarray, stored: float) -> float:
+        """Return the energy [J] stored at rows ``x`` (n, 3) less the work of the loads that act."""
+        return stored - float(np.vdot(self.loads, x - self._model.nodes))
 
     def inertial_work(self, start: np.ndarray, end: np.ndarray) -> float:
         """Return the work [J] against the forces that a time step adds, from rows ``start`` to ``end`` (n, 3).

@@ -180,12 +180,12 @@ class Statics:
         return self.linearisation.update(self.x, self.effort, exact=exact)
 
     def _correction(
-        self, Ar: np.ndarray, delta: np.ndarray, effort: np.ndarray, target: np.ndarray, driven: np.ndarray
+        self, Ar: np.ndarray | None, delta: np.ndarray, effort: np.ndarray, target: np.ndarray, driven: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Solve the linearised KKT system for the steps of the equations (N,) and of the efforts (size,).
 
         Args:
-            Ar: ``A^-1 residual``, shape (N,).
+            Ar: ``A^-1 residual`` of another state, shape (N,), or None at the state of the linearisation.
             delta: values of the constraints, shape (size,).
             effort: their efforts, shape (size,).
             target: commanded values of driven rows and efforts of all others, shape (size,).
@@ -198,7 +198,8 @@ class Statics:
         forced[driven] = False
         step_effort[forced] = target[forced] - effort[forced]
         if len(driven):
-            gap = (delta - target - Ar @ linear.H + linear.W @ step_effort)[driven]
+            shift = linear.shift if Ar is None else Ar @ linear.H
+            gap = (delta - target - shift + linear.W @ step_effort)[driven]
             W = linear.W[driven[:, None], driven]
             unilateral = np.zeros(len(effort), dtype=bool)
             unilateral[: self._actuators] = self.unilateral
@@ -206,7 +207,7 @@ class Statics:
                 step_effort[driven] = _complementary_step(W, gap, effort[driven], unilateral[driven])
             except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (two actuators act alike)
                 raise NewtonFailure from None
-        step_q = linear.response(step_effort) - Ar
+        step_q = linear.response(step_effort, 1.0) if Ar is None else linear.response(step_effort) - Ar
         if len(self._bonds):
             # The tangent holds `bond_stiffness` H_b H_b^T, which already carries its share of the force.
             open_by = delta[self._bonds] - target[self._bonds]
@@ -232,7 +233,7 @@ class Statics:
             raise NewtonFailure
         if linear.contact is not None:
             return self._newton_in_contact(target, driven)
-        step_q, step_effort = self._correction(linear.correction, linear.delta, self.effort, target, driven)
+        step_q, step_effort = self._correction(None, linear.delta, self.effort, target, driven)
         length = 1.0
         for iteration in range(1, self.max_iterations + 1):
             norm = self._norm(step_q)
@@ -265,7 +266,7 @@ class Statics:
             self.x, self.effort = x, effort
             if not linear.factorise(assembled, x):
                 raise NewtonFailure
-            step_q, step_effort = self._correction(linear.correction, linear.delta, effort, target, driven)
+            step_q, step_effort = self._correction(None, linear.delta, effort, target, driven)
             if length == 1.0 and self._norm(step_q) <= self.tolerance:
                 return iteration
             length = min(1.0, 2.0 * length)
@@ -289,7 +290,7 @@ class Statics:
 
         full = False
         for iteration in range(self.max_iterations + 1):
-            step_q, step_effort = self._correction(linear.correction, linear.delta, self.effort, target, driven)
+            step_q, step_effort = self._correction(None, linear.delta, self.effort, target, driven)
             norm = self._norm(step_q)
             if not np.isfinite(norm):
                 raise NewtonFailure
@@ -301,32 +302,46 @@ class Statics:
                 step_q = step_q * (self._longest_step / norm)
                 norm = self._longest_step
             weight = np.maximum(weight, 1.5 * np.abs((self.effort + step_effort)[driven]) + 1e-9)
-            before = linear.current_energy(self.x) + penalty(linear.delta)
+            before = linear.energy(self.x, linear.elastic + linear.contact.energy(self.x)) + penalty(linear.delta)
             pull = linear.residual + linear.H @ self.effort  # derivative of the energy
             slope = float((pull - linear.H[:, forced] @ target[forced]) @ step_q)
             slope -= float(weight @ violation(linear.delta))
             length = 1.0
             while True:
                 x = self.x + self._displacement(self.x, length * step_q)
+                effort = self.effort + step_effort * (1.0 if length > 0.1 else length)
                 part = linear.contact.free_path(self.x, x)
                 if part < 1.0:
                     length *= max(part, 0.05)  # the way bends, so it is tested again
                 else:
-                    after = linear.energy(x) + linear.inertial_work(self.x, x) + penalty(self._values(x))
-                    allowed = before + 1e-4 * length * min(slope, 0.0) + 1e-12 * abs(before) + 1e-14
-                    if after <= allowed or (norm < self._round_off and np.isfinite(after)):
-                        break
+                    barrier = linear.contact.energy(x)
+                    assembled = linear.assemble(x, effort) if np.isfinite(barrier) else None
+                    if assembled is not None:
+                        after = linear.energy(x, assembled.energy + barrier) + penalty(assembled.delta)
+                        after += linear.inertial_work(self.x, x)
+                        allowed = before + 1e-4 * length * min(slope, 0.0) + 1e-12 * abs(before) + 1e-14
+                        if after <= allowed or norm < self._round_off:
+                            break
                     length *= 0.5
                 if length < 1e-6:
                     raise NewtonFailure
-            effort = self.effort + step_effort * (1.0 if length > 0.1 else length)
-            assembled = linear.assemble(x, effort)
-            if assembled is None:
-                raise NewtonFailure
+            assert assembled is not None
+            full = length == 1.0
+            if full and norm**2 <= 1e2 * self.tolerance * self._longest_step:
+                # The simplified correction alone may reach the tolerance: this saves a factorisation.
+                Ar = linear.solve(assembled.residual)
+                next_q, next_effort = self._correction(Ar, assembled.delta, effort, target, driven)
+                remaining = self._norm(next_q)
+                if self.tolerance < remaining and remaining**2 <= 0.1 * self.tolerance * norm:
+                    closer = x + self._displacement(x, next_q)
+                    if linear.contact.free_path(x, closer) == 1.0:
+                        x, effort = closer, effort + next_effort
+                        assembled = linear.assemble(x, effort)
+                        if assembled is None:
+                            raise NewtonFailure
             self.x, self.effort = x, effort
             if not linear.factorise(assembled, x):
                 raise NewtonFailure
-            full = length == 1.0
         raise NewtonFailure
 
     def _values(self, x: np.ndarray) -> np.ndarray:
@@ -489,8 +504,8 @@ class Statics:
         """Let friction remember the current state, at which the next increment starts."""
         contact = self.linearisation.contact
         assert contact is not None
+        # Forces stay as they are, so the linearisation stays current; sliding points are expected to slide on.
         contact.commit(self.x)
-        self.linearisation.current = False
         return contact.memory
 
     def _state(self, target: np.ndarray, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
