@@ -103,11 +103,12 @@ def test_gradient_and_tangent_are_exact(pressed):
     kinematics, h = model.kinematics, 1e-8
     ways = [[kinematics.displacement(x, s * h * e) for s in (1, -1)] for e in np.eye(kinematics.equations)]
     exact = slope(model, state, x)
+    terms = state.evaluate(x)
+    state.hold(terms)
     differences = np.array([state.energy(x + plus) - state.energy(x + minus) for plus, minus in ways]) / (2 * h)
     assert np.abs(differences - exact).max() < 1e-7 * np.abs(exact).max()
 
-    terms = state.evaluate(x)
-    tangent = terms.tangent.toarray() + terms.directions @ terms.loading.T
+    tangent = (terms.tangent + terms.directions @ terms.loading.T).toarray()
     # The curvature of frames, which the assembly adds.
     assembly, values = model.assembly, np.zeros(len(model.assembly.keys))
     arms = kinematics.map.linearise(x)
