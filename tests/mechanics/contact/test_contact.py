@@ -169,7 +169,7 @@ def test_block_holds_up_to_the_angle_of_friction(rigid):
     """tan 26.565 degrees = 0.5."""
     for degrees in (10.0, 26.5):
         model = block_on_incline(degrees, rigid=rigid)
-        contacts = Statics(model).solve([]).contacts
+        contacts = Statics(model, tolerance=1e-13).solve([]).contacts
         weight, angle = GRAVITY * model.mass, np.radians(degrees)
         expected = weight * np.array([-np.sin(angle), 0.0, np.cos(angle)])
         np.testing.assert_allclose(contacts.total[0], expected, atol=1e-6 * weight)
