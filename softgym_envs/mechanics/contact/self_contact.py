@@ -3,7 +3,7 @@
 The energy is a barrier between all pairs of a vertex and a face, and of two edges, that are closer than ``distance``:
 Li et al., "Incremental Potential Contact" (2020), with the area weights and the barrier with physical units of Li et
 al., "Convergent Incremental Potential Contact" (2023). Collisions, distances and their derivatives come from ipctk, the
-library of the authors.
+library of the authors; steps are limited by its additive collision detection (Li, Kaufman, Jiang 2021).
 """
 
 from __future__ import annotations
