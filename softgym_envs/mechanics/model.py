@@ -16,7 +16,7 @@ from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.contact.contact import Contact
-from softgym_envs.mechanics.contact.obstacles import Obstacle
+from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
 from softgym_envs.mechanics.contact.surface import surface_of
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, quadratic_triangles
@@ -326,7 +326,7 @@ class MechanicalModel:
     def set_contact(
         self,
         *,
-        obstacles: Sequence[Obstacle] = (),
+        obstacles: Sequence[Obstacle | MeshObstacle] = (),
         self_contact: bool = False,
         self_friction: float = 0.0,
         excluded: Sequence[int] | np.ndarray = (),

@@ -10,15 +10,17 @@ import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, hstack
 
 from softgym_envs.mechanics.contact.obstacle_contact import ObstacleContact, Touch
-from softgym_envs.mechanics.contact.obstacles import Obstacle
+from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
 from softgym_envs.mechanics.contact.self_contact import SelfContact, SelfContactMemory
-from softgym_envs.mechanics.contact.surface import Mapping, Surface
+from softgym_envs.mechanics.contact.surface import Mapping, Surface, surface_set
 from softgym_envs.mechanics.kinematics import Kinematics
 
 
 @dataclass(frozen=True)
 class Contacts:
     """Where a model touches at one state: one entry for each point of its surface that an obstacle presses on.
+
+    Meshed obstacles have no entries, only a total force.
 
     Attributes:
         obstacles: names of the obstacles.
@@ -28,7 +30,8 @@ class Contacts:
         force: on the model [N], shape (k, 3).
         pressing: normal forces [N], shape (k,).
         sliding: whether the friction force has reached its limit, shape (k,).
-        self_force: sum of the normal forces between surfaces of the model [N].
+        self_force: sum of the normal forces between surfaces, of the model and of meshed obstacles [N].
+        mesh_force: force of each meshed obstacle on the model [N], zero for others, shape (o, 3).
         smallest_gap: to any obstacle or between surfaces of the model [m]; inf beyond the distance of contact.
     """
 
@@ -40,6 +43,7 @@ class Contacts:
     pressing: np.ndarray
     sliding: np.ndarray
     self_force: float
+    mesh_force: np.ndarray
     smallest_gap: float
 
     @property
@@ -50,7 +54,7 @@ class Contacts:
     @property
     def total(self) -> np.ndarray:
         """Force of each obstacle on the model [N], shape (o, 3)."""
-        out = np.zeros((len(self.obstacles), 3))
+        out = self.mesh_force.copy()
         np.add.at(out, self.obstacle, self.force)
         return out
 
@@ -123,7 +127,7 @@ class Contact:
         self,
         surface: Surface,
         *,
-        obstacles: Sequence[Obstacle] = (),
+        obstacles: Sequence[Obstacle | MeshObstacle] = (),
         self_contact: bool = False,
         self_friction: float = 0.0,
         distance: float = 5e-4,
@@ -148,18 +152,27 @@ class Contact:
         self.stiffness = float(stiffness)
         self.stick = float(stick)
         self.surface = surface
+        self.surfaces = surface_set(surface, self.meshes, self.self_contact)
+
+    @property
+    def meshes(self) -> tuple[MeshObstacle, ...]:
+        """The meshed obstacles."""
+        return tuple(each for each in self.obstacles if isinstance(each, MeshObstacle))
 
     def intersections(self, x: np.ndarray) -> str | None:
         """Return what crosses what at rows ``x`` (n, 3), or None."""
         for number, obstacle in enumerate(self.obstacles):
+            if isinstance(obstacle, MeshObstacle):
+                continue
             points = self.surface.points[0] @ x
             if obstacle.frame is not None:
                 points = (points - x[obstacle.frame]) @ x[obstacle.frame + 1 : obstacle.frame + 4].T
             own = self.not_carried(obstacle)
             if not (obstacle.gap(points[own]) > 0.0).all():
                 return f"the body is inside obstacle {obstacle.name or number + 1}"
-        if self.self_contact and self.between_surfaces().intersects(self.surface.weights @ x):
-            return "surfaces of the body cross each other"
+        surfaces = self.between_surfaces(x)
+        if surfaces is not None and surfaces.intersects(self.surfaces.places(x)):
+            return "surfaces of the body cross each other" + (" or a meshed obstacle" if self.meshes else "")
         return None
 
     def not_carried(self, obstacle: Obstacle) -> np.ndarray:
@@ -170,14 +183,22 @@ class Contact:
         touches = weights[:, obstacle.frame : obstacle.frame + 4]
         return np.diff(touches.tocsr().indptr) == 0
 
-    def between_surfaces(self) -> SelfContact:
-        """Return the contact between the surfaces of the model."""
+    def between_surfaces(self, x: np.ndarray) -> SelfContact | None:
+        """Return the contact between the surfaces of the model and meshed obstacles, or None if none touch.
+
+        Args:
+            x: rows (n, 3) at which meshed obstacles have their size, such as those at rest.
+        """
+        if not self.self_contact and not self.meshes:
+            return None
         return SelfContact(
-            self.surface.rest,
-            self.surface.triangles,
+            self.surfaces.places(x),
+            self.surfaces.triangles,
             distance=self.distance,
             stiffness=self.stiffness,
             friction=self.self_friction,
+            groups=self.surfaces.groups,
+            obstacle_friction=self.surfaces.friction,
         )
 
 
@@ -198,6 +219,8 @@ class ContactState:
         n = len(nodes)
         self.pairs = []
         for obstacle in contact.obstacles:
+            if isinstance(obstacle, MeshObstacle):
+                continue
             own = contact.not_carried(obstacle)
             frame = None
             if obstacle.frame is not None:
@@ -215,8 +238,8 @@ class ContactState:
                     stick=contact.stick,
                 )
             )
-        self._surfaces = contact.between_surfaces() if contact.self_contact else None
-        self._vertices = Mapping(contact.surface.weights, kinematics)
+        self._surfaces = contact.between_surfaces(nodes)
+        self._vertices = Mapping(contact.surfaces.weights, kinematics)
         self._limits: tuple[np.ndarray | None, ...] = (None,) * len(self.pairs)
         self.begin(nodes)
 
@@ -225,7 +248,7 @@ class ContactState:
     @property
     def rubs(self) -> bool:
         """Whether there is friction, so that forces depend on the path."""
-        return any(pair.obstacle.friction > 0.0 for pair in self.pairs) or self.contact.self_friction > 0.0
+        return any(each.friction > 0.0 for each in self.contact.obstacles) or self.contact.self_friction > 0.0
 
     def begin(self, x: np.ndarray) -> None:
         """Forget the past: all friction springs are relaxed at rows ``x`` (n, 3)."""
@@ -265,7 +288,7 @@ class ContactState:
     # -- energy and derivatives ---------------------------------------------------------------------------------------
 
     def _corners(self, x: np.ndarray) -> np.ndarray:
-        return self.contact.surface.weights @ x
+        return self.contact.surfaces.places(x)
 
     def energy(self, x: np.ndarray) -> float:
         """Return the potential [J] at rows ``x`` (n, 3), with the limits of friction that are held; see `hold`."""
@@ -315,7 +338,7 @@ class ContactState:
         if self._surfaces is not None:
             slope, curvature = self._surfaces.derivatives(self._corners(x), project=convex)
             if curvature.nnz:
-                gradient += self.contact.surface.weights.T @ slope
+                gradient += self.contact.surfaces.weights.T @ slope
                 tangent = tangent + self._to_equations(curvature)
         return ContactTerms(
             gradient, tangent.tocsr(), hstack(directions, format="csc"), hstack(loading, format="csc"), tuple(limits)
@@ -338,7 +361,8 @@ class ContactState:
     def rows(self, x: np.ndarray, *, each_point: bool = False) -> list[ContactRow]:
         """Return the openings at rows ``x`` (n, 3): one for each obstacle, or for each point that presses."""
         found = []
-        for name, pair in zip(self._names(), self.pairs, strict=True):
+        names = self._names()
+        for name, pair in zip([names[k] for k in self._numbers(meshed=False)], self.pairs, strict=True):
             touch = pair.touch(x, None)
             loaded, opening = bool(touch.pressing.any()), 0.0
             if loaded and not each_point:
@@ -367,7 +391,11 @@ class ContactState:
         return found
 
     def _names(self) -> tuple[str, ...]:
-        return tuple(pair.obstacle.name or f"obstacle {k + 1}" for k, pair in enumerate(self.pairs))
+        return tuple(each.name or f"obstacle {k + 1}" for k, each in enumerate(self.contact.obstacles))
+
+    def _numbers(self, meshed: bool) -> np.ndarray:
+        """Numbers, among all obstacles, of those that are or are not meshed."""
+        return np.flatnonzero([isinstance(each, MeshObstacle) == meshed for each in self.contact.obstacles])
 
     def _to_equations(self, curvature: csr_matrix) -> csr_matrix:
         """Return the tangent (N, N) of a tangent over the components of the vertices (3 v, 3 v)."""
@@ -399,23 +427,27 @@ class ContactState:
     def _record(self, x: np.ndarray, touches: list[Touch]) -> Contacts:
         places = [pair.weights[touch.points] @ x for pair, touch in zip(self.pairs, touches, strict=True)]
         smallest = min((float(touch.gap.min(initial=np.inf)) for touch in touches), default=np.inf)
-        self_force = 0.0
+        self_force, mesh_force = 0.0, np.zeros((len(self.contact.obstacles), 3))
         if self._surfaces is not None:
             corners = self._corners(x)
             smallest = min(smallest, self._surfaces.minimum_distance(corners))
-            self_force = 0.5 * float(np.linalg.norm(self._surfaces.forces(corners), axis=1).sum())
+            forces, owner = self._surfaces.forces(corners), self.contact.surfaces.owner
+            self_force = 0.5 * float(np.linalg.norm(forces, axis=1).sum())
+            for mesh, number in enumerate(self._numbers(meshed=True)):
+                mesh_force[number] = -forces[owner == mesh].sum(axis=0)
 
         def joined(parts: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
             return np.concatenate([np.empty((0, *shape)), *parts])
 
         return Contacts(
             obstacles=self._names(),
-            obstacle=np.repeat(np.arange(len(touches)), [len(touch.points) for touch in touches]),
+            obstacle=np.repeat(self._numbers(meshed=False), [len(touch.points) for touch in touches]),
             point=joined(places, (3,)),
             gap=joined([touch.gap for touch in touches], ()),
             force=joined([touch.force for touch in touches], (3,)),
             pressing=joined([touch.pressing for touch in touches], ()),
             sliding=joined([touch.sliding for touch in touches], ()).astype(bool),
             self_force=self_force,
+            mesh_force=mesh_force,
             smallest_gap=smallest,
         )

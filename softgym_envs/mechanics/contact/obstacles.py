@@ -464,8 +464,8 @@ def _prism_geometry(points, start, length, direction, outward, half_height, radi
 class MeshObstacle(RigidShape):
     """A solid bounded by triangles.
 
-    It has no formula for its gap: bodies touch it by their surfaces, see `SelfContact.with_obstacles`. Only its surface
-    keeps them out, so no part of a body may lie inside at the start.
+    It has no formula for its gap: bodies touch it by their surfaces, see `self_contact`. Only its surface keeps them
+    out, so no part of a body may lie inside at the start.
 
     Attributes:
         vertices: [m], shape (m, 3).
@@ -486,17 +486,6 @@ class MeshObstacle(RigidShape):
         if (numbers % 1.0 != 0.0).any() or numbers.max() >= len(self.vertices):
             raise ValueError(f"{self._label}: triangles must be whole numbers below {len(self.vertices)}")
         object.__setattr__(self, "triangles", tuple(map(tuple, numbers.astype(int).tolist())))
-
-    @cached_property
-    def _arms(self) -> np.ndarray:
-        return np.column_stack([np.ones(len(self.vertices)), np.asarray(self.vertices)])
-
-    def placed(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Vertices in space [m] (m, 3), where the rows (4, 3) of its frame are if it has one.
-
-        They are linear in the rows: ``[1, X, Y, Z] @ rows``.
-        """
-        return np.asarray(self.vertices) if rows is None else self._arms @ rows
 
     def skin(self, extent: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(self.vertices), np.asarray(self.triangles)

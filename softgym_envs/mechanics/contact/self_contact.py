@@ -8,7 +8,6 @@ library of the authors; steps are limited by its additive collision detection (L
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
@@ -16,8 +15,6 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.sparse import csc_matrix
-
-from softgym_envs.mechanics.contact.obstacles import MeshObstacle
 
 Pairs = Literal["IPC", "IMPROVED_MAX_APPROX"]
 MAX_CCD_STEPS = 1_000
@@ -134,9 +131,10 @@ class SelfContact:
             groups = np.asarray(groups)
             if groups.shape != (len(rest),):
                 raise ValueError(f"self-contact: groups must have shape ({len(rest)},), got {groups.shape}")
-            own = groups.max(initial=-1) + 1 + np.arange(len(rest))
-            labels = np.where(groups < 0, own, groups).astype(np.int32)
-            self.mesh.can_collide = ipctk.make_vertex_patches_filter(labels)
+            if (groups >= 0).any():
+                own = groups.max() + 1 + np.arange(len(rest))
+                labels = np.where(groups < 0, own, groups).astype(np.int32)
+                self.mesh.can_collide = ipctk.make_vertex_patches_filter(labels)
         self.distance = distance
         self.friction = np.full(len(rest), float(friction))
         if obstacle_friction is not None:
@@ -161,40 +159,6 @@ class SelfContact:
         self._at = np.empty((0, 3))
         self._memory = SelfContactMemory()
         self._tangential: Any = None
-
-    @classmethod
-    def with_obstacles(
-        cls,
-        rest: np.ndarray,
-        faces: np.ndarray,
-        obstacles: Sequence[MeshObstacle],
-        *,
-        groups: np.ndarray | None = None,
-        **options: Any,
-    ) -> SelfContact:
-        """Contact of bodies with meshed obstacles, and with each other.
-
-        The vertices of the obstacles follow those of the bodies, in order. Obstacles do not touch each other.
-
-        Args:
-            rest: rest positions [m] of the vertices of the bodies, shape (m, 3).
-            faces: triangles of the bodies, shape (f, 3).
-            obstacles: the obstacles.
-            groups: group of each vertex of the bodies, shape (m,), as in the constructor.
-            options: further arguments of the constructor.
-        """
-        skins = [each.skin() for each in obstacles]
-        starts = len(rest) + np.cumsum([0, *(len(vertices) for vertices, _ in skins)])
-        count = int(starts[-1]) - len(rest)
-        own = np.full(len(rest), -1) if groups is None else np.asarray(groups)
-        frictions = [np.full(len(each.vertices), each.friction) for each in obstacles]
-        return cls(
-            np.concatenate([rest, *(vertices for vertices, _ in skins)]),
-            np.concatenate([faces, *(triangles + start for (_, triangles), start in zip(skins, starts, strict=False))]),
-            groups=np.concatenate([own, np.full(count, own.max(initial=-1) + 1)]),
-            obstacle_friction=np.concatenate([np.full(len(rest), np.nan), *frictions]),
-            **options,
-        )
 
     @staticmethod
     def _indices(name: str, values: np.ndarray, columns: int, count: int) -> np.ndarray:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, identity, kron, vstack
 
+from softgym_envs.mechanics.contact.obstacles import MeshObstacle
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, split_triangles
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, boundary_triangles
@@ -96,6 +97,78 @@ def surface_of(
         )
     stacked = vstack(weights).tocsr()
     return Surface(stacked, np.concatenate(triangles), np.concatenate(body), stacked @ nodes)
+
+
+@dataclass(frozen=True)
+class SurfaceSet:
+    """The surface of a model and its meshed obstacles, whose vertices follow in order.
+
+    Attributes:
+        weights: vertices as combinations of the rows, sparse matrix of shape (v, n); zero if they stand still.
+        offset: places of vertices that stand still [m], zero for others, shape (v, 3).
+        triangles: vertex indices, shape (t, 3).
+        groups: vertices of one group do not touch each other; those with -1 touch all; shape (v,).
+        friction: coefficient of friction of the obstacle that a vertex belongs to, NaN for the model; shape (v,).
+        owner: number of that obstacle, -1 for the model; shape (v,).
+    """
+
+    weights: csr_matrix
+    offset: np.ndarray
+    triangles: np.ndarray
+    groups: np.ndarray
+    friction: np.ndarray
+    owner: np.ndarray
+
+    def places(self, x: np.ndarray) -> np.ndarray:
+        """Return the vertices [m] (v, 3) at rows ``x`` (n, 3)."""
+        return self.weights @ x + self.offset
+
+
+def surface_set(surface: Surface, obstacles: Sequence[MeshObstacle], self_contact: bool) -> SurfaceSet:
+    """Return the surface of a model together with meshed obstacles.
+
+    Obstacles that stand still do not touch each other; nor do obstacles and parts on one frame.
+
+    Args:
+        surface: of the model.
+        obstacles: the meshed obstacles.
+        self_contact: whether the surface of the model touches itself.
+    """
+    count, n = surface.weights.shape
+    weights, offset, triangles = [surface.weights], [np.zeros((count, 3))], [surface.triangles]
+    friction, owner = [np.full(count, np.nan)], [np.full(count, -1)]
+    groups = [np.full(count, -1 if self_contact else 0)]
+    frames = sorted({each.frame for each in obstacles if each.frame is not None})
+    if self_contact:
+        for number, frame in enumerate(frames):
+            carried = np.diff(surface.weights[:, frame : frame + 4].tocsr().indptr) > 0
+            groups[0][carried] = 2 + number
+    start = count
+    for number, each in enumerate(obstacles):
+        vertices, faces = each.skin()
+        m = len(vertices)
+        if each.frame is None:
+            weights.append(csr_matrix((m, n)))
+            offset.append(vertices)
+            groups.append(np.full(m, 1))
+        else:
+            arms = np.column_stack([np.ones(m), vertices])
+            rows, columns = np.repeat(np.arange(m), 4), np.tile(each.frame + np.arange(4), m)
+            weights.append(csr_matrix((arms.ravel(), (rows, columns)), shape=(m, n)))
+            offset.append(np.zeros((m, 3)))
+            groups.append(np.full(m, 2 + frames.index(each.frame)))
+        triangles.append(faces + start)
+        friction.append(np.full(m, each.friction))
+        owner.append(np.full(m, number))
+        start += m
+    return SurfaceSet(
+        vstack(weights).tocsr(),
+        np.concatenate(offset),
+        np.concatenate(triangles),
+        np.concatenate(groups),
+        np.concatenate(friction),
+        np.concatenate(owner),
+    )
 
 
 class Mapping:

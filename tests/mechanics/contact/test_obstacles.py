@@ -203,9 +203,6 @@ def test_mesh_obstacles():
     assert obstacle_from(json.loads(json.dumps(ball.as_dict()))) == ball
     np.testing.assert_array_equal(ball.skin()[0], vertices)
     np.testing.assert_array_equal(ball.skin()[1], triangles)
-    np.testing.assert_array_equal(ball.placed(), vertices)
-    rows = np.vstack([[0.1, 0.2, 0.3], np.transpose(TURN)])
-    np.testing.assert_allclose(ball.placed(rows), vertices @ np.transpose(TURN) + rows[0], atol=1e-15)
 
 
 def test_every_kind_has_its_name():

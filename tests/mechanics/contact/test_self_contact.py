@@ -1,4 +1,4 @@
-"""Contact between surfaces: derivatives, steps without collisions, friction within an increment, meshed obstacles."""
+"""Contact between surfaces: derivatives, steps without collisions, friction within an increment."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softgym_envs.mechanics.contact.obstacles import MeshObstacle
 from softgym_envs.mechanics.contact.self_contact import SelfContact, SelfContactMemory, load_ipctk
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.testing import box_mesh
@@ -235,42 +234,16 @@ def test_the_memory_does_not_change_with_the_positions_it_was_taken_from():
     np.testing.assert_array_equal(surfaces.memory.start, v)
 
 
-# -- meshed obstacles ---------------------------------------------------------------------------------------------
-
-
-def test_meshed_obstacles():
-    """A block between two obstacles, of which one would touch itself and the other."""
-    block, faces = cuboid((0.006, 0.006, 0.004), (2, 2, 1), (0.0, 0.0, 0.0))
-    below = MeshObstacle(*cuboid((0.01, 0.01, 4e-4), (1, 1, 1), (-0.002, -0.002, -4e-4 - GAP)), friction=0.3)
-    beside = MeshObstacle(*cuboid((0.002, 0.01, 0.01), (1, 1, 1), (0.006 + GAP, -0.001, -1e-4)), friction=0.6)
-    options = {"distance": DISTANCE, "stiffness": STIFFNESS, "smoothing": 1e-7}
-    surfaces = SelfContact.with_obstacles(block, faces, [below, beside], friction=0.9, **options)
-    v = np.concatenate([block, below.placed(), beside.placed()])
-    owner = np.repeat([0, 1, 2], [len(block), len(below.vertices), len(beside.vertices)])
-    forces = surfaces.forces(v)
-    assert forces[owner == 0, 2].sum() > 1.0 and forces[owner == 0, 0].sum() < -1.0
-    # The obstacles feel only the block, not each other or themselves.
-    alone = SelfContact.with_obstacles(block, faces, [below], **options).forces(v[owner != 2])
-    np.testing.assert_allclose(forces[owner == 1], alone[owner[owner != 2] == 1], atol=1e-9)
-    assert not surfaces.intersects(v)
-    # Every obstacle has its own friction.
-    surfaces.begin_increment(v)
-    without = SelfContact.with_obstacles(block, faces, [below, beside], **options)
-    slide = v + 1e-6 * np.array([0.0, 1.0, 0.0]) * (owner == 0)[:, None]
-    friction = surfaces.forces(slide) - without.forces(slide)
-    for obstacle, coefficient, axis in ((1, 0.3, 2), (2, 0.6, 0)):
-        normal = abs(forces[owner == obstacle, axis].sum())
-        assert friction[owner == obstacle, 1].sum() == pytest.approx(coefficient * normal, rel=0.15)
-
-
-def test_bodies_without_self_contact_touch_obstacles():
-    block, faces = cuboid((0.006, 0.006, 4e-4), (2, 2, 1), (0.0, 0.0, 0.0))  # thinner than the distance
-    below = MeshObstacle(*cuboid((0.01, 0.01, 0.004), (1, 1, 1), (-0.002, -0.002, -0.004 - GAP)))
-    options = {"distance": DISTANCE, "stiffness": STIFFNESS}
-    v = np.concatenate([block, below.placed()])
-    surfaces = SelfContact.with_obstacles(block, faces, [below], groups=np.zeros(len(block), dtype=int), **options)
-    assert 0.0 < surfaces.energy(v) < SelfContact.with_obstacles(block, faces, [below], **options).energy(v)
-    assert SelfContact(block, faces, **options).energy(block) > 0.0
+def test_vertices_of_obstacles_have_their_own_friction():
+    rest, _, small = pile()
+    slide = rest + 1e-5 * np.array([1.0, 0.0, 0.0]) * small[:, None]
+    expected, found = contact(friction=0.4), contact(friction=0.9, obstacle_friction=np.where(small, np.nan, 0.4))
+    for surfaces in (expected, found):
+        surfaces.begin_increment(rest)
+    np.testing.assert_allclose(found.forces(slide), expected.forces(slide), rtol=1e-12, atol=1e-12)
+    smooth = contact(friction=0.9, obstacle_friction=np.where(small, 0.0, np.nan))
+    smooth.begin_increment(rest)
+    np.testing.assert_array_equal(smooth.forces(slide), contact().forces(slide))
 
 
 # -- wrong inputs -------------------------------------------------------------------------------------------------

@@ -1,0 +1,137 @@
+"""Meshed obstacles, fixed or carried by a frame, in the mechanics of a model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse import csc_matrix
+
+from softgym_envs.mechanics.builder import ModelBuilder
+from softgym_envs.mechanics.contact.contact import ContactState
+from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Plane
+from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
+from softgym_envs.mechanics.skins import box_skin
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.testing import box_mesh
+
+
+def mesh_box(half, cells, centre=(0.0, 0.0, 0.0), **options):
+    """A meshed obstacle in the shape of a box."""
+    nodes, tetrahedra = box_mesh(2.0 * np.asarray(half), cells)
+    used, triangles = np.unique(boundary_triangles(tetrahedra), return_inverse=True)
+    vertices = nodes[used] - half + np.asarray(centre)
+    return MeshObstacle(vertices.tolist(), triangles.reshape(-1, 3).tolist(), **options)
+
+
+FLOOR = mesh_box((0.03, 0.03, 0.005), (3, 3, 1), (0.01, 0.01, -0.0052), friction=0.5, name="floor")
+
+
+@pytest.fixture
+def pressed(rng):
+    """A soft block between a meshed floor and a rigid box that carries a meshed obstacle around it, moved a little."""
+    nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2))
+    builder = ModelBuilder(floating=True)
+    builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e6, poisson_ratio=0.3)
+    frame = builder.add_frame([0.01, 0.012, 0.0199])
+    builder.add_mass(frame, 0.01, 1e-6 * np.eye(3))
+    model = builder.build()
+    model.skins.append(box_skin(frame, (0.006, 0.005, 0.004), model.nodes))
+    lid = mesh_box((0.008, 0.007, 0.0096), (2, 2, 2), friction=0.4, frame=frame)
+    model.set_contact(obstacles=[FLOOR, lid], distance=6e-4)
+    step = 1e-5 * rng.normal(size=model.equations)
+    step[-3:] = 0.004 * rng.normal(size=3)
+    state = ContactState(model.contact, model.kinematics, model.nodes)
+    return model, state, model.nodes + model.kinematics.displacement(model.nodes, step)
+
+
+def slope(model, state, x):
+    """Derivative of the contact energy by the equations (N,)."""
+    gradient = state.evaluate(x).gradient
+    kinematics = model.kinematics
+    kinematics.map.linearise(x)
+    out = np.zeros(kinematics.equations)
+    out[: len(kinematics.free_dofs)] = gradient.ravel()[kinematics.free_dofs]
+    return out + kinematics.map.transposed @ gradient[kinematics.frames.carried].ravel()
+
+
+def test_gradient_and_tangent_are_exact(pressed):
+    model, state, x = pressed
+    assert model.contact.intersections(x) is None
+    total = state.contacts(x).total
+    assert total[0, 2] > 0.01 and total[1, 2] < -0.01
+    kinematics, h = model.kinematics, 1e-9
+    ways = [[kinematics.displacement(x, s * h * e) for s in (1, -1)] for e in np.eye(kinematics.equations)]
+    exact = slope(model, state, x)
+    differences = np.array([state.energy(x + plus) - state.energy(x + minus) for plus, minus in ways]) / (2 * h)
+    assert np.abs(differences - exact).max() < 1e-6 * np.abs(exact).max()
+
+    terms = state.evaluate(x)
+    assembly, values = model.assembly, np.zeros(len(model.assembly.keys))
+    arms = kinematics.map.linearise(x)
+    kinematics.map.add_curvature(values, arms, terms.gradient[kinematics.frames.carried], assembly.spin_target)
+    n = kinematics.equations
+    lower = csc_matrix((values[: len(assembly.indices)], assembly.indices, assembly.indptr), shape=(n, n)).toarray()
+    tangent = terms.tangent.toarray() + lower + np.tril(lower, -1).T
+    differences = np.array([slope(model, state, x + plus) - slope(model, state, x + minus) for plus, minus in ways])
+    assert np.abs(differences.T / (2 * h) - tangent).max() < 1e-6 * np.abs(tangent).max()
+
+
+def test_a_part_does_not_touch_the_obstacle_that_it_carries(pressed):
+    """The box lies inside the meshed obstacle on its own frame; lifted off the block and the floor, nothing acts."""
+    model, state, _ = pressed
+    frame = model.kinematics.frames.rows[0]
+    x = model.nodes.copy()
+    x[frame] += [0.0, 0.0, 0.01]
+    solid = np.ones(len(x), bool)
+    solid[frame : frame + 4] = False
+    x[solid] += [0.0, 0.0, 0.002]
+    state.begin(x)
+    contacts = state.contacts(x)
+    assert contacts.self_force == 0.0 and not contacts.total.any()
+    assert contacts.smallest_gap == np.inf
+
+
+def block_on(floor, degrees):
+    angle = np.radians(degrees)
+    builder = ModelBuilder(gravity=9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
+    nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2))
+    builder.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] > 0.0099, young_modulus=1e4, poisson_ratio=0.3)
+    model = builder.build()
+    model.add_effector("middle", (0.01, 0.01, 0.003))
+    model.set_contact(obstacles=[floor], distance=4e-4)
+    return model
+
+
+def test_a_meshed_floor_carries_what_a_plane_carries():
+    """The reaction of a soft block that hangs onto the floor; both barriers are much stiffer than the block."""
+    plane = Plane((0.0, 0.0, -2e-4), (0.0, 0.0, 1.0))
+    forces = []
+    for floor in (FLOOR, plane):
+        model = block_on(floor, 0.0)
+        found = Statics(model).solve([], effector_force=[0.0, 0.0, -0.4])
+        assert 0.0 < found.contacts.smallest_gap < 4e-4
+        assert found.contacts.obstacles == (floor.name or "obstacle 1",)
+        forces.append(found.contacts.total[0])
+    assert forces[0][2] > 0.02
+    assert forces[0][2] == pytest.approx(forces[1][2], rel=0.1)
+
+
+def test_nothing_passes_through_a_thin_mesh(rng):
+    nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2))
+    builder = ModelBuilder(floating=True)
+    builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool))
+    model = builder.build()
+    thin = mesh_box((0.05, 0.05, 1e-4), (1, 1, 1), (0.0, 0.0, -0.003))
+    model.set_contact(obstacles=[thin])
+    state = ContactState(model.contact, model.kinematics, model.nodes)
+    stopped = 0
+    for _ in range(30):
+        end = model.nodes + 0.1 * rng.normal(size=3)
+        part = state.free_path(model.nodes, end)
+        stopped += part < 1.0
+        for t in np.linspace(0.0, part, 5):
+            assert model.contact.intersections(model.nodes + t * (end - model.nodes)) is None
+    assert 3 < stopped < 27
+    assert model.contact.intersections(model.nodes - [0.0, 0.0, 0.005]) == (
+        "surfaces of the body cross each other or a meshed obstacle"
+    )
