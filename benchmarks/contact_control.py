@@ -127,7 +127,7 @@ def random_problems(count: int = 1000, most: int = 5, seed: int = 0) -> dict[str
             programs.append(case.controller.optimum.programs)
             closures += int((case.controller.optimum.closed != before).any())
         seconds.append(time.perf_counter() - started)
-        problem, _ = case.controller.problem(case.model, case.goal, case.command, forces=case.forces)
+        problem, *_ = case.controller.problem(case.model, case.goal, case.command, forces=case.forces)
         best = enumerated_optimum(problem)
         infeasible += int(np.isinf(best))
         hits += int(found == best or found <= best + 1e-6 * abs(best) + 1e-9)

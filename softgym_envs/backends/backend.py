@@ -126,6 +126,17 @@ class Backend(ABC):
         finally:
             self.restore(kept)
 
+    def contact_model(self) -> CondensedModel:
+        """Return the condensed model at the current state, with openings of contacts as further rows ``c``.
+
+        The openings and the normal forces on them are complementary, see `Statics.contact_model`.
+
+        Raises:
+            ConvergenceError: if the body has no equilibrium without its contacts.
+            ValueError: if the body cannot touch anything, or the backend does not compute its contacts.
+        """
+        raise ValueError(f"{type(self).__name__} does not compute contacts")
+
     @abstractmethod
     def restore(self, state: State) -> None:
         """Go back to a state of the current design."""

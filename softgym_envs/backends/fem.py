@@ -9,6 +9,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.statics import Equilibrium, Statics
@@ -134,6 +135,11 @@ class FEMBackend(Backend):
             return self._state(self._statics.solve(command, mode), command, still=True)
         finally:
             self._go_back(kept)
+
+    def contact_model(self) -> CondensedModel:
+        if self.moving:
+            raise ValueError("contact_model() is that of an equilibrium; make the backend with dynamics=False")
+        return self._statics.contact_model()
 
     def restore(self, state: State) -> None:
         """Go back to a state; in dynamics with its velocities, but with time, work and the scheme's history reset.

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from softgym_envs.control.contact_control import ContactControl as ContactControl
     from softgym_envs.control.contact_qp import ContactQP as ContactQP
     from softgym_envs.control.contact_qp import ForceGoal as ForceGoal
     from softgym_envs.control.coupling import HeldObject as HeldObject
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
+        "contact_control": ["ContactControl"],
         "contact_qp": ["ContactQP", "ForceGoal"],
         "coupling": ["HeldObject"],
         "embedded": ["EmbeddedLoop", "PICorrection"],

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softgym_envs.control.inverse_qp import UNBOUNDED, InverseQP
+from softgym_envs.control.inverse_qp import UNBOUNDED, InverseQP, StepLimits
 from softgym_envs.control.qpcc import ComplementarityQP, Optimum, solve_qpcc
 from softgym_envs.errors import ConvergenceError, unknown_name
 from softgym_envs.mechanics.condensation import CondensedModel
@@ -20,6 +20,8 @@ from softgym_envs.mechanics.condensation import CondensedModel
 @dataclass(frozen=True)
 class ForceGoal:
     """A range for a sum of contact forces, e.g. ``ForceGoal({"wall": 1.0}, 1.0)``: press on the wall with 1 N.
+
+    While none of its contacts presses, a goal of a positive force also counts their openings, so they are closed first.
 
     Attributes:
         contacts: factors of the normal forces, by the names of the contacts.
@@ -96,6 +98,7 @@ class ContactQP(InverseQP):
         slack: np.ndarray | None = None,
         *,
         forces: Sequence[ForceGoal] = (),
+        size: float = 1.0,
     ) -> np.ndarray:
         """Return the next command, shape (n_a,): displacements or efforts, according to the actuators' modes.
 
@@ -106,12 +109,13 @@ class ContactQP(InverseQP):
             command: current command, shape (n_a,).
             slack: actuators that are slack, shape (n_a,); default none.
             forces: goals of contact forces.
+            size: share of the rates that this step may use.
 
         Raises:
             ValueError: if goal, command or model has a wrong shape or is not finite, or for an unknown contact.
             ConvergenceError: if no set of closed contacts allows a step within the limits.
         """
-        problem, scale = self.problem(condensed, goal, command, slack, forces=forces)
+        problem, scale, limits = self.problem(condensed, goal, command, slack, forces=forces, size=size)
         a, c = len(self.rates), len(problem.pairs)
         start = _closed_at_present_efforts(problem, a)
         self.optimum = solve_qpcc(problem, start, max_programs=self.max_programs)
@@ -123,7 +127,30 @@ class ContactQP(InverseQP):
         self.effort = before[:a] + step[:a]
         self.contact_force = before[a:] + step[a:]
         self.displacement, self.opening, self.effector = moved[:a], moved[a : a + c], moved[a + c :]
-        return self.command(self.limits(condensed, np.asarray(command, dtype=float), slack))
+        return self.command(limits)
+
+    def error(self, condensed: CondensedModel, goal: np.ndarray | None, forces: Sequence[ForceGoal] = ()) -> float:
+        """Return the root of the weighted sum of squared errors of effectors and forces at a state [m].
+
+        Raises:
+            ValueError: as `solve`.
+        """
+        wanted, _, root = self._wanted(condensed, goal, condensed.delta.a)
+        W, delta = _blocks(condensed)
+        errors = [root * (condensed.delta.e - wanted)]
+        before = _efforts(condensed)
+        for force in forces:
+            _, value, width = _force_error(force, _contact_names(condensed), len(self.rates), W, delta, before)
+            errors.append(np.array([min(value, 0.0) + max(value - width, 0.0)]))
+        return float(np.linalg.norm(np.concatenate(errors)))
+
+    def _wanted(
+        self, condensed: CondensedModel, goal: np.ndarray | None, command: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Goal (n_e,), command (n_a,) and roots of the goal weights (n_e,); zero roots without a goal."""
+        wanted, command = self.checked(condensed, condensed.delta.e if goal is None else goal, command)
+        root = np.ones(wanted.size) if self.goal_weights is None else np.sqrt(self.goal_weights)
+        return wanted, command, np.zeros(wanted.size) if goal is None else root
 
     def problem(
         self,
@@ -133,8 +160,9 @@ class ContactQP(InverseQP):
         slack: np.ndarray | None = None,
         *,
         forces: Sequence[ForceGoal] = (),
-    ) -> tuple[ComplementarityQP, np.ndarray]:
-        """Return the scaled problem of `solve`, and the scale of actuator and contact efforts, shape (n_a + k,).
+        size: float = 1.0,
+    ) -> tuple[ComplementarityQP, np.ndarray, StepLimits]:
+        """Return the scaled problem of `solve`, the scale of actuator and contact efforts (n_a + k,), and the limits.
 
         Its variables are the changes of the actuator efforts, the contact forces, and how far force goals are above
         their lower limits.
@@ -142,19 +170,17 @@ class ContactQP(InverseQP):
         Raises:
             ValueError: as `solve`.
         """
-        wanted = condensed.delta.e if goal is None else goal
-        wanted, command = self.checked(condensed, wanted, command)
-        root = np.ones(wanted.size) if self.goal_weights is None else np.sqrt(self.goal_weights)
-        if goal is None:
-            root = np.zeros(wanted.size)
+        wanted, command, root = self._wanted(condensed, goal, command)
         W, delta = _blocks(condensed)
         a = len(command)
         n = len(delta) - wanted.size
         before = _efforts(condensed)
-        limits = self.limits(condensed, command, slack)
+        limits = self.limits(condensed, command, slack, size)
 
         # Lengths that count as one: the rates of actuators, and for contacts the motion that they cause.
-        stiffness = 1.0 / np.abs(np.diag(W)[:n])
+        # An open contact of a point that cannot move has no compliance; it stays open whatever its scale.
+        own = np.abs(np.diag(W)[:n])
+        stiffness = 1.0 / np.where(own > 0.0, own, own.max())
         limited = np.isfinite(self.effort_rates)
         by_effort = np.where(limited, self.effort_rates, 0.0) / stiffness[:a]
         length = np.where(limited, np.minimum(self.rates, by_effort), self.rates)
@@ -166,27 +192,22 @@ class ContactQP(InverseQP):
         # Errors are linear in the changes of actuator efforts, the contact forces, and the excess over lower limits.
         errors = [root[:, None] * W[n:, :n]]
         offsets = [root * (delta[n:] - wanted)]
-        names = [row.name for row in condensed.labels[condensed.slices["c"]]] if n > a else []
+        names = _contact_names(condensed)
         excess = np.zeros(len(forces))
         columns = np.zeros((wanted.size + len(forces), len(forces)))
         for number, force in enumerate(forces):
-            row = np.zeros(n)
-            for name, factor in force.contacts.items():
-                if name not in names:
-                    raise ValueError(unknown_name("contact", name, names))
-                row[a + names.index(name)] = factor
-            yielding = np.sqrt(force.weight) * float(row @ W[:n, :n] @ row) / np.linalg.norm(row) ** 3
-            errors.append(yielding * row[None])
-            offsets.append(np.array([yielding * (row @ before - force.range[0])]))
+            row, offset, width = _force_error(force, names, a, W, delta, before)
+            errors.append(row[None])
+            offsets.append(np.array([offset]))
             columns[wanted.size + number, number] = -reach
-            excess[number] = min(yielding * (force.range[1] - force.range[0]) / reach, UNBOUNDED)
+            excess[number] = min(width / reach, UNBOUNDED)
         J, error = np.concatenate(errors), np.concatenate(offsets)
 
         # Energy of the efforts, in units of the errors; see `InverseQP` on states that are stable only while held.
         unit = float(length.max()) / length
         energy = scale[:, None] * W[:n, :n] * scale
         # Contacts do not change the weights, unless there are only goals of forces.
-        few = a if J[:, :a].any() else n
+        few = a if J[: wanted.size, :a].any() else n
         sensitive = J[:, :few] * unit[:few]
         compliance = unit[:few, None] * W[:few, :few] * unit[:few]
         epsilon = np.linalg.norm(sensitive.T @ sensitive) / np.linalg.norm(compliance)
@@ -221,7 +242,7 @@ class ContactQP(InverseQP):
             pair_rows=rows[a:],
             pair_offset=delta[a:n] / length[a:] - shift[a:],
         )
-        return problem, scale
+        return problem, scale, limits
 
 
 def _blocks(condensed: CondensedModel) -> tuple[np.ndarray, np.ndarray]:
@@ -236,12 +257,41 @@ def _efforts(condensed: CondensedModel) -> np.ndarray:
     return np.concatenate([condensed.effort[condensed.slices[r]] for r in "ac" if r in condensed.slices])
 
 
+def _contact_names(condensed: CondensedModel) -> list[str]:
+    slices = condensed.slices
+    return [row.name for row in condensed.labels[slices["c"]]] if "c" in slices else []
+
+
+def _force_error(
+    force: ForceGoal, names: Sequence[str], actuators: int, W: np.ndarray, delta: np.ndarray, before: np.ndarray
+) -> tuple[np.ndarray, float, float]:
+    """Return the error of a force goal as a length: its derivative by efforts (n,), its value, and the goal's width.
+
+    Efforts ``before`` are those of actuators and contacts; ``W`` and ``delta`` may have further rows.
+    """
+    W, delta = W[: len(before), : len(before)], delta[: len(before)]
+    row = np.zeros(len(before))
+    for name, factor in force.contacts.items():
+        if name not in names:
+            raise ValueError(unknown_name("contact", name, names))
+        row[actuators + names.index(name)] = factor
+    low, high = force.range
+    norm, weight = np.linalg.norm(row), np.sqrt(force.weight)
+    yielding = weight * float(row @ W @ row) / norm**3
+    derivative, value = yielding * row, yielding * float(row @ before - low)
+    if low > 0.0 and not before[row != 0.0].any():
+        # Nothing presses yet, so that small steps cause no force: the openings are what is missing.
+        opening = weight * np.abs(row) / norm
+        derivative, value = derivative - opening @ W, value - float(opening @ delta)
+    return derivative, value, yielding * (high - low)
+
+
 def _closed_at_present_efforts(problem: ComplementarityQP, actuators: int) -> np.ndarray | None:
     """Contacts that are closed while the actuator efforts do not change, shape (1, k); None if not found."""
     k = len(problem.pairs)
     compliance = problem.pair_rows[:, actuators : actuators + k]
     contacts = ComplementarityQP(
-        hessian=0.5 * (compliance + compliance.T),
+        hessian=0.5 * (compliance + compliance.T) + 1e-9 * np.eye(k),
         gradient=problem.pair_offset,
         lower=np.zeros(k),
         upper=np.full(k, UNBOUNDED),

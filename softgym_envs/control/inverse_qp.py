@@ -195,26 +195,30 @@ class InverseQP:
             raise ValueError(f"goal_weights must be {goal.size} numbers, got {self.goal_weights.tolist()}")
         return goal, command
 
-    def limits(self, condensed: CondensedModel, command: np.ndarray, slack: np.ndarray | None = None) -> StepLimits:
+    def limits(
+        self, condensed: CondensedModel, command: np.ndarray, slack: np.ndarray | None = None, size: float = 1.0
+    ) -> StepLimits:
         """Return what the next step may change.
 
         Args:
             condensed: model at the current state.
             command: current command, shape (n_a,).
             slack: actuators that are slack, shape (n_a,): the command does not bound the displacement of a slack cable.
+            size: share of the rates that the step may use.
         """
+        rates, effort_rates = size * self.rates, size * self.effort_rates
         displacement, effort = condensed.delta.a, condensed.lambda_.a
         start = np.where(self.by_effort, displacement, command)
-        low, high = np.maximum(self.lower, start - self.rates), np.minimum(self.upper, start + self.rates)
+        low, high = np.maximum(self.lower, start - rates), np.minimum(self.upper, start + rates)
         # Standing still is allowed (unless it exceeds max_effort), so round-off cannot make the problem infeasible.
         box_low, box_high = np.minimum(low - displacement, 0.0), np.maximum(high - displacement, 0.0)
         if slack is not None:
             box_high = np.where(slack, np.inf, box_high)
-        effort_low = np.maximum(-np.maximum(effort - self.min_effort, 0.0), -self.effort_rates)
-        effort_high = np.minimum(self.max_effort - effort, self.effort_rates)
+        effort_low = np.maximum(-np.maximum(effort - self.min_effort, 0.0), -effort_rates)
+        effort_high = np.minimum(self.max_effort - effort, effort_rates)
         # Steps of commanded efforts start from the last command, which may differ from the effort of the model.
-        least = np.clip(command - self.effort_rates, self.min_effort, self.max_effort)
-        most = np.clip(command + self.effort_rates, self.min_effort, self.max_effort)
+        least = np.clip(command - effort_rates, self.min_effort, self.max_effort)
+        most = np.clip(command + effort_rates, self.min_effort, self.max_effort)
         effort_low = np.where(self.by_effort, least - effort, effort_low)
         effort_high = np.where(self.by_effort, most - effort, effort_high)
         return StepLimits((box_low, box_high), (effort_low, effort_high), (low, high), (least, most))

@@ -370,10 +370,9 @@ class ContactState:
             elif loaded:
                 shares = list(np.eye(len(touch.points))[touch.pressing > 0.0])
             elif not each_point:
-                gaps = pair.gaps(x)
-                nearest = int(gaps.argmin())
+                nearest, gap = pair.nearest(x)
                 touch = pair.touch(x, None, points=np.array([nearest]))
-                opening, shares = float(gaps[nearest]) - self.contact.distance, [np.ones(1)]
+                opening, shares = gap - self.contact.distance, [np.ones(1)]
             else:
                 shares = []
             for number, share in enumerate(shares):

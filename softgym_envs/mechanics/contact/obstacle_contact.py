@@ -111,6 +111,15 @@ class ObstacleContact:
         """Return all gaps [m], shape (p,)."""
         return self.obstacle.gap(self.local(x))
 
+    def nearest(self, x: np.ndarray) -> tuple[int, float]:
+        """Return the nearest point that can move, and its gap [m], at rows ``x`` (n, 3)."""
+        gaps = self.gaps(x)
+        movable = self._mapping.movable
+        if self._frame is None and movable.any():
+            gaps = np.where(movable, gaps, np.inf)
+        point = int(gaps.argmin())
+        return point, float(gaps[point])
+
     def energy(self, x: np.ndarray, anchors: np.ndarray | None, limits: np.ndarray | None) -> float:
         """Return the potential [J]; inf if a point is inside the obstacle.
 

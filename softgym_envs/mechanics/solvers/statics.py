@@ -458,8 +458,9 @@ class Statics:
         The opening of a contact is zero while it presses, and otherwise the gap less the distance of contact. So
         forces ``0 <= effort.c`` and openings ``0 <= delta.c`` are complementary, and they predict how contacts close
         and open. Each obstacle has one row: the mean over the points that press, weighted with their forces, or the
-        nearest point. Or each point that presses has one; eliminating these gives back ``W``. ``W.cc`` includes the
-        compliance of the barrier. Friction is left out, and contacts between surfaces of the body stay as they are.
+        nearest point that can move. Or each point that presses has one; eliminating these gives back ``W``. ``W.cc``
+        includes the compliance of the barrier. Friction is left out, and contacts between surfaces of the body stay as
+        they are.
 
         Raises:
             ConvergenceError: if the body has no equilibrium without its contacts, e.g. because they alone hold it.

@@ -1,0 +1,94 @@
+"""Closed loop that brings a robot in contact to goals of effectors and contact forces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from softgym_envs.backends.backend import Backend, State
+from softgym_envs.control.contact_qp import ContactQP, ForceGoal
+from softgym_envs.errors import ConvergenceError
+
+#: Steps never become smaller than this share of the controller's rates.
+SMALLEST_STEP = 1.0 / 64.0
+#: Growth of an error that does not count [m].
+ROUND_OFF = 1e-9
+
+
+class ContactControl:
+    """Quasi-static loop: linearise with contacts, solve for the next command, apply it.
+
+    The linear model does not know how contacts move along a surface, which points touch next, and how friction changes.
+    So steps are limited: a step after which the error is larger than before halves the next ones, down to a 64th of
+    the controller's rates; others let them grow again.
+
+    Args:
+        backend: of a robot whose model can touch something, quasi-static.
+        controller: its rates are those of the largest steps.
+
+    Attributes:
+        size: of the next step over the controller's rates.
+        error: before the last step [m], see `ContactQP.error`; inf before the first one.
+    """
+
+    def __init__(self, backend: Backend, controller: ContactQP) -> None:
+        self.backend = backend
+        self.controller = controller
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past steps; the backend stays where it is."""
+        self.size = 1.0
+        self.error = np.inf
+        self._goals: tuple[np.ndarray | None, Sequence[ForceGoal]] = (None, ())
+
+    def step(self, goal: np.ndarray | None, *, forces: Sequence[ForceGoal] = ()) -> State:
+        """Go one step towards goals, and return the state there.
+
+        Args:
+            goal: desired effector coordinates [m], shape (n_e,) or (k, 3), or None if only forces matter.
+            forces: goals of contact forces.
+
+        Raises:
+            ValueError: for malformed goals, or a backend without contact.
+            ConvergenceError: if there is no equilibrium even after the smallest step, or the controller finds no step;
+                the backend's state is unchanged.
+        """
+        condensed = self.backend.contact_model()
+        grew = self.controller.error(condensed, *self._goals) > self.error + ROUND_OFF
+        self.size = max(0.5 * self.size, SMALLEST_STEP) if grew else min(1.0, 1.5 * self.size)
+        self._goals = (goal, tuple(forces))
+        self.error = self.controller.error(condensed, goal, forces)
+        state, mode = self.backend.state, "effort" if self.controller.by_effort.all() else "displacement"
+        while True:
+            command = self.controller.solve(condensed, goal, state.command, state.slack, forces=forces, size=self.size)
+            try:
+                return self.backend.step(command, mode)
+            except ConvergenceError:
+                if self.size <= SMALLEST_STEP:
+                    raise
+                self.size = max(0.5 * self.size, SMALLEST_STEP)
+
+    def reach(
+        self, goal: np.ndarray | None, *, forces: Sequence[ForceGoal] = (), steps: int = 100, tolerance: float = 1e-5
+    ) -> list[State]:
+        """Step until nothing moves by more than a tolerance, and return the states.
+
+        Args:
+            goal: see `step`.
+            forces: see `step`.
+            steps: most steps.
+            tolerance: of actuators, in shares of their rates.
+
+        Raises:
+            ValueError: as `step`.
+            ConvergenceError: as `step`.
+        """
+        states = [self.backend.state]
+        for _ in range(steps):
+            states.append(self.step(goal, forces=forces))
+            moved = np.abs(states[-1].command - states[-2].command)
+            if (moved <= tolerance * self.controller.rates).all():
+                break
+        return states[1:]
