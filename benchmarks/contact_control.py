@@ -1,4 +1,4 @@
-"""Inverse control with contact: random problems against the enumeration of all sets of closed contacts.
+"""Inverse control with contact: random problems against enumeration, and closed loops on finite elements.
 
 ``python -m benchmarks.contact_control`` prints one JSON object.
 """
@@ -8,16 +8,21 @@ from __future__ import annotations
 import itertools
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import click
 import numpy as np
 
-from softgym_envs.control import ContactQP, ForceGoal
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.control import ContactControl, ContactQP, ForceGoal, InverseQP
 from softgym_envs.control.qpcc import ComplementarityQP
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics import CondensedModel
+from softgym_envs.mechanics import CondensedModel, MechanicalModel
 from softgym_envs.mechanics.condensation import Row, point_rows
+from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane
+from softgym_envs.robots.cable_trunk import CableTrunk
+from softgym_envs.robots.soft_finger import SoftFinger
 
 
 @dataclass(frozen=True)
@@ -160,16 +165,132 @@ def many_contacts(counts: tuple[int, ...] = (8, 12, 16), problems: int = 20, see
     return results
 
 
-def contact_control() -> dict[str, object]:
-    """Inverse control with contact: random problems against enumeration, and larger ones."""
-    return {"random_problems": random_problems(), "many_contacts": many_contacts()}
+class FingerAtRod(SoftFinger):
+    """Soft Finger that bends towards a rod across its way.
+
+    Args:
+        friction: of the rod.
+    """
+
+    def __init__(self, *, friction: float = 0.0) -> None:
+        super().__init__()
+        self.rod = Cylinder((0.0, 0.055, -0.10), (1.0, 0.0, 0.0), 0.01, name="rod", friction=friction)
+
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        model = super().assemble(design)
+        model.set_contact(obstacles=[self.rod])
+        return model
+
+
+def force_goal(friction: float = 0.0, force: float = 1.0, steps: int = 15) -> dict[str, object]:
+    """Soft Finger that starts 25 mm from a rod and presses on it with a given force."""
+    robot = FingerAtRod(friction=friction)
+    fem = FEMBackend(robot)
+    loop = ContactControl(fem, ContactQP.for_robot(robot, rates=np.full(2, 0.004)))
+    forces = []
+    for _ in range(steps):
+        state = loop.step(None, forces=[ForceGoal({"rod": 1.0}, force)])
+        assert state.contacts is not None
+        forces.append(float(state.contacts.pressing.sum()))
+    errors = np.abs(np.array(forces) / force - 1.0)
+    within = np.flatnonzero(errors > 0.01)
+    return {
+        "force_N": forces[-1],
+        "relative_error": float(errors[-1]),
+        "steps_to_1_percent": int(within[-1]) + 2 if len(within) else 1,
+    }
+
+
+TRUNK_GOAL = np.array([0.0278, 0.0, 0.155])
+"""Between the trunk and the wall, 40 mm below the tip at rest [m]."""
+
+
+class TrunkAtWall(CableTrunk):
+    """Cable trunk beside a wall.
+
+    Args:
+        obstacles: the wall, or nothing.
+        layers: see `CableTrunk`.
+    """
+
+    def __init__(self, obstacles: tuple[Obstacle, ...], *, layers: int = 24) -> None:
+        super().__init__(layers=layers)
+        self.obstacles = obstacles
+
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        model = super().assemble(design)
+        if self.obstacles:
+            model.set_contact(obstacles=self.obstacles)
+        return model
+
+
+def reach_along_wall(friction: float = 0.0, steps: int = 20, layers: int = 24) -> dict[str, object]:
+    """Trunk that slides its tip along a wall to a goal which it cannot reach without the wall.
+
+    Only its four long cables pull; the short ones are paid out. Both controllers have the same limits, rates and
+    weights.
+    """
+    paid_out = np.full(4, -0.03)
+    limits = {
+        "lower": np.append(np.zeros(4), paid_out),
+        "upper": np.append(np.full(4, 0.035), paid_out),
+        "rates": np.full(8, 0.004),
+        "effort_weight": 1e-7,
+    }
+    wall = Plane((0.03, 0.0, 0.0), (-1.0, 0.0, 0.0), name="wall", friction=friction)
+    results: dict[str, object] = {}
+    for name, obstacles in (("without_wall", ()), ("with_wall", (wall,))):
+        fem = FEMBackend(TrunkAtWall(obstacles, layers=layers))
+        state = fem.step(np.append(np.zeros(4), paid_out))
+        plain = InverseQP.for_robot(fem.robot, **limits)
+        loop = ContactControl(fem, ContactQP.for_robot(fem.robot, **limits))
+        distances = []
+        for _ in range(steps):
+            if obstacles:
+                state = loop.step(TRUNK_GOAL)
+            else:
+                state = fem.step(plain.solve(state.condensed, TRUNK_GOAL, state.command, state.slack))
+            distances.append(1e3 * float(np.linalg.norm(state.effector - TRUNK_GOAL)))
+        results[f"{name}_final_mm"] = distances[-1]
+        results[f"{name}_smallest_mm"] = min(distances)
+        if state.contacts is not None:
+            results["wall_force_N"] = float(state.contacts.pressing.sum())
+    return results
+
+
+def distance_without_wall(samples: int = 100, seed: int = 0) -> float:
+    """Smallest distance [mm] from the goal of the trunk without the wall, over random pulls of its long cables."""
+    fem = FEMBackend(TrunkAtWall(()))
+    rng = np.random.default_rng(seed)
+    distances = []
+    for pulls in rng.uniform(0.0, 0.035, (samples, 4)):
+        fem.reset()
+        try:
+            state = fem.step(np.append(pulls, np.full(4, -0.03)))
+        except ConvergenceError:  # opposite cables crush the thin tip
+            continue
+        distances.append(np.linalg.norm(state.effector - TRUNK_GOAL))
+    return 1e3 * float(min(distances))
+
+
+def contact_control(count: int = 1000) -> dict[str, object]:
+    """Inverse control with contact: random problems against enumeration, and closed loops on finite elements."""
+    return {
+        "random_problems": random_problems(count),
+        "many_contacts": many_contacts(),
+        "force_goal": force_goal(),
+        "force_goal_with_friction": force_goal(0.5),
+        "reach_along_wall": reach_along_wall(),
+        "reach_along_wall_with_friction": reach_along_wall(0.3),
+        "sampled_distance_without_wall_mm": distance_without_wall(),
+    }
 
 
 @click.command(help=__doc__)
 @click.option("--count", default=1000, show_default=True, help="Random problems of up to 5 contacts.")
 def main(count: int) -> None:
     """Print the results."""
-    click.echo(json.dumps({"random_problems": random_problems(count), "many_contacts": many_contacts()}, indent=2))
+    click.echo(json.dumps(contact_control(count), indent=2))
 
 
 if __name__ == "__main__":
