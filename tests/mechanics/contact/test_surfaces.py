@@ -1,6 +1,8 @@
-"""Meshed obstacles, fixed or carried by a frame, in the mechanics of a model."""
+"""Surfaces that touch in the mechanics of a model: of two bodies, and of meshed obstacles, fixed or on a frame."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -114,6 +116,54 @@ def test_a_meshed_floor_carries_what_a_plane_carries():
         forces.append(found.contacts.total[0])
     assert forces[0][2] > 0.02
     assert forces[0][2] == pytest.approx(forces[1][2], rel=0.1)
+
+
+def two_blocks():
+    """A block that is clamped at its bottom, and a smaller one above it, clamped at its top."""
+    builder = ModelBuilder()
+    lower, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2), jitter=0.1)
+    builder.add_solid(lower, tetrahedra, fixed=lower[:, 2] < 1e-6, young_modulus=1e5, poisson_ratio=0.4)
+    upper, tetrahedra = box_mesh((0.012, 0.012, 0.012), (2, 2, 3), jitter=0.1)
+    upper = upper + [0.0043, 0.0037, 0.0103]
+    builder.add_solid(upper, tetrahedra, fixed=upper[:, 2] > 0.0222, young_modulus=1e5, poisson_ratio=0.4)
+    model = builder.build()
+    model.add_effector("inside", (0.01, 0.01, 0.007))
+    model.set_contact(self_contact=True, distance=4e-4)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("make", "force"),
+    [
+        (two_blocks, (0.1, 0.05, 1.0)),
+        (lambda: block_on(replace(FLOOR, friction=0.0), 0.0), (0.005, 0.002, -0.1)),
+    ],
+    ids=["two bodies", "mesh"],
+)
+def test_compliance_is_the_derivative_of_the_equilibrium(make, force):
+    statics = Statics(make(), tolerance=1e-13, max_iterations=60)
+    found = statics.solve([], effector_force=force)
+    W, h = found.condensed.compliance, 1e-5 * np.linalg.norm(force)
+    assert found.contacts.self_force > 0.1
+    columns = []
+    for direction in np.eye(3):
+        ends = []
+        for sign in (1.0, -1.0):
+            statics.restore(found.x, found.effort)
+            ends.append(statics.solve([], effector_force=force + sign * h * direction).delta)
+        columns.append((ends[0] - ends[1]) / (2 * h))
+    assert np.abs(np.array(columns).T - W).max() < 1e-6 * np.abs(W).max()
+    np.testing.assert_allclose(W, W.T, atol=1e-12 * np.abs(W).max())
+
+
+def test_two_bodies_press_on_each_other_with_equal_forces():
+    model = two_blocks()
+    found = Statics(model, tolerance=1e-12).solve([], effector_force=[0.0, 0.0, 1.0])
+    state = ContactState(model.contact, model.kinematics, model.nodes)
+    force = -state.evaluate(found.x).gradient
+    lower = np.arange(len(force)) < model.solids[0].corners.max() + 1
+    assert force[~lower, 2].sum() > 0.1
+    np.testing.assert_allclose(force[lower].sum(axis=0), -force[~lower].sum(axis=0), atol=1e-12)
 
 
 def test_nothing_passes_through_a_thin_mesh(rng):
