@@ -23,13 +23,22 @@ from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature
-from softgym_envs.robots.geometry.zigzag_shape import LEFT_FOOT, check_outline, draw_extrusion, zigzag_outline
+from softgym_envs.robots.geometry.zigzag_shape import (
+    LEFT_FOOT,
+    check_outline,
+    draw_extrusion,
+    draw_published,
+    zigzag_outline,
+)
 
 MESHES = {"published": ("linear", 3.0e-3), "accurate": ("quadratic", 8.0e-3)}
 """Element and target edge length [m] of each mesh."""
 
 SERVO_AXIS = np.array([30.0e-3, -18.0e-3, 0.0])
 """A point of the servo's axis, which is parallel to z [m]."""
+
+ON_SERVO, HELD = -3.0e-3, -1.0e-3
+"""Heights [m] up to which the left foot moves with the servo, and the right foot is held."""
 
 CONTROL_POINTS = (7, 12)
 """Allowed numbers of control points: of the initial design of the thesis, and of its recorded studies."""
@@ -43,8 +52,8 @@ class ContactAidedFinger(MeshedRobot):
 
     Args:
         control_points: 7 (initial design of the thesis) or 12 (its optimised designs) distances shape the zigzag.
-        mesh: ``"accurate"``, or ``"published"``: linear tetrahedra of 3 mm, which are too stiff (see the page of this
-            robot) but needed to compare with published values.
+        mesh: ``"accurate"``, or ``"published"``: linear tetrahedra of 3 mm, made as by the public model. They are too
+            stiff (see the page of this robot) but needed to compare with published values.
         mesh_size: target edge length [m], instead of that of the mesh.
         element: kind of element (`softgym_envs.mechanics.solids.SOLIDS`), instead of that of the mesh.
         length: height of the finger above its feet [m].
@@ -95,6 +104,7 @@ class ContactAidedFinger(MeshedRobot):
             gravity=gravity,
         )
         self.element = element
+        self.published_mesh = mesh == "published"
         self.control_points = control_points
         self.length, self.width, self.thickness, self.density = (float(value) for value in sizes.values())
         self.design_space = DesignSpace(
@@ -142,7 +152,10 @@ class ContactAidedFinger(MeshedRobot):
 
     def mesh(self, design: Mapping[str, float]) -> BodyMesh:
         """Mesh the body of a complete design."""
-        return mesh_geometry(*self.drawing(design), mesh_size=self.mesh_size)
+        draw, lengths = self.drawing(design)
+        if self.published_mesh:
+            draw, lengths = draw_published, lengths | {"size": round(1e3 * self.mesh_size, 9)}
+        return mesh_geometry(draw, lengths, mesh_size=self.mesh_size)
 
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
         """Return no surfaces: the mesh is never moved."""
@@ -175,12 +188,13 @@ class ContactAidedFinger(MeshedRobot):
         if self.element == "quadratic":
             nodes, elements = add_midside_nodes(nodes, elements)
         x, y, _ = nodes.T
-        in_foot = y < 1e-9
-        on_servo = in_foot & (x < LEFT_FOOT * 1e-3 + 1e-9)
+        left = x < LEFT_FOOT * 1e-3 + 1e-9
+        on_servo = left & (y < ON_SERVO + 1e-9)
+        held = ~left & (y < HELD + 1e-9)
         start = assembly.add_solid(
             nodes,
             elements,
-            fixed=in_foot & ~on_servo,
+            fixed=held,
             element=self.element,
             material=self.material,
             young_modulus=design["young_modulus"],
