@@ -175,6 +175,13 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             "trusted": state.trusted,
             "converged": True,
         }
+        if state.contacts is not None:
+            contacts = state.contacts
+            info |= {
+                "contact_force": contacts.total,
+                "smallest_gap": contacts.smallest_gap,
+                "sliding": float(contacts.sliding.mean()) if contacts.count else 0.0,
+            }
         velocity = state.velocity[0] if self.spaces.moving else None
         observation = self.spaces.observe(
             state.command, state.displacement, state.effort, effector, goal, self._unit_design, velocity

@@ -127,7 +127,8 @@ def default_backend(robot: Robot, backend_options: Mapping[str, Any]) -> str:
     """Return ``"surrogate"`` where weights are given or ship for the robot, else ``"fem"``."""
     from softgym_envs.surrogate.pretrained import pretrained_folder
 
-    return "surrogate" if "weights" in backend_options or pretrained_folder(robot).is_dir() else "fem"
+    shipped = pretrained_folder(robot).is_dir() and not robot.touches
+    return "surrogate" if "weights" in backend_options or shipped else "fem"
 
 
 def design_names(space: DesignSpace, choice: bool | Sequence[str]) -> tuple[str, ...]:

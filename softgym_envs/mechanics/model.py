@@ -345,17 +345,16 @@ class MechanicalModel:
             excluded: rows whose triangles touch nothing, e.g. nodes clamped inside a mount that is not modelled.
             distance: gap below which there are forces [m]. It must be smaller than the thinnest wall.
             stiffness: of the barrier [Pa], about the pressure at 0.4 of the distance; default a tenth of the largest
-                Young's modulus of a solid. It is never adapted to the load.
+                Young's modulus of the body. It is never adapted to the load.
             stick: stiffness of friction before sliding, per area [Pa/m]; default 5 ``stiffness / distance``.
 
         Raises:
             ValueError: for a value that is not positive, or if there is no Young's modulus to choose a stiffness from.
         """
         if stiffness is None:
-            moduli = [block.largest_young_modulus for block in self.solids]
-            if not moduli:
-                raise ValueError("a body without solids needs the 'stiffness' [Pa] of its contact")
-            stiffness = 0.1 * max(moduli)
+            stiffness = 0.1 * max((block.largest_young_modulus for block in self.blocks), default=0.0)
+            if not stiffness:
+                raise ValueError("a body without elastic parts needs the 'stiffness' [Pa] of its contact")
         self.contact = Contact(
             surface_of(self.nodes, self.blocks, self.skins, excluded),
             obstacles=obstacles,

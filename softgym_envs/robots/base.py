@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any, TypeVar
@@ -13,8 +13,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from softgym_envs.designs import Design, DesignSpace
-from softgym_envs.errors import SoftGymError
+from softgym_envs.errors import InfeasibleDesign, SoftGymError
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.contact.obstacles import Obstacle, obstacle_from
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.geometry.meshing import BodyMesh
@@ -28,6 +29,15 @@ Drawing = tuple[Callable[..., None], dict]
 LARGEST = 10.0
 """Largest allowed robot, stroke or dimension [m]; larger ones were probably given in millimetres."""
 
+
+WITHOUT_CONTACT: dict[str, object] = {
+    "obstacles": (),
+    "self_contact": False,
+    "self_friction": 0.0,
+    "contact_distance": 5e-4,
+    "contact_stiffness": None,
+}
+"""Options of a robot that touches nothing. They are not part of its key."""
 
 _REQUIRED = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
 
@@ -89,7 +99,18 @@ class Robot(ABC):
     """A family of bodies; one file per robot.
 
     A subclass defines the attributes without a default below, as class attributes or in its ``__init__``, and the
-    method `assemble`. All arguments of its ``__init__`` are options; they become part of `mechanics_key`.
+    method `assemble`. All arguments of its ``__init__`` are options; they become part of `mechanics_key`. A constructor
+    that takes ``**options`` and passes them on gives its robot the options of this class.
+
+    Args:
+        gravity: acceleration [m/s2].
+        obstacles: what the robot's surface touches: obstacles, or their records
+            ``{"kind": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "friction": 0.5}``. Points within a triangle
+            of a clamped node touch nothing.
+        self_contact: whether surfaces of the robot touch each other.
+        self_friction: coefficient of friction between them.
+        contact_distance: gap below which there are forces [m]. It must be smaller than the thinnest wall.
+        contact_stiffness: of the barrier [Pa]; default a tenth of the largest Young's modulus of the body.
 
     Attributes:
         name: registry name, also used to look up weights and meshes.
@@ -138,10 +159,26 @@ class Robot(ABC):
             _check_defined(cls, cls)
 
     @_recording_options
-    def __init__(self, *, gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+    def __init__(
+        self,
+        *,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        obstacles: Sequence[Obstacle | Mapping[str, Any]] = (),
+        self_contact: bool = False,
+        self_friction: float = 0.0,
+        contact_distance: float = 5e-4,
+        contact_stiffness: float | None = None,
+    ) -> None:
         if len(gravity) != 3 or not np.isfinite(gravity).all():
             raise ValueError(f"gravity must be three finite numbers [m/s2], got {gravity!r}")
+        if isinstance(obstacles, Mapping | Obstacle):
+            raise ValueError(f"robot '{self.name}': obstacles must be a list, got one obstacle: {obstacles!r}")
         self.gravity = gravity
+        self.obstacles = tuple(obstacle_from(obstacle) for obstacle in obstacles)
+        self.self_contact = self_contact
+        self.self_friction = self_friction
+        self.contact_distance = contact_distance
+        self.contact_stiffness = contact_stiffness
 
     # -- what a robot defines ---------------------------------------------------------------------------------------
 
@@ -157,6 +194,10 @@ class Robot(ABC):
     def weights_name(self) -> str:
         """Name of the pretrained weights; variants of a robot with different mechanics have different names."""
         return self.name
+
+    def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> Sequence[Obstacle]:
+        """Return the rigid objects that are part of an assembled robot, as obstacles that the rest of it touches."""
+        return ()
 
     def drawing(self, design: Mapping[str, float]) -> Drawing:
         """Return the function that draws the exact shape of a complete design, and its parameters.
@@ -189,30 +230,59 @@ class Robot(ABC):
 
         Raises:
             DesignError: for a malformed design.
-            InfeasibleDesign: if the geometry cannot exist.
+            InfeasibleDesign: if the geometry cannot exist, or the body at rest crosses an obstacle or itself.
 
         Any other exception is an error in the robot's code; a note is added that names the robot and the design.
         """
         complete = self.design_space.complete(design)
         try:
-            return self.assemble(complete)
+            model = self.assemble(complete)
+            self._add_contact(model, complete)
+            return model
         except SoftGymError:
             raise
         except Exception as error:
             error.add_note(f"while assembling robot '{self.name}' for {complete}")
             raise
 
+    def _add_contact(self, model: MechanicalModel, design: Mapping[str, float]) -> None:
+        obstacles = (*self.own_obstacles(model, design), *self.obstacles)
+        if not obstacles and not self.self_contact:
+            return
+        if model.contact is not None:
+            raise ValueError(f"robot '{self.name}' adds its own contact and does not take obstacles or self_contact")
+        model.set_contact(
+            obstacles=obstacles,
+            self_contact=self.self_contact,
+            self_friction=self.self_friction,
+            excluded=np.flatnonzero(model.fixed),
+            distance=self.contact_distance,
+            stiffness=self.contact_stiffness,
+        )
+        assert model.contact is not None
+        crossing = model.contact.intersections(model.nodes)
+        if crossing is not None:
+            raise InfeasibleDesign(f"robot '{self.name}' at rest: {crossing}")
+
+    @property
+    def touches(self) -> bool:
+        """Whether options give the robot something to touch: obstacles, or itself."""
+        return bool(self.obstacles) or self.self_contact
+
     @property
     def mechanics_key(self) -> dict[str, Any]:
         """All options that change the mechanics, JSON-serialisable. Weights are valid for exactly one key.
 
         The options are the arguments of the constructor, defaults included. If the robot has an attribute of the
-        same name, for example because a default depends on other options, the attribute's value is used.
+        same name, for example because a default depends on other options, the attribute's value is used. Options of
+        contact are left out at their defaults, so that weights without contact keep their key.
         """
+        values = {name: vars(self).get(name, value) for name, value in self._options.items()}
         return {
-            name: _json_value(vars(self).get(name, value), f"option '{name}' of robot '{self.name}'")
-            for name, value in self._options.items()
+            name: _json_value(value, f"option '{name}' of robot '{self.name}'")
+            for name, value in values.items()
             if name not in self.non_mechanical_options
+            and not (name in WITHOUT_CONTACT and WITHOUT_CONTACT[name] == value)
         }
 
     @property
@@ -267,6 +337,8 @@ class Robot(ABC):
             raise TypeError(f"robot '{self.name}': effectors must be a tuple of names, got {self.effectors!r}")
         if not hasattr(self, "workspace_scale"):
             self.workspace_scale = 0.25 * self.size
+        if self.touches and self.contact_stiffness is not None:
+            self.stiffness_variable = None  # this stiffness does not scale with that of the body
         for name, count in (("effector_rest", 3), ("effort_scale", len(self.actuators))):
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != (count,):
@@ -297,6 +369,8 @@ def _json_value(value: Any, label: str) -> Any:
         return {str(key): _json_value(item, label) for key, item in value.items()}
     if isinstance(value, PurePath):
         return str(value)
+    if isinstance(value, Obstacle):
+        return _json_value(value.as_dict(), label)
     if isinstance(value, Robot):
         return {"robot": value.name, **value.mechanics_key}
     if callable(value) and hasattr(value, "__qualname__"):
@@ -314,7 +388,7 @@ class MeshedRobot(Robot):
         mesh_size: target edge length [m].
         meshing: ``"morph"`` moves the reference mesh, ``"remesh"`` creates a new mesh for every design.
         material: name of a material of `softgym_envs.mechanics.materials`.
-        gravity: acceleration [m/s2], shape (3,).
+        **options: options of `Robot`.
     """
 
     #: Smallest element quality, relative to the reference mesh, that a moved mesh may have before it is remeshed.
@@ -326,14 +400,14 @@ class MeshedRobot(Robot):
         mesh_size: float,
         meshing: str = "morph",
         material: str = "corotational",
-        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        **options: Any,
     ) -> None:
         if meshing not in ("morph", "remesh"):
             raise ValueError(f"meshing = {meshing!r} is unknown; allowed: 'morph', 'remesh'")
         if not (isinstance(mesh_size, int | float) and 0.0 < mesh_size < np.inf):
             raise ValueError(f"robot '{self.name}': mesh_size = {mesh_size!r} m must be positive and finite")
         resolve_material(material)
-        super().__init__(gravity=gravity)
+        super().__init__(**options)
         self.material = material
         self.mesh_size = float(mesh_size)
         self.meshing = meshing

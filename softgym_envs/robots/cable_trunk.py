@@ -7,6 +7,7 @@ clamped base along +z. Four cables run to the tip and four to the middle, each p
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -89,6 +90,7 @@ class CableTrunk(Robot):
             long cable alone can be pulled by 57 mm.
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the baseline body weighs 42 g.
+        **options: options of `Robot`.
     """
 
     name = "cable_trunk"
@@ -104,13 +106,14 @@ class CableTrunk(Robot):
         strokes: tuple[float, float] = (0.035, 0.020),
         unilateral: bool = True,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        **options: Any,
     ) -> None:
         if not (isinstance(layers, int) and layers >= 1 and isinstance(rings, int) and rings >= 1):
             raise ValueError(f"layers = {layers!r} and rings = {rings!r} must be positive integers")
         resolve_material(material)
         if len(strokes) != 2 or not all(0.0 < stroke < np.inf for stroke in strokes):
             raise ValueError(f"strokes must be two positive lengths [m], got {strokes!r}")
-        super().__init__(gravity=gravity)
+        super().__init__(gravity=gravity, **options)
         self.layers = layers
         self.rings = rings
         self.material = material

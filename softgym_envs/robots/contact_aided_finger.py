@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -62,6 +63,7 @@ class ContactAidedFinger(MeshedRobot):
         density: [kg/m3].
         material: name of a material of `softgym_envs.mechanics.materials`.
         gravity: acceleration [m/s2].
+        **options: options of `Robot`.
     """
 
     name = "contact_aided_finger"
@@ -84,6 +86,7 @@ class ContactAidedFinger(MeshedRobot):
         density: float = 500.0,
         material: str = "corotational",
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        **options: Any,
     ) -> None:
         if control_points not in CONTROL_POINTS:
             raise ValueError(f"control_points = {control_points!r} is unknown; allowed: 7, 12")
@@ -102,6 +105,7 @@ class ContactAidedFinger(MeshedRobot):
             meshing="remesh",
             material=material,
             gravity=gravity,
+            **options,
         )
         self.element = element
         self.published_mesh = mesh == "published"

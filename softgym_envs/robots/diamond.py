@@ -7,6 +7,7 @@ cable pulls each elbow inwards, which lifts the top and tilts it away.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -78,6 +79,7 @@ class Diamond(MeshedRobot):
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the condensed-model work of the thesis has none. Its reinforcement-learning scene
             is ``gravity=(0, 0, -9.81)`` with the design ``{"young_modulus": 1.8e5}``; the baseline body weighs 0.5 kg.
+        **options: options of `Robot`.
     """
 
     name = "diamond"
@@ -94,8 +96,9 @@ class Diamond(MeshedRobot):
         material: str = "corotational",
         unilateral: bool = True,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        **options: Any,
     ) -> None:
-        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity)
+        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity, **options)
         self.design_space = DesignSpace(
             DesignVariable("leg_width", 0.8, 1.2, 1.0, "1", "width of the legs over that of the published body"),
             DesignVariable("top_height", 0.115, 0.140, 0.126, "m", "height of the top above the origin"),

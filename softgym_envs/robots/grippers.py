@@ -38,6 +38,7 @@ class FingerRobot(Robot):
         material: name of a material.
         unilateral: whether cables cannot push (default).
         gravity: acceleration [m/s2].
+        **options: options of `Robot`.
     """
 
     size = 0.12
@@ -57,8 +58,9 @@ class FingerRobot(Robot):
         material: str = "corotational",
         unilateral: bool = True,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        **options: Any,
     ) -> None:
-        super().__init__(gravity=gravity)
+        super().__init__(gravity=gravity, **options)
         self.finger = SoftFinger(
             cables=2, mesh_size=mesh_size, meshing=meshing, material=material, unilateral=unilateral
         )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -82,6 +83,7 @@ class SensorizedFinger(MeshedRobot):
         gravity: acceleration [m/s2].
         tip_height: height of the effector over the bottom [m]: 0 as published, 10 mm as in the `SoftFinger`.
         cable_clearance: height of the cable over the bellows [m]: 0.8 mm in the published study, 1 mm as built.
+        **options: options of `Robot`.
     """
 
     name = "sensorized_finger"
@@ -99,10 +101,11 @@ class SensorizedFinger(MeshedRobot):
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         tip_height: float = 0.0,
         cable_clearance: float = 0.8e-3,
+        **options: Any,
     ) -> None:
         if cavities not in (2, 4):
             raise ValueError(f"cavities = {cavities!r} is unknown; allowed: 2, 4")
-        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity)
+        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity, **options)
         self.cavities = cavities
         mm = 1e-3
         shape = [

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -45,6 +46,7 @@ class SoftFinger(MeshedRobot):
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the condensed-model work of the thesis has none.
         contacts: whether to add three contact points (role ``c``) to the front of the last segment (sec. 4.3.2).
+        **options: options of `Robot`.
     """
 
     name = "finger"
@@ -61,12 +63,13 @@ class SoftFinger(MeshedRobot):
         unilateral: bool = True,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         contacts: bool = False,
+        **options: Any,
     ) -> None:
         if cables not in (1, 2):
             raise ValueError(f"cables = {cables!r} is unknown; allowed: 1, 2")
         if mesh_size is None:
             mesh_size = 8.0e-3 if cables == 2 else 7.9e-3
-        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity)
+        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity, **options)
         self.cables = cables
         self.contacts = contacts
         self.slope = math.radians(45.0 if cables == 2 else 30.0)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,7 @@ class StiffFlop(Robot):
         gravity: acceleration [m/s2]; the published work has none.
         unilateral: whether pressures must not be negative (default): a chamber that the others stretch beyond its
             commanded volume is open, without pressure.
+        **options: options of `Robot`.
     """
 
     name = "trunk"
@@ -63,8 +65,9 @@ class StiffFlop(Robot):
         elements: int = 5,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         unilateral: bool = True,
+        **options: Any,
     ) -> None:
-        super().__init__(gravity=gravity)
+        super().__init__(gravity=gravity, **options)
         if not isinstance(elements, int) or elements < 1:
             raise ValueError(f"elements = {elements!r} is out of bounds; allowed: integers from 1")
         self.elements = elements

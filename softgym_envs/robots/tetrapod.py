@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
@@ -45,6 +46,7 @@ class Tetrapod(Robot):
         payload: mass at the centre [kg].
         elements: quadratic beam elements per leg.
         gravity: acceleration [m/s2].
+        **options: options of `Robot`.
     """
 
     name = "tetrapod"
@@ -58,8 +60,9 @@ class Tetrapod(Robot):
         payload: float = 0.0,
         elements: int = 6,
         gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+        **options: Any,
     ) -> None:
-        super().__init__(gravity=gravity)
+        super().__init__(gravity=gravity, **options)
         if not (np.isfinite(payload) and payload >= 0.0):
             raise ValueError(f"payload = {payload} kg must be finite and not negative")
         if not isinstance(elements, int) or elements < 2:

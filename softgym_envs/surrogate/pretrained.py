@@ -30,6 +30,11 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
     Raises:
         WeightsError: if there are no weights, or they are damaged or for another robot.
     """
+    if weights is None and robot.touches:
+        raise WeightsError(
+            f"the shipped weights of '{robot.weights_name}' know no contact: use backend='fem' for a robot with "
+            "obstacles or self_contact"
+        )
     folder = Path(weights) if weights is not None else pretrained_folder(robot)
     if weights is None and not folder.is_dir():
         shipped = sorted(p.name for p in _ROOT.iterdir()) if _ROOT.is_dir() else []

@@ -63,10 +63,10 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
     if card.get("robot") != robot.name or card.get("mechanics_key") != robot.mechanics_key:
         wanted = {"robot": robot.name, **robot.mechanics_key}
         found = {"robot": card.get("robot"), **card.get("mechanics_key", {})}
-        different = sorted(k for k in wanted if wanted[k] != found.get(k))
+        different = sorted(k for k in wanted | found if wanted.get(k) != found.get(k))
         raise WeightsError(
             f"weights '{folder.name}' were trained for another robot: "
-            + ", ".join(f"{k} = {found.get(k)!r}, needed {wanted[k]!r}" for k in different)
+            + ", ".join(f"{k} = {found.get(k)!r}, needed {wanted.get(k)!r}" for k in different)
             + "; use backend='fem' or train weights with 'softgym fit'"
         )
     expected = card_of(robot, card["network"])

@@ -309,6 +309,7 @@ class Beam(ElementBlock):
         if not ((poisson > -1.0) & (poisson < 0.5)).all():
             raise ValueError(f"poisson_ratio = {poisson_ratio} must be inside (-1, 0.5)")
         self.sections = sections
+        self._largest_young_modulus = float(young.max())
         self.element_stiffness = np.array(
             [s.stiffness(e, nu) for s, e, nu in zip(sections, young, poisson, strict=True)]
         )
@@ -326,6 +327,10 @@ class Beam(ElementBlock):
         self._rest = self.strains(rest)
         if not (self._rest[..., 0] > 0.5).all():
             raise ValueError("the directors d_1 of a beam's frames must point along its axis")
+
+    @property
+    def largest_young_modulus(self) -> float:
+        return self._largest_young_modulus
 
     def strains(self, x: np.ndarray) -> np.ndarray:
         """Strains (Gamma, K) beyond those at rest at the Gauss points, shape (m, q, 6) [1, 1/m]."""

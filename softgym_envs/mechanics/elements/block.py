@@ -33,6 +33,11 @@ class ElementBlock(ABC):
     stiffness: float
     elasticity_version: int = 0
 
+    @property
+    def largest_young_modulus(self) -> float:
+        """Young's modulus [Pa] of the stiffest element; zero for parts that are not elastic."""
+        return 0.0
+
     @abstractmethod
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Pairs of degrees of freedom of the tangent's entries: (rows, columns), index arrays of one shape.
