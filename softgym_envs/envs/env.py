@@ -14,10 +14,13 @@ from softgym_envs.backends.backend import Backend, State
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.designs import Design
 from softgym_envs.envs.options import EnvironmentOptions, check_reset_options, set_up
-from softgym_envs.errors import ConvergenceError
+from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 if TYPE_CHECKING:
     from softgym_envs.envs.registration import RobotSource, TaskSource
+
+MAX_DRAWS = 100
+"""Number of infeasible bodies that are drawn in turn before `reset` gives up."""
 
 
 class SoftRobotEnv(gymnasium.Env, EzPickle):
@@ -94,7 +97,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
 
     @property
     def goal(self) -> np.ndarray:
-        """The present goal [m], shape (3,)."""
+        """The present goal [m, or the unit of the task's goals], shape (3,)."""
         return self.task.goals(self._path[None], np.array([len(self._path)]), np.array([self._step]))[0]
 
     @property
@@ -118,14 +121,11 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         """
         super().reset(seed=seed)
         given, goal = check_reset_options(options)
-        if given is not None:
-            design = self.design_space.complete(given, self._fixed_design)
-        elif self._sampled:
-            drawn = self.design_space.sample(self.np_random, self._sampled)
-            design = self.design_space.complete({name: drawn[name] for name in self._sampled}, self._fixed_design)
+        if given is None and self._sampled:
+            design = self._draw_body()
         else:
-            design = self._fixed_design
-        self.backend.reset(design)
+            design = self._fixed_design if given is None else self.design_space.complete(given, self._fixed_design)
+            self.backend.reset(design)
         shown = self.spaces.design_names
         self._unit_design = np.array([self.design_space[name].to_unit(design[name]) for name in shown], dtype=float)
         if goal is None:
@@ -136,10 +136,29 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self._step = 0
         return self._observe()
 
+    def _draw_body(self) -> Design:
+        """Draw the sampled variables and go to the rest state of that body; bodies that cannot exist are drawn again.
+
+        Raises:
+            InfeasibleDesign: if `MAX_DRAWS` bodies in turn cannot exist.
+        """
+        for attempt in range(MAX_DRAWS):
+            drawn = self.design_space.sample(self.np_random, self._sampled)
+            design = self.design_space.complete({name: drawn[name] for name in self._sampled}, self._fixed_design)
+            try:
+                self.backend.reset(design)
+            except InfeasibleDesign:
+                if attempt == MAX_DRAWS - 1:
+                    raise
+            else:
+                break
+        return design
+
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply one action, shape (n_a,) in [-1, 1]; values outside are clipped.
 
-        A step whose equilibrium is not found ends the episode (truncated) with ``info["converged"] = False``.
+        A step whose equilibrium is not found ends the episode (truncated) with ``info["converged"] = False``. An
+        episode that the task has lost ends too (terminated), with ``info["lost"] = True``.
 
         Raises:
             ValueError: for an action with a wrong shape or a value that is not finite.
@@ -156,17 +175,20 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self._step += 1
         observation, info = self._observe()
         reward = prod(info["reward_terms"].values()) if converged else 0.0
-        return observation, reward, False, not converged, info | {"converged": converged}
+        return observation, reward, info["lost"], not converged, info | {"converged": converged}
 
     def _observe(self) -> tuple[np.ndarray, dict[str, Any]]:
         state, goal = self.backend.state, self.goal
-        effector = state.effector[0]
-        distance, terms, _ = self.task.rate(effector, goal, self.spaces.effort_share(state.effort))
+        measured = self.task.measure(state)
+        distance, terms, _ = self.task.rate(measured, goal, self.spaces.effort_share(state.effort))
+        terms |= self.task.state_terms(state)
         info = {
-            "effector": effector.copy(),
+            "effector": state.effector[0].copy(),
+            "measured": measured.copy(),
             "goal": goal.copy(),
             "distance": float(distance),
             "is_success": bool(distance < self.task.success_distance),
+            "lost": self.task.lost(state),
             "reward_terms": {name: float(term) for name, term in terms.items()},
             "displacement": state.displacement.copy(),
             "effort": state.effort.copy(),
@@ -184,7 +206,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             }
         velocity = state.velocity[0] if self.spaces.moving else None
         observation = self.spaces.observe(
-            state.command, state.displacement, state.effort, effector, goal, self._unit_design, velocity
+            state.command, state.displacement, state.effort, measured, goal, self._unit_design, velocity
         )
         return observation, info
 

@@ -84,7 +84,13 @@ class Setup:
     def spaces(self, *, moving: bool = False) -> AgentSpaces:
         """Return the agent's spaces; with ``moving``, observations include the effector's velocity."""
         return AgentSpaces(
-            self.robot, action_mode=self.action_mode, design_names=self.shown, axes=self.task.axes, moving=moving
+            self.robot,
+            action_mode=self.action_mode,
+            design_names=self.shown,
+            axes=self.task.axes,
+            moving=moving,
+            goal_scale=self.task.goal_scale,
+            error_scale=self.task.error_scale,
         )
 
 
@@ -160,3 +166,11 @@ def check_counts(num_envs: int, max_episode_steps: int | None) -> None:
     for name, value in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
         if value is not None and value < 1:
             raise ValueError(f"{name} = {value} must be at least 1")
+
+
+def check_batchable(task: Task) -> None:
+    """Raise ValueError for a task that a batched environment on the surrogate cannot rate."""
+    if task.pushes:
+        raise ValueError(f"task '{task.name}' pushes the effector, but the batched environment takes no forces")
+    if task.needs_state:
+        raise ValueError(f"task '{task.name}' reads forces of contacts, which the batched environment does not have")

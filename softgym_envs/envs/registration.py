@@ -71,6 +71,9 @@ def _row(robot: str, task: str, max_episode_steps: int, backend: str = "surrogat
 
 
 MOVING = {"dynamics": True}
+# One implicit step per control step damps all vibrations, but objects fall.
+SLOW = {"dynamics": True, "time_step": 0.05}
+COARSE = {"mesh_size": 0.020}
 
 ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/FingerReach-v0": _row("finger", "reach", 50),
@@ -85,6 +88,10 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/FingerPress-v0": _row("press_finger", "track", 100),
     "SoftGym/GripperPinch-v0": _row("two_finger_gripper", "track", 100),
     "SoftGym/GripperManipulate-v0": _row("three_finger_gripper", "track", 100),
+    "SoftGym/FingerGrasp-v0": _row("grasping_finger", "grasp", 25, backend="fem", robot_options=COARSE),
+    "SoftGym/GripperLift-v0": _row(
+        "contact_aided_gripper", "lift", 50, backend="fem", robot_options=COARSE, backend_options=SLOW
+    ),
     "SoftGym/TetrapodReach-v0": _row("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
     "SoftGym/TetrapodTrack-v0": _row("tetrapod", "track", 100, backend="fem", backend_options=MOVING),
     "SoftGym/TetrapodCarry-v0": _row("tetrapod", "carry", 100, backend="fem", backend_options=MOVING),

@@ -22,11 +22,13 @@ class AgentSpaces:
         design_names: design variables in the observation; an empty tuple for none.
         axes: coordinates of the effector that count in the error, 1 or 0, shape (3,); default all.
         moving: whether the observation contains the effector's velocity, which an agent needs in dynamics.
+        goal_scale: that of the task; default 1.25 times the size of the robot.
+        error_scale: that of the task; default 0.4 times the workspace scale of the robot.
 
     Attributes:
         action_space: of one environment, shape (n_a,).
         observation_space: of one environment, shape (d,).
-        position_scale: unit of observed positions [m].
+        position_scale: unit of observed effectors and goals [m].
         error_scale: distance to the goal that is observed as one half [m].
         slices: where to find the parts of an observation: command, displacement, effort, effector, goal, error,
             velocity, design.
@@ -40,6 +42,8 @@ class AgentSpaces:
         design_names: tuple[str, ...],
         axes: np.ndarray | None = None,
         moving: bool = False,
+        goal_scale: float | None = None,
+        error_scale: float | None = None,
     ) -> None:
         if action_mode not in ("increment", "absolute"):
             raise ValueError(f"action_mode = {action_mode!r} is unknown; allowed: 'increment', 'absolute'")
@@ -54,8 +58,8 @@ class AgentSpaces:
         self.effort_scale: Array = np.asarray(robot.effort_scale, dtype=float)
         self.middle: Array = 0.5 * (robot.lower + robot.upper)
         self.half_range: Array = 0.5 * (robot.upper - robot.lower)
-        self.position_scale = 1.25 * robot.size
-        self.error_scale = robot.workspace_scale / 2.5
+        self.position_scale = 1.25 * robot.size if goal_scale is None else goal_scale
+        self.error_scale = robot.workspace_scale / 2.5 if error_scale is None else error_scale
         n = len(robot.actuators)
         self.action_space = spaces.Box(-1.0, 1.0, (n,), np.float32)
         self.slices: dict[str, slice] = {}

@@ -19,7 +19,13 @@ import torch
 from torch import Tensor
 
 from softgym_envs.backends.torch_batch import MAX_NEWTON_STEPS, Bodies, TorchBatch, put_rows, repeat_body, take_rows
-from softgym_envs.envs.options import EnvironmentOptions, check_counts, check_reset_options, set_up
+from softgym_envs.envs.options import (
+    EnvironmentOptions,
+    check_batchable,
+    check_counts,
+    check_reset_options,
+    set_up,
+)
 from softgym_envs.envs.registration import ENVIRONMENTS, find_row
 from softgym_envs.surrogate.pretrained import pretrained_model
 
@@ -92,8 +98,7 @@ class TorchVectorEnv:
             supported = [name for name, other in ENVIRONMENTS.items() if other.backend == "surrogate"]
             raise ValueError(f"id = {id!r} is not an environment on the surrogate; allowed: {', '.join(supported)}")
         self.robot, self.task, self.spaces = setup.robot, setup.task, setup.spaces()
-        if self.task.pushes:
-            raise ValueError(f"task '{self.task.name}' pushes the effector, but the surrogate takes no forces")
+        check_batchable(self.task)
         self.design_space = self.robot.design_space
         self.num_envs, self.dtype = num_envs, dtype
         self.max_episode_steps = row.max_episode_steps if max_episode_steps is None else max_episode_steps

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from softgym_envs.backends.surrogate import BatchState, rest_state, solve_displacements
-from softgym_envs.envs.options import EnvironmentOptions, check_counts, check_reset_options, set_up
+from softgym_envs.envs.options import EnvironmentOptions, check_batchable, check_counts, check_reset_options, set_up
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.surrogate.model import Context
@@ -68,10 +68,7 @@ class SoftRobotVectorEnv(VectorEnv):
                 f"backend = {setup.backend!r} of robot '{self.robot.name}' has no batched environment; "
                 "allowed: 'surrogate', or gymnasium.make_vec(..., vectorization_mode='sync')"
             )
-        if self.task.pushes:
-            raise ValueError(
-                f"task '{self.task.name}' pushes the effector, but the batched environment takes no forces"
-            )
+        check_batchable(self.task)
         self.num_envs = num_envs
         self.render_mode = None
         self.design_space = self.robot.design_space

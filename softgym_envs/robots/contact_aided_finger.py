@@ -8,7 +8,7 @@ faces the object, which is at larger x.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,8 @@ SERVO_AXIS = np.array([30.0e-3, -18.0e-3, 0.0])
 
 ON_SERVO, HELD = -3.0e-3, -1.0e-3
 """Heights [m] up to which the left foot moves with the servo, and the right foot is held."""
+
+IN_PLACE = np.eye(3)
 
 CONTROL_POINTS = (7, 12)
 """Allowed numbers of control points: of the initial design of the thesis, and of its recorded studies."""
@@ -180,13 +182,23 @@ class ContactAidedFinger(MeshedRobot):
         model.add("e", Point("tip", model.embed(self.tip(design))))
         return model
 
-    def add_to(self, assembly: ModelBuilder, mesh: BodyMesh, design: Mapping[str, float]) -> int:
+    def add_to(
+        self,
+        assembly: ModelBuilder,
+        mesh: BodyMesh,
+        design: Mapping[str, float],
+        *,
+        turn: np.ndarray = IN_PLACE,
+        shift: np.ndarray | Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> int:
         """Add the finger to an assembly and return the first row of the frame of its servo.
 
         Args:
             assembly: collects the parts.
             mesh: the meshed body, from `body`.
             design: a complete design.
+            turn: rotation of the finger by multiples of 90 degrees, shape (3, 3).
+            shift: displacement of the turned finger [m], shape (3,).
         """
         nodes, elements = mesh.nodes, mesh.tetrahedra
         if self.element == "quadratic":
@@ -196,7 +208,7 @@ class ContactAidedFinger(MeshedRobot):
         on_servo = left & (y < ON_SERVO + 1e-9)
         held = ~left & (y < HELD + 1e-9)
         start = assembly.add_solid(
-            nodes,
+            nodes @ turn.T + shift,
             elements,
             fixed=held,
             element=self.element,
@@ -205,6 +217,6 @@ class ContactAidedFinger(MeshedRobot):
             poisson_ratio=design["poisson_ratio"],
             density=self.density,
         )
-        frame = assembly.add_frame(SERVO_AXIS, fixed=True, fixed_spin=(True, True, False))
+        frame = assembly.add_frame(turn @ SERVO_AXIS + shift, fixed=True, fixed_spin=np.abs(turn[:, 2]) < 0.5)
         assembly.carry(frame, start + np.flatnonzero(on_servo))
         return frame

@@ -19,6 +19,8 @@ ROBOTS = Registry(
         "trunk": "softgym_envs.robots.stiff_flop:StiffFlop",
         "contact_finger": "softgym_envs.robots.contact_finger:ContactFinger",
         "contact_aided_finger": "softgym_envs.robots.contact_aided_finger:ContactAidedFinger",
+        "grasping_finger": "softgym_envs.robots.grasping_hands:GraspingFinger",
+        "contact_aided_gripper": "softgym_envs.robots.grasping_hands:ContactAidedGripper",
         "press_finger": "softgym_envs.robots.grippers:PressFinger",
         "two_finger_gripper": "softgym_envs.robots.grippers:TwoFingerGripper",
         "tetrapod": "softgym_envs.robots.tetrapod:Tetrapod",

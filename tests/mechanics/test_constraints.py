@@ -20,6 +20,7 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.constraints.servo import Servo
+from softgym_envs.mechanics.constraints.slide import Slide
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.frames import frame_rows
@@ -92,6 +93,10 @@ def make_servo(nodes, tetrahedra):
     return Servo("servo", 4, np.array([0.2, 1.0, 0.3]), nodes)
 
 
+def make_slide(nodes, tetrahedra):
+    return Slide("slide", 4, np.array([0.2, 1.0, -0.3]), nodes)
+
+
 def make_pose(nodes, tetrahedra):
     return Pose("pose", 4, 1, nodes)
 
@@ -110,6 +115,7 @@ FACTORIES = {
     "Pose": make_pose,
     "Pose of a turn": make_turn,
     "Servo": make_servo,
+    "Slide": make_slide,
 }
 
 

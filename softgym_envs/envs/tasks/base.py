@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from softgym_envs.backends.backend import State
 from softgym_envs.envs.arrays import Array, namespace, pick_rows
 from softgym_envs.robots.base import Robot
 
@@ -90,10 +91,16 @@ class Task(ABC):
         robot: the robot.
         axes: coordinates of the effector that count, 1 or 0, shape (3,).
         success_distance: distance below which a goal counts as reached [m].
+        goal_scale: unit of goals and of what is compared with them in observations [m].
+        error_scale: distance to the goal that is observed as one half [m].
     """
 
     #: Whether the task applies forces to the effector, which not every backend supports.
     pushes = False
+    #: Whether the task reads whole mechanical states, which batched environments do not have.
+    needs_state = False
+    #: Unit of goals; that of positions by default.
+    goal_unit = "m"
 
     name: str
     horizon: int = 1
@@ -105,6 +112,8 @@ class Task(ABC):
         self.robot = robot
         self.axes: Array = np.asarray(robot.goal_axes, dtype=float)
         self.success_distance = robot.goal_tolerance
+        self.goal_scale = 1.25 * robot.size
+        self.error_scale = robot.workspace_scale / 2.5
 
     @abstractmethod
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
@@ -140,6 +149,28 @@ class Task(ABC):
     def push(self, step: int) -> np.ndarray | None:
         """Return the force on the first effector during a control step [N], shape (3,), or None."""
         return None
+
+    def measure(self, state: State) -> np.ndarray:
+        """Return what is compared with the goal, shape (3,): the first effector [m] unless a task overrides it."""
+        return state.effector[0]
+
+    def contact_forces(self, state: State) -> np.ndarray:
+        """Return the force of each obstacle on the robot [N], shape (o, 3).
+
+        Raises:
+            ValueError: for a robot that touches nothing.
+        """
+        if state.contacts is None:
+            raise ValueError(f"task '{self.name}' needs contacts, but robot '{self.robot.name}' touches nothing")
+        return state.contacts.total
+
+    def lost(self, state: State) -> bool:
+        """Whether the goal is out of reach for good, which terminates the episode; never by default."""
+        return False
+
+    def state_terms(self, state: State) -> dict[str, float]:
+        """Return further factors of the reward, each in [0, 1]; none by default."""
+        return {}
 
     def distance(self, effector: Array, goal: Array) -> Array:
         """Return the distance [m] (...) of effectors to goals, each (..., 3), along the axes that count."""

@@ -16,6 +16,8 @@ TASKS = Registry(
         "reach": "softgym_envs.envs.tasks.reach:Reach",
         "track": "softgym_envs.envs.tasks.track:Track",
         "carry": "softgym_envs.envs.tasks.carry:Carry",
+        "grasp": "softgym_envs.envs.tasks.grasp:Grasp",
+        "lift": "softgym_envs.envs.tasks.lift:Lift",
     },
     base="softgym_envs.envs.tasks.base:Task",
     group="softgym_envs.tasks",

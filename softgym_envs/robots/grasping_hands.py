@@ -1,0 +1,244 @@
+"""Hands of contact-aided fingers, and what they hold: one finger that closes on an object, two that lift one.
+
+Objects are part of the scene, so their place, size, mass and friction are design variables like the moduli of the
+body: environments can draw them at each reset and show them to the agent, and a study can average over them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.mechanics.builder import ModelBuilder
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.constraints.servo import Servo
+from softgym_envs.mechanics.constraints.slide import Slide
+from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane, RoundedPrism, Sphere
+from softgym_envs.mechanics.elements.beams import Section
+from softgym_envs.mechanics.elements.rigid import box_inertia
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.skins import box_skin
+from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
+
+OBJECTS = ("plane", "hexagon", "cylinder", "sphere")
+"""Kinds of objects that a finger closes on."""
+
+ROUNDING = 1.0e-3
+"""Radius of the edges of prisms [m]."""
+
+CLOSING_RATE = math.radians(2.0)
+"""Largest change of a servo's angle in a control step [rad]."""
+
+UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Turns a finger so that it points down (-z) and closes along +x."""
+
+
+def fixed_object(kind: str, face: float, scene: Mapping[str, float], *, half_length: float = 0.05) -> Obstacle:
+    """Return an object that stands still in front of a finger.
+
+    Args:
+        kind: one of `OBJECTS`. Axes of hexagons and cylinders are along z; a flat of a hexagon faces the finger.
+        face: x of the outer side of the finger's foot [m].
+        scene: ``object_gap``: distance of the object from there, along x; ``friction``; for all kinds but planes also
+            ``object_height``: y of its middle, and ``object_size``: its width along x [m].
+        half_length: half the length of a hexagonal prism [m].
+    """
+    x, friction = face + scene["object_gap"], scene["friction"]
+    if kind == "plane":
+        return Plane((x, 0.0, 0.0), (-1.0, 0.0, 0.0), name="object", friction=friction)
+    radius = 0.5 * scene["object_size"]
+    centre = (x + radius, scene["object_height"], 0.0)
+    if kind == "sphere":
+        return Sphere(centre, radius, name="object", friction=friction)
+    if kind == "cylinder":
+        return Cylinder(centre, (0.0, 0.0, 1.0), radius, name="object", friction=friction)
+    return RoundedPrism.hexagonal(2.0 * radius, half_length, ROUNDING, centre=centre, name="object", friction=friction)
+
+
+class GraspingFinger(ContactAidedFinger):
+    """A contact-aided finger that closes on an object that stands still (thesis, sec. 3.4).
+
+    Args:
+        object: ``"plane"``, ``"hexagon"``, ``"cylinder"``, ``"sphere"``, or ``"any"``, which makes the kind a variable.
+        self_contact: whether the zigzag touches itself and the other leg.
+        self_friction: coefficient of friction between them.
+        **options: options of `ContactAidedFinger`.
+    """
+
+    name = "grasping_finger"
+
+    def __init__(
+        self, *, object: str = "plane", self_contact: bool = True, self_friction: float = 0.0, **options: Any
+    ) -> None:
+        if object not in (*OBJECTS, "any"):
+            raise ValueError(f"object = {object!r} is unknown; allowed: {', '.join(OBJECTS)}, any")
+        super().__init__(**options)
+        self.object, self.self_contact, self.self_friction = object, self_contact, self_friction
+        scene = [
+            DesignVariable("object_gap", 0.010, 0.040, 0.0301, "m", "distance of the object from the finger, along x"),
+            DesignVariable("friction", 0.10, 1.0, 0.85, "1", "coefficient of friction of the object"),
+        ]
+        if object != "plane":
+            scene.append(
+                DesignVariable("object_height", 0.040, 0.100, 0.070, "m", "middle of the object above the foot")
+            )
+            scene.append(DesignVariable("object_size", 0.030, 0.080, 0.060, "m", "width of the object along x"))
+        if object == "any":
+            kinds = ", ".join(f"{k} {kind}" for k, kind in enumerate(OBJECTS))
+            scene.append(DesignVariable("object_kind", 0.0, 4.0, 0.0, "1", f"rounded down: {kinds}"))
+        self.scene = tuple(variable.name for variable in scene)
+        self.design_space = DesignSpace(*self.design_space, *scene)
+        (servo,) = self.actuators
+        self.actuators = (
+            Actuator(servo.name, servo.low, servo.high, CLOSING_RATE, servo.unit, False, servo.max_effort),
+        )
+
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        """Put the object in front of the finger.
+
+        Raises:
+            InfeasibleDesign: if the outline of the finger crosses itself, or the finger at rest the object.
+        """
+        model = super().assemble(design)
+        kind = self.object if self.object != "any" else OBJECTS[min(int(design["object_kind"]), len(OBJECTS) - 1)]
+        contact = model.set_contact(
+            obstacles=[fixed_object(kind, self.width, design)],
+            self_contact=self.self_contact,
+            self_friction=self.self_friction,
+        )
+        crossing = contact.intersections(model.nodes)
+        if crossing:
+            raise InfeasibleDesign(f"at rest, {crossing}")
+        return model
+
+
+class ContactAidedGripper(Robot):
+    """Two contact-aided fingers that point down and close along x on a free box, which they lift off a table.
+
+    The hand stands still and the table goes down, which is the same in the frame of the hand. Heights are therefore
+    measured from the table: the effector is the middle of the box relative to it. Gravity acts along -z.
+
+    Args:
+        clearance: height of the finger tips at rest above the table [m].
+        box: width (x), depth (y) and height (z) of the box [m].
+        control_points: as for `ContactAidedFinger`.
+        mesh: as for `ContactAidedFinger`.
+        mesh_size: target edge length [m], instead of that of the mesh.
+        element: kind of element, instead of that of the mesh.
+        self_contact: whether each zigzag touches itself and the other leg.
+        gravity: acceleration [m/s2].
+    """
+
+    name = "contact_aided_gripper"
+    effectors = ("box",)
+    size = 0.1
+    rest_mode = "displacement"
+    convex = False
+    goal_axes = np.array([0.0, 0.0, 1.0])
+    goal_tolerance = 1.0e-3
+    workspace_scale = 0.010
+
+    def __init__(
+        self,
+        *,
+        clearance: float = 0.010,
+        box: tuple[float, float, float] = (0.040, 0.030, 0.050),
+        control_points: int = 12,
+        mesh: str = "accurate",
+        mesh_size: float | None = None,
+        element: str | None = None,
+        self_contact: bool = True,
+        gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+    ) -> None:
+        super().__init__(gravity=gravity)
+        for name, value in {
+            "clearance": clearance,
+            **dict(zip(("box[0]", "box[1]", "box[2]"), box, strict=True)),
+        }.items():
+            if not 2.0 * ROUNDING < value < 0.2:
+                raise ValueError(f"robot '{self.name}': {name} = {value} m must be inside (0.002, 0.2)")
+        self.finger = ContactAidedFinger(control_points=control_points, mesh=mesh, mesh_size=mesh_size, element=element)
+        self.clearance, self.box, self.self_contact = clearance, box, self_contact
+        self.design_space = DesignSpace(
+            *self.finger.design_space,
+            DesignVariable("object_gap", 0.005, 0.030, 0.015, "m", "distance of each finger from the box, along x"),
+            DesignVariable("object_mass", 0.005, 0.2, 0.020, "kg", "mass of the box", log=True),
+            DesignVariable("friction", 0.10, 1.0, 0.85, "1", "coefficient of friction of the box"),
+        )
+        (servo,) = self.finger.actuators
+        self.actuators = (
+            *(
+                Actuator(f"servo_{k + 1}", 0.0, servo.high, CLOSING_RATE, "rad", False, servo.max_effort)
+                for k in range(2)
+            ),
+            Actuator("lift", 0.0, 0.020, 0.001, "m", unilateral=False),
+        )
+        self.effort_scale = np.array([0.3, 0.3, 1.0])
+        self.effector_rest = np.array([0.0, 0.0, 0.5 * box[2]])
+
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        """Place both fingers, the table and the box, which rests on it.
+
+        Raises:
+            InfeasibleDesign: if the outline of a finger crosses itself, or a finger at rest the box or the table.
+        """
+        own = {name: design[name] for name in self.finger.design_space.names}
+        mesh = self.finger.body(own)
+        builder = ModelBuilder(gravity=self.gravity, floating=True)
+        reach = self.finger.width + design["object_gap"] + 0.5 * self.box[0]
+        height = self.clearance + self.finger.length
+        servos = []
+        for turn in (np.eye(3), np.diag([-1.0, -1.0, 1.0])):
+            shift = turn @ np.array([-reach, 0.0, height])
+            servos.append((self.finger.add_to(builder, mesh, own, turn=turn @ UPRIGHT, shift=shift), turn @ UPRIGHT))
+        table = _add_table(builder)
+        half = 0.5 * np.array(self.box)
+        middle = half[2] + 2e-4  # within the distance of contact, so that the table carries the box from the start
+        frame = builder.add_frame([0.0, 0.0, middle])
+        builder.add_mass(frame, design["object_mass"], box_inertia(design["object_mass"], half))
+        model = builder.build()
+        for actuator, (servo, turn) in zip(self.actuators, servos, strict=False):
+            axis = turn @ np.array([0.0, 0.0, -1.0])
+            model.add("a", Servo(actuator.name, servo, axis, model.nodes))
+        model.add("a", Slide("lift", table, np.array([0.0, 0.0, -1.0]), model.nodes))
+        above_table = EmbeddedPoints.from_weights(np.array([[frame, table]]), np.array([[1.0, -1.0]]), model.nodes)
+        model.add("e", Point("box", above_table))
+        # Fingers touch the prism below; the skin stays back further than their contact with it would reach.
+        model.skins.append(box_skin(frame, (half - ROUNDING).tolist(), model.nodes))
+        friction = design["friction"]
+        surface = Plane((ROUNDING, 0.0, 0.0), (1.0, 0.0, 0.0), name="table", friction=friction, frame=table)
+        held = RoundedPrism.box(half.tolist(), ROUNDING, name="box", friction=friction, frame=frame)
+        contact = model.set_contact(obstacles=[surface, held], self_contact=self.self_contact)
+        crossing = contact.intersections(model.nodes)
+        if crossing:
+            raise InfeasibleDesign(f"at rest, {crossing}")
+        return model
+
+
+def _add_table(builder: ModelBuilder) -> int:
+    """Add the frame of a table at z = 0 that can only move along z, on a column as soft as a spring of 100 N/m.
+
+    Its first director points up. Without the column nothing but the drive would hold the table, and a condensed model
+    needs a body that is held without its drives.
+    """
+    up = np.column_stack([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    height, modulus, stiffness = 0.2, 1.0e6, 100.0
+    foot = builder.add_frame([0.0, 0.0, -height], up, fixed=True, fixed_spin=True)
+    middle = builder.add_frame([0.0, 0.0, -0.5 * height], up)
+    table = builder.add_frame(np.zeros(3), up, fixed=(True, True, False), fixed_spin=True)
+    side = math.sqrt(stiffness * height / modulus)
+    builder.add_beam(
+        [foot, middle, table],
+        section=Section.rectangle(side, side),
+        young_modulus=modulus,
+        poisson_ratio=0.3,
+        density=1000.0,
+    )
+    return table
