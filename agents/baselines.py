@@ -1,4 +1,4 @@
-"""Agents that need no training: the inverse QP in several forms, and random actions."""
+"""Agents that need no training: the inverse QP in several forms, control of forces, and random actions."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.control.contact_qp import ContactQP, ForceGoal
 from softgym_envs.control.embedded import PICorrection
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.envs.tasks.base import Task
@@ -115,6 +116,81 @@ class ModelQPAgent(InverseQPAgent):
         return command
 
 
+class OpenLoopGrasp:
+    """Closes all servos at full rate to a share of their range; then the drive ``"lift"`` rises by the goal's height.
+
+    Nothing is measured. Forces are whatever the angle gives.
+
+    Args:
+        share: of the range of the servos.
+    """
+
+    def __init__(self, share: float = 0.75) -> None:
+        self._share = share
+
+    def __call__(self, observation: Any, env: Any) -> np.ndarray:
+        """Return the action in the state of ``env``, shape (n_a,)."""
+        present, command = env.state.command, self._share * env.robot.upper
+        if _lifts(env.robot):
+            closed = (present[:-1] >= command[:-1] - 1e-9).all()
+            command[-1] = env.goal[2] - env.robot.effector_rest[2] if closed else present[-1]
+        return _towards(env, command)
+
+
+class ForceGrasp:
+    """Controls contact forces that it measures.
+
+    On an object that stands still: inverse QP with contacts for the wanted force (`ContactQP`), whose steps become
+    smaller while the error of the force grows. On a free object: closes until the fingers press it with twice the force
+    that friction needs for its weight, then lifts, and corrects the height by the error that is left.
+    """
+
+    margin = 2.0
+
+    def __init__(self) -> None:
+        self._controls: WeakKeyDictionary[Any, tuple[ContactQP, float, float]] = WeakKeyDictionary()
+
+    def __call__(self, observation: Any, env: Any) -> np.ndarray:
+        """Return the action in the state of ``env``, shape (n_a,)."""
+        return self._lift(env) if _lifts(env.robot) else self._press(env)
+
+    def _press(self, env: Any) -> np.ndarray:
+        present = env.state.command
+        if env not in self._controls or not present.any():
+            self._controls[env] = (ContactQP.for_robot(env.robot), 1.0, np.inf)
+        controller, size, before = self._controls[env]
+        error = float(env.task.distance(env.task.measure(env.state), env.goal))
+        size = max(0.5 * size, 1.0 / 64.0) if error > before + 1e-9 else min(1.0, 1.5 * size)
+        self._controls[env] = (controller, size, error)
+        wanted = ForceGoal({env.state.contacts.obstacles[0]: 1.0}, float(env.goal[0]))
+        try:
+            model = env.backend.contact_model()
+            command = controller.solve(model, None, present, env.state.slack, forces=[wanted], size=size)
+        except ConvergenceError:
+            command = present
+        return _towards(env, command)
+
+    def _lift(self, env: Any) -> np.ndarray:
+        state, command = env.state, env.state.command.copy()
+        weight = 9.81 * env.design["object_mass"]
+        pressing = state.contacts.pressing[state.contacts.obstacle == 1].sum()
+        if pressing < self.margin * weight / env.design["friction"]:
+            command[:-1] = env.robot.upper[:-1]
+        else:
+            command[-1] += env.goal[2] - state.effector[0, 2]
+        return _towards(env, command)
+
+
+def _lifts(robot: Robot) -> bool:
+    return robot.actuators[-1].name == "lift"
+
+
+def _towards(env: Any, command: np.ndarray) -> np.ndarray:
+    """Return the action that moves the commands of ``env`` towards others, shape (n_a,)."""
+    present, rates = env.state.command, env.robot.rates
+    return env.spaces.action(present + np.clip(command - present, -rates, rates), present)
+
+
 def _random(seed: int) -> Agent:
     rng = np.random.default_rng(seed)
     return lambda observation, env: rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
@@ -125,11 +201,18 @@ _MAKERS: dict[str, Callable[[int], Agent]] = {
     "qp_static": lambda seed: StaticQPAgent(),
     "qp_model": lambda seed: ModelQPAgent(closed=False),
     "qp_pi": lambda seed: ModelQPAgent(closed=True),
+    "close": lambda seed: OpenLoopGrasp(),
+    "force": lambda seed: ForceGrasp(),
     "random": _random,
 }
 
 BASELINES = tuple(_MAKERS)
 """Names of agents that need no training."""
+
+
+def baselines_for(task: type[Task]) -> tuple[str, ...]:
+    """Return the names of the agents that a task is compared with: those for forces, or those for positions."""
+    return ("close", "force", "random") if task.needs_state else ("qp", "qp_model", "qp_pi", "random")
 
 
 def make_baseline(name: str, seed: int = 0) -> Agent:
@@ -139,7 +222,8 @@ def make_baseline(name: str, seed: int = 0) -> Agent:
         name: ``"qp"``: inverse QP on the condensed model of the plant's present state, in dynamics of its next time
             step; ``"qp_static"``: on the static equilibrium under the present command, without momentum;
             ``"qp_model"``: on the surrogate, whatever the plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI
-            controller on the measured effector; ``"random"``: uniform actions.
+            controller on the measured effector; ``"close"``: closing a hand without measuring anything; ``"force"``:
+            control of the measured contact forces; ``"random"``: uniform actions.
         seed: seed of the random agent.
 
     Raises:

@@ -26,6 +26,8 @@ AGENTS = {
     "qp": "QP",
     "qp_model": "QP, model",
     "qp_pi": "QP, model, PI",
+    "close": "open loop",
+    "force": "force control",
     "random": "random",
 }
 
@@ -138,9 +140,9 @@ def table(runs: list[StoredRuns]) -> str:
     seeds = sorted({len(entry.runs) for entry in runs})
     text = [
         f"Interquartile means over all seeds ({' or '.join(map(str, seeds))}) and goals, with 95 % bootstrap intervals "
-        "over both (with three seeds that differ much, they cover only about 80 %). Distances are in mm: to the "
-        "goal at the end of an episode, or the mean along a path (track tasks, marked *). Policies were chosen on "
-        "other goals.\n"
+        "over both (with three seeds that differ much, they cover only about 80 %). Distances are in mm, errors of "
+        "forces in %: to the goal at the end of an episode, or the mean along a path (track tasks, marked *). Policies "
+        "were chosen on other goals.\n"
     ]
     for backend, title in (("own", "On the backend of the training"), ("fem", "The same policies on FEM")):
         shown = [entry for entry in runs if backend == "own" or entry.environment.backend != "fem"]
@@ -161,7 +163,11 @@ def _grid(runs: Iterable[StoredRuns], cell: Callable[[StoredRuns, str], str]) ->
 
 def _distance(entry: StoredRuns, agent: str, backend: str) -> str:
     scores = entry.scores(agent, backend, "mean_distances" if entry.follows else "distances")
-    return "" if scores is None else _present(crossed_estimate(1e3 * scores))
+    if scores is None:
+        return ""
+    if entry.environment.task_class.goal_unit == "m":
+        return _present(crossed_estimate(1e3 * scores))
+    return f"{_present(crossed_estimate(1e2 * scores))} %"
 
 
 def _success(entry: StoredRuns, agent: str, backend: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -145,7 +145,7 @@ class InverseQP:
         self._qp: Any = None
 
     @classmethod
-    def for_robot(cls, robot: Robot, **options: Any) -> InverseQP:
+    def for_robot(cls, robot: Robot, **options: Any) -> Self:
         """Return the controller of a robot, with the ranges and rates of its actuators.
 
         Args:
