@@ -162,7 +162,10 @@ class ForceGrasp:
         error = float(env.task.distance(env.task.measure(env.state), env.goal))
         size = max(0.5 * size, 1.0 / 64.0) if error > before + 1e-9 else min(1.0, 1.5 * size)
         self._controls[env] = (controller, size, error)
-        wanted = ForceGoal({env.state.contacts.obstacles[0]: 1.0}, float(env.goal[0]))
+        # The controller counts normal forces; friction and the direction of the normals add their share.
+        contacts, along = env.state.contacts, float(env.task.measure(env.state)[0])
+        share = contacts.pressing[contacts.obstacle == 0].sum() / along if along > 0.0 else 1.0
+        wanted = ForceGoal({contacts.obstacles[0]: 1.0}, float(env.goal[0] * share))
         try:
             model = env.backend.contact_model()
             command = controller.solve(model, None, present, env.state.slack, forces=[wanted], size=size)

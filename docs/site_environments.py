@@ -35,7 +35,9 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
     task: Task = task_class(robot, **row.task_options)
     moving = bool(row.backend_options.get("dynamics"))
     spaces = AgentSpaces(robot, action_mode="increment", design_names=(), axes=task.axes, moving=moving)
-    scales = observation_scales(robot)
+    scales = observation_scales(robot) | {"position": task.goal_scale, "error": task.error_scale}
+    goal_unit = task.goal_unit
+    forces = goal_unit == "N"
     along = "" if task.axes.all() else " along " + " and ".join(np.array(list("xyz"))[task.axes > 0.0])
     unit = robot.actuators[0].unit
     effort_unit = EFFORT.get(unit, "")
@@ -69,14 +71,17 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
             "m3": ("chamber", "pressure", "clipped for open chambers beyond it"),
         }
         word, effort, clipped = what.get(unit, ("actuator", "effort", "clipped"))
-        reach, error = quantity(scales["position"], "m"), quantity(scales["error"], "m")
+        reach, error = quantity(scales["position"], goal_unit), quantity(scales["error"], goal_unit)
+        measured = "force x, y, z on the object" if forces else f"position x, y, z of the effector `{effector}`"
+        wanted = "wanted force x, y, z" if forces else "goal position x, y, z"
+        difference = f"{'wanted minus present force' if forces else 'goal minus effector'}{along and f',{along} only'}"
         parts = [
             (n, f"commanded displacement of each {word}", "range to [-1, 1]", unit),
             (n, f"reached displacement of each {word}", f"range to [-1, 1], {clipped}", unit),
             (n, f"{effort} of each {word}", f"x / (1 + abs(x)) of the {effort} over {scale}", effort_unit),
-            (3, f"position x, y, z of the effector `{effector}`", reach, "m"),
-            (3, "goal position x, y, z", reach, "m"),
-            (3, f"goal minus effector{along and f',{along} only'}", f"x / (1 + abs(x)) of it over {error}", "m"),
+            (3, measured, reach, goal_unit),
+            (3, wanted, reach, goal_unit),
+            (3, difference, f"x / (1 + abs(x)) of it over {error}", goal_unit),
         ]
         if moving:
             speed = f"x / (1 + abs(x)) of it over {quantity(scales['speed'], 'm')}/s"
@@ -91,6 +96,8 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         return table(["index", "observation", "scaled by", "unit"], rows)
 
     def rewards() -> str:
+        if forces:
+            return code(inspect.cleandoc(task_class.__doc__ or "")).partition("\nArgs:")[0]
         if task_class.reward_terms is not Task.reward_terms:
             return code(inspect.cleandoc(task_class.reward_terms.__doc__ or "")).partition("\nArgs:")[0]
         near, far = quantity(task.success_distance, "m"), quantity(robot.workspace_scale, "m")
@@ -127,15 +134,20 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         held = (
             " There is no termination: the goal has to be held." if task.horizon == 1 else " There is no termination."
         )
+        if task_class.lost is not Task.lost:
+            held = f" Termination when the episode is lost: {inspect.cleandoc(task_class.lost.__doc__ or '')}"
         return (
             f"Truncation after {spec.max_episode_steps} steps.{held} If no equilibrium is found the episode is "
             'truncated with `info["converged"] = False` and a reward of 0.'
         )
 
     def information() -> str:
+        error = "relative error of the force" if forces else f"{along} [m]"
+        limit = f"{task.success_distance:g}" if forces else quantity(task.success_distance, "m")
         return (
-            f"`effector` and `goal` [m], `distance`{along} [m], `is_success` (`distance` < "
-            f"{quantity(task.success_distance, 'm')}), `reward_terms`, `displacement` [{unit}], `effort` "
+            f"`effector` [m], `goal` [{goal_unit}], `measured` [{goal_unit}] (what is compared with the goal), "
+            f"`distance` ({error.strip()}), `is_success` (`distance` < "
+            f"{limit}), `lost`, `reward_terms`, `displacement` [{unit}], `effort` "
             f"[{effort_unit}], `stable` (FEM: the tangent is positive definite), `converged`. `env.unwrapped.state` is "
             "the whole mechanical state, with the condensed model at `env.unwrapped.state.condensed` (`W.ea`, "
             "`delta_free.e`, ...)."

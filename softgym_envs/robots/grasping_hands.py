@@ -169,7 +169,7 @@ class ContactAidedGripper(Robot):
         self.design_space = DesignSpace(
             *self.finger.design_space,
             DesignVariable("object_gap", 0.005, 0.030, 0.015, "m", "distance of each finger from the box, along x"),
-            DesignVariable("object_mass", 0.005, 0.2, 0.020, "kg", "mass of the box", log=True),
+            DesignVariable("object_mass", 0.005, 1.0, 0.020, "kg", "mass of the box", log=True),
             DesignVariable("friction", 0.10, 1.0, 0.85, "1", "coefficient of friction of the box"),
         )
         (servo,) = self.finger.actuators
