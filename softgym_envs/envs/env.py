@@ -226,8 +226,13 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             from softgym_envs.viewer.image import ImageRenderer
 
             self._renderer = ImageRenderer(self.robot, self.render_size)
-        distance = float(self.task.distance(self.backend.state.effector[0], self.goal))
-        return self._renderer.render(self.backend.design, self.backend.state, self._path, self.goal, distance)
+        state, goal, path = self.backend.state, self.goal, self._path
+        distance = float(self.task.distance(self.task.measure(state), goal))
+        text = f"distance {1e3 * distance:.1f} mm"
+        if self.task.goal_unit != "m":  # goals that are not places
+            goal, path = state.effector[0], state.effector[:1]
+            text = f"error {1e2 * distance:.1f} %"
+        return self._renderer.render(self.backend.design, state, path, goal, text=text)
 
     def close(self) -> None:
         """Free the renderer."""

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
@@ -68,19 +67,16 @@ class GraspingFinger(ContactAidedFinger):
     Args:
         object: ``"plane"``, ``"hexagon"``, ``"cylinder"``, ``"sphere"``, or ``"any"``, which makes the kind a variable.
         self_contact: whether the zigzag touches itself and the other leg.
-        self_friction: coefficient of friction between them.
         **options: options of `ContactAidedFinger`.
     """
 
     name = "grasping_finger"
 
-    def __init__(
-        self, *, object: str = "plane", self_contact: bool = True, self_friction: float = 0.0, **options: Any
-    ) -> None:
+    def __init__(self, *, object: str = "plane", self_contact: bool = True, **options: Any) -> None:
         if object not in (*OBJECTS, "any"):
             raise ValueError(f"object = {object!r} is unknown; allowed: {', '.join(OBJECTS)}, any")
-        super().__init__(**options)
-        self.object, self.self_contact, self.self_friction = object, self_contact, self_friction
+        super().__init__(self_contact=self_contact, **options)
+        self.object = object
         scene = [
             DesignVariable("object_gap", 0.010, 0.040, 0.0301, "m", "distance of the object from the finger, along x"),
             DesignVariable("friction", 0.10, 1.0, 0.85, "1", "coefficient of friction of the object"),
@@ -100,23 +96,10 @@ class GraspingFinger(ContactAidedFinger):
             Actuator(servo.name, servo.low, servo.high, CLOSING_RATE, servo.unit, False, servo.max_effort),
         )
 
-    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
-        """Put the object in front of the finger.
-
-        Raises:
-            InfeasibleDesign: if the outline of the finger crosses itself, or the finger at rest the object.
-        """
-        model = super().assemble(design)
+    def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> tuple[Obstacle, ...]:
+        """Return the object in front of the finger."""
         kind = self.object if self.object != "any" else OBJECTS[min(int(design["object_kind"]), len(OBJECTS) - 1)]
-        contact = model.set_contact(
-            obstacles=[fixed_object(kind, self.width, design)],
-            self_contact=self.self_contact,
-            self_friction=self.self_friction,
-        )
-        crossing = contact.intersections(model.nodes)
-        if crossing:
-            raise InfeasibleDesign(f"at rest, {crossing}")
-        return model
+        return (fixed_object(kind, self.width, design),)
 
 
 class ContactAidedGripper(Robot):
@@ -134,6 +117,7 @@ class ContactAidedGripper(Robot):
         element: kind of element, instead of that of the mesh.
         self_contact: whether each zigzag touches itself and the other leg.
         gravity: acceleration [m/s2].
+        **options: options of `Robot`.
     """
 
     name = "contact_aided_gripper"
@@ -156,8 +140,9 @@ class ContactAidedGripper(Robot):
         element: str | None = None,
         self_contact: bool = True,
         gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+        **options: Any,
     ) -> None:
-        super().__init__(gravity=gravity)
+        super().__init__(gravity=gravity, self_contact=self_contact, **options)
         for name, value in {
             "clearance": clearance,
             **dict(zip(("box[0]", "box[1]", "box[2]"), box, strict=True)),
@@ -165,7 +150,7 @@ class ContactAidedGripper(Robot):
             if not 2.0 * ROUNDING < value < 0.2:
                 raise ValueError(f"robot '{self.name}': {name} = {value} m must be inside (0.002, 0.2)")
         self.finger = ContactAidedFinger(control_points=control_points, mesh=mesh, mesh_size=mesh_size, element=element)
-        self.clearance, self.box, self.self_contact = clearance, box, self_contact
+        self.clearance, self.box = clearance, box
         self.design_space = DesignSpace(
             *self.finger.design_space,
             DesignVariable("object_gap", 0.005, 0.030, 0.015, "m", "distance of each finger from the box, along x"),
@@ -187,7 +172,7 @@ class ContactAidedGripper(Robot):
         """Place both fingers, the table and the box, which rests on it.
 
         Raises:
-            InfeasibleDesign: if the outline of a finger crosses itself, or a finger at rest the box or the table.
+            InfeasibleDesign: if the outline of a finger crosses itself.
         """
         own = {name: design[name] for name in self.finger.design_space.names}
         mesh = self.finger.body(own)
@@ -210,16 +195,20 @@ class ContactAidedGripper(Robot):
         model.add("a", Slide("lift", table, np.array([0.0, 0.0, -1.0]), model.nodes))
         above_table = EmbeddedPoints.from_weights(np.array([[frame, table]]), np.array([[1.0, -1.0]]), model.nodes)
         model.add("e", Point("box", above_table))
-        # Fingers touch the prism below; the skin stays back further than their contact with it would reach.
+        # Fingers touch the prism of `own_obstacles`; they must not feel this skin as well, so it stays back further
+        # than contact between surfaces reaches.
         model.skins.append(box_skin(frame, (half - ROUNDING).tolist(), model.nodes))
-        friction = design["friction"]
-        surface = Plane((ROUNDING, 0.0, 0.0), (1.0, 0.0, 0.0), name="table", friction=friction, frame=table)
-        held = RoundedPrism.box(half.tolist(), ROUNDING, name="box", friction=friction, frame=frame)
-        contact = model.set_contact(obstacles=[surface, held], self_contact=self.self_contact)
-        crossing = contact.intersections(model.nodes)
-        if crossing:
-            raise InfeasibleDesign(f"at rest, {crossing}")
         return model
+
+    def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> tuple[Obstacle, ...]:
+        """Return the table and the box."""
+        box = len(model.nodes) - 4  # frames of four rows each: that of the table comes before that of the box
+        half, friction = [0.5 * length for length in self.box], design["friction"]
+        return (
+            # The skin of the box, on which the table acts, stands back from its faces.
+            Plane((ROUNDING, 0.0, 0.0), (1.0, 0.0, 0.0), name="table", friction=friction, frame=box - 4),
+            RoundedPrism.box(half, ROUNDING, name="box", friction=friction, frame=box),
+        )
 
 
 def _add_table(builder: ModelBuilder) -> int:

@@ -43,7 +43,8 @@ class ImageRenderer:
         state: State,
         path: np.ndarray,
         goal: np.ndarray,
-        distance: float | None = None,
+        *,
+        text: str | None = None,
     ) -> np.ndarray:
         """Return an image of a state, shape (height, width, 3) uint8.
 
@@ -54,7 +55,7 @@ class ImageRenderer:
             state: its state.
             path: all goals of the episode [m], shape (p, 3).
             goal: the current goal [m], shape (3,).
-            distance: distance to the goal as the task measures it [m]; default: Euclidean.
+            text: caption; default the Euclidean distance to the goal.
         """
         scene = self._open()
         model = self._shapes.load(design)
@@ -63,9 +64,7 @@ class ImageRenderer:
         scene.set_ghost(None)
         scene.set_state(x, state)
         scene.set_goal(np.asarray(goal), np.asarray(path))
-        if distance is None:
-            distance = float(np.linalg.norm(state.effector[0] - goal))
-        scene.set_text(f"distance {1e3 * distance:.1f} mm")
+        scene.set_text(text or f"distance {1e3 * float(np.linalg.norm(state.effector[0] - goal)):.1f} mm")
         return scene.image()
 
     def render_body(

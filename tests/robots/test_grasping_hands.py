@@ -58,7 +58,7 @@ def test_scene_does_not_change_the_body():
 
 def test_an_object_inside_the_finger_is_infeasible():
     wide = {"e1": 0.012, "e3": 0.006, "object_gap": 0.010} | {f"d{k}": 0.028 for k in range(12)}
-    with pytest.raises(InfeasibleDesign, match="at rest, the body is inside obstacle object"):
+    with pytest.raises(InfeasibleDesign, match="at rest: the body is inside obstacle object"):
         make_robot("grasping_finger", **COARSE).build(wide)
 
 
