@@ -59,7 +59,29 @@ class MeshRow:
     order: float = NAN
 
 
+@dataclass(frozen=True)
+class CheckedRow:
+    """One computed value that has a tolerance.
+
+    Args:
+        case: what is computed.
+        setting: mesh or parameters, in words.
+        value: computed.
+        reference: exact.
+        error: relative to the reference, or as the case says.
+        tolerance: of the error.
+    """
+
+    case: str
+    setting: str
+    value: float
+    reference: float
+    error: float
+    tolerance: float
+
+
 AnyRow = TypeVar("AnyRow", Row, MeshRow)
+LabelledRow = TypeVar("LabelledRow", Row, MeshRow, CheckedRow)
 
 
 def with_orders(rows: Sequence[AnyRow], floor: float = 0.0) -> list[AnyRow]:
@@ -77,7 +99,7 @@ def with_orders(rows: Sequence[AnyRow], floor: float = 0.0) -> list[AnyRow]:
     return result
 
 
-def as_results(rows: Sequence[AnyRow], *labels: str) -> dict[str, object]:
+def as_results(rows: Sequence[LabelledRow], *labels: str) -> dict[str, object]:
     """Return rows as plain data for JSON: the labels joined by ``|``, then the other fields; NaN becomes None."""
     return {
         " | ".join(getattr(row, label) for label in labels): {
