@@ -38,6 +38,8 @@ COMMANDS: dict[str, tuple[float, ...]] = {
     "tetrapod": (-0.5, 0.0, 0.5, 0.0),
     "two_finger_gripper": (0.7, 0.1, 0.1, 0.7),
     "three_finger_gripper": (0.35, 0.35, 0.35, 0.35, 0.35, 0.35),
+    "two_finger_friction_gripper": (0.3, 0.3, 0.3, 0.3),
+    "three_finger_friction_gripper": (0.35, 0.35, 0.2, 0.2, 0.2, 0.2),
 }
 WIDTH, HEIGHT = 800, 520
 FILMED = ("SoftGym/FingerTrack-v0", "SoftGym/DiamondTrack-v0", "SoftGym/TrunkTrack-v0")

@@ -1,4 +1,4 @@
-"""Surfaces of beams and rigid parts, for pictures and export; they do not affect the mechanics."""
+"""Surfaces of beams and rigid parts, for pictures, export and contact."""
 
 from __future__ import annotations
 
@@ -49,10 +49,26 @@ def tube_skin(beam: Beam, nodes: np.ndarray, outline: np.ndarray) -> Skin:
     return Skin(points, np.concatenate([sides, fan[:, ::-1], fan + end]))
 
 
-def box_skin(row: int, half_extents: Sequence[float], nodes: np.ndarray) -> Skin:
-    """A box about the origin of the frame at a row, with half extents [m] along its directors."""
-    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+def box_skin(row: int, half_extents: Sequence[float], nodes: np.ndarray, *, divisions: int = 1) -> Skin:
+    """Return a box about the origin of a frame.
+
+    Args:
+        row: first row of the frame.
+        half_extents: along its directors [m].
+        nodes: rest rows [m], shape (n, 3).
+        divisions: of each edge; obstacles touch the box at the vertices and the middles of its triangles.
+    """
+    steps = np.linspace(-1.0, 1.0, divisions + 1)
+    u, v = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
+    first = (np.arange(divisions)[:, None] * (divisions + 1) + np.arange(divisions)).ravel()
+    a, b, c, d = first, first + divisions + 1, first + divisions + 2, first + 1
+    face = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    corners, triangles = [], []
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            points = np.roll(np.column_stack([np.full(len(u), side), u, v]), axis, axis=1)
+            corners.append(points)
+            triangles.append((face if side > 0.0 else face[:, ::-1]) + (len(corners) - 1) * len(u))
+    signs, places = np.unique(np.concatenate(corners), axis=0, return_inverse=True)
     points = EmbeddedPoints.in_frame(row, signs * np.asarray(half_extents), nodes)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Skin(points, triangles, rigid=True)
+    return Skin(points, places.ravel()[np.concatenate(triangles)], rigid=True)

@@ -47,6 +47,8 @@ class FingerRobot(Robot):
     #: Range of the cables and their largest change in a control step [m].
     cable_range = (0.0, 0.020)
     cable_rate = 0.001
+    #: Nothing but contact holds the object.
+    holds_by_contact = False
     #: Without gravity, all efforts are proportional to Young's modulus.
     proportional_to_modulus = True
 
@@ -91,13 +93,18 @@ class FingerRobot(Robot):
         """Return the position of the rigid object [m], shape (3,), or None if there is none."""
         return None
 
+    def add_object(self, assembly: ModelBuilder, design: Mapping[str, float]) -> int | None:
+        """Add the rigid object and return the first row of its frame, or None if there is none."""
+        position = self.object_frame(design)
+        return None if position is None else assembly.add_frame(position)
+
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Place the fingers, route their cables, and tie them to the object."""
         names = self.finger.design_space.names
         self._shape = {name: design[name] for name in names}
         mesh = self.finger.body(self._shape)
         fixed = in_flange(mesh.nodes)
-        assembly = ModelBuilder(gravity=self.gravity)
+        assembly = ModelBuilder(gravity=self.gravity, floating=self.holds_by_contact)
         for turn, shift in self.placements:
             assembly.add_solid(
                 mesh.nodes @ turn.T + shift,
@@ -107,8 +114,7 @@ class FingerRobot(Robot):
                 young_modulus=design["young_modulus"],
                 poisson_ratio=design["poisson_ratio"],
             )
-        position = self.object_frame(design)
-        frame = None if position is None else assembly.add_frame(position)
+        frame = self.add_object(assembly, design)
         model = assembly.build()
         cables = iter(self.actuators)
         for k, (turn, shift) in enumerate(self.placements):

@@ -23,6 +23,8 @@ ROBOTS = Registry(
         "contact_aided_gripper": "softgym_envs.robots.grasping_hands:ContactAidedGripper",
         "press_finger": "softgym_envs.robots.grippers:PressFinger",
         "two_finger_gripper": "softgym_envs.robots.grippers:TwoFingerGripper",
+        "two_finger_friction_gripper": "softgym_envs.robots.friction_grippers:TwoFingerFrictionGripper",
+        "three_finger_friction_gripper": "softgym_envs.robots.friction_grippers:ThreeFingerFrictionGripper",
         "tetrapod": "softgym_envs.robots.tetrapod:Tetrapod",
         "three_finger_gripper": "softgym_envs.robots.grippers:ThreeFingerGripper",
     },
