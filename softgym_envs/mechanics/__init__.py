@@ -12,6 +12,11 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints as EmbeddedPoints
     from softgym_envs.mechanics.constraints.point import Point as Point
     from softgym_envs.mechanics.constraints.servo import Servo as Servo
+    from softgym_envs.mechanics.contact.obstacles import Cylinder as Cylinder
+    from softgym_envs.mechanics.contact.obstacles import MeshObstacle as MeshObstacle
+    from softgym_envs.mechanics.contact.obstacles import Plane as Plane
+    from softgym_envs.mechanics.contact.obstacles import RoundedPrism as RoundedPrism
+    from softgym_envs.mechanics.contact.obstacles import Sphere as Sphere
     from softgym_envs.mechanics.elements.beams import Section as Section
     from softgym_envs.mechanics.io import read_mesh as read_mesh
     from softgym_envs.mechanics.model import MechanicalModel as MechanicalModel
@@ -28,6 +33,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "constraints.embedding": ["EmbeddedPoints"],
         "constraints.point": ["Point"],
         "constraints.servo": ["Servo"],
+        "contact.obstacles": ["Cylinder", "MeshObstacle", "Plane", "RoundedPrism", "Sphere"],
         "elements.beams": ["Section"],
         "io": ["read_mesh"],
         "model": ["MechanicalModel"],

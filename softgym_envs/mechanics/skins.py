@@ -66,8 +66,7 @@ def box_skin(row: int, half_extents: Sequence[float], nodes: np.ndarray, *, divi
     corners, triangles = [], []
     for axis in range(3):
         for side in (-1.0, 1.0):
-            points = np.roll(np.column_stack([np.full(len(u), side), u, v]), axis, axis=1)
-            corners.append(points)
+            corners.append(np.roll(np.column_stack([np.full(len(u), side), u, v]), axis, axis=1))
             triangles.append((face if side > 0.0 else face[:, ::-1]) + (len(corners) - 1) * len(u))
     signs, places = np.unique(np.concatenate(corners), axis=0, return_inverse=True)
     points = EmbeddedPoints.in_frame(row, signs * np.asarray(half_extents), nodes)

@@ -67,8 +67,8 @@ class FrictionGripper(FingerRobot):
         self.stand_friction = float(stand_friction)
         super().__init__(gravity=gravity, **options)
 
-    def half_extents_of(self, design: Mapping[str, float]) -> np.ndarray:
-        """Return half the size of the object [m], shape (3,)."""
+    def half_extents_of(self, design: Mapping[str, float]) -> tuple[float, float, float]:
+        """Return half the size of the object [m]."""
         raise NotImplementedError
 
     def object_frame(self, design: Mapping[str, float]) -> np.ndarray:
@@ -76,7 +76,9 @@ class FrictionGripper(FingerRobot):
 
     def add_object(self, assembly: ModelBuilder, design: Mapping[str, float]) -> int:
         frame = assembly.add_frame(self.object_frame(design))
-        assembly.add_mass(frame, self.object_mass, box_inertia(self.object_mass, self.half_extents_of(design)))
+        assembly.add_mass(
+            frame, self.object_mass, box_inertia(self.object_mass, np.array(self.half_extents_of(design)))
+        )
         return frame
 
     def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
@@ -89,11 +91,13 @@ class FrictionGripper(FingerRobot):
     def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> list[Obstacle]:
         """Return the object, which moves with its frame, and the stand below it."""
         half = self.half_extents_of(design)
-        below = half - [INSET, INSET, 0.0]
-        below[2] = 0.5 * STAND_HEIGHT
         top = self.object_rest(design) - [0.0, 0.0, half[2] + 0.9 * self.contact_distance]
         stand = RoundedPrism.box(
-            below, ROUNDING, centre=top - [0.0, 0.0, below[2]], name="stand", friction=self.stand_friction
+            (half[0] - INSET, half[1] - INSET, 0.5 * STAND_HEIGHT),
+            ROUNDING,
+            centre=(top - [0.0, 0.0, 0.5 * STAND_HEIGHT]).tolist(),
+            name="stand",
+            friction=self.stand_friction,
         )
         held = RoundedPrism.box(half, ROUNDING, name=self.effectors[0], friction=self.friction, frame=self._frame)
         return [held, stand]
@@ -121,8 +125,8 @@ class TwoFingerFrictionGripper(FrictionGripper):
         """Middle of the bar, between the last segments."""
         return np.array([0.0, 0.040, -2.5 * design["length"]])
 
-    def half_extents_of(self, design: Mapping[str, float]) -> np.ndarray:
-        return np.array([self.half_width, 0.5 * design["bar_length"], self.half_width])
+    def half_extents_of(self, design: Mapping[str, float]) -> tuple[float, float, float]:
+        return self.half_width, 0.5 * design["bar_length"], self.half_width
 
 
 class ThreeFingerFrictionGripper(FrictionGripper, ThreeFingerGripper):
@@ -133,5 +137,5 @@ class ThreeFingerFrictionGripper(FrictionGripper, ThreeFingerGripper):
 
     name = "three_finger_friction_gripper"
 
-    def half_extents_of(self, design: Mapping[str, float]) -> np.ndarray:
-        return np.array(self.half_extents)
+    def half_extents_of(self, design: Mapping[str, float]) -> tuple[float, float, float]:
+        return self.half_extents
