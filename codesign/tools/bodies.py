@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from codesign.tools.grasps import GraspConfig
 from codesign.tools.metrics import Course, Metric, find_metrics
 from codesign.variables import split_values
 from softgym_envs.backends.backend import State
@@ -17,6 +18,8 @@ from softgym_envs.backends.registry import make_backend
 from softgym_envs.errors import ConfigError
 from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.robots.base import Robot
+from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
+from softgym_envs.robots.grasping import Grasp
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import TorchModel
 from softgym_envs.surrogate.pretrained import pretrained_model
@@ -43,10 +46,12 @@ def check_metrics(robot: Robot, metrics: Sequence[str | Metric], backend: str) -
     if not found:
         raise ConfigError("name at least one metric")
     for metric in found:
-        if metric.needs in ("body", "sensors") and backend != "fem":
+        if metric.needs in ("body", "sensors", "grasps") and backend != "fem":
             raise ConfigError(f"metric '{metric.name}' needs backend 'fem', got '{backend}'")
         if metric.needs == "sensors" and not hasattr(robot, "cavities"):
             raise ConfigError(f"metric '{metric.name}' needs a robot with sensing cavities, got '{robot.name}'")
+        if metric.needs == "grasps" and not isinstance(robot, ContactAidedFinger):
+            raise ConfigError(f"metric '{metric.name}' needs robot 'contact_aided_finger', got '{robot.name}'")
     return found
 
 
@@ -66,6 +71,7 @@ class Evaluator:
         steps: states beyond rest along the actuation, evenly spaced.
         weights: folder of the surrogate's weights; default: the pretrained ones.
         make_robot: needed for designs that contain robot options.
+        grasps: over which metrics of grasps are averaged.
 
     Raises:
         ConfigError: for an unknown metric, one that the backend or the robot does not provide, or a malformed command.
@@ -81,6 +87,7 @@ class Evaluator:
         steps: int = 1,
         weights: str | Path | None = None,
         make_robot: RobotMaker | None = None,
+        grasps: Sequence[GraspConfig] = (GraspConfig(),),
     ) -> None:
         self.metrics = check_metrics(robot, metrics, backend)
         self.robot = robot
@@ -88,15 +95,13 @@ class Evaluator:
         self.steps = steps
         self.backend = backend
         self._backend_options = {"weights": weights} if backend == "surrogate" else {}
+        self.grasps = tuple(grasps)
         self._make_robot = make_robot
         self._options: dict[str, float] = {}
 
     def course(self, design: Mapping[str, float]) -> Course:
         """Return the states of one design; raises `InfeasibleDesign` and `ConvergenceError`."""
-        variables, options = split_values(design)
-        if options != self._options:
-            assert self._make_robot is not None
-            self.robot, self._options = self._make_robot(options), options
+        variables = self._choose_robot(design)
         # A backend keeps its body in memory, so every design gets a new one.
         backend = make_backend(self.backend, self.robot, design=variables, **self._backend_options)
         states = [backend.state]
@@ -118,13 +123,33 @@ class Evaluator:
         )
 
     def __call__(self, design: Mapping[str, float]) -> dict[str, float]:
-        """Return the metrics of a complete design by name [SI]; raises as `course`."""
-        from_states = any(metric.needs != "design" for metric in self.metrics)
-        course = self.course(design) if from_states else None
-        return {
-            metric.name: float(metric(dict(design)) if metric.needs == "design" else metric(course)[0])
-            for metric in self.metrics
-        }
+        """Return the metrics of a complete design by name [SI]; raises as `course` and `close`."""
+        needs = {metric.needs for metric in self.metrics}
+        course = self.course(design) if needs - {"design", "grasps"} else None
+        grasps = self.close(design) if "grasps" in needs else []
+        values = {}
+        for metric in self.metrics:
+            if metric.needs == "design":
+                values[metric.name] = float(metric(dict(design)))
+            elif metric.needs == "grasps":
+                values[metric.name] = float(np.mean([metric(each) for each in grasps]))
+            else:
+                values[metric.name] = float(metric(course)[0])
+        return values
+
+    def close(self, design: Mapping[str, float]) -> list[Grasp]:
+        """Return all grasps of a complete design; raises `InfeasibleDesign` and `ConvergenceError`."""
+        variables = self._choose_robot(design)
+        assert isinstance(self.robot, ContactAidedFinger)
+        return [config.evaluate(self.robot, variables) for config in self.grasps]
+
+    def _choose_robot(self, design: Mapping[str, float]) -> dict[str, float]:
+        """Make the robot with the options of a design, and return the values of its variables."""
+        variables, options = split_values(design)
+        if options != self._options:
+            assert self._make_robot is not None
+            self.robot, self._options = self._make_robot(options), options
+        return variables
 
 
 def _stack(arrays: list[np.ndarray]) -> Tensor:

@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from codesign.sampling import SamplerConfig
 from codesign.tools.bodies import Evaluator, LearnedBodies, check_metrics, full_command
 from codesign.tools.box import Box
+from codesign.tools.grasps import GraspConfig
 from codesign.tools.metrics import METRICS, Metric, find_metric
 from codesign.tools.nuisance import ContactConfig, OffsetConfig, check_nuisances
 from codesign.variables import OptionRange, change_options
@@ -77,6 +78,9 @@ class BodiesConfig(RobotConfig):
         default=None, description="full command: a displacement per actuator; default half of their upper limits"
     )
     steps: int = Field(default=1, ge=1, description="states beyond rest along the actuation")
+    grasps: tuple[GraspConfig, ...] = Field(
+        default=(GraspConfig(),), min_length=1, description="over which metrics of grasps are averaged"
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> BodiesConfig:
@@ -99,6 +103,7 @@ class BodiesConfig(RobotConfig):
             steps=self.steps,
             weights=self.weights if backend == "surrogate" else None,
             make_robot=self.make_robot,
+            grasps=self.grasps,
         )
 
     def learned(self, metrics: tuple[str, ...]) -> LearnedBodies:

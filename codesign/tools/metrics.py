@@ -9,15 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from softgym_envs.errors import unknown_name
 from softgym_envs.registry import import_object
+from softgym_envs.robots.grasping import Grasp
 
 Direction = Literal["maximize", "minimize"]
+Needs = Literal["states", "body", "sensors", "grasps", "design"]
 
 
 @dataclass(frozen=True)
@@ -147,17 +149,34 @@ def cavity_volume(course: Course) -> Tensor:
     return course.sensor[0, :, 0]
 
 
+def grip_force(grasp: Grasp) -> float:
+    """Return the largest force on the object along x (thesis, eq. 3.10)."""
+    return grasp.contact_force
+
+
+def grip_resistance(grasp: Grasp) -> float:
+    """Return the smallest torque per force on the object (thesis, eq. 3.11)."""
+    return grasp.grasp_resistance
+
+
+def grip_energy(grasp: Grasp) -> float:
+    """Return the sum of torque times angle over all angles (thesis, eq. 3.13)."""
+    return grasp.grasp_energy
+
+
 @dataclass(frozen=True)
 class Metric:
     """One number of a body.
 
     Args:
         name: identifier, as in configurations and tables.
-        function: ``Course -> values`` of shape (B,); with ``needs="design"``, ``{variable: value} -> value``.
+        function: ``Course -> values`` of shape (B,); with ``needs="design"``, ``{variable: value} -> value``; with
+            ``needs="grasps"``, ``Grasp -> value``, of which the mean over all grasps is taken.
         unit: SI unit, or ``"1"``.
         direction: what a designer usually wants: ``"maximize"`` or ``"minimize"``.
         needs: ``"states"``: any backend; ``"body"``: a meshed body, on FEM; ``"sensors"``: sensing cavities, on
-            FEM; ``"design"``: the values of the variables alone.
+            FEM; ``"grasps"``: a contact-aided finger that closes on objects, on FEM; ``"design"``: the values of the
+            variables alone.
         description: one line for tables; default: the first line of the function's documentation.
     """
 
@@ -165,14 +184,14 @@ class Metric:
     function: Callable[[Any], Any]
     unit: str
     direction: Direction
-    needs: Literal["states", "body", "sensors", "design"] = "states"
+    needs: Needs = "states"
     description: str = ""
 
     def __post_init__(self) -> None:
         if self.direction not in ("maximize", "minimize"):
             raise ValueError(f"metric '{self.name}': direction = {self.direction!r}; allowed: maximize, minimize")
-        if self.needs not in ("states", "body", "sensors", "design"):
-            raise ValueError(f"metric '{self.name}': needs = {self.needs!r}; allowed: states, body, sensors, design")
+        if self.needs not in get_args(Needs):
+            raise ValueError(f"metric '{self.name}': needs = {self.needs!r}; allowed: {', '.join(get_args(Needs))}")
         if not self.description:
             object.__setattr__(self, "description", (self.function.__doc__ or self.name).splitlines()[0])
 
@@ -216,6 +235,9 @@ METRICS: dict[str, Metric] = {
         Metric("volume_change", volume_change, "m3", "maximize", needs="sensors"),
         Metric("relative_volume_change", relative_volume_change, "1", "maximize", needs="sensors"),
         Metric("cavity_volume", cavity_volume, "m3", "maximize", needs="sensors"),
+        Metric("grip_force", grip_force, "N", "maximize", needs="grasps"),
+        Metric("grip_resistance", grip_resistance, "m", "minimize", needs="grasps"),
+        Metric("grip_energy", grip_energy, "N m", "minimize", needs="grasps"),
     )
 }
 """Metrics of the suite by name."""

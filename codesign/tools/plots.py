@@ -89,29 +89,31 @@ def draw_front(
     front: np.ndarray,
     references: Mapping[str, Sequence[float]] | None = None,
 ) -> None:
-    """Draw all evaluated designs with the Pareto front of the first two metrics; for one metric, all its values.
+    """Draw all evaluated designs and the front: the first metric against each other one, or all values of a single one.
 
     The values [SI] have the shape (n, m), in the order of evaluation, ``front`` has indices into them, and
     ``references`` has metrics [SI] of designs to compare with, by name.
     """
     scale = np.array([metric.display_scale for metric in metrics])
     shown = scale * values
-    with figure(path, width=6.0, height=4.4) as (axis,):
+    with figure(path, max(1, len(metrics) - 1), width=6.0, height=4.4) as axes:
         if len(metrics) == 1:
-            axis.scatter(np.arange(len(shown)), shown[:, 0], s=7, color=MUTED)
-            axis.scatter(front, shown[front, 0], s=36, color=WINNER, label="best")
-            axis.set_xlabel("evaluation")
-            axis.set_ylabel(metrics[0].label)
+            axes[0].scatter(np.arange(len(shown)), shown[:, 0], s=7, color=MUTED)
+            axes[0].scatter(front, shown[front, 0], s=36, color=WINNER, label="best")
+            axes[0].set_xlabel("evaluation")
+            axes[0].set_ylabel(metrics[0].label)
         else:
-            axis.scatter(shown[:, 0], shown[:, 1], s=7, color=MUTED, label=f"{len(shown)} designs")
-            axis.scatter(shown[front, 0], shown[front, 1], s=16, color=WINNER, label=f"front, {len(front)} designs")
-            for name, point in (references or {}).items():
-                x, y = scale[:2] * point[:2]
-                axis.scatter(x, y, s=50, marker="D", color=BASELINE, zorder=3)
-                axis.annotate(name, (x, y), xytext=(6, 5), textcoords="offset points")
-            axis.set_xlabel(metrics[0].label)
-            axis.set_ylabel(metrics[1].label)
-        axis.legend()
+            for k, axis in enumerate(axes, start=1):
+                x, y = shown[:, 0], shown[:, k]
+                axis.scatter(x, y, s=7, color=MUTED, label=f"{len(shown)} designs")
+                axis.scatter(x[front], y[front], s=16, color=WINNER, label=f"front, {len(front)} designs")
+                for name, point in (references or {}).items():
+                    place = (scale[0] * point[0], scale[k] * point[k])
+                    axis.scatter(*place, s=50, marker="D", color=BASELINE, zorder=3)
+                    axis.annotate(name, place, xytext=(6, 5), textcoords="offset points")
+                axis.set_xlabel(metrics[0].label)
+                axis.set_ylabel(metrics[k].label)
+        axes[0].legend()
 
 
 def draw_sensitivity(

@@ -91,6 +91,17 @@ def test_bodies_as_files_in_millimetres(name, tmp_path, occ):
     assert volume(occ, entities) == pytest.approx(1e9 * enclosed_volume(mesh.nodes, mesh.surface()), rel=0.005)
 
 
+@pytest.mark.parametrize("mesh", ["published", "accurate"])
+def test_files_of_a_printed_finger_have_its_exact_shape(mesh, tmp_path, occ):
+    """The outline has flat sides only, so no mesh cuts it."""
+    robot = make_robot("contact_aided_finger", mesh=mesh, control_points=7)
+    x, y = 1e3 * robot.outline(robot.design_space.baseline).T
+    exact = 20.0 * 0.5 * abs(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+    assert check_closed(read_stl(export_body(robot, tmp_path / "body.stl"))) == pytest.approx(exact, rel=1e-5)
+    entities = occ.importShapes(str(export_body(robot, tmp_path / "body.step")))
+    assert volume(occ, entities) == pytest.approx(exact, rel=1e-9)
+
+
 def test_designs_change_the_files(tmp_path):
     robot = make_robot("finger")
     corners = read_stl(export_body(robot, tmp_path / "body.stl", {"length": 0.042}))
