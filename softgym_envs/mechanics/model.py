@@ -344,7 +344,7 @@ class MechanicalModel:
             self_friction: coefficient of friction between them.
             excluded: rows whose triangles touch nothing, e.g. nodes clamped inside a mount that is not modelled.
             distance: gap below which there are forces [m]. It must be smaller than the thinnest wall.
-            stiffness: of the barrier [Pa], about the pressure at 0.4 of the distance; default a tenth of the largest
+            stiffness: of the barrier [Pa], about the pressure at 0.8 of the distance; default a tenth of the largest
                 Young's modulus of the body. It is never adapted to the load.
             stick: stiffness of friction before sliding, per area [Pa/m]; default 5 ``stiffness / distance``.
 
