@@ -36,12 +36,15 @@ class InverseQPAgent:
 
     def __init__(self) -> None:
         self._controllers: WeakKeyDictionary[Any, InverseQP] = WeakKeyDictionary()
+        self._forces = ForceGrasp()
 
     def __call__(self, observation: Any, env: Any) -> np.ndarray:
         """Return the action in the state of ``env``, shape (n_a,); the command is held if the QP finds no solution.
 
-        A state in which no actuator is commanded begins an episode.
+        A state in which no actuator is commanded begins an episode. For tasks with forces, this is `ForceGrasp`.
         """
+        if env.task.needs_state:
+            return self._forces(observation, env)
         present = env.state.command
         if env not in self._controllers or not present.any():
             self._begin(env)
@@ -223,7 +226,8 @@ def make_baseline(name: str, seed: int = 0) -> Agent:
 
     Args:
         name: ``"qp"``: inverse QP on the condensed model of the plant's present state, in dynamics of its next time
-            step; ``"qp_static"``: on the static equilibrium under the present command, without momentum;
+            step, and for forces ``"force"``; ``"qp_static"``: on the static equilibrium under the present command,
+            without momentum;
             ``"qp_model"``: on the surrogate, whatever the plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI
             controller on the measured effector; ``"close"``: closing a hand without measuring anything; ``"force"``:
             control of the measured contact forces; ``"random"``: uniform actions.

@@ -18,16 +18,14 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.constraints.slide import Slide
-from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane, RoundedPrism, Sphere
+from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane, RoundedPrism
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
-
-OBJECTS = ("plane", "hexagon", "cylinder", "sphere")
-"""Kinds of objects that a finger closes on."""
+from softgym_envs.robots.grasping import KINDS, GraspObject
 
 ROUNDING = 1.0e-3
 """Radius of the edges of prisms [m]."""
@@ -39,33 +37,12 @@ UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Turns a finger so that it points down (-z) and closes along +x."""
 
 
-def fixed_object(kind: str, face: float, scene: Mapping[str, float], *, half_length: float = 0.05) -> Obstacle:
-    """Return an object that stands still in front of a finger.
-
-    Args:
-        kind: one of `OBJECTS`. Axes of hexagons and cylinders are along z; a flat of a hexagon faces the finger.
-        face: x of the outer side of the finger's foot [m].
-        scene: ``object_gap``: distance of the object from there, along x; ``friction``; for all kinds but planes also
-            ``object_height``: y of its middle, and ``object_size``: its width along x [m].
-        half_length: half the length of a hexagonal prism [m].
-    """
-    x, friction = face + scene["object_gap"], scene["friction"]
-    if kind == "plane":
-        return Plane((x, 0.0, 0.0), (-1.0, 0.0, 0.0), name="object", friction=friction)
-    radius = 0.5 * scene["object_size"]
-    centre = (x + radius, scene["object_height"], 0.0)
-    if kind == "sphere":
-        return Sphere(centre, radius, name="object", friction=friction)
-    if kind == "cylinder":
-        return Cylinder(centre, (0.0, 0.0, 1.0), radius, name="object", friction=friction)
-    return RoundedPrism.hexagonal(2.0 * radius, half_length, ROUNDING, centre=centre, name="object", friction=friction)
-
-
 class GraspingFinger(ContactAidedFinger):
     """A contact-aided finger that closes on an object that stands still (thesis, sec. 3.4).
 
     Args:
-        object: ``"plane"``, ``"hexagon"``, ``"cylinder"``, ``"sphere"``, or ``"any"``, which makes the kind a variable.
+        object: a kind of `GraspObject`: ``"plane"``, ``"hexagon"``, ``"horizontal_hexagon"`` or ``"sphere"``; or
+            ``"any"``, which makes the kind a variable.
         self_contact: whether the zigzag touches itself and the other leg.
         **options: options of `ContactAidedFinger`.
     """
@@ -73,8 +50,8 @@ class GraspingFinger(ContactAidedFinger):
     name = "grasping_finger"
 
     def __init__(self, *, object: str = "plane", self_contact: bool = True, **options: Any) -> None:
-        if object not in (*OBJECTS, "any"):
-            raise ValueError(f"object = {object!r} is unknown; allowed: {', '.join(OBJECTS)}, any")
+        if object not in (*KINDS, "any"):
+            raise ValueError(f"object = {object!r} is unknown; allowed: {', '.join(KINDS)}, any")
         super().__init__(self_contact=self_contact, **options)
         self.object = object
         scene = [
@@ -83,11 +60,11 @@ class GraspingFinger(ContactAidedFinger):
         ]
         if object != "plane":
             scene.append(
-                DesignVariable("object_height", 0.040, 0.100, 0.070, "m", "middle of the object above the foot")
+                DesignVariable("object_height", 0.030, 0.100, 0.050, "m", "middle of the object above the foot")
             )
             scene.append(DesignVariable("object_size", 0.030, 0.080, 0.060, "m", "width of the object along x"))
         if object == "any":
-            kinds = ", ".join(f"{k} {kind}" for k, kind in enumerate(OBJECTS))
+            kinds = ", ".join(f"{k} {kind}" for k, kind in enumerate(KINDS))
             scene.append(DesignVariable("object_kind", 0.0, 4.0, 0.0, "1", f"rounded down: {kinds}"))
         self.scene = tuple(variable.name for variable in scene)
         self.design_space = DesignSpace(*self.design_space, *scene)
@@ -98,8 +75,11 @@ class GraspingFinger(ContactAidedFinger):
 
     def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> tuple[Obstacle, ...]:
         """Return the object in front of the finger."""
-        kind = self.object if self.object != "any" else OBJECTS[min(int(design["object_kind"]), len(OBJECTS) - 1)]
-        return (fixed_object(kind, self.width, design),)
+        kind = self.object if self.object != "any" else KINDS[min(int(design["object_kind"]), len(KINDS) - 1)]
+        place = {"distance": design["object_gap"], "friction": design["friction"]}
+        if self.object != "plane":
+            place |= {"height": design["object_height"], "size": design["object_size"]}
+        return (GraspObject(kind, **place).obstacle(self.width),)
 
 
 class ContactAidedGripper(Robot):

@@ -61,7 +61,7 @@ def test_force_control_reaches_the_wanted_force():
     """On another object than the baseline, with the contact of the finite-element model."""
     env = gymnasium.make(
         "SoftGym/FingerGrasp-v0",
-        robot_options=COARSE | {"object": "cylinder"},
+        robot_options=COARSE | {"object": "horizontal_hexagon"},
         design={"friction": 0.4, "object_gap": 0.020},
     )
     infos = episode(env, make_baseline("force"), 25, options={"goal": (0.8, 0.0, 0.0)})
