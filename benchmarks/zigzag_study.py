@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +29,9 @@ from softgym_envs.storage import JsonLines, read_json, write_json
 
 MESHES: dict[str, dict[str, Any]] = {
     "published": {"mesh": "published"},
-    "search": {"mesh": "accurate", "mesh_size": 20e-3},
     "accurate": {"mesh": "accurate", "mesh_size": 12e-3},
 }
-"""Options of the robot. The coarse quadratic mesh is that on which the search may run."""
+"""Options of the robot."""
 
 OBJECTIVES = {"grip_force": "maximize", "grip_energy": "minimize", "grip_resistance": "minimize"}
 
@@ -82,15 +81,18 @@ def evaluate(name: str, design: Mapping[str, float], mesh: str) -> Value:
 
 
 def evaluate_all(designs: Mapping[str, Mapping[str, float]], path: Path) -> list[Value]:
-    """Evaluate designs on all meshes; values that a file of JSON lines holds are not computed again."""
+    """Evaluate designs on all meshes, each once; values that a file of JSON lines holds are not computed again."""
     lines = JsonLines(path)
     known = {(value.design, value.mesh): value for value in (Value(**record) for record in lines.read())}
-    for name, design in designs.items():
+    space = ContactAidedFinger().design_space
+    complete = {name: tuple(space.complete(design).values()) for name, design in designs.items()}
+    first = {name: next(other for other in designs if complete[other] == complete[name]) for name in designs}
+    for name in dict.fromkeys(first.values()):
         for mesh in MESHES:
             if (name, mesh) not in known:
-                known[name, mesh] = evaluate(name, design, mesh)
+                known[name, mesh] = evaluate(name, designs[name], mesh)
                 lines.append(asdict(known[name, mesh]))
-    return [known[name, mesh] for name in designs for mesh in MESHES]
+    return [replace(known[first[name], mesh], design=name) for name in designs for mesh in MESHES]
 
 
 def draw(path: Path, all_designs: np.ndarray, values: Sequence[Value], shapes: Mapping[str, np.ndarray]) -> None:

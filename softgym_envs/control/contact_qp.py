@@ -65,9 +65,8 @@ class ContactQP(InverseQP):
 
     The energy terms of the objective include the contact forces: ``(effort, f)^T W (effort, f)``.
 
-    Friction: the model of `Statics.contact_model` holds the friction forces of its state. So the result is right where
-    nothing changes any more, and friction that follows the step counts in the next one. `ContactControl` corrects the
-    changes of forces for it.
+    Friction: the linear model holds the friction forces of its state. Tangential forces of contacts that stick or slide
+    are therefore right at the state and follow with a delay of one step. Step sizes decide how far this is wrong.
 
     The problem has one local optimum for each set of closed contacts, and the best of them is found by branch and bound
     (`solve_qpcc`). A condensed model without contacts gives the result of `InverseQP`.
@@ -130,40 +129,20 @@ class ContactQP(InverseQP):
         self.displacement, self.opening, self.effector = moved[:a], moved[a : a + c], moved[a + c :]
         return self.command(limits)
 
-    def error(
-        self,
-        condensed: CondensedModel,
-        goal: np.ndarray | None,
-        forces: Sequence[ForceGoal] = (),
-        *,
-        reference: CondensedModel | None = None,
-    ) -> float:
+    def error(self, condensed: CondensedModel, goal: np.ndarray | None, forces: Sequence[ForceGoal] = ()) -> float:
         """Return the root of the weighted sum of squared errors of effectors and forces at a state [m].
-
-        Args:
-            condensed: model at the state.
-            goal: see `solve`.
-            forces: see `solve`.
-            reference: model whose compliance turns errors of forces into lengths, by default the same. Errors of
-                several states can be compared if their reference is the same.
 
         Raises:
             ValueError: as `solve`.
         """
         wanted, _, root = self._wanted(condensed, goal, condensed.delta.a)
-        W, delta = _blocks(condensed if reference is None else reference)[0], _blocks(condensed)[1]
+        W, delta = _blocks(condensed)
         errors = [root * (condensed.delta.e - wanted)]
         before = _efforts(condensed)
         for force in forces:
-            _, value, width = _force_error(force, self.contact_names(condensed), len(self.rates), W, delta, before)
+            _, value, width = _force_error(force, _contact_names(condensed), len(self.rates), W, delta, before)
             errors.append(np.array([min(value, 0.0) + max(value - width, 0.0)]))
         return float(np.linalg.norm(np.concatenate(errors)))
-
-    @staticmethod
-    def contact_names(condensed: CondensedModel) -> list[str]:
-        """Return the names of the contacts of a model."""
-        slices = condensed.slices
-        return [row.name for row in condensed.labels[slices["c"]]] if "c" in slices else []
 
     def _wanted(
         self, condensed: CondensedModel, goal: np.ndarray | None, command: np.ndarray
@@ -213,7 +192,7 @@ class ContactQP(InverseQP):
         # Errors are linear in the changes of actuator efforts, the contact forces, and the excess over lower limits.
         errors = [root[:, None] * W[n:, :n]]
         offsets = [root * (delta[n:] - wanted)]
-        names = self.contact_names(condensed)
+        names = _contact_names(condensed)
         excess = np.zeros(len(forces))
         columns = np.zeros((wanted.size + len(forces), len(forces)))
         for number, force in enumerate(forces):
@@ -276,6 +255,11 @@ def _blocks(condensed: CondensedModel) -> tuple[np.ndarray, np.ndarray]:
 def _efforts(condensed: CondensedModel) -> np.ndarray:
     """Efforts of actuators and contacts, in this order."""
     return np.concatenate([condensed.effort[condensed.slices[r]] for r in "ac" if r in condensed.slices])
+
+
+def _contact_names(condensed: CondensedModel) -> list[str]:
+    slices = condensed.slices
+    return [row.name for row in condensed.labels[slices["c"]]] if "c" in slices else []
 
 
 def _force_error(
