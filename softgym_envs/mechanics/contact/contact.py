@@ -112,7 +112,8 @@ class Contact:
 
     Args:
         surface: of the model.
-        obstacles: what the model touches, each with its coefficient of friction.
+        obstacles: what the model touches, each with its coefficient of friction. With self-contact, an obstacle on a
+            frame stands for the skin of that frame, which then touches no other surface.
         self_contact: whether the surfaces of the model touch each other.
         self_friction: coefficient of friction between them.
         distance: gap below which there are forces [m]. It must be smaller than the thinnest wall.
@@ -120,7 +121,8 @@ class Contact:
         stick: stiffness of friction before sliding, per area [Pa/m]; default 5 ``stiffness / distance``.
 
     Raises:
-        ValueError: for a value that is not positive.
+        ValueError: for a value that is not positive, or if a skin has to touch a meshed obstacle itself, because an
+            obstacle without a mesh stands for it in self-contact.
     """
 
     def __init__(
@@ -152,7 +154,14 @@ class Contact:
         self.stiffness = float(stiffness)
         self.stick = float(stick)
         self.surface = surface
-        self.surfaces = surface_set(surface, self.meshes, self.self_contact)
+        frames = [each.frame for each in self.obstacles if each.frame is not None]
+        self.surfaces = surface_set(surface, self.meshes, self.self_contact, frames)
+        for each in self.obstacles if self_contact and self.meshes else ():
+            if not isinstance(each, MeshObstacle) and not self.not_carried(each).all():
+                raise ValueError(
+                    f"obstacle '{each.name}' stands for the skin of its frame in self-contact and cannot touch meshed "
+                    "obstacles: make it a MeshObstacle, or leave self-contact out"
+                )
 
     @property
     def meshes(self) -> tuple[MeshObstacle, ...]:

@@ -124,25 +124,32 @@ class SurfaceSet:
         return self.weights @ x + self.offset
 
 
-def surface_set(surface: Surface, obstacles: Sequence[MeshObstacle], self_contact: bool) -> SurfaceSet:
+def surface_set(
+    surface: Surface, obstacles: Sequence[MeshObstacle], self_contact: bool, represented: Sequence[int] = ()
+) -> SurfaceSet:
     """Return the surface of a model together with meshed obstacles.
 
-    Obstacles that stand still do not touch each other; nor do obstacles and parts on one frame.
+    Obstacles that stand still do not touch each other, nor do those on one frame. A meshed obstacle stands for the
+    skin of its frame.
 
     Args:
         surface: of the model.
         obstacles: the meshed obstacles.
         self_contact: whether the surface of the model touches itself.
+        represented: first rows of frames with other obstacles, which stand for the skins of these frames in contact of
+            the model with itself.
     """
-    count, n = surface.weights.shape
-    weights, offset, triangles = [surface.weights], [np.zeros((count, 3))], [surface.triangles]
+    n = surface.weights.shape[1]
+    kept = np.ones(len(surface.rest), dtype=bool)
+    frames = sorted({each.frame for each in obstacles if each.frame is not None})
+    for frame in [*frames, *(represented if self_contact else ())]:
+        kept &= np.diff(surface.weights[:, frame : frame + 4].tocsr().indptr) == 0
+    own = surface.weights[np.flatnonzero(kept)]
+    faces = (np.cumsum(kept) - 1)[surface.triangles[kept[surface.triangles].all(axis=1)]]
+    count = own.shape[0]
+    weights, offset, triangles = [own], [np.zeros((count, 3))], [faces]
     friction, owner = [np.full(count, np.nan)], [np.full(count, -1)]
     groups = [np.full(count, -1 if self_contact else 0)]
-    frames = sorted({each.frame for each in obstacles if each.frame is not None})
-    if self_contact:
-        for number, frame in enumerate(frames):
-            carried = np.diff(surface.weights[:, frame : frame + 4].tocsr().indptr) > 0
-            groups[0][carried] = 2 + number
     start = count
     for number, each in enumerate(obstacles):
         vertices, faces = each.skin()

@@ -10,7 +10,8 @@ from scipy.sparse import csc_matrix
 
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactState
-from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Plane
+from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Plane, RoundedPrism
+from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -185,3 +186,44 @@ def test_nothing_passes_through_a_thin_mesh(rng):
     assert model.contact.intersections(model.nodes - [0.0, 0.0, 0.005]) == (
         "surfaces of the body cross each other or a meshed obstacle"
     )
+
+
+def box_on_a_block(shape, *, self_contact, obstacles=()):
+    """A free rigid box with a skin, which an obstacle stands for, on a soft block."""
+    nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (4, 4, 2))
+    builder = ModelBuilder(floating=True, gravity=(0.0, 0.0, -9.81))
+    builder.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] == 0.0, young_modulus=1e5, poisson_ratio=0.4)
+    half = (0.006, 0.005, 0.004)
+    frame = builder.add_frame((0.01, 0.01, 0.01 + half[2] + 3e-4))
+    builder.add_mass(frame, 0.02, box_inertia(0.02, np.array(half)))
+    model = builder.build()
+    model.skins.append(box_skin(frame, half, model.nodes))
+    model.set_contact(obstacles=[shape(half, frame), *obstacles], self_contact=self_contact, distance=4e-4)
+    return model
+
+
+@pytest.mark.parametrize("meshed", [False, True], ids=["prism", "mesh"])
+def test_a_skin_does_not_touch_beside_the_obstacle_that_stands_for_it(meshed):
+    """Self-contact changes nothing: all forces are those of the obstacle, with its friction."""
+
+    def shape(half, frame):
+        if meshed:
+            return mesh_box(half, (2, 2, 2), frame=frame, friction=0.5)
+        return RoundedPrism.box(half, 1e-3, frame=frame, friction=0.5)
+
+    gradients = []
+    for self_contact in (False, True):
+        model = box_on_a_block(shape, self_contact=self_contact)
+        state = ContactState(model.contact, model.kinematics, model.nodes)
+        gradients.append(state.evaluate(model.nodes).gradient)
+    assert np.abs(gradients[0]).max() > 1e-3
+    np.testing.assert_allclose(gradients[1], gradients[0], atol=1e-12)
+
+
+def test_a_prism_that_cannot_touch_a_mesh_is_refused():
+    def shape(half, frame):
+        return RoundedPrism.box(half, 1e-3, frame=frame, name="box")
+
+    assert box_on_a_block(shape, self_contact=False, obstacles=[FLOOR]).contact is not None
+    with pytest.raises(ValueError, match="'box' stands for the skin .* make it a MeshObstacle"):
+        box_on_a_block(shape, self_contact=True, obstacles=[FLOOR])
