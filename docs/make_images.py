@@ -24,6 +24,7 @@ from site_writing import DOCS, environment_pages
 
 from agents.evaluation import make_agent
 from softgym_envs import make_robot
+from softgym_envs.backends import make_backend
 from softgym_envs.robots import ROBOTS
 from softgym_envs.viewer.image import ImageRenderer, render_bodies
 
@@ -38,8 +39,8 @@ COMMANDS: dict[str, tuple[float, ...]] = {
     "tetrapod": (-0.5, 0.0, 0.5, 0.0),
     "two_finger_gripper": (0.7, 0.1, 0.1, 0.7),
     "three_finger_gripper": (0.35, 0.35, 0.35, 0.35, 0.35, 0.35),
-    "two_finger_friction_gripper": (0.3, 0.3, 0.3, 0.3),
-    "three_finger_friction_gripper": (0.35, 0.35, 0.2, 0.2, 0.2, 0.2),
+    "two_finger_friction_gripper": (0.6, 0.6, 0.6, 0.6),
+    "three_finger_friction_gripper": (0.5, 0.5, 0.3, 0.3, 0.3, 0.3),
 }
 WIDTH, HEIGHT = 800, 520
 FILMED = ("SoftGym/FingerTrack-v0", "SoftGym/DiamondTrack-v0", "SoftGym/TrunkTrack-v0")
@@ -103,6 +104,21 @@ def draw_codesign() -> np.ndarray:
     )
 
 
+def draw_grasp() -> np.ndarray:
+    """Draw the two-finger gripper before and after it lifts the bar."""
+    robot = make_robot("two_finger_friction_gripper")
+    backend, renderer = make_backend("fem", robot), ImageRenderer(robot, (WIDTH // 2, HEIGHT))
+    baseline, goals = robot.design_space.baseline, robot.effector_rest[None]
+    try:
+        pictures = [renderer.render(baseline, backend.state, goals, goals[0], text="at rest")]
+        for pull in np.linspace(0.0, 0.007, 15)[1:]:
+            state = backend.step(np.full(4, pull))
+        pictures.append(renderer.render(baseline, state, goals, goals[0], text="all cables pulled by 7 mm"))
+    finally:
+        renderer.close()
+    return np.concatenate(pictures, axis=1)
+
+
 def draw_arm() -> np.ndarray:
     """Return the picture that the tutorial on a robot of your own draws."""
     with tempfile.TemporaryDirectory() as folder:
@@ -126,7 +142,7 @@ def draw_report() -> np.ndarray:
 
 def main(names: list[str]) -> None:
     """Draw the named pictures, or all but the report."""
-    table: dict[str, Callable[[], np.ndarray]] = {"codesign": draw_codesign, "arm": draw_arm}
+    table: dict[str, Callable[[], np.ndarray]] = {"codesign": draw_codesign, "arm": draw_arm, "grasp": draw_grasp}
     table |= {name: partial(draw_robot, name) for name in ROBOTS}
     table |= {name: partial(draw_environment, name) for name in environment_pages()}
     for name in names or [*table, "episodes"]:

@@ -44,6 +44,8 @@ class FrictionGripper(FingerRobot):
     """
 
     holds_by_contact = True
+    #: Pulled further, the fingers press the object so much that it turns out of the grip.
+    cable_range = (0.0, 0.008)
     rest_mode = "displacement"
     proportional_to_modulus = False  # the weight of the object does not scale with it
     convex = False

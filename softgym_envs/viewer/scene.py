@@ -154,6 +154,7 @@ class Scene:
         self._shadow = _Part(self, "shadow", back=True, lit=False)
         self._ghost = _Part(self, "ghost", back=True, opacity=0.55)
         self._body = _Part(self, "body", specular=0.25)
+        self._obstacles = _Part(self, "object", back=True, opacity=0.55)
         self._edges = _Part(self, "edge", lit=False, opacity=0.35, line_width=1.2 * self._line)
         self._cables: dict[int, _Part] = {}
         self._trail = _Part(self, "goal", lit=False, opacity=0.8, line_width=2.5 * self._line, faint=0.3)
@@ -264,6 +265,7 @@ class Scene:
             self._shadow.show(self._flat)
             self._seams = _line_mesh(np.zeros_like(self._surface.shape(x)), self._surface.edges)
             self._edges.show(self._seams)
+            self._obstacles.show(_obstacle_mesh(model, self._length))
         points = self._surface.points(x)
         _move(self._skin, points, self._surface.normals(points))
         light = -_LIGHT / _LIGHT[0]
@@ -353,6 +355,15 @@ def _surface_mesh(surface: BodySurface) -> pyvista.PolyData:
     import pyvista
 
     return pyvista.PolyData.from_regular_faces(np.zeros((len(surface.nodes), 3)), surface.triangles)
+
+
+def _obstacle_mesh(model: MechanicalModel, extent: float) -> pyvista.PolyData | None:
+    """Surface of the obstacles that stand still, or None; those that move are skins of the body."""
+    import pyvista
+
+    skins = [o.skin(extent) for o in (model.contact.obstacles if model.contact else ()) if o.frame is None]
+    parts = [pyvista.PolyData.from_regular_faces(points, triangles) for points, triangles in skins]
+    return pyvista.merge(parts) if parts else None
 
 
 def _move(mesh: pyvista.PolyData, points: np.ndarray, normals: np.ndarray | None = None) -> None:
