@@ -1,0 +1,103 @@
+"""Robots pressed against a wall, and the Soft Finger in contact with itself."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from softgym_envs import make_robot
+from softgym_envs.mechanics import MechanicalModel, Plane, Statics
+from softgym_envs.robots.soft_finger import SoftFinger
+
+#: Share of the range of each actuator, chosen so that no cable is slack.
+PULLS = {
+    "finger": (0.6, 0.4),
+    "diamond": (0.7, 0.2, 0.2, 0.3),
+    "cable_trunk": (0.3, 0.1, 0.1, 0.1, 0.4, 0.1, 0.1, 0.1),
+    "sensorized_finger": (0.5,),
+    "trunk": (0.5, 0.1, 0.1, 0.1, 0.4, 0.2),
+    "contact_finger": (0.4, 0.3, 0.2, 0.1, 0.1, 0.0, 0.1, 0.1),
+    "two_finger_gripper": (0.6, 0.3, 0.2, 0.3),
+    "three_finger_gripper": (0.2, 0.3, 0.3, 0.1, 0.2, 0.4),
+}
+
+DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+
+
+def wall_in_the_way(name):
+    """A plane half way along the way that a command moves the outermost points of a robot, and that command."""
+    robot = make_robot(name)
+    command = np.array(PULLS[name]) * robot.upper
+    model = robot.build()
+    points = model.set_contact(excluded=np.flatnonzero(model.fixed)).surface.points[0]
+    model.contact = None
+    statics = Statics(model)
+    states = [model.nodes, statics.solve(np.zeros(len(command))).x, statics.solve(command).x]
+    reach = np.array([(points @ x @ DIRECTIONS.T).max(axis=0) for x in states])
+    start = reach[:2].max(axis=0)
+    best = int((reach[2] - start).argmax())
+    assert reach[2, best] > start[best] + 1e-3
+    normal = -DIRECTIONS[best]
+    return Plane(-0.5 * (start[best] + reach[2, best]) * normal, normal, name="wall"), command
+
+
+@pytest.mark.parametrize("name", PULLS)
+def test_robot_presses_a_wall(name):
+    """Nothing penetrates, and the force is the derivative of the energy by the wall's place."""
+    wall, command = wall_in_the_way(name)
+    normal = np.array(wall.normal)
+    potential, h = {}, 1e-6
+    for shift in (-h, 0.0, h):
+        moved = Plane(wall.point + shift * normal, normal, name="wall")
+        statics = Statics(make_robot(name, obstacles=[moved]).build(), tolerance=1e-12, max_iterations=60)
+        for share in np.linspace(0.25, 1.0, 4):
+            found = statics.solve(share * command)
+            assert found.contacts.smallest_gap > 0.0
+        potential[shift] = statics.model.energy(found.x) + statics.linearisation.contact.stored_energy(found.x)
+        if not shift:
+            force = found.contacts.total[0]
+    pressing = force @ normal
+    assert pressing > 1e-3
+    np.testing.assert_allclose(force, pressing * normal, atol=1e-9 * pressing)
+    assert (potential[h] - potential[-h]) / (2 * h) == pytest.approx(pressing, rel=1e-4)
+
+
+class FineFinger(SoftFinger):
+    """The finger of quadratic elements: with linear ones it is so stiff that its grooves never close."""
+
+    def solid(self, mesh, design, *, fixed, density=1100.0):
+        return MechanicalModel.from_mesh(
+            mesh.nodes,
+            mesh.tetrahedra,
+            fixed=fixed,
+            element="quadratic",
+            young_modulus=design["young_modulus"],
+            poisson_ratio=design["poisson_ratio"],
+        )
+
+
+def test_grooves_of_the_finger_close():
+    """Without self-contact faces cross between 15 and 17.5 mm of pull; with it they never do, and W is exact."""
+    checked = FineFinger(cables=1, self_contact=True).build()
+    through = Statics(FineFinger(cables=1).build())
+    for pull, crossed in ((0.010, False), (0.015, False), (0.0175, True)):
+        x = through.solve([pull]).x
+        assert (checked.contact.intersections(x) is not None) == crossed
+    statics = Statics(checked, tolerance=1e-12)
+    for pull in (0.010, 0.015, 0.0175):
+        found = statics.solve([pull])
+        assert checked.contact.intersections(found.x) is None
+        assert found.contacts.smallest_gap > 0.0
+    assert found.contacts.self_force > 1.0
+    x, effort, W, h = statics.x, statics.effort, found.condensed.W, 1e-6
+    ends = []
+    for change in (h, -h):
+        statics.restore(x, effort)
+        ends.append(statics.solve([pull + change]))
+    tension = (ends[0].effort[0] - ends[1].effort[0]) / (2 * h)
+    assert tension == pytest.approx(1.0 / W.aa[0, 0], rel=1e-6)
+    tip = (ends[0].delta[1:4] - ends[1].delta[1:4]) / (2 * h)
+    np.testing.assert_allclose(tip, W.ea[:, 0] / W.aa[0, 0], rtol=1e-6, atol=1e-6 * np.abs(tip).max())
