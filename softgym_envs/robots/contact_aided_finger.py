@@ -69,7 +69,7 @@ class ContactAidedFinger(MeshedRobot):
     """
 
     name = "contact_aided_finger"
-    effectors = ("tip",)
+    effectors: tuple[str, ...] = ("tip",)
     size = 0.1
     goal_axes = np.array([1.0, 1.0, 0.0])
     rest_mode = "displacement"

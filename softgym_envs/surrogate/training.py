@@ -37,7 +37,7 @@ class SplitConfig(Config):
     """One dataset split."""
 
     groups: int = Field(gt=0)
-    states: int = Field(gt=0)
+    states: int = Field(ge=0)
     sequence: Literal["halton", "sobol", "latin", "random"] = "random"
     seed: int = Field(default=0, ge=0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +31,8 @@ def card_of(robot: Robot, network: str) -> dict[str, Any]:
     }
 
 
-def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> SurrogateModel:
-    """Load weights (``model.safetensors``) and their card (``model.json``) for a robot.
-
-    Args:
-        folder: the folder with both files.
-        robot: the robot they must be for.
-        members: how many members of an ensemble to use; default all.
+def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return the card and the weights of a folder after checking that they fit a robot.
 
     Raises:
         WeightsError: if a file is missing, truncated, of another format or for another robot; the message names the
@@ -56,10 +52,6 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
         raise WeightsError(f"weights card '{card_path}' is not valid JSON: {error}") from None
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         raise WeightsError(f"weights card '{card_path}' does not have format {FORMAT}")
-    try:
-        module = network_module(str(card.get("network")))
-    except ValueError as error:
-        raise WeightsError(f"'{card_path}': {error}") from None
     if card.get("robot") != robot.name or card.get("mechanics_key") != robot.mechanics_key:
         wanted = {"robot": robot.name, **robot.mechanics_key}
         found = {"robot": card.get("robot"), **card.get("mechanics_key", {})}
@@ -69,7 +61,7 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
             + ", ".join(f"{k} = {found.get(k)!r}, needed {wanted.get(k)!r}" for k in different)
             + "; use backend='fem' or train weights with 'softgym fit'"
         )
-    expected = card_of(robot, card["network"])
+    expected = card_of(robot, str(card.get("network")))
     for name in ("design_variables", "actuators"):
         if card.get(name) != expected[name]:
             raise WeightsError(f"weights '{folder.name}' have {name} = {card.get(name)}, needed {expected[name]}")
@@ -79,6 +71,27 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
         raise WeightsError(f"weights '{weights_path}' are damaged or truncated: {error}") from None
     if wrong := sorted(name for name, tensor in tensors.items() if not np.isfinite(tensor).all()):
         raise WeightsError(f"weights '{weights_path}' have values that are not finite in {', '.join(wrong)}")
+    return card, tensors
+
+
+def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> SurrogateModel:
+    """Load weights (``model.safetensors``) and their card (``model.json``) for a robot.
+
+    Args:
+        folder: the folder with both files.
+        robot: the robot they must be for.
+        members: how many members of an ensemble to use; default all.
+
+    Raises:
+        WeightsError: if a file is missing, truncated, of another format or for another robot; the message names the
+            file and what is expected.
+    """
+    card, tensors = read_weights(folder, robot)
+    card_path, weights_path = Path(folder) / "model.json", Path(folder) / "model.safetensors"
+    try:
+        module = network_module(str(card.get("network")))
+    except ValueError as error:
+        raise WeightsError(f"'{card_path}': {error}") from None
     try:
         return module.Model(robot, tensors, card, members)
     except (KeyError, ValueError, IndexError, TypeError) as error:
@@ -87,11 +100,16 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
 
 def save_model(model: SurrogateModel, folder: str | Path) -> None:
     """Write a model's weights and its card, with the provenance of this run, for `load_model`."""
+    write_weights(model.tensors, model.card, folder)
+
+
+def write_weights(tensors: Mapping[str, np.ndarray], card: Mapping[str, Any], folder: str | Path) -> None:
+    """Write weights in single precision and their card, with the provenance of this run, for `read_weights`."""
     from safetensors.numpy import save
 
     folder = Path(folder)
     # Not np.ascontiguousarray, which turns a scalar into a vector.
-    weights = {name: np.array(value, dtype=np.float32, order="C") for name, value in model.tensors.items()}
+    weights = {name: np.array(value, dtype=np.float32, order="C") for name, value in tensors.items()}
     with atomic_write(folder / "model.safetensors") as stream:
         stream.write(save(weights))
-    write_json(folder / "model.json", {**model.card, "provenance": provenance()})
+    write_json(folder / "model.json", {**card, "provenance": provenance()})

@@ -52,7 +52,7 @@ def test_malformed_plans():
     for groups, states, seed, message in (
         (0, 1, 0, "groups = 0 must be an integer of at least 1"),
         (2.5, 1, 0, "groups = 2.5 must be an integer"),
-        (1, 0, 0, "states = 0"),
+        (1, -1, 0, "states = -1"),
         (1, 1, -1, "seed = -1 must be an integer of at least 0"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -290,7 +290,7 @@ class RoundedPrism(Obstacle):
         if len(polygon) < 3:
             raise ValueError(f"{self._label}: polygon must have at least 3 corners, got {len(polygon)}")
         size = np.ptp(polygon, axis=0).max()
-        start, lengths, _, outward = self._edges
+        start, lengths, _, outward = self.edges
         if lengths.min() <= 1e-9 * size:
             raise ValueError(f"{self._label}: two consecutive corners of polygon must not be equal, got {self.polygon}")
         heights = (start[None] - start[:, None]) @ outward[:, :, None]
@@ -354,7 +354,7 @@ class RoundedPrism(Obstacle):
         return cls(corners, height, radius, centre, rotation, name=name, friction=friction, frame=frame)
 
     @cached_property
-    def _edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Start (m, 2), length (m,), direction (m, 2) and outward normal (m, 2) of the polygon's edges."""
         start = np.asarray(self.polygon)
         x, y = start.T
@@ -375,17 +375,17 @@ class RoundedPrism(Obstacle):
 
     def gap(self, points: np.ndarray) -> np.ndarray:
         out = np.empty(len(points))
-        _prism_gap((points - self._centre) @ self._rotation, *self._edges, self.half_height, self.radius, out)
+        _prism_gap((points - self._centre) @ self._rotation, *self.edges, self.half_height, self.radius, out)
         return out
 
     def geometry(self, points: np.ndarray) -> Geometry:
         gap, normal, curvature = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3, 3))
         local = (points - self._centre) @ self._rotation
-        _prism_geometry(local, *self._edges, self.half_height, self.radius, gap, normal, curvature)
+        prism_geometry(local, *self.edges, self.half_height, self.radius, gap, normal, curvature)
         return gap, normal @ self._rotation.T, self._rotation @ curvature @ self._rotation.T
 
     def skin(self, extent: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
-        start, _, _, outward = self._edges
+        start, _, _, outward = self.edges
         rounding = self.radius * directions(np.arctan2(outward[:, 1], outward[:, 0]))
         core = [(x, y, z) for x, y in start for z in (-self.half_height, self.half_height)]
         points = (np.asarray(core)[:, None] + rounding).reshape(-1, 3)
@@ -437,7 +437,8 @@ def _prism_gap(points, start, length, direction, outward, half_height, radius, g
 
 
 @njit(cache=True, error_model="numpy")
-def _prism_geometry(points, start, length, direction, outward, half_height, radius, gap, normal, curvature):
+def prism_geometry(points, start, length, direction, outward, half_height, radius, gap, normal, curvature):
+    """Fill gap (k,), normal (k, 3) and curvature (k, 3, 3) of a prism at points (k, 3) in its local axes."""
     # The distance to a face, edge or corner is |P r| with P the projection across its tangents.
     for k in range(points.shape[0]):
         x, y, z = points[k]

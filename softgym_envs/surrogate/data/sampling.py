@@ -31,7 +31,7 @@ class SamplingPlan:
 
     Args:
         groups: number of designs.
-        states: commanded states per design, in addition to the state at rest.
+        states: commanded states per design, in addition to the state at rest; 0 for the latter only.
         sequence: one of `SEQUENCES`. Use ``"random"`` for validation and test.
         seed: seed of the sequence.
         margin: how far slack cables are moved back [fraction of the actuator range]; 1 samples cables that push.
@@ -52,7 +52,7 @@ class SamplingPlan:
     def __post_init__(self) -> None:
         if self.sequence not in SEQUENCES:
             raise ValueError(f"sequence = {self.sequence!r} is unknown; allowed: {', '.join(map(repr, SEQUENCES))}")
-        for name, least in (("groups", 1), ("states", 1), ("seed", 0)):
+        for name, least in (("groups", 1), ("states", 0), ("seed", 0)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
                 raise ValueError(f"{name} = {value!r} must be an integer of at least {least}")
@@ -63,8 +63,8 @@ class SamplingPlan:
 
     def unit_points(self, dimension: int, first: int, count: int, total: int, stream: int) -> np.ndarray:
         """Points ``first .. first + count`` of ``total`` in [0, 1], shape (count, dimension)."""
-        if dimension == 0:
-            return np.zeros((count, 0))
+        if dimension == 0 or count == 0:
+            return np.zeros((count, dimension))
         if self.sequence == "random":
             rows = range(first, first + count)
             return np.stack([np.random.default_rng([self.seed, stream, row]).random(dimension) for row in rows])

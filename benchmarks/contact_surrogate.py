@@ -1,0 +1,184 @@
+"""The learned chain of the contact-aided finger against finite elements, with 1 to 10 contacts that it has not seen.
+
+``python -m benchmarks.contact_surrogate`` prints one JSON object. Bodies are drawn from the box of the training,
+obstacles are round bars in front of the zigzag leg, and friction differs from scene to scene. The chain was trained
+without any contact.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.contact.obstacles import Cylinder
+    from softgym_envs.surrogate.chain.model import ChainModel
+
+INCREMENTS = 12
+BUILDS = 20
+"""Scenes that are drawn before giving up on one."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A body that closes on round bars.
+
+    Attributes:
+        design: values in the order of the design space.
+        bars: the obstacles.
+        angle: of the servo at the end [rad].
+    """
+
+    design: np.ndarray
+    bars: tuple[Cylinder, ...]
+    angle: float
+
+
+def draw_scene(model: ChainModel, contacts: int, rng: np.random.Generator) -> Scene:
+    """Draw a body and bars so that its free motion would enter each bar by 1 to 4 mm.
+
+    Raises:
+        RuntimeError: if no scene is found in which the body at rest is free.
+    """
+    from softgym_envs.errors import InfeasibleDesign
+    from softgym_envs.mechanics.contact.obstacles import Cylinder
+    from softgym_envs.surrogate.chain.contact import ChainBatch
+
+    robot, chain = model.robot, model.chain
+    space = robot.design_space
+    domain = model.card["domain"]["design"]
+    for _ in range(BUILDS * 50):
+        values = {name: rng.uniform(*box) for name, box in domain.items()}
+        design = space.complete(values)
+        try:
+            robot.outline(design)  # type: ignore[attr-defined]
+        except InfeasibleDesign:
+            continue
+        angle = np.radians(rng.uniform(15.0, 35.0))
+        friction = float(rng.uniform(0.0, 0.85))
+        row = design.array[None]
+        free = model.markers(row, np.array([angle]))
+        corners = free.markers[0, 1 : 2 + chain.points]
+        chosen = np.sort(rng.choice(len(corners) - 1, size=contacts, replace=False))
+        radius = rng.uniform(0.002, 0.004 if contacts > 4 else 0.008, size=contacts)
+        centres = corners[chosen] + np.column_stack([radius - rng.uniform(0.001, 0.004, contacts), np.zeros(contacts)])
+        bars = tuple(
+            Cylinder(point=(x, y, 0.0), axis=(0.0, 0.0, 1.0), radius=float(r), friction=friction, name=f"bar {k + 1}")
+            for k, ((x, y), r) in enumerate(zip(centres, radius, strict=True))
+        )
+        at_rest = ChainBatch(model.prepare(row), [bars])
+        if free.found[0] and at_rest.states.gap[0] > 0.001:
+            return Scene(design.array, bars, float(angle))
+    raise RuntimeError(f"no scene with {contacts} contacts was found")
+
+
+def close_chain(model: ChainModel, scene: Scene) -> tuple[np.ndarray, np.ndarray, float, bool]:
+    """Return the forces of the bars [N] (k, 2), the tip [m] (2,), the torque [N m], and whether all was found."""
+    from softgym_envs.surrogate.chain.contact import ChainBatch
+
+    batch = ChainBatch(model.prepare(scene.design[None]), [scene.bars])
+    found = True
+    for part in range(1, INCREMENTS + 1):
+        states = batch.close(np.array([scene.angle * part / INCREMENTS]))
+        found &= bool(states.found[0])
+    return states.force[0], states.tip[0], float(states.torque[0]), found
+
+
+def close_fem(model: ChainModel, scene: Scene, self_contact: bool) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Return the forces of the bars [N] (k, 2), the tip [m] (2,), the torque [N m] and the seconds.
+
+    Raises:
+        ConvergenceError: if finite elements find no equilibrium.
+    """
+    from softgym_envs.mechanics.solvers.statics import Statics
+
+    body = model.robot.build(dict(zip(model.robot.design_space.names, map(float, scene.design), strict=True)))
+    body.set_contact(obstacles=scene.bars, self_contact=self_contact)
+    statics = Statics(body)
+    start = time.process_time()
+    for part in range(1, INCREMENTS + 1):
+        state = statics.solve([scene.angle * part / INCREMENTS])
+    seconds = time.process_time() - start
+    assert state.contacts is not None
+    return state.contacts.total[:, :2], state.condensed.delta.e[:2], float(state.effort[0]), seconds
+
+
+def accuracy(model: ChainModel, counts: Sequence[int], scenes: int, seed: int, self_contact: bool) -> dict[str, Any]:
+    """Errors of contact force and tip for scenes with each number of bars."""
+    from softgym_envs.errors import ConvergenceError, MeshingError
+
+    rows = []
+    for contacts in counts:
+        for number in range(scenes):
+            rng = np.random.default_rng([seed, contacts, number])
+            row: dict[str, Any] = {"contacts": contacts, "scene": number}
+            scene = draw_scene(model, contacts, rng)
+            force, tip, torque, found = close_chain(model, scene)
+            try:
+                true_force, true_tip, true_torque, seconds = close_fem(model, scene, self_contact)
+            except (ConvergenceError, MeshingError) as error:
+                print(f"{contacts} contacts, scene {number}: finite elements fail: {error}", file=sys.stderr)
+                rows.append(row | {"fem": False})
+                continue
+            total, true = force.sum(axis=0), true_force.sum(axis=0)
+            size = float(np.abs(true_force[:, 0]).sum())
+            row |= {
+                "fem": True,
+                "found": found,
+                "pressed": int((np.linalg.norm(true_force, axis=1) > 1e-3 * max(size, 1e-9)).sum()),
+                "force": float(np.linalg.norm(true)),
+                "force_error": float(np.linalg.norm(total - true) / np.linalg.norm(true)),
+                "share_error": float(np.linalg.norm(force - true_force, axis=1).max() / np.linalg.norm(true)),
+                "tip_error": float(np.linalg.norm(tip - true_tip)),
+                "torque_error": abs(torque / true_torque - 1.0),
+                "fem_seconds": seconds,
+            }
+            print(json.dumps(row), file=sys.stderr, flush=True)
+            rows.append(row)
+    good = [row for row in rows if row.get("found")]
+    return {
+        "rows": rows,
+        "summary": _summary(good),
+        "by_count": {str(k): _summary([r for r in good if r["contacts"] == k]) for k in counts},
+    }
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, float]:
+    found: dict[str, float] = {"scenes": len(rows)}
+    for name in ("force_error", "share_error", "tip_error", "torque_error"):
+        values = np.array([row[name] for row in rows])
+        if len(values):
+            found |= {f"{name}_median": float(np.median(values)), f"{name}_worst": float(values.max())}
+    return found
+
+
+@click.command()
+@click.option("--weights", type=click.Path(path_type=Path), help="Folder of the weights (default: the shipped ones).")
+@click.option("--contacts", default="1-10", show_default=True, help="Numbers of contacts, such as 1-10 or 1,3.")
+@click.option("--scenes", default=3, show_default=True, help="Scenes for each number of contacts.")
+@click.option("--seed", default=0, show_default=True)
+@click.option("--self-contact", is_flag=True, help="Let the finite elements touch themselves, which chains do not.")
+def main(weights: Path | None, contacts: str, scenes: int, seed: int, self_contact: bool) -> None:
+    """Compare the learned chain with finite elements."""
+    from softgym_envs.robots.registry import make_robot
+    from softgym_envs.surrogate.chain.model import load_chain
+
+    model = load_chain(make_robot("contact_aided_finger"), weights)
+    if "-" in contacts:
+        low, high = map(int, contacts.split("-"))
+        counts = list(range(low, high + 1))
+    else:
+        counts = [int(part) for part in contacts.split(",")]
+    print(json.dumps(accuracy(model, counts, scenes, seed, self_contact), indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,331 @@
+"""Compiled mechanics of chains of segments: energy, contact with friction, and equilibria by Newton's method.
+
+A chain has N nodes with the coordinates (x, y, rotation). The first node is driven, the last one is held, and every
+segment joins a node to the next one. The tangent is therefore block tridiagonal, with blocks of 3 by 3, and a Newton
+step costs a few microseconds. Friction makes the tangent unsymmetric.
+
+Points of the skin lie between two neighbouring nodes, or on one node. Where an obstacle presses on a point, it adds the
+barrier and the friction of `softgym_envs.mechanics.contact.law`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from softgym_envs.mechanics.contact.obstacles import prism_geometry
+
+PLANE, ROUND, PRISM = 0, 1, 2
+"""Kinds of obstacles. A row of parameters holds: kind, friction, radius, half height, number of edges, centre (3),
+matrix (9, row by row: the projection of round obstacles, the rotation of prisms, the normal of planes in its first
+row)."""
+
+PARAMETERS = 17
+MAX_STEP = 0.004
+"""Largest displacement of a node in one Newton step [m]; half of the thinnest allowed obstacle."""
+MAX_TURN = 0.25
+"""Largest rotation of a node in one Newton step [rad]."""
+MAX_ITERATIONS = 60
+
+
+@njit(cache=True, error_model="numpy")
+def segment(a, b, length, along, stiffness, convex, gradient, hessian):
+    """Return the energy of a segment; fill its derivatives by the coordinates of its ends, (6,) and (6, 6).
+
+    Args:
+        a: coordinates of its first node, shape (3,).
+        b: of its second node.
+        length: at rest [m].
+        along: its direction at rest, shape (2,).
+        stiffness: of elongation [N/m] and of the two end rotations [N m], shape (3, 3).
+        convex: leave out the terms that can make the Hessian indefinite.
+        gradient: work array.
+        hessian: work array.
+    """
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    now = math.sqrt(dx * dx + dy * dy)
+    c, s = dx / now, dy / now
+    turn = math.atan2(along[0] * dy - along[1] * dx, along[0] * dx + along[1] * dy)
+    e0, e1, e2 = now - length, a[2] - turn, b[2] - turn
+    t0 = stiffness[0, 0] * e0 + stiffness[0, 1] * e1 + stiffness[0, 2] * e2
+    t1 = stiffness[1, 0] * e0 + stiffness[1, 1] * e1 + stiffness[1, 2] * e2
+    t2 = stiffness[2, 0] * e0 + stiffness[2, 1] * e1 + stiffness[2, 2] * e2
+    # Rows of B: derivatives of elongation and end rotations.
+    B = np.zeros((3, 6))
+    r = np.array([-c, -s, 0.0, c, s, 0.0])
+    z = np.array([s, -c, 0.0, -s, c, 0.0])
+    for i in range(6):
+        B[0, i] = r[i]
+        B[1, i] = -z[i] / now
+        B[2, i] = -z[i] / now
+    B[1, 2] += 1.0
+    B[2, 5] += 1.0
+    bend = -(t1 + t2)
+    for i in range(6):
+        gradient[i] = t0 * B[0, i] + t1 * B[1, i] + t2 * B[2, i]
+        k0 = stiffness[0, 0] * B[0, i] + stiffness[0, 1] * B[1, i] + stiffness[0, 2] * B[2, i]
+        k1 = stiffness[1, 0] * B[0, i] + stiffness[1, 1] * B[1, i] + stiffness[1, 2] * B[2, i]
+        k2 = stiffness[2, 0] * B[0, i] + stiffness[2, 1] * B[1, i] + stiffness[2, 2] * B[2, i]
+        for j in range(6):
+            value = k0 * B[0, j] + k1 * B[1, j] + k2 * B[2, j]
+            if not convex:
+                value += t0 * z[i] * z[j] / now - bend * (r[i] * z[j] + z[i] * r[j]) / now**2
+            hessian[i, j] = value
+    return 0.5 * (t0 * e0 + t1 * e1 + t2 * e2)
+
+
+@njit(cache=True, error_model="numpy")
+def gap_of(p, parameters, edges, normal, curvature):
+    """Return the gap [m] of a point (3,) to an obstacle; fill its normal (3,) and curvature (3, 3)."""
+    kind = int(parameters[0])
+    matrix = parameters[8:17].reshape(3, 3)
+    if kind == PLANE:
+        gap = 0.0
+        for i in range(3):
+            normal[i] = matrix[0, i]
+            gap += normal[i] * (p[i] - parameters[5 + i])
+            for j in range(3):
+                curvature[i, j] = 0.0
+        return gap
+    if kind == ROUND:
+        arm = matrix @ (p - parameters[5:8])
+        length = max(math.sqrt(arm @ arm), 1e-300)
+        for i in range(3):
+            normal[i] = arm[i] / length
+        for i in range(3):
+            for j in range(3):
+                curvature[i, j] = (matrix[i, j] - normal[i] * normal[j]) / length
+        return length - parameters[2]
+    count = int(parameters[4])
+    local = np.empty((1, 3))
+    local[0] = (p - parameters[5:8]) @ matrix
+    found, n, h = np.empty(1), np.empty((1, 3)), np.empty((1, 3, 3))
+    prism_geometry(
+        local, edges[:count, 0:2], edges[:count, 2], edges[:count, 3:5], edges[:count, 5:7], parameters[3],
+        parameters[2], found, n, h,
+    )  # fmt: skip
+    normal[:] = matrix @ n[0]
+    curvature[:, :] = matrix @ h[0] @ matrix.T
+    return found[0]
+
+
+@njit(cache=True, error_model="numpy")
+def skin_point(q, node, other, share, arm, far, height, p, arm_now, far_now):
+    """Fill a point of the skin [m] (3,) and the turned arms (2,) of its two nodes."""
+    c, s = math.cos(q[node, 2]), math.sin(q[node, 2])
+    arm_now[0], arm_now[1] = c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]
+    c, s = math.cos(q[other, 2]), math.sin(q[other, 2])
+    far_now[0], far_now[1] = c * far[0] - s * far[1], s * far[0] + c * far[1]
+    for i in range(2):
+        p[i] = (1.0 - share) * (q[node, i] + arm_now[i]) + share * (q[other, i] + far_now[i])
+    p[2] = height
+
+
+@njit(cache=True, error_model="numpy")
+def touch(p, area, obstacle, edges, anchor, law, convex, pull, tangent):
+    """Return what one obstacle does to one point: energy with friction limits held, gap, pressing, sliding.
+
+    Args:
+        p: point [m], shape (3,).
+        area: [m2].
+        obstacle: parameters.
+        edges: of a prism.
+        anchor: of the friction spring [m], shape (3,).
+        law: distance of contact [m], stiffness [Pa], stick [Pa/m].
+        convex: leave out what can make the tangent indefinite, and what makes it unsymmetric.
+        pull: minus the force on the point in the plane, shape (2,), is filled.
+        tangent: its derivative by the point, shape (2, 2), is filled.
+    """
+    distance, stiffness, stick = law[0], law[1], law[2]
+    normal, curvature = np.empty(3), np.empty((3, 3))
+    gap = gap_of(p, obstacle, edges, normal, curvature)
+    pull[:] = 0.0
+    tangent[:, :] = 0.0
+    if gap >= distance:
+        return 0.0, gap, 0.0, False
+    if not gap > 0.0:
+        return np.inf, gap, 0.0, False
+    s = (gap / distance) ** 2
+    log, rest = math.log(s), s - 1.0
+    by_s = -distance * (2.0 * rest * log + rest * rest / s)
+    by_ss = -distance * (2.0 * log + 4.0 * rest / s - rest * rest / (s * s))
+    slope = 2.0 * gap / distance**2
+    scale = stiffness * area
+    first = scale * by_s * slope
+    second = scale * (by_ss * slope * slope + by_s * 2.0 / distance**2)
+    for i in range(2):
+        pull[i] = first * normal[i]
+        for j in range(2):
+            tangent[i, j] = second * normal[i] * normal[j]
+            if not convex:
+                tangent[i, j] += first * curvature[i, j]
+    energy = scale * (-distance * rest * rest * log)
+    sliding = False
+    if obstacle[1] > 0.0:
+        place, unused = np.empty(3), np.empty((3, 3))
+        gap_of(anchor, obstacle, edges, place, unused)
+        stretch = p - anchor
+        along = stretch - place * (place @ stretch)
+        size = math.sqrt(along @ along)
+        spring, limit = stick * area, -obstacle[1] * first
+        sliding = spring * size > limit
+        factor = spring
+        if sliding:
+            factor = limit / size
+        energy += limit * size - 0.5 * limit * limit / spring if sliding else 0.5 * spring * size * size
+        for i in range(2):
+            pull[i] += factor * along[i]
+            for j in range(2):
+                plane = -place[i] * place[j]
+                if i == j:
+                    plane += 1.0
+                value = factor * plane
+                if sliding:
+                    value -= factor * along[i] * along[j] / size**2
+                    if not convex:
+                        value -= obstacle[1] * second * along[i] / size * normal[j]
+                tangent[i, j] += value
+    return energy, gap, -first, sliding
+
+
+@njit(cache=True, error_model="numpy")
+def assemble(
+    q, length, along, stiffness, skin, obstacles, edges, anchors, law, convex, gradient, diagonal, upper, lower
+):
+    """Return the energy of a chain in contact; fill its gradient (N, 3) and the blocks of its tangent.
+
+    ``skin`` holds nodes (P, 2), shares (P,), arms (P, 4), heights (P,) and areas (P,). The energy is inf if a point is
+    inside an obstacle. Blocks: diagonal (N, 3, 3), upper and lower (N - 1, 3, 3).
+    """
+    nodes, shares, arms, heights, areas = skin
+    count = len(q)
+    gradient[:, :] = 0.0
+    diagonal[:, :, :] = 0.0
+    upper[:, :, :] = 0.0
+    lower[:, :, :] = 0.0
+    g, h = np.empty(6), np.empty((6, 6))
+    energy = 0.0
+    for k in range(count - 1):
+        energy += segment(q[k], q[k + 1], length[k], along[k], stiffness[k], convex, g, h)
+        for i in range(3):
+            gradient[k, i] += g[i]
+            gradient[k + 1, i] += g[3 + i]
+            for j in range(3):
+                diagonal[k, i, j] += h[i, j]
+                diagonal[k + 1, i, j] += h[3 + i, 3 + j]
+                upper[k, i, j] += h[i, 3 + j]
+                lower[k, i, j] += h[3 + i, j]
+    if len(obstacles) == 0:
+        return energy
+    p, arm, far = np.empty(3), np.empty(2), np.empty(2)
+    pull, tangent = np.empty(2), np.empty((2, 2))
+    for k in range(len(areas)):
+        node, other, share = nodes[k, 0], nodes[k, 1], shares[k]
+        skin_point(q, node, other, share, arms[k, :2], arms[k, 2:], heights[k], p, arm, far)
+        for o in range(len(obstacles)):
+            part, gap, pressing, sliding = touch(
+                p, areas[k], obstacles[o], edges[o], anchors[o, k], law, convex, pull, tangent
+            )
+            energy += part
+            if pressing == 0.0:
+                continue
+            # Derivatives of the point by (x, y, rotation) of both nodes.
+            near, away = np.zeros((2, 3)), np.zeros((2, 3))
+            near[0, 0] = near[1, 1] = 1.0 - share
+            near[0, 2], near[1, 2] = -(1.0 - share) * arm[1], (1.0 - share) * arm[0]
+            away[0, 0] = away[1, 1] = share
+            away[0, 2], away[1, 2] = -share * far[1], share * far[0]
+            for i in range(3):
+                gradient[node, i] += near[0, i] * pull[0] + near[1, i] * pull[1]
+                gradient[other, i] += away[0, i] * pull[0] + away[1, i] * pull[1]
+            nn, na = near.T @ tangent @ near, near.T @ tangent @ away
+            an, aa = away.T @ tangent @ near, away.T @ tangent @ away
+            if not convex:
+                nn[2, 2] -= (1.0 - share) * (arm[0] * pull[0] + arm[1] * pull[1])
+                aa[2, 2] -= share * (far[0] * pull[0] + far[1] * pull[1])
+            if node == other:
+                diagonal[node] += nn + na + an + aa
+            else:
+                diagonal[node] += nn
+                diagonal[other] += aa
+                upper[node] += na
+                lower[node] += an
+    return energy
+
+
+@njit(cache=True, error_model="numpy")
+def energy_of(q, length, along, stiffness, skin, obstacles, edges, anchors, limits, law):
+    """Return the energy of a chain with held limits of friction (O, P); inf if a point is inside an obstacle."""
+    nodes, shares, arms, heights, areas = skin
+    energy = 0.0
+    for k in range(len(q) - 1):
+        dx, dy = q[k + 1, 0] - q[k, 0], q[k + 1, 1] - q[k, 1]
+        e = np.empty(3)
+        turn = math.atan2(along[k, 0] * dy - along[k, 1] * dx, along[k, 0] * dx + along[k, 1] * dy)
+        e[0], e[1], e[2] = math.sqrt(dx * dx + dy * dy) - length[k], q[k, 2] - turn, q[k + 1, 2] - turn
+        energy += 0.5 * (e @ stiffness[k] @ e)
+    p, arm, far = np.empty(3), np.empty(2), np.empty(2)
+    normal, curvature = np.empty(3), np.empty((3, 3))
+    for k in range(len(areas)):
+        skin_point(q, nodes[k, 0], nodes[k, 1], shares[k], arms[k, :2], arms[k, 2:], heights[k], p, arm, far)
+        for o in range(len(obstacles)):
+            gap = gap_of(p, obstacles[o], edges[o], normal, curvature)
+            if not gap > 0.0:
+                return np.inf
+            if gap < law[0]:
+                s = (gap / law[0]) ** 2
+                energy -= law[1] * areas[k] * law[0] * (s - 1.0) ** 2 * math.log(s)
+            if limits[o, k] > 0.0:
+                gap_of(anchors[o, k], obstacles[o], edges[o], normal, curvature)
+                stretch = p - anchors[o, k]
+                along_surface = stretch - normal * (normal @ stretch)
+                size, spring = math.sqrt(along_surface @ along_surface), law[2] * areas[k]
+                if spring * size > limits[o, k]:
+                    energy += limits[o, k] * size - 0.5 * limits[o, k] ** 2 / spring
+                else:
+                    energy += 0.5 * spring * size * size
+    return energy
+
+
+@njit(cache=True, error_model="numpy")
+def factorise(diagonal, upper, lower, pivots):
+    """Fill the inverses of the block pivots (N, 3, 3) of the free nodes; False if one is not positive definite."""
+    count = len(diagonal)
+    for k in range(1, count - 1):
+        block = diagonal[k].copy()
+        if k > 1:
+            block -= lower[k - 1] @ pivots[k - 1] @ upper[k - 1]
+        minor = block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0]
+        if not (block[0, 0] > 0.0 and minor > 0.0):
+            return False
+        out = pivots[k]
+        out[0, 0] = block[1, 1] * block[2, 2] - block[1, 2] * block[2, 1]
+        out[0, 1] = block[0, 2] * block[2, 1] - block[0, 1] * block[2, 2]
+        out[0, 2] = block[0, 1] * block[1, 2] - block[0, 2] * block[1, 1]
+        out[1, 0] = block[1, 2] * block[2, 0] - block[1, 0] * block[2, 2]
+        out[1, 1] = block[0, 0] * block[2, 2] - block[0, 2] * block[2, 0]
+        out[1, 2] = block[0, 2] * block[1, 0] - block[0, 0] * block[1, 2]
+        out[2, 0] = block[1, 0] * block[2, 1] - block[1, 1] * block[2, 0]
+        out[2, 1] = block[0, 1] * block[2, 0] - block[0, 0] * block[2, 1]
+        out[2, 2] = minor
+        determinant = block[0, 0] * out[0, 0] + block[0, 1] * out[1, 0] + block[0, 2] * out[2, 0]
+        if not determinant > 0.0:
+            return False
+        out /= determinant
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def substitute(upper, lower, pivots, values):
+    """Overwrite right-hand sides (N, 3, r) with the solution; rows of the first and last node are zero."""
+    count = len(values)
+    values[0] = 0.0
+    values[count - 1] = 0.0
+    for k in range(2, count - 1):
+        values[k] -= lower[k - 1] @ (pivots[k - 1] @ values[k - 1])
+    for k in range(count - 2, 0, -1):
+        if k < count - 2:
+            values[k] -= upper[k] @ values[k + 1]
+        values[k] = pivots[k] @ values[k]
