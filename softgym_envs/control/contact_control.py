@@ -9,6 +9,7 @@ import numpy as np
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.control.contact_qp import ContactQP, ForceGoal
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.condensation import CondensedModel
 
 #: Steps never become smaller than this share of the controller's rates.
 SMALLEST_STEP = 1.0 / 64.0
@@ -41,7 +42,7 @@ class ContactControl:
         """Forget the past steps; the backend stays where it is."""
         self.size = 1.0
         self.error = np.inf
-        self._goals: tuple[np.ndarray | None, Sequence[ForceGoal]] = (None, ())
+        self._last: tuple[CondensedModel, np.ndarray | None, Sequence[ForceGoal]] | None = None
 
     def step(self, goal: np.ndarray | None, *, forces: Sequence[ForceGoal] = ()) -> State:
         """Go one step towards goals, and return the state there.
@@ -56,9 +57,12 @@ class ContactControl:
                 the backend's state is unchanged.
         """
         condensed = self.backend.contact_model()
-        grew = self.controller.error(condensed, *self._goals) > self.error + ROUND_OFF
-        self.size = max(0.5 * self.size, SMALLEST_STEP) if grew else min(1.0, 1.5 * self.size)
-        self._goals = (goal, tuple(forces))
+        if self._last is not None:
+            before, last_goal, last_forces = self._last
+            now = self.controller.error(condensed, last_goal, last_forces, reference=before)
+            grew = now > self.error + ROUND_OFF
+            self.size = max(0.5 * self.size, SMALLEST_STEP) if grew else min(1.0, 1.5 * self.size)
+        self._last = (condensed, goal, tuple(forces))
         self.error = self.controller.error(condensed, goal, forces)
         state, mode = self.backend.state, "effort" if self.controller.by_effort.all() else "displacement"
         while True:

@@ -129,14 +129,28 @@ class ContactQP(InverseQP):
         self.displacement, self.opening, self.effector = moved[:a], moved[a : a + c], moved[a + c :]
         return self.command(limits)
 
-    def error(self, condensed: CondensedModel, goal: np.ndarray | None, forces: Sequence[ForceGoal] = ()) -> float:
+    def error(
+        self,
+        condensed: CondensedModel,
+        goal: np.ndarray | None,
+        forces: Sequence[ForceGoal] = (),
+        *,
+        reference: CondensedModel | None = None,
+    ) -> float:
         """Return the root of the weighted sum of squared errors of effectors and forces at a state [m].
+
+        Args:
+            condensed: model at the state.
+            goal: see `solve`.
+            forces: see `solve`.
+            reference: model whose compliance turns errors of forces into lengths, by default the same. Errors of
+                several states can be compared if their reference is the same.
 
         Raises:
             ValueError: as `solve`.
         """
         wanted, _, root = self._wanted(condensed, goal, condensed.delta.a)
-        W, delta = _blocks(condensed)
+        W, delta = _blocks(condensed if reference is None else reference)[0], _blocks(condensed)[1]
         errors = [root * (condensed.delta.e - wanted)]
         before = _efforts(condensed)
         for force in forces:

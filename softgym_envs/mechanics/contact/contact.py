@@ -367,8 +367,15 @@ class ContactState:
                 tangent = tangent + self._to_equations(curvature)
         return tangent.tocsr()
 
-    def rows(self, x: np.ndarray, *, each_point: bool = False) -> list[ContactRow]:
-        """Return the openings at rows ``x`` (n, 3): one for each obstacle, or for each point that presses."""
+    def rows(self, x: np.ndarray, motions: np.ndarray, *, each_point: bool = False) -> list[ContactRow]:
+        """Return the openings: one for each obstacle, or for each point that presses.
+
+        Args:
+            x: rows (n, 3).
+            motions: of the equations, shape (N, k); of an obstacle that nothing presses on, the point that they bring
+                there first counts.
+            each_point: see above.
+        """
         found = []
         names = self._names()
         for name, pair in zip([names[k] for k in self._numbers(meshed=False)], self.pairs, strict=True):
@@ -379,7 +386,7 @@ class ContactState:
             elif loaded:
                 shares = list(np.eye(len(touch.points))[touch.pressing > 0.0])
             elif not each_point:
-                nearest, gap = pair.nearest(x)
+                nearest, gap = pair.next_point(x, motions)
                 touch = pair.touch(x, None, points=np.array([nearest]))
                 opening, shares = gap - self.contact.distance, [np.ones(1)]
             else:

@@ -111,14 +111,23 @@ class ObstacleContact:
         """Return all gaps [m], shape (p,)."""
         return self.obstacle.gap(self.local(x))
 
-    def nearest(self, x: np.ndarray) -> tuple[int, float]:
-        """Return the nearest point that can move, and its gap [m], at rows ``x`` (n, 3)."""
-        gaps = self.gaps(x)
-        movable = self._mapping.movable
-        if self._frame is None and movable.any():
-            gaps = np.where(movable, gaps, np.inf)
-        point = int(gaps.argmin())
-        return point, float(gaps[point])
+    def next_point(self, x: np.ndarray, motions: np.ndarray) -> tuple[int, float]:
+        """Return the point that motions bring to the obstacle first, and its gap [m].
+
+        Args:
+            x: rows (n, 3).
+            motions: of the equations, scaled alike, shape (N, k). Without any, the nearest point that can move counts.
+        """
+        touch = self.touch(x, None, points=np.arange(len(self.area)))
+        if motions.shape[1]:
+            moved = (touch.jacobian @ motions).reshape(*touch.gaps.shape, -1)
+            speed = np.abs(np.einsum("pi,pik->pk", touch.gaps, moved)).max(axis=1)
+        else:
+            speed = np.asarray(abs(touch.jacobian).sum(axis=1)).reshape(touch.gaps.shape).any(axis=1).astype(float)
+        with np.errstate(divide="ignore"):
+            way = touch.gap / speed
+        point = int((way if np.isfinite(way).any() else touch.gap).argmin())
+        return point, float(touch.gap[point])
 
     def energy(self, x: np.ndarray, anchors: np.ndarray | None, limits: np.ndarray | None) -> float:
         """Return the potential [J]; inf if a point is inside the obstacle.

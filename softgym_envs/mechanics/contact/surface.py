@@ -202,11 +202,6 @@ class Mapping:
         return self._to_equations(self._components[components])
 
     @property
-    def movable(self) -> np.ndarray:
-        """Which points can move, shape (p,)."""
-        return np.diff(self._components.indptr).reshape(-1, 3).any(axis=1)
-
-    @property
     def all(self) -> csr_matrix:
         """The derivatives of all points, shape (3 p, N)."""
         return self._to_equations(self._components)

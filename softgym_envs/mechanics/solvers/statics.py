@@ -458,9 +458,9 @@ class Statics:
         The opening of a contact is zero while it presses, and otherwise the gap less the distance of contact. So
         forces ``0 <= effort.c`` and openings ``0 <= delta.c`` are complementary, and they predict how contacts close
         and open. Each obstacle has one row: the mean over the points that press, weighted with their forces, or the
-        nearest point that can move. Or each point that presses has one; eliminating these gives back ``W``. ``W.cc``
-        includes the compliance of the barrier. Friction is left out, and contacts between surfaces of the body stay as
-        they are.
+        point that actuators bring there first. Or each point that presses has one; eliminating these gives back ``W``.
+        ``W.cc`` includes the compliance of the barrier. Friction is left out, and contacts between surfaces of the body
+        stay as they are.
 
         Raises:
             ConvergenceError: if the body has no equilibrium without its contacts, e.g. because they alone hold it.
@@ -469,7 +469,7 @@ class Statics:
         contact = self.linearisation.contact
         if contact is None:
             raise ValueError("the model has no contact; call its 'set_contact' before making the solver")
-        rows = contact.rows(self.x, each_point=each_point)
+        rows = contact.rows(self.x, self._motions_of_actuators(), each_point=each_point)
         gradients = [np.empty((self.model.equations, 0)), *(row.gradient[:, None] for row in rows)]
         found = self.linearisation.without_contact(self.x, self.effort, np.hstack(gradients))
         self.linearisation.current = False
@@ -500,6 +500,16 @@ class Statics:
             roles=tuple((role, sizes[role]) for role in "aecs" if role in sizes),
             rows=tuple(labels),
         )
+
+    def _motions_of_actuators(self) -> np.ndarray:
+        """Motions (N, n_a) of the equations that each actuator's effort causes, with a largest component of one."""
+        linear = self.linearisation
+        if not linear.current and not self._linearise(exact=True):
+            raise ConvergenceError("the tangent of the current state is singular", fraction=0.0)
+        units = np.eye(len(self.effort))[: self._actuators]
+        motions = np.array([linear.response(effort) for effort in units]).reshape(len(units), -1).T
+        largest = np.abs(motions).max(axis=0, initial=0.0)
+        return motions[:, largest > 0.0] / largest[largest > 0.0]
 
     def _accept(self) -> ContactMemory:
         """Let friction remember the current state, at which the next increment starts."""
