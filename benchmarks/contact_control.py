@@ -215,12 +215,12 @@ class TrunkAtWall(CableTrunk):
 
     def __init__(self, obstacles: tuple[Obstacle, ...], *, layers: int = 24) -> None:
         super().__init__(layers=layers)
-        self.obstacles = obstacles
+        self.walls = obstacles
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         model = super().assemble(design)
-        if self.obstacles:
-            model.set_contact(obstacles=self.obstacles)
+        if self.walls:
+            model.set_contact(obstacles=self.walls)
         return model
 
 

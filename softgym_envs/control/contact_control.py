@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +16,10 @@ from softgym_envs.mechanics.condensation import CondensedModel
 SMALLEST_STEP = 1.0 / 64.0
 #: Growth of an error that does not count [m].
 ROUND_OFF = 1e-9
+#: Smallest change of a force, relative to it, from which the ratio of measured to predicted changes is taken.
+LEAST_CHANGE = 1e-4
+#: Largest ratio of measured to predicted changes that counts; the smallest is one.
+LARGEST_RATIO = 4.0
 
 
 class ContactControl:
@@ -22,7 +27,9 @@ class ContactControl:
 
     The linear model does not know how contacts move along a surface, which points touch next, and how friction changes.
     So steps are limited: a step after which the error is larger than before halves the next ones, down to a 64th of
-    the controller's rates; others let them grow again.
+    the controller's rates; others let them grow again. And the change of a force that is asked for is divided by the
+    ratio of measured to predicted change in the last step, as the secant method does: where friction is large, forces
+    can change by several times what the model predicts.
 
     Args:
         backend: of a robot whose model can touch something, quasi-static.
@@ -43,6 +50,8 @@ class ContactControl:
         self.size = 1.0
         self.error = np.inf
         self._last: tuple[CondensedModel, np.ndarray | None, Sequence[ForceGoal]] | None = None
+        self._planned: dict[str, tuple[float, float]] = {}  # contact forces before the last step and predicted after it
+        self._ratios: dict[tuple[tuple[str, float], ...], float] = {}
 
     def step(self, goal: np.ndarray | None, *, forces: Sequence[ForceGoal] = ()) -> State:
         """Go one step towards goals, and return the state there.
@@ -64,15 +73,35 @@ class ContactControl:
             self.size = max(0.5 * self.size, SMALLEST_STEP) if grew else min(1.0, 1.5 * self.size)
         self._last = (condensed, goal, tuple(forces))
         self.error = self.controller.error(condensed, goal, forces)
+        present = dict(zip(self.controller.contact_names(condensed), condensed.lambda_.c.tolist(), strict=True))
+        aims = [self._aim(force, present) for force in forces]
         state, mode = self.backend.state, "effort" if self.controller.by_effort.all() else "displacement"
         while True:
-            command = self.controller.solve(condensed, goal, state.command, state.slack, forces=forces, size=self.size)
+            command = self.controller.solve(condensed, goal, state.command, state.slack, forces=aims, size=self.size)
+            predicted = self.controller.contact_force.tolist()
+            self._planned = {name: (present[name], after) for name, after in zip(present, predicted, strict=True)}
             try:
                 return self.backend.step(command, mode)
             except ConvergenceError:
                 if self.size <= SMALLEST_STEP:
                     raise
                 self.size = max(0.5 * self.size, SMALLEST_STEP)
+
+    def _aim(self, goal: ForceGoal, present: Mapping[str, float]) -> ForceGoal:
+        """Return the goal to ask the linear model for, with the measured ratio of changes."""
+        if not all(name in self._planned and present.get(name) for name in goal.contacts):
+            return goal
+        now = sum(factor * present[name] for name, factor in goal.contacts.items())
+        before, after = (
+            sum(factor * self._planned[name][k] for name, factor in goal.contacts.items()) for k in range(2)
+        )
+        key = tuple(goal.contacts.items())
+        if before > 0.0 and abs(after - before) > LEAST_CHANGE * abs(now):
+            ratio = (now - before) / (after - before)
+            self._ratios[key] = min(max(ratio, 1.0), LARGEST_RATIO)
+        ratio = self._ratios.get(key, 1.0)
+        low, high = (now + (limit - now) / ratio for limit in goal.range)
+        return replace(goal, lower=low, upper=high)
 
     def reach(
         self, goal: np.ndarray | None, *, forces: Sequence[ForceGoal] = (), steps: int = 100, tolerance: float = 1e-5

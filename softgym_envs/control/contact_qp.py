@@ -154,9 +154,15 @@ class ContactQP(InverseQP):
         errors = [root * (condensed.delta.e - wanted)]
         before = _efforts(condensed)
         for force in forces:
-            _, value, width = _force_error(force, _contact_names(condensed), len(self.rates), W, delta, before)
+            _, value, width = _force_error(force, self.contact_names(condensed), len(self.rates), W, delta, before)
             errors.append(np.array([min(value, 0.0) + max(value - width, 0.0)]))
         return float(np.linalg.norm(np.concatenate(errors)))
+
+    @staticmethod
+    def contact_names(condensed: CondensedModel) -> list[str]:
+        """Return the names of the contacts of a model."""
+        slices = condensed.slices
+        return [row.name for row in condensed.labels[slices["c"]]] if "c" in slices else []
 
     def _wanted(
         self, condensed: CondensedModel, goal: np.ndarray | None, command: np.ndarray
@@ -206,7 +212,7 @@ class ContactQP(InverseQP):
         # Errors are linear in the changes of actuator efforts, the contact forces, and the excess over lower limits.
         errors = [root[:, None] * W[n:, :n]]
         offsets = [root * (delta[n:] - wanted)]
-        names = _contact_names(condensed)
+        names = self.contact_names(condensed)
         excess = np.zeros(len(forces))
         columns = np.zeros((wanted.size + len(forces), len(forces)))
         for number, force in enumerate(forces):
@@ -269,11 +275,6 @@ def _blocks(condensed: CondensedModel) -> tuple[np.ndarray, np.ndarray]:
 def _efforts(condensed: CondensedModel) -> np.ndarray:
     """Efforts of actuators and contacts, in this order."""
     return np.concatenate([condensed.effort[condensed.slices[r]] for r in "ac" if r in condensed.slices])
-
-
-def _contact_names(condensed: CondensedModel) -> list[str]:
-    slices = condensed.slices
-    return [row.name for row in condensed.labels[slices["c"]]] if "c" in slices else []
 
 
 def _force_error(
