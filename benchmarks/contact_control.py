@@ -8,21 +8,19 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import click
 import numpy as np
 
+from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.control import ContactControl, ContactQP, ForceGoal, InverseQP
 from softgym_envs.control.qpcc import ComplementarityQP
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics import CondensedModel, MechanicalModel
+from softgym_envs.mechanics import CondensedModel
 from softgym_envs.mechanics.condensation import Row, point_rows
-from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane
-from softgym_envs.robots.cable_trunk import CableTrunk
-from softgym_envs.robots.soft_finger import SoftFinger
+from softgym_envs.mechanics.contact.obstacles import Cylinder, Plane
 
 
 @dataclass(frozen=True)
@@ -165,31 +163,29 @@ def many_contacts(counts: tuple[int, ...] = (8, 12, 16), problems: int = 20, see
     return results
 
 
-class FingerAtRod(SoftFinger):
-    """Soft Finger that bends towards a rod across its way.
-
-    Args:
-        friction: of the rod.
-    """
-
-    def __init__(self, *, friction: float = 0.0) -> None:
-        super().__init__()
-        self.rod = Cylinder((0.0, 0.055, -0.10), (1.0, 0.0, 0.0), 0.01, name="rod", friction=friction)
-
-    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
-        model = super().assemble(design)
-        model.set_contact(obstacles=[self.rod])
-        return model
-
-
 def force_goal(friction: float = 0.0, force: float = 1.0, steps: int = 15) -> dict[str, object]:
     """Soft Finger that starts 25 mm from a rod and presses on it with a given force."""
-    robot = FingerAtRod(friction=friction)
+    rod = Cylinder((0.0, 0.055, -0.10), (1.0, 0.0, 0.0), 0.01, name="rod", friction=friction)
+    robot = make_robot("finger", obstacles=[rod])
     fem = FEMBackend(robot)
-    loop = ContactControl(fem, ContactQP.for_robot(robot, rates=np.full(2, 0.004)))
+    return _press(ContactControl(fem, ContactQP.for_robot(robot, rates=np.full(2, 0.004))), "rod", force, steps)
+
+
+def hold(friction: float = 0.85, force: float = 1.0, steps: int = 15) -> dict[str, object]:
+    """Contact-aided finger of measured design 203 that touches itself and holds a plane with a given force."""
+    plane = Plane((0.0631, 0.0, 0.0), (-1.0, 0.0, 0.0), name="object", friction=friction)
+    robot = make_robot("contact_aided_finger", obstacles=[plane], self_contact=True)
+    lengths = [14.7, 3.2, 9.7, 12.2, 17.3, 13.1, 15.1, 18.1, 28.0, 20.9, 9.0, 18.3, 19.3, 10.6, 18.1]  # mm
+    names = ["e1", "e2", "e3", *(f"d{k}" for k in range(12))]
+    fem = FEMBackend(robot, {name: 1e-3 * length for name, length in zip(names, lengths, strict=True)})
+    controller = ContactQP.for_robot(robot, rates=np.full(1, np.radians(3.0)))
+    return _press(ContactControl(fem, controller), "object", force, steps)
+
+
+def _press(loop: ContactControl, name: str, force: float, steps: int) -> dict[str, object]:
     forces = []
     for _ in range(steps):
-        state = loop.step(None, forces=[ForceGoal({"rod": 1.0}, force)])
+        state = loop.step(None, forces=[ForceGoal({name: 1.0}, force)])
         assert state.contacts is not None
         forces.append(float(state.contacts.pressing.sum()))
     errors = np.abs(np.array(forces) / force - 1.0)
@@ -203,25 +199,6 @@ def force_goal(friction: float = 0.0, force: float = 1.0, steps: int = 15) -> di
 
 TRUNK_GOAL = np.array([0.0278, 0.0, 0.155])
 """Between the trunk and the wall, 40 mm below the tip at rest [m]."""
-
-
-class TrunkAtWall(CableTrunk):
-    """Cable trunk beside a wall.
-
-    Args:
-        obstacles: the wall, or nothing.
-        layers: see `CableTrunk`.
-    """
-
-    def __init__(self, obstacles: tuple[Obstacle, ...], *, layers: int = 24) -> None:
-        super().__init__(layers=layers)
-        self.walls = obstacles
-
-    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
-        model = super().assemble(design)
-        if self.walls:
-            model.set_contact(obstacles=self.walls)
-        return model
 
 
 def reach_along_wall(friction: float = 0.0, steps: int = 20, layers: int = 24) -> dict[str, object]:
@@ -239,8 +216,8 @@ def reach_along_wall(friction: float = 0.0, steps: int = 20, layers: int = 24) -
     }
     wall = Plane((0.03, 0.0, 0.0), (-1.0, 0.0, 0.0), name="wall", friction=friction)
     results: dict[str, object] = {}
-    for name, obstacles in (("without_wall", ()), ("with_wall", (wall,))):
-        fem = FEMBackend(TrunkAtWall(obstacles, layers=layers))
+    for name, obstacles in (("without_wall", []), ("with_wall", [wall])):
+        fem = FEMBackend(make_robot("cable_trunk", obstacles=obstacles, layers=layers))
         state = fem.step(np.append(np.zeros(4), paid_out))
         plain = InverseQP.for_robot(fem.robot, **limits)
         loop = ContactControl(fem, ContactQP.for_robot(fem.robot, **limits))
@@ -260,7 +237,7 @@ def reach_along_wall(friction: float = 0.0, steps: int = 20, layers: int = 24) -
 
 def distance_without_wall(samples: int = 100, seed: int = 0) -> float:
     """Smallest distance [mm] from the goal of the trunk without the wall, over random pulls of its long cables."""
-    fem = FEMBackend(TrunkAtWall(()))
+    fem = FEMBackend(make_robot("cable_trunk"))
     rng = np.random.default_rng(seed)
     distances = []
     for pulls in rng.uniform(0.0, 0.035, (samples, 4)):
@@ -280,6 +257,7 @@ def contact_control(count: int = 1000) -> dict[str, object]:
         "many_contacts": many_contacts(),
         "force_goal": force_goal(),
         "force_goal_with_friction": force_goal(0.5),
+        "hold_with_contact_aided_finger": hold(),
         "reach_along_wall": reach_along_wall(),
         "reach_along_wall_with_friction": reach_along_wall(0.3),
         "sampled_distance_without_wall_mm": distance_without_wall(),

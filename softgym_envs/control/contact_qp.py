@@ -65,8 +65,9 @@ class ContactQP(InverseQP):
 
     The energy terms of the objective include the contact forces: ``(effort, f)^T W (effort, f)``.
 
-    Friction: the linear model holds the friction forces of its state. Tangential forces of contacts that stick or slide
-    are therefore right at the state and follow with a delay of one step. Step sizes decide how far this is wrong.
+    Friction: the model of `Statics.contact_model` holds the friction forces of its state. So the result is right where
+    nothing changes any more, and friction that follows the step counts in the next one. `ContactControl` corrects the
+    changes of forces for it.
 
     The problem has one local optimum for each set of closed contacts, and the best of them is found by branch and bound
     (`solve_qpcc`). A condensed model without contacts gives the result of `InverseQP`.

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.contact_control import TrunkAtWall, force_goal, reach_along_wall
+from benchmarks.contact_control import force_goal, reach_along_wall
+from softgym_envs import make_robot
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.control import ContactControl, ContactQP, ForceGoal
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.contact.obstacles import Plane
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])
@@ -33,9 +35,11 @@ class Spring(Backend):
     Args:
         surprise: how far the opening differs from its prediction, for each step [m].
         reach: largest step that has an equilibrium [m].
+        stiffening: real over predicted change of the contact force.
     """
 
-    def __init__(self, surprise=(), reach=1.0):
+    def __init__(self, surprise=(), reach=1.0, stiffening=1.0):
+        self.stiffening = stiffening
         self.surprise = list(surprise)
         self.reach = reach
         self.wall = 5e-3
@@ -49,8 +53,8 @@ class Spring(Backend):
 
     def model(self, command):
         W = 1e-3 * np.array([[1.0, 0.0, -1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 1.5]])
-        force = max(0.0, float(command[0]) - self.wall) / 1.5e-3
-        effort = np.array([command[0] / 1e-3 + force, 0.0, force])
+        force = self.stiffening * max(0.0, float(command[0]) - self.wall) / 0.5e-3
+        effort = np.array([float(command[0]) / 1e-3 + force, 0.0, force])
         delta = np.array([command[0], 0.0, max(0.0, self.wall - float(command[0]))])
         return CondensedModel(W, delta - W @ effort, effort, (("a", 1), ("e", 1), ("c", 1)))
 
@@ -98,6 +102,27 @@ def test_a_new_goal_does_not_count_as_a_step_that_made_it_worse():
     assert loop.size == 1.0
 
 
+@pytest.mark.parametrize("stiffening", [0.5, 1.0, 1.9, 3.0])
+def test_forces_that_change_more_or_less_than_predicted_are_reached(stiffening):
+    """Without the measured ratio, a contact that is twice as stiff as in the model makes the loop swing for ever."""
+    plant = Spring(stiffening=stiffening)
+    loop = loop_on(plant)
+    for _ in range(16):
+        loop.step(None, forces=PRESS)
+    assert plant.state.condensed.lambda_.c == pytest.approx([1.0], rel=2e-3)
+
+
+def test_the_row_of_an_open_obstacle_is_that_of_a_point_which_actuators_move():
+    """The base of the trunk is nearest to the wall, but it hardly moves."""
+    wall = Plane((0.03, 0.0, 0.0), (-1.0, 0.0, 0.0), name="wall")
+    fem = FEMBackend(make_robot("cable_trunk", obstacles=[wall], layers=8))
+    model = fem.contact_model()
+    nearest = 0.03 - fem.model.nodes[:, 0].max() - 5e-4
+    assert model.delta.c[0] > nearest + 1e-3
+    east = fem.robot.actuators.index(next(a for a in fem.robot.actuators if a.name == "long_east"))
+    assert model.W.ca[0, east] < -1e-4
+
+
 def test_steps_without_equilibrium_are_halved_and_the_loop_goes_on():
     plant = Spring(reach=0.6e-3)
     loop = loop_on(plant)
@@ -114,7 +139,7 @@ def test_steps_without_equilibrium_are_halved_and_the_loop_goes_on():
 def test_backends_without_contact_say_so():
     with pytest.raises(ValueError, match="Spring does not compute contacts"):
         Backend.contact_model(Spring())
-    trunk = TrunkAtWall((), layers=4)
+    trunk = make_robot("cable_trunk", layers=4)
     with pytest.raises(ValueError, match="the model has no contact"):
         FEMBackend(trunk).contact_model()
     with pytest.raises(ValueError, match="dynamics=False"):
