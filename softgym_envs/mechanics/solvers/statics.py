@@ -507,7 +507,7 @@ class Statics:
         if not linear.current and not self._linearise(exact=True):
             raise ConvergenceError("the tangent of the current state is singular", fraction=0.0)
         units = np.eye(len(self.effort))[: self._actuators]
-        motions = np.array([linear.response(effort) for effort in units]).reshape(len(units), -1).T
+        motions = np.reshape([linear.response(effort) for effort in units], (len(units), self.model.equations)).T
         largest = np.abs(motions).max(axis=0, initial=0.0)
         return motions[:, largest > 0.0] / largest[largest > 0.0]
 
