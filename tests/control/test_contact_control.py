@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.contact_control import force_goal, reach_along_wall
+from benchmarks.contact_control import distance_without_wall, force_goal, reach_along_wall
 from softgym_envs import make_robot
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.backends.fem import FEMBackend
@@ -24,8 +24,9 @@ def test_a_finger_comes_to_a_rod_and_presses_with_the_force_asked_for(friction):
 
 def test_a_trunk_reaches_a_goal_along_a_wall_that_it_cannot_reach_without():
     found = reach_along_wall(layers=12, steps=12)
-    assert found["with_wall_final_mm"] < 1.0
-    assert found["without_wall_smallest_mm"] > 15.0
+    assert found["with_wall_final_mm"] < 2.0  # the tolerance of goals
+    assert found["without_wall_smallest_mm"] > 20.0
+    assert distance_without_wall(samples=12, layers=12) > 20.0
     assert found["wall_force_N"] > 0.1
 
 
