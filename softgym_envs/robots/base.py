@@ -129,6 +129,8 @@ class Robot(ABC):
             loads), or None. Surrogates use it exactly instead of learning it.
         convex: the elastic energy is convex in the actuator displacements, so that the body is also stable when its
             actuators are driven by efforts. Surrogates rely on it; without it, they learn unstable states too.
+        free_object: whether the robot holds an object that can fall. Many commands then have no static equilibrium, so
+            pictures are framed by the robot at rest.
         non_mechanical_options: options that do not change the condensed model.
     """
 
@@ -145,6 +147,7 @@ class Robot(ABC):
     rest_mode: str = "effort"
     stiffness_variable: str | None = None
     convex: bool = True
+    free_object: bool = False
     non_mechanical_options: tuple[str, ...] = ("unilateral",)
     _options: dict[str, object]
 

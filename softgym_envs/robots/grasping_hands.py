@@ -105,6 +105,7 @@ class ContactAidedGripper(Robot):
     size = 0.1
     rest_mode = "displacement"
     convex = False
+    free_object = True
     goal_axes = np.array([0.0, 0.0, 1.0])
     goal_tolerance = 1.0e-3
     workspace_scale = 0.010

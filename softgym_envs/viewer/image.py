@@ -108,7 +108,10 @@ class ImageRenderer:
             model = self._shapes.load(baseline)
             # At rest, with each actuator alone at its limit, and with all of them, which deforms a body differently.
             seen = []
-            for command in (None, *np.where(np.eye(len(upper), dtype=bool), upper, lower), upper):
+            commands = (
+                [] if self.robot.free_object else [*np.where(np.eye(len(upper), dtype=bool), upper, lower), upper]
+            )
+            for command in (None, *commands):
                 x = self._shapes.at(baseline, command)
                 lines = cable_lines(model, x, self._shapes.state, stub=STUB * self.robot.size)
                 seen += [BodySurface(model).points(x), *lines.values()]
