@@ -101,3 +101,18 @@ def test_grooves_of_the_finger_close():
     assert tension == pytest.approx(1.0 / W.aa[0, 0], rel=1e-6)
     tip = (ends[0].delta[1:4] - ends[1].delta[1:4]) / (2 * h)
     np.testing.assert_allclose(tip, W.ea[:, 0] / W.aa[0, 0], rtol=1e-6, atol=1e-6 * np.abs(tip).max())
+
+
+def test_tetrapod_presses_on_a_floor():
+    """Friction holds the loaded centre, which the servos move by 4 mm without a floor; forces stay in the cone."""
+    floor = Plane((0.0, 0.0, -0.160), (0.0, 0.0, 1.0), friction=0.5, name="floor")
+    ends = []
+    for obstacles in ([], [floor]):
+        statics = Statics(make_robot("tetrapod", payload=1.0, obstacles=obstacles).build())
+        rest = statics.solve(np.zeros(4))
+        found = statics.solve([0.1, -0.03, -0.1, 0.02])
+        ends.append(np.linalg.norm((found.delta - rest.delta)[4:7]))
+    assert ends[0] > 3e-3 and ends[1] < 1e-5
+    x, y, z = found.contacts.total[0]
+    assert 0.1 < np.hypot(x, y) < 0.5 * z
+    assert found.contacts.smallest_gap > 0.0
