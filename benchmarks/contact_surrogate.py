@@ -43,7 +43,7 @@ class Scene:
 
 
 def draw_scene(model: ChainModel, contacts: int, rng: np.random.Generator) -> Scene:
-    """Draw a body and bars so that its free motion would enter each bar by 1 to 4 mm.
+    """Draw a body and bars so that its free motion would enter each bar by 10 to 40 % of its way there.
 
     Raises:
         RuntimeError: if no scene is found in which the body at rest is free.
@@ -67,9 +67,11 @@ def draw_scene(model: ChainModel, contacts: int, rng: np.random.Generator) -> Sc
         row = design.array[None]
         free = model.markers(row, np.array([angle]))
         corners = free.markers[0, 1 : 2 + chain.points]
+        start = model.chain.bodies(row).markers[0, 1 : 2 + chain.points]
         chosen = np.sort(rng.choice(len(corners) - 1, size=contacts, replace=False))
+        entered = rng.uniform(0.1, 0.4, contacts) * (corners - start)[chosen, 0]
         radius = rng.uniform(0.002, 0.004 if contacts > 4 else 0.008, size=contacts)
-        centres = corners[chosen] + np.column_stack([radius - rng.uniform(0.001, 0.004, contacts), np.zeros(contacts)])
+        centres = corners[chosen] + np.column_stack([radius - entered, np.zeros(contacts)])
         bars = tuple(
             Cylinder(point=(x, y, 0.0), axis=(0.0, 0.0, 1.0), radius=float(r), friction=friction, name=f"bar {k + 1}")
             for k, ((x, y), r) in enumerate(zip(centres, radius, strict=True))

@@ -309,3 +309,18 @@ def test_stiffness_is_positive_definite_for_all_weights(robot):
     designs = np.array([[rng.uniform(v.low, v.high) for v in space] for _ in range(50)])
     prepared = ChainModel(robot, tensors, {}).prepare(designs)
     assert (np.linalg.eigvalsh(prepared.stiffness) > 0.0).all()
+
+
+def test_shipped_weights(robot):
+    model = load_chain(robot)
+    prepared = model.prepare(np.concatenate([body(robot), body(robot, e3=0.001)]))
+    assert not prepared.known[1]
+    assert model.card["test"]["held_median"] < 0.03
+    batch = ChainBatch(model.prepare(body(robot)), [[wall(0.055, 0.5)]])
+    for degrees in range(2, 21, 2):
+        states = batch.close(np.radians([degrees]))
+    W, stable = batch.compliance()
+    assert states.found[0]
+    assert states.force[0, 0, 0] < 0.0 < states.gap[0]
+    assert stable[0]
+    assert np.linalg.eigvalsh(0.5 * (W[0] + W[0].T))[0] > 0.0
