@@ -80,13 +80,18 @@ def evaluate(name: str, design: Mapping[str, float], mesh: str) -> Value:
     )
 
 
+def first_names(designs: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
+    """Return for each name of a design the first name of the same design."""
+    space = ContactAidedFinger().design_space
+    complete = {name: tuple(np.round(list(space.complete(design).values()), 9)) for name, design in designs.items()}
+    return {name: next(other for other in designs if complete[other] == complete[name]) for name in designs}
+
+
 def evaluate_all(designs: Mapping[str, Mapping[str, float]], path: Path) -> list[Value]:
     """Evaluate designs on all meshes, each once; values that a file of JSON lines holds are not computed again."""
     lines = JsonLines(path)
     known = {(value.design, value.mesh): value for value in (Value(**record) for record in lines.read())}
-    space = ContactAidedFinger().design_space
-    complete = {name: tuple(space.complete(design).values()) for name, design in designs.items()}
-    first = {name: next(other for other in designs if complete[other] == complete[name]) for name in designs}
+    first = first_names(designs)
     for name in dict.fromkeys(first.values()):
         for mesh in MESHES:
             if (name, mesh) not in known:
@@ -145,13 +150,20 @@ def main(folder: Path) -> None:
     values = evaluate_all(designs, folder / "chosen.jsonl")
     robot = ContactAidedFinger()
     shapes = {}
+    different = set(first_names(designs).values())
     for name, design in designs.items():
         complete = robot.design_space.complete(design)
-        shapes[name] = robot.outline(complete)
+        if name in different:
+            shapes[name] = robot.outline(complete)
         for ending in ("step", "stl"):
             export_body(robot, folder / "print" / f"{name.replace(' ', '_')}.{ending}", complete)
     every = np.genfromtxt(folder / "trials.csv", delimiter=",", names=True, usecols=tuple(OBJECTIVES), dtype=float)
-    draw(folder / "chosen.png", np.column_stack([every[name] for name in OBJECTIVES]), values, shapes)
+    draw(
+        folder / "chosen.png",
+        np.column_stack([every[name] for name in OBJECTIVES]),
+        [v for v in values if v.design in shapes],
+        shapes,
+    )
     output = {
         "search": {
             "mesh": config.bodies.robot_options,
