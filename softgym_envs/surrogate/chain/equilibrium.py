@@ -92,7 +92,7 @@ def find(q, angle, target, drive, length, along, stiffness, skin, obstacles, edg
         if left == 0.0 and far_step <= TOLERANCE and turn <= 100.0 * TOLERANCE:
             # The last step is taken without another evaluation.
             q += step[:, :, 0]
-            return True, direction @ (gradient[0] + upper[0] @ step[1, :, 0]), iteration
+            return True, direction @ (gradient[0] + upper[0] @ np.ascontiguousarray(step[1, :, 0])), iteration
         part = min(1.0, min(MAX_STEP / max(far_step, 1e-30), MAX_TURN / max(turn, 1e-30)))
         part = min(part, MAX_TURN / max(abs(left), 1e-30))
         limits[:, :] = 0.0
