@@ -103,7 +103,8 @@ class Linearisation:
             if self._slips:
                 self._loading = terms.loading
                 extra = hstack([terms.directions, terms.loading], format="csc")
-        columns = np.asfortranarray(np.column_stack([self.H, self.residual]))
+        columns = np.empty((len(self.residual), count + 1), order="F")
+        columns[:, :count], columns[:, count] = self.H, self.residual
         gram, self._half = self._tangent.solver.condense(columns, extra)
         if not np.isfinite(gram).all():
             return False
