@@ -318,6 +318,15 @@ def validation() -> str:
     return markdown(head, rows, "lllrrrrr")
 
 
+def contact() -> str:
+    """Contact beside exact solutions."""
+    rows = []
+    for key, row in results("contact").items():
+        values = [f"{row[name]:.5g}" for name in ("value", "reference")]
+        rows.append([*key.split(" | "), *values, f"{row['error']:.2g}", f"{row['tolerance']:.2g}"])
+    return markdown(["case", "setup", "value", "reference", "error", "tolerance"], rows, "llrrrr")
+
+
 # -- speed ----------------------------------------------------------------------------------------------------------
 
 
@@ -371,7 +380,7 @@ TABLES: dict[str, Callable[[], str]] = {
     for function in (
         headlines, codesign, codesign_goals, codesign_bodies, strategies, kills, profile, agents, carry, test_set,
         buckling, predicted_tracking, trajectories, design_gradients, networks, design_optima,
-        tracking, stiff_flop, validation, surrogate_speed, fem_speed, deployed, provenance,
+        tracking, stiff_flop, validation, contact, surrogate_speed, fem_speed, deployed, provenance,
     )
 }  # fmt: skip
 """Tables by the name in a marked place."""

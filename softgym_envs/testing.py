@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.contact.contact import ContactState
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Robot
@@ -135,6 +136,17 @@ def dense_tangent(model: MechanicalModel, values: np.ndarray) -> np.ndarray:
     lower = csc_matrix((values.copy(), indices, indptr), shape=2 * (len(indptr) - 1,)).toarray()
     assert np.allclose(np.triu(lower, 1), 0.0)
     return lower + np.tril(lower, -1).T
+
+
+def contact_slope(model: MechanicalModel, state: ContactState, x: np.ndarray) -> np.ndarray:
+    """Return the derivative of the contact energy by the equations (N,) at rows ``x`` (n, 3) of a model with frames."""
+    gradient = state.evaluate(x).gradient
+    kinematics = model.kinematics
+    assert kinematics.map is not None
+    kinematics.map.linearise(x)
+    slope = np.zeros(kinematics.equations)
+    slope[: len(kinematics.free_dofs)] = gradient.ravel()[kinematics.free_dofs]
+    return slope + kinematics.map.transposed @ gradient[kinematics.frames.carried].ravel()
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh
+from softgym_envs.testing import box_mesh, contact_slope
 
 GRAVITY = 9.81
 
@@ -85,16 +85,6 @@ def pressed(rng):
     return model, state, model.nodes + model.kinematics.displacement(model.nodes, step)
 
 
-def slope(model, state, x):
-    """Derivative of the contact energy by the equations (N,)."""
-    gradient = state.evaluate(x).gradient
-    kinematics = model.kinematics
-    kinematics.map.linearise(x)
-    out = np.zeros(kinematics.equations)
-    out[: len(kinematics.free_dofs)] = gradient.ravel()[kinematics.free_dofs]
-    return out + kinematics.map.transposed @ gradient[kinematics.frames.carried].ravel()
-
-
 def test_gradient_and_tangent_are_exact(pressed):
     """With friction that sticks and slides, and an obstacle that moves; limits of friction are held for the energy."""
     model, state, x = pressed
@@ -102,7 +92,7 @@ def test_gradient_and_tangent_are_exact(pressed):
     assert set(contacts.obstacle) == {0, 1, 2} and 0 < contacts.sliding.sum() < contacts.count
     kinematics, h = model.kinematics, 1e-8
     ways = [[kinematics.displacement(x, s * h * e) for s in (1, -1)] for e in np.eye(kinematics.equations)]
-    exact = slope(model, state, x)
+    exact = contact_slope(model, state, x)
     terms = state.evaluate(x)
     state.hold(terms)
     differences = np.array([state.energy(x + plus) - state.energy(x + minus) for plus, minus in ways]) / (2 * h)
@@ -116,7 +106,9 @@ def test_gradient_and_tangent_are_exact(pressed):
     n = kinematics.equations
     lower = csc_matrix((values[: len(assembly.indices)], assembly.indices, assembly.indptr), shape=(n, n)).toarray()
     tangent += lower + np.tril(lower, -1).T
-    differences = np.array([slope(model, state, x + plus) - slope(model, state, x + minus) for plus, minus in ways])
+    differences = np.array(
+        [contact_slope(model, state, x + plus) - contact_slope(model, state, x + minus) for plus, minus in ways]
+    )
     assert np.abs(differences.T / (2 * h) - tangent).max() < 1e-6 * np.abs(tangent).max()
 
 

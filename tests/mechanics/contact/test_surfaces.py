@@ -15,7 +15,7 @@ from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh
+from softgym_envs.testing import box_mesh, contact_slope
 
 
 def mesh_box(half, cells, centre=(0.0, 0.0, 0.0), **options):
@@ -47,16 +47,6 @@ def pressed(rng):
     return model, state, model.nodes + model.kinematics.displacement(model.nodes, step)
 
 
-def slope(model, state, x):
-    """Derivative of the contact energy by the equations (N,)."""
-    gradient = state.evaluate(x).gradient
-    kinematics = model.kinematics
-    kinematics.map.linearise(x)
-    out = np.zeros(kinematics.equations)
-    out[: len(kinematics.free_dofs)] = gradient.ravel()[kinematics.free_dofs]
-    return out + kinematics.map.transposed @ gradient[kinematics.frames.carried].ravel()
-
-
 def test_gradient_and_tangent_are_exact(pressed):
     model, state, x = pressed
     assert model.contact.intersections(x) is None
@@ -64,7 +54,7 @@ def test_gradient_and_tangent_are_exact(pressed):
     assert total[0, 2] > 0.01 and total[1, 2] < -0.01
     kinematics, h = model.kinematics, 1e-9
     ways = [[kinematics.displacement(x, s * h * e) for s in (1, -1)] for e in np.eye(kinematics.equations)]
-    exact = slope(model, state, x)
+    exact = contact_slope(model, state, x)
     differences = np.array([state.energy(x + plus) - state.energy(x + minus) for plus, minus in ways]) / (2 * h)
     assert np.abs(differences - exact).max() < 1e-6 * np.abs(exact).max()
 
@@ -75,7 +65,9 @@ def test_gradient_and_tangent_are_exact(pressed):
     n = kinematics.equations
     lower = csc_matrix((values[: len(assembly.indices)], assembly.indices, assembly.indptr), shape=(n, n)).toarray()
     tangent = terms.tangent.toarray() + lower + np.tril(lower, -1).T
-    differences = np.array([slope(model, state, x + plus) - slope(model, state, x + minus) for plus, minus in ways])
+    differences = np.array(
+        [contact_slope(model, state, x + plus) - contact_slope(model, state, x + minus) for plus, minus in ways]
+    )
     assert np.abs(differences.T / (2 * h) - tangent).max() < 1e-6 * np.abs(tangent).max()
 
 
