@@ -211,7 +211,13 @@ class MechanicalModel:
         return [block for block in self.blocks if isinstance(block, SolidBlock)]
 
     def embed(
-        self, points: ArrayLike, hint: np.ndarray | None = None, *, block: int = 0, name: str = "point"
+        self,
+        points: ArrayLike,
+        hint: np.ndarray | None = None,
+        *,
+        block: int = 0,
+        name: str = "point",
+        radius: float = 0.0,
     ) -> EmbeddedPoints:
         """Embed points in a solid block.
 
@@ -220,14 +226,17 @@ class MechanicalModel:
             hint: elements from which points outside the mesh are extrapolated, shape (p,).
             block: its number among `solids`.
             name: what the points are, for messages.
+            radius: of the part of the body on which a point acts [m], see `averaged_points`. With zero it acts on a
+                single point, whose compliance grows with every refinement of the mesh.
 
         Raises:
-            ValueError: if a point is farther from the body than the body's size.
+            ValueError: if a point is farther from the body than the body's size, or the body does not reach into its
+                radius.
         """
         solid = self._solid(block)
         places = np.asarray(points, dtype=float)
         check_distance(places, self._solid_nodes, name, 1.0)
-        return solid.embed(places, self.nodes, hint)
+        return solid.embed_average(places, self.nodes, radius) if radius else solid.embed(places, self.nodes, hint)
 
     def _solid(self, block: int) -> SolidBlock:
         solids = self.solids
@@ -257,6 +266,7 @@ class MechanicalModel:
         unilateral: bool = True,
         hint: np.ndarray | None = None,
         block: int = 0,
+        radius: float = 0.0,
     ) -> Cable:
         """Add a cable actuator.
 
@@ -267,13 +277,14 @@ class MechanicalModel:
             unilateral: True for a real cable, which cannot push.
             hint: elements from which guides outside the mesh are extrapolated, shape (p,).
             block: number of the solid among `solids`.
+            radius: of the channel's part on which a guide acts [m], see `embed`.
 
         Raises:
             ValueError: if a guide is farther from the body than its size, or the pull point than ten times its size.
         """
         origin = np.asarray(pull_point, dtype=float)
         check_distance(origin, self._solid_nodes, f"the pull point of cable '{name}'", 10.0)
-        embedding = self.embed(points, hint, block=block, name=f"a guide of cable '{name}'")
+        embedding = self.embed(points, hint, block=block, name=f"a guide of cable '{name}'", radius=radius)
         cable = Cable(name, embedding, origin, unilateral=unilateral)
         self.add("a", cable)
         return cable
@@ -311,15 +322,19 @@ class MechanicalModel:
         self.add("a", cavity)
         return cavity
 
-    def add_effector(self, name: str, point: ArrayLike, *, hint: np.ndarray | None = None, block: int = 0) -> Point:
-        """Add an effector at a material point [m] (3,) of a solid."""
-        effector = Point(name, self.embed(point, hint, block=block, name=f"effector '{name}'"))
+    def add_effector(
+        self, name: str, point: ArrayLike, *, hint: np.ndarray | None = None, block: int = 0, radius: float = 0.0
+    ) -> Point:
+        """Add an effector at a material point [m] (3,) of a solid, or averaged over a radius [m] (see `embed`)."""
+        effector = Point(name, self.embed(point, hint, block=block, name=f"effector '{name}'", radius=radius))
         self.add("e", effector)
         return effector
 
-    def add_contact(self, name: str, point: ArrayLike, *, hint: np.ndarray | None = None, block: int = 0) -> Point:
-        """Add a contact point at a material point [m] (3,) of a solid."""
-        contact = Point(name, self.embed(point, hint, block=block, name=f"contact '{name}'"))
+    def add_contact(
+        self, name: str, point: ArrayLike, *, hint: np.ndarray | None = None, block: int = 0, radius: float = 0.0
+    ) -> Point:
+        """Add a contact point at a material point [m] (3,) of a solid, or averaged over a radius [m] (see `embed`)."""
+        contact = Point(name, self.embed(point, hint, block=block, name=f"contact '{name}'", radius=radius))
         self.add("c", contact)
         return contact
 

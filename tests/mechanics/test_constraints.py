@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.mechanics import constraints
+from softgym_envs.mechanics.constraints.averaging import averaged_points
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.cavity import Cavity, enclosed_volume
@@ -39,6 +40,12 @@ def make_cable(nodes, tetrahedra):
     points = np.array([[0.2, 0.3, 0.4], [0.22, 0.31, 0.41], [0.7, 0.5, 0.8], [1.1, 0.4, 0.6]])
     cable = Cable("cable", EmbeddedPoints(points, nodes, tetrahedra), np.array([-0.3, 0.1, 0.2]))
     return cable
+
+
+def make_averaged_cable(nodes, tetrahedra):
+    # The balls share nodes; one has fewer of them than the other.
+    points = averaged_points([[0.4, 0.4, 0.4], [0.8, 0.8, 1.0]], nodes, tetrahedra, lambda weights: weights, 0.2)
+    return Cable("cable", points, np.array([-0.3, 0.1, 0.2]))
 
 
 def make_point(nodes, tetrahedra):
@@ -108,6 +115,7 @@ def make_turn(nodes, tetrahedra):
 FACTORIES = {
     "Bond": make_bond,
     "Cable": make_cable,
+    "Cable of averaged points": make_averaged_cable,
     "Cavity": make_cavity,
     "Cavity of quadratic triangles": make_quadratic_cavity,
     "Chamber": make_chamber,

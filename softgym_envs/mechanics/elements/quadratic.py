@@ -162,6 +162,9 @@ class QuadraticTetrahedra(SolidBlock):
             weights[:, q] = determinant / 24.0
         super().__init__(connectivity, gradients.reshape(-1, 10, 3), weights.ravel(), **options)
 
+    def shape(self, barycentric: np.ndarray) -> np.ndarray:
+        return _shape(barycentric)
+
     def embed(self, points: np.ndarray, nodes: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
         # Barycentric coordinates of the corners: exact for straight edges.
         linear = EmbeddedPoints(points, nodes, self.corners, hint)

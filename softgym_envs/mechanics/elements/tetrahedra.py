@@ -8,6 +8,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numba import njit
 
+from softgym_envs.mechanics.constraints.averaging import averaged_points
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.block import ElementBlock, lower_pairs
 from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
@@ -328,9 +329,17 @@ class SolidBlock(ElementBlock):
         """Young's modulus [Pa] of the stiffest element."""
         return float((self.mu * (3.0 * self.lame + 2.0 * self.mu) / (self.lame + self.mu)).max())
 
+    def shape(self, barycentric: np.ndarray) -> np.ndarray:
+        """Return the shape functions (..., k) at barycentric coordinates (..., 4) of an element."""
+        return barycentric
+
     def embed(self, points: np.ndarray, nodes: np.ndarray, hint: np.ndarray | None = None) -> EmbeddedPoints:
         """Embed points [m] (p, 3) of the rest shape ``nodes`` [m] (n, 3) in the elements."""
         return EmbeddedPoints(points, nodes, self.connectivity, hint)
+
+    def embed_average(self, points: np.ndarray, nodes: np.ndarray, radius: float) -> EmbeddedPoints:
+        """Embed points [m] (p, 3) that act on the body within a radius [m] of them; see `averaged_points`."""
+        return averaged_points(points, nodes, self.connectivity, self.shape, radius)
 
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
         k = self.connectivity.shape[1]
