@@ -54,6 +54,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "hybrid": hybrid.hybrid,
     "deployed": export.deployed,
     "tracking": robots.tracking,
+    "closed_loop": robots.closed_loop,
     "predicted_tracking": robots.predicted_tracking,
     "shared_finger": robots.shared_finger,
     "stiff_flop": robots.stiff_flop,

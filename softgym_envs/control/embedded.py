@@ -15,7 +15,7 @@ from softgym_envs.mechanics.condensation import CondensedModel
 class PICorrection:
     """Shifts a goal by the measured error: ``goal + proportional * error + integral * sum of errors``.
 
-    Gains are per call and thus independent of the rate of the loop (thesis, sec. 4.4.3: 0.01 and 0.002).
+    Gains are per call and thus independent of the rate of the loop (thesis, sec. 4.4.4: 0.01 and 0.002).
 
     Anti-windup by conditional integration and clamping: if the model itself cannot reach the corrected goal (out of
     reach, or limited by a rate), the part of the error in that direction is not integrated, and the integral never

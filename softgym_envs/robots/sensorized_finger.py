@@ -45,9 +45,10 @@ class SensorReadings:
     Attributes:
         volume_change: ``f1 = |V(pull) - V(0)|`` of the first cavity [m3].
         bending_angle: ``f2 = acos(|p_z| / |p|)`` of the tip point p under the pull [rad].
-        relative_volume_change: ``f3 = f1 / V(pull)``, the relative change of pressure of a closed cavity.
+        relative_volume_change: ``f3 = f1 / V(pull)`` (eq. 3.4), the relative change of pressure of a closed cavity.
         initial_volume: ``f4 = V(0)`` of the first cavity [m3].
-        pressure_sensitivity: the smaller of ``f3`` under the pull and under the lateral force; None with two cavities.
+        pressure_sensitivity: change of the first cavity's volume over its volume at rest (sec. 3.3.6), the smaller of
+            that under the pull and that under the lateral force; None with two cavities.
         volumes: of all cavities at rest [m3].
         pulled_volumes: of all cavities under the pull [m3].
         pushed_volumes: of all cavities under the lateral force [m3]; None with two cavities.
@@ -236,7 +237,7 @@ class SensorizedFinger(MeshedRobot):
             model.nodal_loads[point.node_ids[0], 0] += lateral_force * point.weights[0]
             statics.reset()
             pushed = volumes + statics.solve([0.0]).condensed.delta.s
-            sensitivity = min(change / float(pulled[0]), abs(float(pushed[0] - rest[0])) / float(pushed[0]))
+            sensitivity = min(change, abs(float(pushed[0] - rest[0]))) / float(rest[0])
         return SensorReadings(
             volume_change=change,
             bending_angle=math.acos(min(1.0, abs(tip[2]) / float(np.linalg.norm(tip)))),

@@ -2,7 +2,8 @@
 
 Each module bends and stretches when its three pairs of chambers, 120 degrees apart, are filled. The model is that of
 the thesis, but with geometrically exact beams: beams along the axis with chambers that act along off-axis lines
-(Chaillou et al. 2023). The trunk is clamped at the origin and lies along +x.
+(Chaillou et al. 2023). The trunk is clamped at the origin and lies along +x. The baseline has the moduli of Chaillou et
+al., 125 and 70 kPa; the thesis raised them to 150 and 90 kPa for its prototype, whose sensor stiffens it.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ STIFF_LENGTH = 5e-3
 """Length of the stiff end piece of each module [m]; the chambers fill the rest."""
 
 # The published dimensions determine neither the lever arm of the chambers nor the section that carries load. These four
-# values, the same for both modules, are inferred from the published compliance at rest: they make the largest relative
-# errors of its entries about equal, none above 6 % (see the page of this robot).
+# values, the same for both modules, are inferred from the compliance at rest in the authors' public data (the thesis
+# has none): they make the largest relative errors of its entries about equal, none above 6 % (see the robot's page).
 CHAMBER_RADIUS = 0.719e-3
 """Inner radius of one tube [m]: two of them have 3.25 mm2 (nominal 0.75 mm, 3.53 mm2)."""
 CHAMBER_OFFSET = 3.45e-3
@@ -52,12 +53,15 @@ class StiffFlop(Robot):
         gravity: acceleration [m/s2]; the published work has none.
         unilateral: whether pressures must not be negative (default): a chamber that the others stretch beyond its
             commanded volume is open, without pressure.
+        largest_volume: largest growth of a pair of chambers [m3]. The default is that of the authors' public code, and
+            the range of the shipped surrogate. Target A of the thesis (fig. 4.11) needs 35 mm3: pass 60e-9.
         **options: options of `Robot`.
     """
 
     name = "trunk"
     effectors = ("tip",)
     size = 0.11
+    non_mechanical_options = (*Robot.non_mechanical_options, "largest_volume")
 
     def __init__(
         self,
@@ -65,9 +69,12 @@ class StiffFlop(Robot):
         elements: int = 5,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         unilateral: bool = True,
+        largest_volume: float = 30e-9,
         **options: Any,
     ) -> None:
         super().__init__(gravity=gravity, **options)
+        if not 0.0 < largest_volume <= 100e-9:
+            raise ValueError(f"largest_volume = {largest_volume!r} m3 is out of bounds; allowed: up to 1e-7 (100 mm3)")
         if not isinstance(elements, int) or elements < 1:
             raise ValueError(f"elements = {elements!r} is out of bounds; allowed: integers from 1")
         self.elements = elements
@@ -87,7 +94,7 @@ class StiffFlop(Robot):
         self.effector_rest = np.array([0.11, 0.0, 0.0])
         self.effort_scale = np.full(6, 1e5)
         self.actuators = tuple(
-            Actuator(f"{module}_{pair + 1}", 0.0, 30e-9, 1.5e-9, unit="m3", unilateral=unilateral)
+            Actuator(f"{module}_{pair + 1}", 0.0, float(largest_volume), 1.5e-9, unit="m3", unilateral=unilateral)
             for module in ("base", "tip")
             for pair in range(3)
         )

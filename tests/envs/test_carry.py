@@ -30,11 +30,16 @@ def test_only_the_distance_to_the_right_counts(robot):
     np.testing.assert_array_equal(task.axes, [1.0, 0.0, 0.0])
 
 
-def test_the_reward_grows_to_the_right(robot):
-    task = make_task("carry", robot)
-    distance = np.array([0.15, 0.1, 0.05, 0.01, 0.0])
-    terms = task.reward_terms(distance, np.zeros(5))
-    assert (np.diff(terms["distance"]) > 0.0).all() and terms["distance"][-1] == 1.0
+def test_the_reward_grows_to_the_right_also_beyond_the_goal(robot):
+    task = make_task("carry", robot, distance=0.1)
+    goal = task.sample(np.random.default_rng(0), 1, no_kinematics)[:, 0]
+    effectors = robot.effector_rest + np.linspace(-0.1, 0.3, 41)[:, None] * [1.0, 0.0, 0.0]
+    distance, terms, reward = task.rate(effectors, goal, np.full(41, 0.5))
+    assert (np.diff(reward) > 0.0).all()
+    assert terms["distance"][20] == pytest.approx(0.5)  # at the goal
+    np.testing.assert_allclose(reward, terms["distance"] * 0.975)
+    assert (terms["distance"] > 0.0).all() and (terms["distance"] < 1.0).all()
+    np.testing.assert_allclose(distance, np.linspace(0.2, -0.2, 41).clip(min=0.0), atol=1e-15)
 
 
 def test_pushes(robot):
@@ -81,10 +86,15 @@ def test_an_episode_succeeds_beyond_the_goal():
     env = gymnasium.make("SoftGym/TetrapodCarry-v0", task_options={"distance": 0.02})
     env.reset(seed=0)
     right = np.array([1.0, 1.0, -1.0, 1.0], dtype=np.float32)
+    rewards, places = [], []
     for _ in range(10):
         _, reward, _, _, info = env.step(right)
-    assert info["effector"][0] > 0.02 and info["distance"] == 0.0 and info["is_success"]
-    assert reward > 0.9
+        rewards.append(reward)
+        places.append(info["effector"][0])
+    assert places[-1] > 0.02 and info["distance"] == 0.0 and info["is_success"]
+    assert reward > 0.5
+    beyond = np.array(places) > 0.02
+    assert beyond.sum() > 1 and (np.diff(np.array(rewards)[beyond]) * np.diff(np.array(places)[beyond]) > 0.0).all()
     env.close()
 
 

@@ -10,8 +10,9 @@ import pytest
 from benchmarks.robots import PUBLISHED_COMPLIANCE
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.control import InverseQP
-from softgym_envs.errors import DesignError
+from softgym_envs.errors import DesignError, WeightsError
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.stiff_flop import StiffFlop
 
@@ -186,6 +187,27 @@ def test_follows_the_published_circle():
     assert max(errors[20:]) < 0.2e-3
 
 
+@pytest.mark.parametrize(("volume", "misses"), [(30.0, (3.881, 0.0, 0.0)), (60.0, (0.0, 0.0, 0.0))])
+def test_targets_of_the_thesis(volume, misses):
+    """Figure 4.11 [mm]: one pair of the first target grows to 35 mm3, more than the default allows."""
+    robot = StiffFlop(largest_volume=volume * UL)
+    controller = InverseQP.for_robot(robot)
+    for goal, miss in zip(1e-3 * np.array([[57, -5, -70], [106, 26, 32.5], [92.5, -58.5, 9]]), misses, strict=True):
+        backend, command = FEMBackend(robot), np.zeros(6)
+        for _ in range(30):
+            state = backend.state
+            command = controller.solve(state.condensed, goal, command, state.slack)
+            backend.step(command)
+        assert 1e3 * np.linalg.norm(backend.state.effector[0] - goal) == pytest.approx(miss, abs=0.01)
+
+
+def test_the_shipped_surrogate_stands_for_the_published_range_only():
+    wide = StiffFlop(largest_volume=60.0 * UL)
+    assert wide.mechanics_key == StiffFlop().mechanics_key
+    with pytest.raises(WeightsError, match="'trunk' have actuators"):
+        SurrogateBackend(wide)
+
+
 # -- designs and options --------------------------------------------------------------------------------------------
 
 
@@ -224,6 +246,12 @@ def test_gravity_bends_it():
     assert model.loads[:, 2].sum() == pytest.approx(-9.81 * model.mass)
     assert state.delta[8] < -1e-4
     assert state.delta[7] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("volume", [0.0, 30.0, np.nan])
+def test_wrong_volume(volume):
+    with pytest.raises(ValueError, match="largest_volume = .* m3 is out of bounds"):
+        make_robot("trunk", largest_volume=volume)
 
 
 @pytest.mark.parametrize("elements", [0, -1, 2.5, "5"])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import mul
+
 import numpy as np
 
 from softgym_envs.envs.arrays import Array, namespace
@@ -13,7 +16,7 @@ class Carry(Task):
     """A goal far to the right (+x) that slow motions do not reach; only x counts (thesis, sec. 5.3).
 
     With a mass at the effector, momentum carries it further than a straight motion to the goal. An episode succeeds if
-    the effector ends beyond the goal or within the robot's goal tolerance of it.
+    the effector ends beyond the goal or within the robot's goal tolerance of it; the reward goes on growing beyond it.
 
     Args:
         robot: the robot.
@@ -64,3 +67,24 @@ class Carry(Task):
 
     def distance(self, effector: Array, goal: Array) -> Array:
         return (goal[..., 0] - effector[..., 0]).clip(min=0.0)
+
+    def reward_terms(self, distance: Array, effort_share: Array) -> dict[str, Array]:
+        """Return the factors of the reward, each in [0, 1].
+
+        * **distance term**: `0.5 (1 - d / sqrt(d^2 + s^2))`, where `d` is how far the effector falls short of the goal
+          along x, negative beyond it, and `s` is the robot's `workspace_scale`. It is 0.5 at the goal and grows all the
+          way to the right.
+        * **effort term**: `1 - 0.05 * mean effort / scale`.
+
+        Args:
+            distance: goal minus effector along x [m], negative beyond the goal, shape (...).
+            effort_share: mean actuator effort over its scale, shape (...).
+        """
+        scale = self.robot.workspace_scale
+        ahead = 0.5 - 0.5 * distance / namespace(distance).sqrt(distance * distance + scale * scale)
+        return {"distance": ahead, "effort": super().reward_terms(distance, effort_share)["effort"]}
+
+    def rate(self, effector: Array, goal: Array, effort_share: Array) -> tuple[Array, dict[str, Array], Array]:
+        shortfall = goal[..., 0] - effector[..., 0]
+        terms = self.reward_terms(shortfall, effort_share)
+        return shortfall.clip(min=0.0), terms, reduce(mul, terms.values())
