@@ -6,6 +6,7 @@ import numpy as np
 from scipy.sparse import csr_matrix, tril
 
 from softgym_envs.mechanics.solvers.linear import LinearSolver, SuperLUSolver, make_solver
+from softgym_envs.mechanics.solvers.ordering import nested_dissection
 
 
 def _distinct(keys: np.ndarray) -> np.ndarray:
@@ -33,7 +34,8 @@ class Tangent:
     def __init__(self, indptr: np.ndarray, indices: np.ndarray, solver: str) -> None:
         self._name = solver
         self._size = len(indptr) - 1
-        self._preferred: LinearSolver = make_solver(solver, indptr, indices)
+        self._order = nested_dissection(indptr, indices)
+        self._preferred: LinearSolver = make_solver(solver, indptr, indices, self._order)
         self._fallback: SuperLUSolver | None = None
         self._base: np.ndarray | None = None
         self._own = (indptr, indices)
@@ -74,7 +76,7 @@ class Tangent:
             self._keys = _distinct(np.concatenate([kept, keys]))
             self._place = np.searchsorted(self._keys, self._base)
             indptr = np.searchsorted(self._keys, np.arange(self._size + 1, dtype=np.int64) * self._size)
-            self._preferred = make_solver(self._name, indptr, self._keys % self._size)
+            self._preferred = make_solver(self._name, indptr, self._keys % self._size, self._order)
             self._fallback = None
             self.analyses += 1
             at = np.searchsorted(self._keys, keys)
