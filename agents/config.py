@@ -184,6 +184,10 @@ class SACConfig(Config):
     net_arch: list[int] = [128, 128]
     ent_coef: float | str = "auto"
     target_entropy: float | Literal["auto"] = "auto"
+    warm_up: Literal["actions", "postures"] = Field(
+        default="actions",
+        description="before learning starts: random actions, or in each episode straight to a random command",
+    )
     hindsight: float = Field(
         default=0.0,
         ge=0,

@@ -16,9 +16,10 @@ from softgym_envs.envs.tasks.base import Task
 class HindsightBuffer(ReplayBuffer):
     """Replay buffer of flat observations that gives a share of the samples another goal (HER, strategy "future").
 
-    The other goal is a position that the effector reached at or after the transition in the same episode; the task
-    computes the reward for it (Andrychowicz et al., Hindsight experience replay, 2017). Their k goals for each stored
-    transition correspond to a share of k / (k + 1).
+    The other goal is a position (for forces: a force) that was reached at or after the transition in the same episode;
+    the task computes the reward for it (Andrychowicz et al., Hindsight experience replay, 2017). Their k goals for each
+    stored transition correspond to a share of k / (k + 1). Samples whose later state is no goal of the task keep their
+    own.
 
     Args:
         *args: as for `ReplayBuffer`.
@@ -84,13 +85,17 @@ class HindsightBuffer(ReplayBuffer):
         rewards = self.rewards[batch_inds, columns].copy()
 
         # A reward of exactly zero marks a step without an equilibrium, whose reward is zero for every goal.
-        chosen = np.flatnonzero((draws[1] < self.share) & (rewards != 0.0))
-        goals = self.spaces.observed_effector(self.next_observations[later[chosen], columns[chosen]])
+        reached = self.spaces.observed_effector(self.next_observations[later, columns])
+        goals, allowed = self.task.hindsight_goals(reached)
+        chosen = np.flatnonzero((draws[1] < self.share) & (rewards != 0.0) & allowed)
+        goals = goals[chosen]
         observations[chosen] = self.spaces.with_goal(observations[chosen], goals)
-        reached = following[chosen]
-        following[chosen] = self.spaces.with_goal(reached, goals)
-        effector, effort_share = self.spaces.observed_effector(reached), self.spaces.observed_effort_share(reached)
-        rewards[chosen] = self.task.rate(effector, goals, effort_share)[2]
+        old = following[chosen]
+        following[chosen] = self.spaces.with_goal(old, goals)
+        effector, effort_share = self.spaces.observed_effector(old), self.spaces.observed_effort_share(old)
+        # Factors that depend on the state alone are the same for both goals.
+        before = self.task.rate(effector, self.spaces.observed_goal(old), effort_share)[2]
+        rewards[chosen] *= self.task.rate(effector, goals, effort_share)[2] / before
 
         ended = self.dones[batch_inds, columns] * (1.0 - self.timeouts[batch_inds, columns])
         return ReplayBufferSamples(

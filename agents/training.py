@@ -184,20 +184,22 @@ def _best_step(curve: list[CurvePoint]) -> int:
 def _make_model(config: TrainConfig) -> SAC:
     from stable_baselines3 import SAC
 
+    from agents.hindsight import HindsightBuffer
     from agents.vec_env import SB3VecEnv
+    from agents.warm_up import PostureSAC
 
     env = SB3VecEnv(config.environment.make_vec(config.num_envs))
     sac = config.sac
-    buffer: dict[str, Any] = {}
+    postures = sac.warm_up == "postures"
+    extra: dict[str, Any] = {}
+    if sac.hindsight or postures:
+        single: Any = config.environment.make().unwrapped
     if sac.hindsight:
-        from agents.hindsight import HindsightBuffer
-
-        single = config.environment.make()
-        known: Any = single.unwrapped
-        options = {"spaces": known.spaces, "task": known.task, "share": sac.hindsight}
-        buffer = {"replay_buffer_class": HindsightBuffer, "replay_buffer_kwargs": options}
-        single.close()
-    model = SAC(
+        options = {"spaces": single.spaces, "task": single.task, "share": sac.hindsight}
+        extra = {"replay_buffer_class": HindsightBuffer, "replay_buffer_kwargs": options}
+    if postures:
+        extra["spaces"] = single.spaces
+    model = (PostureSAC if postures else SAC)(
         "MlpPolicy",
         env,
         learning_rate=sac.learning_rate,
@@ -213,7 +215,7 @@ def _make_model(config: TrainConfig) -> SAC:
         policy_kwargs={"net_arch": list(sac.net_arch), "optimizer_kwargs": {"fused": True}},
         seed=config.seed,
         device="cpu",
-        **buffer,
+        **extra,
     )
     # stable-baselines3 measures progress within one call of learn(), but a training consists of many.
     fall = sac.final_learning_rate - sac.learning_rate

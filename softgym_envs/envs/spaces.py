@@ -154,6 +154,10 @@ class AgentSpaces:
         """Return the first effector [m] (..., 3) in observations (..., d), in float32 precision."""
         return observation[..., self.slices["effector"]].astype(float) * self.position_scale
 
+    def observed_goal(self, observation: np.ndarray) -> np.ndarray:
+        """Return the goals [m] (..., 3) in observations (..., d), in float32 precision."""
+        return observation[..., self.slices["goal"]].astype(float) * self.position_scale
+
     def effort_share(self, effort: Array) -> Array:
         """Return the mean over the actuators (...) of efforts (..., n_a) relative to their scale."""
         return abs(effort / self.effort_scale).mean(axis=-1)

@@ -6,6 +6,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from agents.config import EnvironmentConfig, TrainConfig
 from agents.hindsight import HindsightBuffer
+from softgym_envs.envs.spaces import AgentSpaces
+from softgym_envs.envs.tasks.registry import make_task
+from softgym_envs.robots.registry import make_robot
 
 REACH = EnvironmentConfig(id="SoftGym/DiamondReach-v0")
 
@@ -156,3 +159,42 @@ def test_a_moving_goal_is_refused():
     env = EnvironmentConfig(id="SoftGym/DiamondTrack-v0").make_vec(2)
     with pytest.raises(ValueError, match=r"hindsight = 0\.5 needs a fixed goal, but task 'track'"):
         make_buffer(env, share=0.5)
+
+
+def test_a_force_reached_later_is_a_goal_and_factors_of_the_state_stay():
+    task = make_task("grasp", make_robot("grasping_finger"))
+    spaces = AgentSpaces(
+        task.robot,
+        action_mode="increment",
+        design_names=(),
+        axes=task.axes,
+        goal_scale=task.goal_scale,
+        error_scale=task.error_scale,
+    )
+    buffer = HindsightBuffer(
+        4, spaces.observation_space, spaces.action_space, "cpu", spaces=spaces, task=task, share=1.0
+    )
+    wanted = np.array([0.5, 0.0, 0.0])
+    forces = np.array([[0.0, 0.0, 0.0], [0.05, -0.02, 0.0], [0.3, -0.1, 0.0], [0.3, -0.1, 0.0]])
+    for k, force in enumerate(forces):
+        zero, effort = np.zeros(1), np.array([0.01 * k])
+        observation = spaces.observe(zero, zero, effort, force, wanted, np.zeros(0))
+        reward = 0.9 * task.rate(force, wanted, spaces.effort_share(effort))[2]  # 0.9: a factor of the state
+        done = np.array([k == 3])
+        buffer.add(observation[None], observation[None], np.zeros((1, 1)), np.array([reward]), done, [{}])
+    np.random.seed(0)  # noqa: NPY002
+    samples = buffer._get_samples(np.array([2, 3]))
+    goals = spaces.observed_goal(samples.next_observations.numpy())
+    assert np.abs(goals - [0.3, 0.0, 0.0]).max() < 1e-6  # a goal is a force along x
+    expected = 0.9 * task.rate(forces[2], goals[0], spaces.effort_share(np.array([[0.02], [0.03]])))[2]
+    assert np.abs(samples.rewards.numpy()[:, 0] - expected).max() < 1e-5
+    # Without contact, or with less than the smallest wanted force, a state is no goal.
+    assert task.hindsight_goals(forces)[1].tolist() == [False, False, True, True]
+
+
+def test_a_height_reached_later_is_a_goal():
+    task = make_task("lift", make_robot("contact_aided_gripper", mesh_size=0.02))
+    rest = task.robot.effector_rest
+    goals, allowed = task.hindsight_goals(rest + np.array([[1e-4, -2e-4, 0.010], [0.0, 0.0, 0.001], [0.0, 0.0, 0.03]]))
+    assert np.abs(goals[0] - (rest + [0.0, 0.0, 0.010])).max() < 1e-12
+    assert allowed.tolist() == [True, False, False]

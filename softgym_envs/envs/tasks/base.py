@@ -154,6 +154,10 @@ class Task(ABC):
         """Return what is compared with the goal, shape (3,): the first effector [m] unless a task overrides it."""
         return state.effector[0]
 
+    def hindsight_goals(self, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the goals (B, 3) that measured values (B, 3) would have reached, and whether each may be a goal (B,)."""
+        return measured, np.ones(len(measured), dtype=bool)
+
     def contact_forces(self, state: State) -> np.ndarray:
         """Return the force of each obstacle on the robot [N], shape (o, 3).
 

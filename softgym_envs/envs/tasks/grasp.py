@@ -81,6 +81,10 @@ class Grasp(Task):
         """Return the force of the robot on the object [N], shape (3,)."""
         return -self.contact_forces(state)[0]
 
+    def hindsight_goals(self, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        low, high = self.forces
+        return measured * self.axes, (measured[..., 0] >= low) & (measured[..., 0] <= high)
+
     def distance(self, effector: Array, goal: Array) -> Array:
         return abs(effector[..., 0] - goal[..., 0]) / goal[..., 0]
 

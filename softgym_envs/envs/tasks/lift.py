@@ -46,6 +46,12 @@ class Lift(Task):
         goals[:, 0, 2] += rng.uniform(*self.heights, (count,))
         return goals
 
+    def hindsight_goals(self, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        low, high = self.heights
+        height = measured[..., 2] - self.robot.effector_rest[2]
+        # Other coordinates than z are those of all goals.
+        return np.where(self.axes > 0.0, measured, self.robot.effector_rest), (height >= low) & (height <= high)
+
     def lost(self, state: State) -> bool:
         """Whether the hand has risen without the object."""
         height = float(state.effector[0, 2] - self.robot.effector_rest[2])
