@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 
 from softgym_envs.envs.spaces import AgentSpaces
@@ -42,3 +43,15 @@ class PostureSAC(SAC):
         observed = np.asarray(self._last_obs)[:, spaces.slices["command"]]
         actions = spaces.action(self._postures, spaces.middle + spaces.half_range * observed)
         return actions, actions
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: Any,
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._last_episode_starts = dones  # off-policy algorithms leave this as it was at the first reset

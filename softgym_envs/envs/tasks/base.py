@@ -155,7 +155,7 @@ class Task(ABC):
         return state.effector[0]
 
     def hindsight_goals(self, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the goals (B, 3) that measured values (B, 3) would have reached, and whether each may be a goal (B,)."""
+        """Return the goals (B, 3) that measured values (B, 3) would have reached, and which may be goals (B,)."""
         return measured, np.ones(len(measured), dtype=bool)
 
     def contact_forces(self, state: State) -> np.ndarray:
