@@ -1,4 +1,4 @@
-"""Configuration of environments and of SAC training."""
+"""Configuration of environments and of training."""
 
 from __future__ import annotations
 
@@ -211,17 +211,48 @@ class SACConfig(Config):
     @field_validator("net_arch")
     @classmethod
     def _layers(cls, value: list[int]) -> list[int]:
-        if any(width < 1 for width in value):
-            raise ValueError("must be positive widths")
-        return value
+        return check_layers(value)
+
+
+def check_layers(widths: list[int]) -> list[int]:
+    """Return the widths of hidden layers.
+
+    Raises:
+        ValueError: for a width below 1.
+    """
+    if any(width < 1 for width in widths):
+        raise ValueError("must be positive widths")
+    return widths
+
+
+class AnalyticConfig(Config):
+    """Hyperparameters of the analytic policy gradient (`agents.learners.analytic`)."""
+
+    learning_rate: float = Field(default=2e-3, gt=0)
+    final_learning_rate: float = Field(default=4e-5, gt=0, description="reached linearly at the last step")
+    net_arch: list[int] = [64, 64]
+    members: int | None = Field(
+        default=1, ge=1, description="of the surrogate's ensemble, in training; evaluations use all"
+    )
+    slack_pull: float = Field(
+        default=0.3, ge=0, description="how strongly commands of slack cables follow the displacement that is reached"
+    )
+
+    @field_validator("net_arch")
+    @classmethod
+    def _layers(cls, value: list[int]) -> list[int]:
+        return check_layers(value)
 
 
 class TrainConfig(Config):
-    """One SAC training run.
+    """One training run.
 
     Attributes:
         environment: what the policy is trained in.
+        learner: ``"sac"``, model-free, for every environment; or ``"analytic"``, which follows the derivatives of the
+            learned model and needs the surrogate.
         sac: hyper-parameters of SAC.
+        analytic: hyper-parameters of the analytic policy gradient.
         steps: environment steps, over all sub-environments.
         num_envs: number of sub-environments.
         seed: seed of everything random.
@@ -231,7 +262,9 @@ class TrainConfig(Config):
     """
 
     environment: EnvironmentConfig
+    learner: Literal["sac", "analytic"] = "sac"
     sac: SACConfig = SACConfig()
+    analytic: AnalyticConfig = AnalyticConfig()
     steps: int = Field(default=40_000, gt=0)
     num_envs: int = Field(default=16, gt=0)
     seed: int = Field(default=0, ge=0)
@@ -241,8 +274,9 @@ class TrainConfig(Config):
 
     @model_validator(mode="after")
     def _consistent(self) -> TrainConfig:
-        check_hindsight(self.sac, self.environment)
-        check_start("sac.learning_starts", self.sac, "steps", self.steps)
+        if self.learner == "sac":
+            check_hindsight(self.sac, self.environment)
+            check_start("sac.learning_starts", self.sac, "steps", self.steps)
         return self
 
 

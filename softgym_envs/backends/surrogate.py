@@ -102,6 +102,49 @@ def solve_displacements(
     return BatchState(displacement, effort, effector, loose, converged, *model.trust(context, displacement, spread))
 
 
+def displacement_gradient(
+    model: SurrogateModel,
+    context: Context,
+    state: BatchState,
+    effector: np.ndarray,
+    effort: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gradient of a function of the state in its displacements, and in the commands that led to it.
+
+    A command moves its own actuator as long as that is taut, and through the equilibrium the slack ones, whose efforts
+    stay zero: with the stiffness ``K`` and sets ``T`` and ``S`` of taut and slack actuators,
+    ``d displacement_S = -K_SS^-1 K_ST d command_T``.
+
+    Args:
+        model: the learned condensed model.
+        context: prepared bodies.
+        state: the states, from `solve_displacements`.
+        effector: derivative of the function in the effector coordinates, shape (B, n_e).
+        effort: derivative in the efforts, shape (B, n_a).
+
+    Returns:
+        Two gradients, each (B, n_a): with all displacements held, as if no actuator were slack; and in the commands,
+        zero for slack actuators.
+    """
+    held = model.effector_gradient(context, state.displacement, effector)
+    slack = state.slack
+    effort = np.where(slack, 0.0, effort)
+    needed = np.flatnonzero(slack.any(axis=1) | (effort != 0.0).any(axis=1))
+    if not len(needed):
+        return held, held
+    commanded = held.copy()
+    K, free = model.stiffness(context.rows(needed), state.displacement[needed]), slack[needed]
+    # The efforts depend on all displacements, those of slack actuators included.
+    total = held[needed] + np.matmul(K, effort[needed, :, None])[:, :, 0]
+    held = held.copy()
+    held[needed] = total
+    both = free[:, :, None] & free[:, None, :]
+    follow = np.linalg.solve(np.where(both, K, np.eye(model.count)), np.where(free, total, 0.0)[:, :, None])
+    through = total - np.matmul(K, follow)[:, :, 0]
+    commanded[needed] = np.where(free, 0.0, through)
+    return held, commanded
+
+
 class SurrogateBody:
     """One body on a learned model: its states at rest and under commands.
 

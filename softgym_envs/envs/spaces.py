@@ -89,7 +89,9 @@ class AgentSpaces:
         if action.ndim == 0 or action.shape != shape:
             raise ValueError(f"action must have shape {self.action_space.shape}, got {action.shape}")
         if not np.isfinite(action).all():
-            raise ValueError(f"action = {action.tolist()} must be finite; allowed: -1 to 1")
+            rows = action.reshape(-1, action.shape[-1])
+            first = rows[np.flatnonzero(~np.isfinite(rows).all(axis=1))[0]]
+            raise ValueError(f"action = {first.tolist()} must be finite; allowed: -1 to 1")
         return np.minimum(np.maximum(action, -1.0), 1.0)
 
     def command(self, action: Array, previous: Array) -> Array:
@@ -101,6 +103,22 @@ class AgentSpaces:
             target = self.middle + action * self.half_range
             target = previous + xp.minimum(xp.maximum(target - previous, -self.rates), self.rates)
         return xp.minimum(xp.maximum(target, self.lower), self.upper)
+
+    def command_slope(self, action: np.ndarray, previous: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how commands follow actions, each of shape (..., n_a).
+
+        Returns:
+            The derivative of a command in its action where no limit holds it; and which limit holds it: 1 for one above
+            (range, or rate of an absolute action), -1 for one below, 0 for none.
+        """
+        if self.action_mode == "increment":
+            wish, slope = previous + action * self.rates, self.rates
+            high, low = self.upper, self.lower
+        else:
+            wish, slope = self.middle + action * self.half_range, self.half_range
+            high, low = np.minimum(self.upper, previous + self.rates), np.maximum(self.lower, previous - self.rates)
+        limited = (wish > high).astype(float) - (wish < low)
+        return np.broadcast_to(slope, wish.shape), limited
 
     def action(self, command: np.ndarray, previous: np.ndarray) -> np.ndarray:
         """Return the action that leads to a command, shape (..., n_a), for controllers that compute displacements."""

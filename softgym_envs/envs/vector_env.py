@@ -10,7 +10,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from softgym_envs.backends.surrogate import BatchState, rest_state, solve_displacements
+from softgym_envs.backends.surrogate import BatchState, displacement_gradient, rest_state, solve_displacements
+from softgym_envs.envs.gradients import RewardGradient, StepGradient
 from softgym_envs.envs.options import EnvironmentOptions, check_batchable, check_counts, check_reset_options, set_up
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
@@ -84,6 +85,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
+        self._reward_gradient: RewardGradient | None = None  # made when it is first needed, because it loads torch
         self._unilateral = self.robot.unilateral
         self.designs = np.tile(self._fixed_design.array, (num_envs, 1))
         # One body for all rows, until they differ.
@@ -186,6 +188,19 @@ class SoftRobotVectorEnv(VectorEnv):
         return self._paths
 
     @property
+    def steps(self) -> np.ndarray:
+        """Steps of the present episodes so far, shape (num_envs,). Learners set them so that episodes end at different
+        times, which makes the states of a batch less alike."""
+        return self._steps
+
+    @steps.setter
+    def steps(self, values: np.ndarray) -> None:
+        steps = np.asarray(values)
+        if steps.shape != (self.num_envs,) or not np.issubdtype(steps.dtype, np.integer) or (steps < 0).any():
+            raise ValueError(f"steps must be {self.num_envs} non-negative integers, got {values!r}")
+        self._steps[:] = steps
+
+    @property
     def condensed(self) -> CondensedModel:
         """Condensed models of the present states, evaluated at each access; leading shape (num_envs,)."""
         batch = self.model.condensed(self._context, self._state.displacement)
@@ -226,9 +241,34 @@ class SoftRobotVectorEnv(VectorEnv):
         Raises:
             ValueError: for actions with a wrong shape or values that are not finite.
         """
+        self._advance(self._checked(actions))
+        return self._finish_step()
+
+    def step_with_gradient(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any], StepGradient]:
+        """As `step`; also returns the derivatives of the rewards in the actions.
+
+        Rows that found no equilibrium have a reward and derivatives of zero.
+
+        Raises:
+            ValueError: for actions with a wrong shape or values that are not finite.
+            ImportError: without torch, which differentiates the task.
+        """
+        actions = self._checked(actions)
+        slope, limited = self.spaces.command_slope(actions, self._command)
+        self._advance(actions)
+        gradient = self._gradient(slope, limited)
+        return *self._finish_step(), gradient
+
+    def _checked(self, actions: np.ndarray) -> np.ndarray:
         actions = self.spaces.check_action(actions)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
+        return actions
+
+    def _advance(self, actions: np.ndarray) -> None:
+        """Move commands and states by one step."""
         command = self.spaces.command(actions, self._command)
         present = self._state
         state = solve_displacements(
@@ -241,6 +281,23 @@ class SoftRobotVectorEnv(VectorEnv):
             self._command = np.where(found[:, None], command, self._command)
             self._state = replace(_choose(found, state, present), converged=found)
         self._steps += 1
+
+    def _gradient(self, slope: np.ndarray, limited: np.ndarray) -> StepGradient:
+        if self._reward_gradient is None:
+            self._reward_gradient = RewardGradient(self.task, self.spaces)
+        state, goals = self._state, self.goals
+        effector, effort = np.zeros_like(state.effector), state.effort
+        effector[:, :3], by_effort = self._reward_gradient(state.effector[:, :3], effort, goals)
+        held, command = displacement_gradient(self.model, self._context, state, effector, by_effort)
+        _, _, reward = self.task.rate(state.effector[:, :3], goals, self.spaces.effort_share(effort))
+        found, gap = state.converged[:, None], state.displacement - self._command
+        held, command = np.where(found, held, 0.0), np.where(found, command, 0.0)
+        reward = np.where(state.converged, reward, 0.0)
+        return StepGradient(reward, command, held, state.slack.copy(), gap, slope, limited)
+
+    def _finish_step(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Rate the present states, and start new episodes where the last ones have ended."""
+        found = self._state.converged
         info, reward = self._info()
         observation = self._observe()
         reward = np.where(found, reward, 0.0)

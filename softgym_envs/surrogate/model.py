@@ -157,6 +157,21 @@ class SurrogateModel(ABC):
         """Return only the effectors [m] (B, n_e) and their spread [m] (B,), at displacements (B, n_a)."""
         return self._state(context, displacement)[1:]
 
+    def effector_gradient(self, context: Context, displacement: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return the gradient (B, n_a) of ``weights . effector`` in the displacements (B, n_a).
+
+        This is one product with the transposed Jacobian of the effector, which costs about as much as the effector.
+
+        Args:
+            context: prepared bodies.
+            displacement: shape (B, n_a).
+            weights: of the effector coordinates, shape (B, n_e).
+        """
+        n = self.count
+        W = self._compliance(context, displacement)
+        pulled = np.matmul(W[:, :n, n:], weights[:, :, None])
+        return np.linalg.solve(W[:, :n, :n], pulled)[:, :, 0]
+
     def search(
         self,
         context: Context,

@@ -230,6 +230,56 @@ def effectors(u, slot, B1, B2, V, d1, d2, x0, slope, effector, spread):
 
 
 @njit(**_FAST)
+def effector_gradients(u, slot, B1, B1T, B2, B2T, V, d1, d2, slope, weights, gradient):
+    """Gradient (rows, n) of ``weights . effector`` at scaled actuation u (rows, n), in reverse mode."""
+    members, n, w = B1.shape
+    e = V.shape[1]
+    one, share = np.float32(1.0), np.float32(1.0 / members)
+    most = min(ROWS_PER_BLOCK, len(u))
+    h, z = np.empty((most, w), np.float32), np.empty((most, w), np.float32)
+    first, back = np.empty((most, w), np.float32), np.empty((most, n), np.float32)
+    for start in range(0, len(u), ROWS_PER_BLOCK):
+        rows = min(ROWS_PER_BLOCK, len(u) - start)
+        part = u[start : start + rows]
+        gradient[start : start + rows] = np.float32(0.0)
+        for m in range(members):
+            for r in range(rows):
+                s = slot[start + r]
+                for j in range(w):
+                    z[r, j] = d1[s, m, j]
+            _multiply(part, B1[m], z, rows)
+            for r in range(rows):
+                s = slot[start + r]
+                for j in range(w):
+                    inverse = one / np.sqrt(one + z[r, j] * z[r, j])
+                    h[r, j] = z[r, j] * inverse
+                    first[r, j] = inverse * inverse * inverse
+                    z[r, j] = d2[s, m, j]
+            _multiply(h, B2[m], z, rows)
+            for r in range(rows):
+                for j in range(w):
+                    value = np.float32(0.0)
+                    for k in range(e):
+                        value += weights[start + r, k] * V[m, k, j]
+                    inverse = one / np.sqrt(one + z[r, j] * z[r, j])
+                    z[r, j] = value * inverse * inverse * inverse
+                    h[r, j] = np.float32(0.0)
+            _multiply(z, B2T[m], h, rows)
+            for r in range(rows):
+                s = slot[start + r]
+                for j in range(w):
+                    h[r, j] *= first[r, j]
+                for i in range(n):
+                    back[r, i] = np.float32(0.0)
+                    for k in range(e):
+                        back[r, i] += weights[start + r, k] * slope[s, m, k, i]
+            _multiply(h, B1T[m], back, rows)
+            for r in range(rows):
+                for i in range(n):
+                    gradient[start + r, i] += share * back[r, i]
+
+
+@njit(**_FAST)
 def jacobians(u, slot, B1, B2, V, H, d1, d2, slope, held0, jacobian, held):
     """Jacobian of the effector (rows, e, n) and held compliance (rows, e, e) of bodies ``slot`` (rows,)."""
     members, n, w = B1.shape

@@ -98,6 +98,7 @@ class Model(SurrogateModel):
         PT = np.ascontiguousarray(P.transpose(0, 2, 1))
         B1, B2 = kernel("shape1", 0, 2, 1), kernel("shape2", 0, 2, 1)
         self._energy, self._shape = (A1, A2, P, PT), (B1, B2, kernel("effector", 0, 1, 2))
+        self._shape_transposed = kernel("shape1", 0, 1, 2), kernel("shape2", 0, 1, 2)
         self._held = kernel("held", 0, 2, 1)
         layers = [(tensors[f"body.{k}.weight"], tensors[f"body.{k}.bias"]) for k in range(3)]
         self._layers = [(w.astype(np.float32), v.astype(np.float32)[:, None]) for w, v in layers]
@@ -159,6 +160,15 @@ class Model(SurrogateModel):
         if self.members < self.trained:
             spread = np.full(len(u), np.inf)
         return effector * self.effector_scale + self.effector_mean, spread * self.effector_scale
+
+    def effector_gradient(self, context: Context, displacement: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        u, body = self._scaled(displacement), context.arrays
+        gradient = np.empty((len(u), self.count), dtype=np.float32)
+        (B1, B2, V), (B1T, B2T) = self._shape, self._shape_transposed
+        scaled = (self.effector_scale * weights).astype(np.float32)
+        coefficients = (body["d1"], body["d2"], body["slope"])
+        kernels.effector_gradients(u, context.slot, B1, B1T, B2, B2T, V, *coefficients, scaled, gradient)
+        return gradient / self.half_range
 
     def _search(self, context, target, guess, unilateral, tolerance, iterations):
         body = context.arrays

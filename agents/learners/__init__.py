@@ -1,0 +1,31 @@
+"""Learning methods. A new one needs its own file, its section in `TrainConfig` and one row here."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from agents.config import TrainConfig
+
+if TYPE_CHECKING:
+    from agents.learners.base import Learner
+
+LEARNERS = {
+    "sac": "agents.learners.sac:SACLearner",
+    "analytic": "agents.learners.analytic:AnalyticLearner",
+}
+
+
+def make_learner(config: TrainConfig) -> Learner:
+    """Return a new learner of the method that a configuration names.
+
+    Raises:
+        ValueError: if the environment cannot be made, or the method cannot learn in it.
+    """
+    return learner_class(config.learner)(config)
+
+
+def learner_class(name: str) -> type[Learner]:
+    """Return the class of a learning method."""
+    module, _, cls = LEARNERS[name].partition(":")
+    return getattr(import_module(module), cls)

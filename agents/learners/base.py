@@ -1,0 +1,75 @@
+"""The Learner base class: what `agents.training.train` needs of a learning method."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from agents.config import TrainConfig
+
+Tensors = dict[str, np.ndarray]
+
+
+class Learner(ABC):
+    """A policy in training. One file per method, and a row in `agents.learners`.
+
+    `train` makes a learner, restores or loads its weights, calls `learn` for one part of the training after the other,
+    evaluates the policy in between and stores `weights` and `state`. A resumed training must give the same policy as
+    an uninterrupted one, so each call of `learn` begins with new episodes that depend on seed and step only.
+
+    Args:
+        config: configuration of the training.
+
+    Attributes:
+        config: configuration of the training.
+        step: environment steps so far, over all sub-environments.
+        model_based: whether the method differentiates the mechanical model.
+
+    Raises:
+        ValueError: for an environment in which the method cannot learn.
+    """
+
+    model_based: ClassVar[bool] = False
+    step: int
+
+    @abstractmethod
+    def __init__(self, config: TrainConfig) -> None:
+        self.config = config
+
+    @abstractmethod
+    def learn(self, target: int, progress: Callable[[int], object]) -> None:
+        """Train up to at least ``target`` steps; ``progress`` is called with numbers of steps that have been made."""
+
+    @abstractmethod
+    def weights(self) -> Tensors:
+        """Return copies of all weights; those of the policy are named ``actor.latent_pi.<k>`` and ``actor.mu``."""
+
+    @abstractmethod
+    def load_weights(self, tensors: Mapping[str, np.ndarray], path: Path) -> None:
+        """Replace the weights by those of a file.
+
+        Raises:
+            WeightsError: if one is missing or does not fit.
+        """
+
+    @abstractmethod
+    def state(self) -> tuple[Tensors, dict[str, Any]]:
+        """Return what else a resumed training needs, as tensors and as JSON data: optimiser, buffers, random states."""
+
+    @abstractmethod
+    def restore(self, tensors: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
+        """Restore what `state` returned."""
+
+    def log_to(self, folder: Path) -> None:  # noqa: B027 - optional
+        """Write a log to a folder; by default none."""
+
+    def record(self, values: Mapping[str, float]) -> None:  # noqa: B027 - optional
+        """Add values to the log."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the environments."""

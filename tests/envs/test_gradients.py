@@ -1,0 +1,87 @@
+"""Derivatives of rewards in actions, against central differences."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import softgym_envs  # noqa: F401
+from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.envs.tasks.registry import TASKS
+
+IDS = [
+    name
+    for name, row in ENVIRONMENTS.items()
+    if row.backend == "surrogate" and not TASKS.class_of(row.task).needs_state and not TASKS.class_of(row.task).pushes
+]
+
+
+ROWS = 48
+
+
+@pytest.mark.parametrize("action_mode", ["increment", "absolute"])
+@pytest.mark.parametrize("name", IDS)
+def test_gradients_agree_with_differences(name, action_mode):
+    # One member of the ensemble, so that steps of the search use the stiffness of the energy itself.
+    env: Any = gym.make_vec(name, num_envs=ROWS, backend_options={"members": 1}, action_mode=action_mode)
+    rng = np.random.default_rng(0)
+    walk = rng.uniform(-0.4, 1.0, (12, *env.action_space.shape))  # mostly pulling, so that not all cables are slack
+    env.reset(seed=3)
+    for step in walk:
+        env.step(step)
+    # A last action that changes the commands by less than their rates
+    wish = env.command + 0.8 * env.robot.rates * rng.uniform(-1.0, 1.0, env.command.shape)
+    last = env.spaces.action(wish, env.command).astype(float)
+
+    def after(action):
+        """Return rewards, slack actuators and limited commands of a step after the same walk."""
+        env.reset(seed=3)
+        for step in walk:
+            env.step(step)
+        *_, gradient = env.step_with_gradient(action)
+        return gradient.reward, gradient.slack, gradient.limited, gradient.action
+
+    reward, slack, limited, found = after(last)
+    assert (found[slack | (limited != 0.0)] == 0.0).all()
+    env.reset(seed=3)
+    for step in walk:
+        env.step(step)
+    assert np.array_equal(env.step(last)[1], reward)
+    slope, _ = env.spaces.command_slope(last, np.zeros_like(last))
+    h = 0.01 * (env.robot.rates / slope).min()  # the states have single precision
+    compared = 0
+    for i in range(found.shape[1]):
+        shift = np.zeros_like(last)
+        shift[:, i] = h
+        (above, *contacts_above, _), (below, *contacts_below, _) = after(last + shift), after(last - shift)
+        # Rewards have kinks where an actuator becomes slack or a command reaches a limit.
+        sides = zip((slack, limited), contacts_above, contacts_below, strict=True)
+        smooth = np.all([(a == b).all(axis=1) & (a == c).all(axis=1) for a, b, c in sides], axis=0)
+        difference = (above - below) / (2.0 * h)
+        error = np.abs(difference - found[:, i])[smooth]
+        assert error.max() < 0.015 * np.abs(found).max()
+        compared += smooth.sum()
+    assert compared >= 0.5 * found.size
+    env.close()
+
+
+def test_derivatives_are_finite_at_the_goal():
+    env: Any = gym.make_vec("SoftGym/FingerReach-v0", num_envs=2)
+    _, info = env.reset(seed=0)
+    env.reset(options={"goal": info["effector"][0]})
+    *_, gradient = env.step_with_gradient(np.zeros((2, 2)))
+    assert np.isfinite(gradient.action).all()
+    env.close()
+
+
+def test_steps_make_episodes_end_at_different_times():
+    env: Any = gym.make_vec("SoftGym/FingerReach-v0", num_envs=3, max_episode_steps=5)
+    env.reset(seed=0)
+    env.steps = np.array([0, 3, 4])
+    ended = [env.step(np.zeros((3, 2)))[3].tolist() for _ in range(2)]
+    assert ended == [[False, False, True], [False, True, False]]
+    for wrong in ([0, 1], [0, 1, -1], [0.0, 1.0, 2.0]):
+        with pytest.raises(ValueError, match="non-negative integers"):
+            env.steps = np.array(wrong)
+    env.close()
