@@ -230,7 +230,7 @@ class AnalyticConfig(Config):
 
     learning_rate: float = Field(default=2e-3, gt=0)
     final_learning_rate: float = Field(default=4e-5, gt=0, description="reached linearly at the last step")
-    net_arch: list[int] = [64, 64]
+    net_arch: list[int] = [128, 128]
     members: int | None = Field(
         default=1, ge=1, description="of the surrogate's ensemble, in training; evaluations use all"
     )

@@ -107,6 +107,11 @@ class Policy:
             raise WeightsError(f"policy '{self.path}' lacks tensor {error}") from None
         self.observation_size = int((self.hidden[0][0] if self.hidden else self.mean[0]).shape[0])
 
+    @property
+    def widths(self) -> list[int]:
+        """Widths of the hidden layers."""
+        return [weight.shape[1] for weight, _ in self.hidden]
+
     def check_environment(self, environment: EnvironmentConfig) -> None:
         """Refuse an environment in which observations or actions have another meaning than in training.
 

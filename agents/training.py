@@ -55,11 +55,11 @@ def train(
 ) -> Path:
     """Train a policy, or resume an interrupted training in ``folder``.
 
-    Writes ``policy.safetensors`` (for SAC, actor and critics) with its card, ``curve.csv``, and TensorBoard logs if TensorBoard
-    is installed. Until the end, ``checkpoint.safetensors`` holds weights, optimiser moments, replay buffer and random
-    states, so that a resumed training gives the same policy as an uninterrupted one (all episodes restart after each
-    evaluation). The saved policy is the one with the largest mean return in an evaluation; the card gives its step, and
-    the CPU time of all processes that took part in the training.
+    Writes ``policy.safetensors`` (for SAC, actor and critics) with its card and ``curve.csv``; SAC also writes
+    TensorBoard logs if TensorBoard is installed. Until the end, ``checkpoint.safetensors`` holds weights, optimiser
+    moments, replay buffer and random states, so that a resumed training gives the same policy as an uninterrupted one
+    (all episodes restart after each evaluation). The saved policy is the one with the largest mean return in an
+    evaluation; the card gives its step, and the CPU time of all processes that took part in the training.
 
     Args:
         config: configuration of the training.

@@ -207,15 +207,21 @@ class StudyConfig(StudyProblem):
         own, retrained = self.plan.trains, self.finalists.seeds
         runs: list[tuple[str, TrainingConfig]] = [("training", self.training)] * bool(own or retrained)
         runs += [("joint", self.joint)] * bool(self.plan.proposer)
+        refuse(
+            bool(self.plan.proposer) and self.joint.learner != "sac",
+            f"joint.learner = {self.joint.learner} has no critic to propose bodies; allowed: sac",
+        )
         for key, run in runs:
-            check_hindsight(run.sac, self.environment)
             refuse(
                 run.report_every > run.steps,
                 f"{key}.report_every = {run.report_every} exceeds {key}.steps = {run.steps}",
             )
+            if run.learner != "sac":
+                continue
+            check_hindsight(run.sac, self.environment)
             if run is self.joint or own or self.finalists.steps is None:
                 check_start(f"{key}.sac.learning_starts", run.sac, f"{key}.steps", run.steps)
-        if retrained and self.finalists.steps is not None:
+        if self.training.learner == "sac" and retrained and self.finalists.steps is not None:
             check_start("training.sac.learning_starts", self.training.sac, "finalists.steps", self.finalists.steps)
 
     @property

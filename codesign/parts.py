@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from agents.config import SACConfig
+from agents.config import AnalyticConfig, SACConfig
 from codesign.sampling import check_options
 from softgym_envs.config import Config
 
@@ -114,7 +114,9 @@ class TrainingConfig(Config):
     evaluation_episodes: int = Field(default=32, ge=1, description="episodes of each report")
     num_envs: int = Field(default=16, ge=1)
     seed: int = Field(default=0, ge=0, description="the same in all trials, which then differ by their bodies only")
+    learner: Literal["sac", "analytic"] = Field(default="sac", description="see `agents.config.TrainConfig`")
     sac: SACConfig = Field(default_factory=SACConfig)
+    analytic: AnalyticConfig = Field(default_factory=AnalyticConfig)
 
 
 class JointConfig(TrainingConfig):

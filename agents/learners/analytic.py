@@ -1,9 +1,9 @@
 """Analytic policy gradient (model-based): the policy follows the derivative of each step's own reward.
 
-The policy acts in the batched environment on the surrogate. After each step, the environment returns the derivative of
-the reward in the action, which the learned model knows exactly (`SoftRobotVectorEnv.step_with_gradient`), and the policy
-ascends the mean logarithm of the reward. There is no critic, no exploration noise and no differentiation through time:
-a quasi-static robot reaches a goal by improving every step.
+The policy acts in the batched environment on the surrogate. After each step the environment returns the exact
+derivative of the reward in the action (`SoftRobotVectorEnv.step_with_gradient`), and the policy ascends the mean
+logarithm of the reward. There is no critic, no exploration noise and no differentiation through time: a quasi-static
+robot reaches a goal by improving every step.
 
 The logarithm turns a product of reward terms into a sum, and it keeps a slope near the goal and far from it.
 """
@@ -94,14 +94,16 @@ class AnalyticLearner(Learner):
             progress(env.num_envs)
 
     def _ascent(self, gradient: StepGradient) -> np.ndarray:
-        """Return the direction in which actions (B, n_a) should change: the gradient of log rewards, one-sided at kinks.
+        """Return the gradient of the log rewards in the actions (B, n_a), one-sided at kinks.
 
         The exact derivative is zero for commands that are slack or held by a limit; an actor that ended there would
         never come back. So a slack actuator is tightened if that helps, and its command follows what the cable reaches.
         A command held by a limit may move back, but not further out.
         """
         tighten = np.maximum(gradient.held, 0.0)
-        command = np.where(gradient.slack, tighten, gradient.command) / np.maximum(gradient.reward, SMALLEST_REWARD)[:, None]
+        command = (
+            np.where(gradient.slack, tighten, gradient.command) / np.maximum(gradient.reward, SMALLEST_REWARD)[:, None]
+        )
         command += np.where(gradient.slack, self.options.slack_pull * gradient.gap / self._span**2, 0.0)
         outward = gradient.limited * command > 0.0
         return np.where(outward, 0.0, command * gradient.slope)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.config import EnvironmentConfig
-from agents.policy import policy_path
+from agents.policy import Policy
 from agents.training import train
 from codesign.config import StudyConfig
 from codesign.folder import SHARED_POLICY, StudyFolder
@@ -85,11 +85,11 @@ def _trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
     training = training_config(folder, finalist.design, finalist.options)
     steps = config.finalists.steps or training.steps
     initial = config.policy if config.plan.trains else str(folder.path / SHARED_POLICY)
-    sac = training.sac
+    update: dict[str, Any] = {"seed": training.seed + seed, "steps": steps}
     if initial is not None:  # its networks decide the architecture
-        card = read_json(policy_path(initial).with_suffix(".json"))
-        sac = sac.model_copy(update={"net_arch": card["config"]["sac"]["net_arch"]})
-    update = {"sac": sac, "seed": training.seed + seed, "steps": steps}
+        widths = Policy(initial).widths
+        own = getattr(training, training.learner)
+        update[training.learner] = own.model_copy(update={"net_arch": widths})
     training = training.model_copy(update={**update, "report_every": min(training.report_every, steps)})
     name = f"trial{finalist.trial:04d}-seed{seed}"
     place = folder.path / "finalists" / name

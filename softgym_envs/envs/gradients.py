@@ -68,7 +68,7 @@ class RewardGradient:
         return np.where(met[:, None], 0.0, by_effector.numpy()), by_effort.numpy()
 
 
-def _with_tensors(original):  # type: ignore[no-untyped-def]
+def _with_tensors(original):
     """Return a copy of an object whose arrays are tensors."""
     import torch
 

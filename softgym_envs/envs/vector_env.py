@@ -189,8 +189,10 @@ class SoftRobotVectorEnv(VectorEnv):
 
     @property
     def steps(self) -> np.ndarray:
-        """Steps of the present episodes so far, shape (num_envs,). Learners set them so that episodes end at different
-        times, which makes the states of a batch less alike."""
+        """Steps of the present episodes so far, shape (num_envs,).
+
+        Learners set them so that episodes end at different times, which makes the states of a batch less alike.
+        """
         return self._steps
 
     @steps.setter

@@ -9,7 +9,8 @@ import pytest
 
 from agents.config import TrainConfig
 from agents.joint import PROPOSERS, CriticProposer, DistributionProposer, critic_values
-from agents.training import _make_model, train
+from agents.learners.sac import make_model
+from agents.training import train
 from agents.vec_env import SB3VecEnv
 
 ENVIRONMENT = {
@@ -71,7 +72,7 @@ def test_an_episode_is_reported_with_its_own_body(tmp_path):
         def episode(self, body, total):
             told.append((body, total))
 
-    model = _make_model(config())
+    model = make_model(config())
     env = model.get_env()
     listener = Listener()
     listener.attach(model, config(), tmp_path)
@@ -118,7 +119,7 @@ def test_a_stopped_training_ends_as_an_uninterrupted_one(kind, tmp_path):
 def test_critic_values_rank_bodies_as_the_critic_does(monkeypatch, tmp_path):
     """With a critic that only rewards length, values must not depend on the height."""
 
-    model = _make_model(config())
+    model = make_model(config())
     names, bodies = ("length", "height"), np.array([[-0.5, 0.3], [0.5, 0.3], [0.5, -0.9]])
     monkeypatch.setattr(
         type(model.critic), "forward", lambda self, states, actions: (states[:, -2:-1], states[:, -2:-1] + 1.0)
@@ -130,7 +131,7 @@ def test_critic_values_rank_bodies_as_the_critic_does(monkeypatch, tmp_path):
 
 def test_needs_sampled_bodies(tmp_path):
     plain = config(environment={"id": "SoftGym/FingerReach-v0"})
-    model = _make_model(plain)
+    model = make_model(plain)
     with pytest.raises(ValueError, match="sample_design"):
         CriticProposer().attach(model, plain, tmp_path)
     assert isinstance(model.get_env(), SB3VecEnv)

@@ -127,7 +127,7 @@ def test_a_sweep_writes_results_of_every_seed_and_the_baselines(swept):
 def test_a_finished_sweep_runs_nothing_and_a_lost_result_is_computed_again(swept, monkeypatch):
     place = swept / "out" / "results" / "tiny"
     before = (place / "seed0.json").read_text()
-    monkeypatch.setattr("agents.training._make_model", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr("agents.training.make_learner", lambda *_: pytest.fail("trained again"))
     assert sweep.sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0
     (place / "seed0.json").unlink()
     assert sweep.sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0

@@ -13,6 +13,7 @@ from safetensors import safe_open
 from agents import training
 from agents.config import EnvironmentConfig, TrainConfig
 from agents.evaluation import evaluate, sample_goals
+from agents.learners.sac import SACLearner
 from agents.policy import Policy
 from agents.training import train
 from softgym_envs.config import load_config
@@ -54,8 +55,9 @@ def test_training_leaves_policy_curve_logs_and_provenance(trained):
 def test_policy_is_the_mean_action_of_the_actor(trained, tmp_path):
     import torch
 
-    model = training._make_model(CONFIG)
-    training._load_weights(model, training.read_tensors(trained), trained)
+    learner = SACLearner(CONFIG)
+    learner.load_weights(training.read_tensors(trained), trained)
+    model = learner.model
     observation = np.random.default_rng(0).uniform(-1, 1, (6, 15)).astype(np.float32)
     with torch.no_grad():
         expected = model.policy._predict(torch.as_tensor(observation), deterministic=True).numpy()
@@ -75,25 +77,27 @@ def test_interrupted_training_ends_as_an_uninterrupted_one(hindsight, tmp_path, 
     config = CONFIG.model_copy(update={"sac": CONFIG.sac.model_copy(update={"hindsight": hindsight})})
     uninterrupted = train(config, tmp_path / "uninterrupted", progress=False).read_bytes()
     folder = tmp_path / "interrupted"
-    original = training._learn
+    original = SACLearner.learn
     reached = []
 
-    def learn(model, target, bar):
-        if model.num_timesteps >= 200 and not reached:
-            reached.append(model.num_timesteps)
+    def learn(learner, target, progress):
+        if learner.step >= 200 and not reached:
+            reached.append(learner.step)
             raise KeyboardInterrupt
-        original(model, target, bar)
+        original(learner, target, progress)
 
-    monkeypatch.setattr(training, "_learn", learn)
+    monkeypatch.setattr(SACLearner, "learn", learn)
     with pytest.raises(KeyboardInterrupt):
         train(config, folder, progress=False)
     assert (folder / "checkpoint.safetensors").exists() and not (folder / "policy.safetensors").exists()
     with safe_open(folder / "checkpoint.safetensors", framework="numpy") as opened:
-        spent = json.loads(opened.metadata()["state"])["cpu_seconds"]
+        spent = json.loads(opened.metadata()["training"])["cpu_seconds"]
     steps = []
     began = time.process_time()
     monkeypatch.setattr(
-        training, "_learn", lambda model, target, bar: (steps.append(model.num_timesteps), original(model, target, bar))
+        SACLearner,
+        "learn",
+        lambda learner, target, progress: (steps.append(learner.step), original(learner, target, progress)),
     )
     train(config, folder, progress=False)
     own = time.process_time() - began
@@ -130,21 +134,21 @@ def test_a_training_that_should_stop_stops_on_resuming(tmp_path, monkeypatch):
 
     with pytest.raises(KeyboardInterrupt):
         train(CONFIG, tmp_path, progress=False, report=lost)
-    monkeypatch.setattr(training, "_learn", lambda *_: pytest.fail("went on"))
+    monkeypatch.setattr(SACLearner, "learn", lambda *_: pytest.fail("went on"))
     card = Policy(train(CONFIG, tmp_path, progress=False, report=lambda step, outcome: True)).card
     assert card["stopped_early"] and card["steps"] == 200
 
 
 def test_damaged_checkpoint_is_named(tmp_path, monkeypatch):
-    original = training._learn
+    original = SACLearner.learn
 
-    def learn(model, target, bar):
-        if model.num_timesteps >= 200:
+    def learn(learner, target, progress):
+        if learner.step >= 200:
             raise KeyboardInterrupt
-        original(model, target, bar)
+        original(learner, target, progress)
 
     with monkeypatch.context() as patch:
-        patch.setattr(training, "_learn", learn)
+        patch.setattr(SACLearner, "learn", learn)
         with pytest.raises(KeyboardInterrupt):
             train(CONFIG, tmp_path, progress=False)
     path = tmp_path / "checkpoint.safetensors"
@@ -336,16 +340,16 @@ def test_the_best_policy_survives_an_interruption(tmp_path, monkeypatch):
 
     monkeypatch.setattr(training, "evaluate", worse_and_worse)
     config = CONFIG.model_copy(update={"steps": 600})
-    original = training._learn
+    original = SACLearner.learn
 
-    def learn(model, target, bar):
+    def learn(learner, target, progress):
         if len(seen) == 2 and learn.whole:
             learn.whole = False
             raise KeyboardInterrupt
-        original(model, target, bar)
+        original(learner, target, progress)
 
     learn.whole = True
-    monkeypatch.setattr(training, "_learn", learn)
+    monkeypatch.setattr(SACLearner, "learn", learn)
     with pytest.raises(KeyboardInterrupt):
         train(config, tmp_path, progress=False)
     policy = train(config, tmp_path, progress=False)
