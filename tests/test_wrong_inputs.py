@@ -141,7 +141,7 @@ MISTAKES = {
     ),
     "configuration key": (
         lambda f: config(f, TrainConfig, TRAIN, "sac.gama=0.9"),
-        "config '*': sac: unknown key 'gama'; did you mean 'gamma'? allowed: learning_rate, *",
+        "config '*': sac: unknown key 'gama'; did you mean 'gamma'?",
     ),
     "variable of a study": (
         lambda f: config(f, StudyConfig, FINGER, "variables=[heigth]"),
