@@ -316,11 +316,25 @@ class MechanicalModel:
             triangles = cavity_around(self.nodes, solid.corners, np.asarray(inside), name)
         else:
             triangles = np.asarray(surface)
-        if isinstance(solid, QuadraticTetrahedra) and triangles.ndim == 2 and triangles.shape[1] == 3:
-            triangles = quadratic_triangles(triangles, solid.connectivity)
-        cavity = Cavity(name, triangles, self.nodes)
+        cavity = self.cavity(name, triangles, block=block)
         self.add("a", cavity)
         return cavity
+
+    def cavity(self, name: str, surface: np.ndarray, *, block: int = 0) -> Cavity:
+        """Return the cavity within a closed surface of a solid, for any role.
+
+        Args:
+            name: identifier.
+            surface: triangles of corner nodes, shape (k, 3); quadratic elements add their midside nodes.
+            block: number of the solid among `solids`.
+
+        Raises:
+            ValueError: if the surface is not closed.
+        """
+        solid = self._solid(block)
+        if isinstance(solid, QuadraticTetrahedra) and surface.ndim == 2 and surface.shape[1] == 3:
+            surface = quadratic_triangles(surface, solid.connectivity)
+        return Cavity(name, surface, self.nodes)
 
     def add_effector(
         self, name: str, point: ArrayLike, *, hint: np.ndarray | None = None, block: int = 0, radius: float = 0.0

@@ -20,6 +20,7 @@ from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature, Morpher
+from softgym_envs.robots.mesh_tiers import UNIFORM, MeshTier, choose_mesh
 
 F = TypeVar("F", bound=Callable[..., None])
 
@@ -29,7 +30,6 @@ Drawing = tuple[Callable[..., None], dict]
 LARGEST = 10.0
 """Largest allowed robot, stroke or dimension [m]; larger ones were probably given in millimetres."""
 
-
 WITHOUT_CONTACT: dict[str, object] = {
     "obstacles": (),
     "self_contact": False,
@@ -38,6 +38,9 @@ WITHOUT_CONTACT: dict[str, object] = {
     "contact_stiffness": None,
 }
 """Options of a robot that touches nothing. They are not part of its key."""
+
+OMITTED: dict[str, object] = WITHOUT_CONTACT | UNIFORM
+"""Values of options that are not part of a robot's key."""
 
 _REQUIRED = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
 
@@ -278,14 +281,15 @@ class Robot(ABC):
 
         The options are the arguments of the constructor, defaults included. If the robot has an attribute of the
         same name, for example because a default depends on other options, the attribute's value is used. Options of
-        contact are left out at their defaults, so that weights without contact keep their key.
+        contact and of meshes are left out at their simplest values (`OMITTED`).
         """
         values = {name: vars(self).get(name, value) for name, value in self._options.items()}
+        # These follow from the name of the mesh, but may change in a later version.
+        values |= {name: vars(self)[name] for name in ("feature_size", "guide_radius") if vars(self).get(name)}
         return {
             name: _json_value(value, f"option '{name}' of robot '{self.name}'")
             for name, value in values.items()
-            if name not in self.non_mechanical_options
-            and not (name in WITHOUT_CONTACT and WITHOUT_CONTACT[name] == value)
+            if name not in self.non_mechanical_options and not (name in OMITTED and OMITTED[name] == value)
         }
 
     @property
@@ -388,32 +392,51 @@ class MeshedRobot(Robot):
     """A robot whose body is one solid, meshed by gmsh; by default, the mesh is moved from design to design.
 
     Args:
-        mesh_size: target edge length [m].
+        mesh: name of one of the robot's `meshes`.
+        mesh_size: target edge length [m], instead of that of the mesh; other sizes change in proportion.
+        element: name of the solid element (`softgym_envs.mechanics.solids.SOLIDS`), instead of that of the mesh.
+        fillet: radius of re-entrant edges [m], instead of that of the mesh; only for robots that can be drawn with it.
         meshing: ``"morph"`` moves the reference mesh, ``"remesh"`` creates a new mesh for every design.
         material: name of a material of `softgym_envs.mechanics.materials`.
         **options: options of `Robot`.
+
+    Attributes:
+        meshes: the robot's meshes by name: ``published``, ``accurate`` and ``reference`` (see `mesh_tiers`). A robot
+            without any needs a ``mesh_size``.
+        rounded: whether it can be drawn with fillets.
     """
 
+    meshes: Mapping[str, MeshTier] = {}
+    rounded: bool = False
     #: Smallest element quality, relative to the reference mesh, that a moved mesh may have before it is remeshed.
     quality_bound = 0.3
 
     def __init__(
         self,
         *,
-        mesh_size: float,
+        mesh: str = "published",
+        mesh_size: float | None = None,
+        element: str | None = None,
+        fillet: float | None = None,
         meshing: str = "morph",
         material: str = "corotational",
         **options: Any,
     ) -> None:
         if meshing not in ("morph", "remesh"):
             raise ValueError(f"meshing = {meshing!r} is unknown; allowed: 'morph', 'remesh'")
-        if not (isinstance(mesh_size, int | float) and 0.0 < mesh_size < np.inf):
-            raise ValueError(f"robot '{self.name}': mesh_size = {mesh_size!r} m must be positive and finite")
+        if not self.meshes and mesh_size is None:
+            raise TypeError(f"robot '{self.name}' has no meshes by name: it needs a mesh_size [m]")
+        tier = choose_mesh(self.meshes, mesh) if self.meshes else MeshTier(1.0)
+        self.tier = tier.changed(self.name, size=mesh_size, element=element, fillet=fillet)
+        if self.tier.fillet and not self.rounded:
+            raise ValueError(f"robot '{self.name}' cannot be drawn with a fillet: fillet = {fillet!r} m must be zero")
         resolve_material(material)
         super().__init__(**options)
         self.material = material
-        self.mesh_size = float(mesh_size)
-        self.meshing = meshing
+        self.mesh_size, self.element, self.fillet = self.tier.size, self.tier.element, self.tier.fillet
+        self.feature_size, self.guide_radius = self.tier.feature_size, self.tier.guide_radius
+        # Surfaces of fillets are not among the features that a mesh is moved with.
+        self.meshing = "remesh" if self.fillet else meshing
         self._morpher: Morpher | None = None
 
     # -- what a robot defines ---------------------------------------------------------------------------------------
@@ -475,13 +498,14 @@ class MeshedRobot(Robot):
         Args:
             mesh: the meshed body.
             design: a design with the variables ``young_modulus`` [Pa] and ``poisson_ratio``.
-            fixed: clamped nodes, boolean, shape (n,).
+            fixed: clamped nodes of the mesh, boolean, shape (n,).
             density: [kg/m3]; the default is that of silicone.
         """
         return MechanicalModel.from_mesh(
             mesh.nodes,
             mesh.tetrahedra,
             fixed=fixed,
+            element=self.element,
             material=self.material,
             young_modulus=design["young_modulus"],
             poisson_ratio=design["poisson_ratio"],

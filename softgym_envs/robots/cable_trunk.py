@@ -7,18 +7,47 @@ clamped base along +z. Four cables run to the tip and four to the middle, each p
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.mesh_tiers import choose_mesh
 
 MASS = 0.042  # of the published body [kg]
 TIP_FRACTION = 0.4  # radius of the long cables at the tip over the half-width there
 LONG_GUIDES, SHORT_GUIDES = 20, 10
+
+
+@dataclass(frozen=True)
+class TrunkMesh:
+    """Mesh of the trunk.
+
+    Attributes:
+        layers: number of elements along it.
+        rings: number of rings of elements about its axis.
+        element: name of the solid element.
+        guide_radius: radius of the channels on which cables act [m]; 0 for single points.
+    """
+
+    layers: int
+    rings: int
+    element: str
+    guide_radius: float
+
+
+MESHES = {
+    "published": TrunkMesh(24, 2, "linear", 0.0),
+    "accurate": TrunkMesh(24, 2, "quadratic", 0.5e-3),
+    "reference": TrunkMesh(48, 3, "quadratic", 0.5e-3),
+}
+"""Meshes by name. The cables end 2 mm from the axis, and no source states the radius of their channels."""
 
 
 def stretched(share: np.ndarray, short_fraction: float) -> np.ndarray:
@@ -82,8 +111,10 @@ class CableTrunk(Robot):
     as the body.
 
     Args:
-        layers: number of elements along the trunk; the defaults give 825 nodes and 3456 tetrahedra.
-        rings: number of rings of elements about the axis.
+        mesh: ``"published"`` (825 nodes and 3456 linear tetrahedra), ``"accurate"`` or ``"reference"``.
+        layers: number of elements along the trunk, instead of that of the mesh.
+        rings: number of rings of elements about the axis, instead of that of the mesh.
+        element: name of the solid element, instead of that of the mesh.
         material: name of a material of `softgym_envs.mechanics.materials`.
         strokes: largest displacement of the long and of the short cables [m]. The default is half of the public model's
             (0.070, 0.040): from 37 mm on, two opposite long cables crush the thin tip and no equilibrium is found; one
@@ -100,14 +131,22 @@ class CableTrunk(Robot):
     def __init__(
         self,
         *,
-        layers: int = 24,
-        rings: int = 2,
+        mesh: str = "published",
+        layers: int | None = None,
+        rings: int | None = None,
+        element: str | None = None,
         material: str = "corotational",
         strokes: tuple[float, float] = (0.035, 0.020),
         unilateral: bool = True,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         **options: Any,
     ) -> None:
+        tier = choose_mesh(MESHES, mesh)
+        layers = tier.layers if layers is None else layers
+        rings = tier.rings if rings is None else rings
+        element = tier.element if element is None else element
+        if element not in SOLIDS:
+            raise ValueError(unknown_name("element", element, SOLIDS))
         if not (isinstance(layers, int) and layers >= 1 and isinstance(rings, int) and rings >= 1):
             raise ValueError(f"layers = {layers!r} and rings = {rings!r} must be positive integers")
         resolve_material(material)
@@ -116,6 +155,8 @@ class CableTrunk(Robot):
         super().__init__(gravity=gravity, **options)
         self.layers = layers
         self.rings = rings
+        self.element = element
+        self.guide_radius = tier.guide_radius
         self.material = material
         self.strokes = (float(strokes[0]), float(strokes[1]))
         self.design_space = DesignSpace(
@@ -161,6 +202,7 @@ class CableTrunk(Robot):
             nodes,
             tetrahedra,
             fixed=nodes[:, 2] == 0.0,
+            element=self.element,
             material=self.material,
             young_modulus=design["young_modulus"],
             poisson_ratio=design["poisson_ratio"],
@@ -176,8 +218,10 @@ class CableTrunk(Robot):
             for x, y in ((0, 1), (-1, 0), (0, -1), (1, 0)):
                 points = np.column_stack([x * radius, y * radius, height])
                 actuator = next(actuators)
-                model.add_cable(actuator.name, points[1:], points[0], unilateral=actuator.unilateral)
-        model.add_effector("tip", np.array([0.0, 0.0, design["length"]]))
+                model.add_cable(
+                    actuator.name, points[1:], points[0], unilateral=actuator.unilateral, radius=self.guide_radius
+                )
+        model.add_effector("tip", np.array([0.0, 0.0, design["length"]]), radius=self.guide_radius)
         return model
 
     def reference_path(self, count: int = 30) -> np.ndarray:

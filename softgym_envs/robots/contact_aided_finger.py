@@ -14,13 +14,11 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature
@@ -31,9 +29,7 @@ from softgym_envs.robots.geometry.zigzag_shape import (
     draw_published,
     zigzag_outline,
 )
-
-MESHES = {"published": ("linear", 3.0e-3), "accurate": ("quadratic", 8.0e-3)}
-"""Element and target edge length [m] of each mesh."""
+from softgym_envs.robots.mesh_tiers import MeshTier
 
 SERVO_AXIS = np.array([30.0e-3, -18.0e-3, 0.0])
 """A point of the servo's axis, which is parallel to z [m]."""
@@ -55,10 +51,10 @@ class ContactAidedFinger(MeshedRobot):
 
     Args:
         control_points: 7 (initial design of the thesis) or 12 (its optimised designs) distances shape the zigzag.
-        mesh: ``"accurate"``, or ``"published"``: linear tetrahedra of 3 mm, made as by the public model. They are too
-            stiff (see the page of this robot) but needed to compare with published values.
+        mesh: ``"accurate"``, ``"reference"`` or ``"published"``: linear tetrahedra of 3 mm, made as by the public
+            model. They are too stiff (see the page of this robot) but needed to compare with published values.
         mesh_size: target edge length [m], instead of that of the mesh.
-        element: kind of element (`softgym_envs.mechanics.solids.SOLIDS`), instead of that of the mesh.
+        element: name of the solid element, instead of that of the mesh.
         length: height of the finger above its feet [m].
         width: distance between the outer sides of its feet [m].
         thickness: of the finger, along the servo's axis [m].
@@ -74,6 +70,11 @@ class ContactAidedFinger(MeshedRobot):
     goal_axes = np.array([1.0, 1.0, 0.0])
     rest_mode = "displacement"
     convex = False
+    meshes = {
+        "published": MeshTier(3.0e-3),
+        "accurate": MeshTier(8.0e-3, "quadratic"),
+        "reference": MeshTier(4.0e-3, "quadratic"),
+    }
 
     def __init__(
         self,
@@ -92,24 +93,19 @@ class ContactAidedFinger(MeshedRobot):
     ) -> None:
         if control_points not in CONTROL_POINTS:
             raise ValueError(f"control_points = {control_points!r} is unknown; allowed: 7, 12")
-        if mesh not in MESHES:
-            raise ValueError(unknown_name("mesh", mesh, MESHES))
         sizes = {"length": length, "width": width, "thickness": thickness, "density": density}
         for name, value in sizes.items():
             if not (isinstance(value, int | float) and 0.0 < value < math.inf):
                 raise ValueError(f"robot '{self.name}': {name} = {value!r} must be positive and finite")
-        usual_element, usual_size = MESHES[mesh]
-        element = usual_element if element is None else element
-        if element not in SOLIDS:
-            raise ValueError(unknown_name("element", element, SOLIDS))
         super().__init__(
-            mesh_size=usual_size if mesh_size is None else mesh_size,
+            mesh=mesh,
+            mesh_size=mesh_size,
+            element=element,
             meshing="remesh",
             material=material,
             gravity=gravity,
             **options,
         )
-        self.element = element
         self.published_mesh = mesh == "published"
         self.control_points = control_points
         self.length, self.width, self.thickness, self.density = (float(value) for value in sizes.values())

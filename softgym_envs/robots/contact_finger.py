@@ -23,6 +23,7 @@ from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator
 from softgym_envs.robots.grippers import STRAIGHT, FingerRobot
+from softgym_envs.robots.soft_finger import TIP_RADIUS
 
 
 class ContactFinger(FingerRobot):
@@ -102,4 +103,4 @@ class ContactFinger(FingerRobot):
         for component, (name, *_) in enumerate(self.pose_ranges):
             model.add("a", Pose(name, frame, component, model.nodes))
         tip, reference = self.finger.tip(design), self.finger.tip(self.finger.reference_design)
-        model.add("e", Point("tip", self.material_point(model, 0, tip, reference)))
+        model.add("e", Point("tip", self.material_point(model, 0, tip, reference, radius=TIP_RADIUS)))

@@ -17,6 +17,7 @@ from softgym_envs.robots.base import Actuator, MeshedRobot
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature, Plane
 from softgym_envs.robots.geometry.symmetry import mirrored
+from softgym_envs.robots.mesh_tiers import MeshTier
 
 # Contours of one leg (r, z) from the base to the top [mm], inset by a few tenths to match the published volume.
 OUTER = (
@@ -72,8 +73,9 @@ class Diamond(MeshedRobot):
     One eighth of the body is meshed and mirrored, so its response has the symmetry of its shape.
 
     Args:
-        mesh_size: target edge length [m]; the default gives 1529 nodes and 5272 tetrahedra. Edges of the outline are
-            shorter than that, so elements are smaller.
+        mesh: ``"published"`` (1529 nodes and 5272 linear tetrahedra), ``"accurate"`` or ``"reference"``.
+        mesh_size: target edge length [m], instead of that of the mesh. Edges of the outline may be shorter.
+        element: name of the solid element, instead of that of the mesh.
         meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` creates a new mesh for every design.
         material: name of a material of `softgym_envs.mechanics.materials`.
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
@@ -87,18 +89,33 @@ class Diamond(MeshedRobot):
     size = 0.16
     #: Depth of the effector below the top, which is one millimetre in the published model [m].
     effector_depth = 1.0e-3
+    meshes = {
+        "published": MeshTier(17.0e-3),
+        "accurate": MeshTier(17.0e-3, "quadratic", guide_radius=2.0e-3),
+        "reference": MeshTier(8.0e-3, "quadratic", guide_radius=2.0e-3),
+    }
 
     def __init__(
         self,
         *,
-        mesh_size: float = 17.0e-3,
+        mesh: str = "published",
+        mesh_size: float | None = None,
+        element: str | None = None,
         meshing: str = "morph",
         material: str = "corotational",
         unilateral: bool = True,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         **options: Any,
     ) -> None:
-        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity, **options)
+        super().__init__(
+            mesh=mesh,
+            mesh_size=mesh_size,
+            element=element,
+            meshing=meshing,
+            material=material,
+            gravity=gravity,
+            **options,
+        )
         self.design_space = DesignSpace(
             DesignVariable("leg_width", 0.8, 1.2, 1.0, "1", "width of the legs over that of the published body"),
             DesignVariable("top_height", 0.115, 0.140, 0.126, "m", "height of the top above the origin"),
@@ -214,8 +231,8 @@ class Diamond(MeshedRobot):
             # The elbow's outermost point is a node of every mesh.
             anchor = np.array([[x * elbow, y * elbow, height]])
             pull_point = np.array([x * 10.0e-3, y * 10.0e-3, 30.0e-3])
-            model.add_cable(actuator.name, anchor, pull_point, unilateral=actuator.unilateral)
-        model.add_effector("top", self._top(design))
+            model.add_cable(actuator.name, anchor, pull_point, unilateral=actuator.unilateral, radius=self.guide_radius)
+        model.add_effector("top", self._top(design), radius=self.guide_radius)
         return model
 
     def reference_path(self, count: int = 30) -> np.ndarray:

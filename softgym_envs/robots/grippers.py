@@ -22,7 +22,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.geometry.finger_shape import in_flange
-from softgym_envs.robots.soft_finger import SoftFinger
+from softgym_envs.robots.soft_finger import TIP_RADIUS, SoftFinger
 
 STRAIGHT = np.eye(3)
 TURNED = np.diag([-1.0, -1.0, 1.0])
@@ -33,7 +33,10 @@ class FingerRobot(Robot):
     """One or more two-cable fingers, and what they hold. Held objects have no mass.
 
     Args:
-        mesh_size: target edge length of a finger [m].
+        mesh: name of a mesh of the finger: ``"published"``, ``"accurate"`` or ``"reference"``.
+        mesh_size: target edge length of a finger [m], instead of that of the mesh.
+        element: name of the solid element, instead of that of the mesh.
+        fillet: radius of the fingers' re-entrant edges [m], as for the finger.
         meshing: ``"morph"`` or ``"remesh"``, as for the finger.
         material: name of a material.
         unilateral: whether cables cannot push (default).
@@ -55,7 +58,10 @@ class FingerRobot(Robot):
     def __init__(
         self,
         *,
-        mesh_size: float = 8.0e-3,
+        mesh: str = "published",
+        mesh_size: float | None = None,
+        element: str | None = None,
+        fillet: float | None = None,
         meshing: str = "morph",
         material: str = "corotational",
         unilateral: bool = True,
@@ -64,9 +70,18 @@ class FingerRobot(Robot):
     ) -> None:
         super().__init__(gravity=gravity, **options)
         self.finger = SoftFinger(
-            cables=2, mesh_size=mesh_size, meshing=meshing, material=material, unilateral=unilateral
+            cables=2,
+            mesh=mesh,
+            mesh_size=mesh_size,
+            element=element,
+            fillet=fillet,
+            meshing=meshing,
+            material=material,
+            unilateral=unilateral,
         )
-        self.mesh_size = self.finger.mesh_size
+        self.mesh_size, self.element, self.fillet = self.finger.mesh_size, self.finger.element, self.finger.fillet
+        self.meshing = self.finger.meshing
+        self.feature_size, self.guide_radius = self.finger.feature_size, self.finger.guide_radius
         self.design_space = DesignSpace(*self.variables())
         self.actuators = tuple(
             Actuator(f"finger_{k + 1}_{cable.name}", *self.cable_range, self.cable_rate, unilateral=unilateral)
@@ -110,6 +125,7 @@ class FingerRobot(Robot):
                 mesh.nodes @ turn.T + shift,
                 mesh.tetrahedra,
                 fixed=fixed,
+                element=self.element,
                 material=self.finger.material,
                 young_modulus=design["young_modulus"],
                 poisson_ratio=design["poisson_ratio"],
@@ -126,13 +142,14 @@ class FingerRobot(Robot):
                     turn @ pull_point + shift,
                     unilateral=cable.unilateral,
                     block=k,
+                    radius=self.guide_radius,
                 )
         self._mesh = mesh
         self.hold(model, design, frame)
         return model
 
     def material_point(
-        self, model: MechanicalModel, finger: int, point: np.ndarray, reference: np.ndarray
+        self, model: MechanicalModel, finger: int, point: np.ndarray, reference: np.ndarray, *, radius: float
     ) -> EmbeddedPoints:
         """Embed a point [m] (3,), given in the finger's own axes, in one copy of the finger.
 
@@ -141,10 +158,12 @@ class FingerRobot(Robot):
             finger: number of the copy.
             point: the point [m], shape (3,).
             reference: the same point of the reference body, which selects the element for points outside the mesh.
+            radius: of the part of the finger on which the point acts [m], unless cables act on single points.
         """
         turn, shift = self.placements[finger]
         hint = self.finger.reference_element(self._mesh, reference)
-        return model.embed(turn @ point + shift, hint, block=finger)
+        radius = radius if self.guide_radius else 0.0
+        return model.embed(turn @ point + shift, hint, block=finger, radius=radius)
 
     def tie_contacts(self, model: MechanicalModel, frame: int) -> None:
         """Tie the three contact points of each finger to the points of the object that they touch at rest."""
@@ -152,7 +171,7 @@ class FingerRobot(Robot):
         centre = model.nodes[frame]
         for k in range(len(self.placements)):
             for i, point in enumerate(self.finger.contact_points(self._shape)):
-                embedding = self.material_point(model, k, point, reference[i])
+                embedding = self.material_point(model, k, point, reference[i], radius=self.guide_radius)
                 held = EmbeddedPoints.in_frame(frame, embedding.points[0] - centre, model.nodes)
                 model.add("b", Bond(f"contact_{k + 1}_{i + 1}", embedding, held))
 
@@ -241,7 +260,7 @@ class TwoFingerGripper(FingerRobot):
     def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
         """Tie the tips at the bar's length; the effector lies halfway between them."""
         tip, reference = self.finger.tip(design), self.finger.tip(self.finger.reference_design)
-        first, second = (self.material_point(model, k, tip, reference) for k in (0, 1))
+        first, second = (self.material_point(model, k, tip, reference, radius=TIP_RADIUS) for k in (0, 1))
         model.add("b", Bond("bar", first, second, np.array([0.0, -design["bar_length"], 0.0])))
         middle = EmbeddedPoints.from_weights(
             np.concatenate([first.node_ids, second.node_ids], axis=1),

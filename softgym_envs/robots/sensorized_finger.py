@@ -25,11 +25,18 @@ from softgym_envs.robots.geometry.finger_shape import (
     THICKNESS,
     check_finger,
     draw_finger,
-    finger_features,
     in_flange,
 )
-from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
+from softgym_envs.robots.geometry.graded_finger import (
+    draw_rounded_finger,
+    graded_features,
+    mesh_finger,
+    whole_finger,
+)
+from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature
+from softgym_envs.robots.mesh_tiers import MeshTier
+from softgym_envs.robots.soft_finger import FINGER_MESHES
 
 # Fixed dimensions [mm].
 LENGTH = 40.0
@@ -76,7 +83,10 @@ class SensorizedFinger(MeshedRobot):
 
     Args:
         cavities: 2 (one in each bellow) or 4 (two in each, with a wall between; its thickness is then a variable).
-        mesh_size: target edge length [m].
+        mesh: ``"published"``, ``"accurate"`` or ``"reference"``.
+        mesh_size: target edge length [m], instead of that of the mesh.
+        element: name of the solid element, instead of that of the mesh.
+        fillet: radius of the re-entrant edges at the joints [m]; see `SoftFinger`.
         meshing: ``"remesh"`` (default) creates a new mesh for every design, as in the published study. ``"morph"``
             moves the baseline mesh if its elements stay good, which holds in about a quarter of this large space.
         material: name of a material of `softgym_envs.mechanics.materials`.
@@ -90,12 +100,17 @@ class SensorizedFinger(MeshedRobot):
     name = "sensorized_finger"
     effectors = ("tip",)
     size = 0.12
+    rounded = True
+    meshes = {**FINGER_MESHES, "published": MeshTier(7.0e-3)}
 
     def __init__(
         self,
         *,
         cavities: int = 2,
-        mesh_size: float = 7.0e-3,
+        mesh: str = "published",
+        mesh_size: float | None = None,
+        element: str | None = None,
+        fillet: float | None = None,
         meshing: str = "remesh",
         material: str = "corotational",
         unilateral: bool = True,
@@ -106,7 +121,16 @@ class SensorizedFinger(MeshedRobot):
     ) -> None:
         if cavities not in (2, 4):
             raise ValueError(f"cavities = {cavities!r} is unknown; allowed: 2, 4")
-        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity, **options)
+        super().__init__(
+            mesh=mesh,
+            mesh_size=mesh_size,
+            element=element,
+            fillet=fillet,
+            meshing=meshing,
+            material=material,
+            gravity=gravity,
+            **options,
+        )
         self.cavities = cavities
         mm = 1e-3
         shape = [
@@ -159,6 +183,13 @@ class SensorizedFinger(MeshedRobot):
         Raises:
             InfeasibleDesign: if the shape cannot exist.
         """
+        lengths = self._checked(design)
+        if self.fillet:
+            return draw_rounded_finger, {**lengths, "fillet": round(1e3 * self.fillet, 9)}
+        return draw_finger, lengths
+
+    def _checked(self, design: Mapping[str, float]) -> dict[str, float]:
+        """Return `lengths` after checking that the shape can exist."""
         lengths = self.lengths(design)
         check_finger(lengths)
         cable = 1e3 * self.cable_height(design)
@@ -167,28 +198,32 @@ class SensorizedFinger(MeshedRobot):
                 f"the cable must pass through the segments and over the joints: it is {cable:.2f} mm above the "
                 f"bottom, the joints end at {lengths['joint_height']:.2f} mm and the segments at {HEIGHT:.2f} mm"
             )
-        return draw_finger, lengths
+        return lengths
 
     def cable_height(self, design: Mapping[str, float]) -> float:
         """Return the height of the cable over the bottom of a complete design [m]."""
         return design["outer_radius"] + self.cable_clearance
 
     def mesh(self, design: Mapping[str, float]) -> BodyMesh:
-        """Mesh the body of a complete design.
+        """Mesh the body of a complete design, or the half that `unfold` completes.
 
         Raises:
             InfeasibleDesign: if the shape cannot exist or cannot be meshed in time.
         """
-        draw, lengths = self.drawing(design)
-        mesh = mesh_geometry(draw, lengths, mesh_size=self.mesh_size)
-        found = len(mesh.cavities())
+        lengths = self._checked(design)
+        mesh = mesh_finger(lengths, self.tier)
+        found = len(self.unfold(mesh).cavities())
         if found != self.cavities:
             raise InfeasibleDesign(f"the mesh has {found} closed cavities, expected {self.cavities}, for {lengths}")
         return mesh
 
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
         """Return the surfaces of the shape of a complete design."""
-        return finger_features(self.lengths(design))
+        return graded_features(self.lengths(design), self.tier)
+
+    def unfold(self, part: BodyMesh) -> BodyMesh:
+        """Complete the body of a graded mesh."""
+        return whole_finger(part, self.tier)
 
     def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Clamp the flange, route the cable past the notches, put the effector at the tip, make cavities sensors."""
@@ -199,12 +234,13 @@ class SensorizedFinger(MeshedRobot):
         stations = [s for k in range(3) for s in (-k * length - offset, -(k + 1) * length + offset)]
         points = np.array([[0.0, height, s] for s in stations])
         (cable,) = self.actuators
-        model.add_cable(cable.name, points, np.array([0.0, height, 0.0]), unilateral=cable.unilateral)
+        pull_point = np.array([0.0, height, 0.0])
+        model.add_cable(cable.name, points, pull_point, unilateral=cable.unilateral, radius=self.guide_radius)
         # Above the height of the joints the effector lies in front of the slanted end, outside the body.
         hint = self.reference_element(mesh, self.effector_rest)
         model.add_effector("tip", self.effector_rest, hint=hint)
         for number, triangles in enumerate(mesh.cavities(), start=1):
-            model.add("s", Cavity(f"cavity_{number}", triangles, mesh.nodes))
+            model.add("s", model.cavity(f"cavity_{number}", triangles))
         return model
 
     def readings(
@@ -233,8 +269,8 @@ class SensorizedFinger(MeshedRobot):
         change = abs(float(pulled[0] - rest[0]))
         pushed, sensitivity = None, None
         if self.cavities == 4:
-            point = model.embed(np.array(_LATERAL_POINT) * 1e-3)
-            model.nodal_loads[point.node_ids[0], 0] += lateral_force * point.weights[0]
+            point = model.embed(np.array(_LATERAL_POINT) * 1e-3, radius=self.guide_radius)
+            np.add.at(model.nodal_loads[:, 0], point.node_ids[0], lateral_force * point.weights[0])
             statics.reset()
             pushed = volumes + statics.solve([0.0]).condensed.delta.s
             sensitivity = min(change, abs(float(pushed[0] - rest[0]))) / float(rest[0])

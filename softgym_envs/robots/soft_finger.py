@@ -12,13 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.designs import Design, DesignSpace, DesignVariable
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
-from softgym_envs.robots.geometry.finger_shape import check_finger, draw_finger, finger_features, in_flange
-from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
+from softgym_envs.robots.geometry.finger_shape import check_finger, draw_finger, in_flange
+from softgym_envs.robots.geometry.graded_finger import (
+    draw_rounded_finger,
+    graded_features,
+    is_half,
+    mesh_finger,
+    whole_finger,
+)
+from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature
+from softgym_envs.robots.mesh_tiers import MeshTier
 
 BELLOWS = {
     "outer_radius": 14.75,
@@ -32,6 +40,17 @@ BELLOWS = {
 CONTACT_RADIUS = 2.0e-3
 """Radius of the circle of contact points [m]."""
 
+TIP_RADIUS = 8.0e-3
+"""Part of the last segment over which the tip is averaged, unless cables act on single points [m]."""
+
+FINGER_MESHES = {
+    "published": MeshTier(8.0e-3),
+    "accurate": MeshTier(10.0e-3, "quadratic", feature_size=2.5e-3, guide_radius=1.0e-3),
+    "reference": MeshTier(6.0e-3, "quadratic", feature_size=1.5e-3, guide_radius=1.0e-3),
+}
+"""Meshes of the fingers. No source states the radius of the cables' channels; with less than 1 mm, cables cut through
+the fine meshes before the end of their range, and from 1 to 1.5 mm efforts hardly change."""
+
 
 class SoftFinger(MeshedRobot):
     """Cable-driven soft finger.
@@ -39,9 +58,14 @@ class SoftFinger(MeshedRobot):
     Args:
         cables: 2 (thesis, sec. 4.3: x = -5 and 5 mm, y = 15.33 mm, notch slope 45 degrees, nu 0.3) or
             1 (thesis, sec. 4.5: x = 0, y = 17.75 mm, notch slope 30 degrees, nu 0.47).
-        mesh_size: target edge length [m]; default 8 mm (485 nodes, 1572 tetrahedra) with two cables, 7.9 mm (520
-            nodes, 1721 tetrahedra) with one. Meshes of these sizes can be moved to every design without remeshing.
-        meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` creates a new mesh for every design.
+        mesh: ``"published"``, ``"accurate"`` or ``"reference"``; the published one has 485 nodes and 1572 linear
+            tetrahedra with two cables, 520 and 1721 with one.
+        mesh_size: target edge length [m], instead of that of the mesh.
+        element: name of the solid element, instead of that of the mesh.
+        fillet: radius of the re-entrant edges at the joints [m], which no source states; by default they are sharp, as
+            drawn. A fillet makes the finger stiffer, see its page.
+        meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` creates a new mesh for every design, as is always
+            done with a fillet.
         material: name of a material of `softgym_envs.mechanics.materials`.
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the condensed-model work of the thesis has none.
@@ -52,12 +76,17 @@ class SoftFinger(MeshedRobot):
     name = "finger"
     effectors = ("tip",)
     size = 0.12
+    rounded = True
+    meshes: Mapping[str, MeshTier] = FINGER_MESHES
 
     def __init__(
         self,
         *,
         cables: int = 2,
+        mesh: str = "published",
         mesh_size: float | None = None,
+        element: str | None = None,
+        fillet: float | None = None,
         meshing: str = "morph",
         material: str = "corotational",
         unilateral: bool = True,
@@ -67,9 +96,19 @@ class SoftFinger(MeshedRobot):
     ) -> None:
         if cables not in (1, 2):
             raise ValueError(f"cables = {cables!r} is unknown; allowed: 1, 2")
-        if mesh_size is None:
-            mesh_size = 8.0e-3 if cables == 2 else 7.9e-3
-        super().__init__(mesh_size=mesh_size, meshing=meshing, material=material, gravity=gravity, **options)
+        if cables == 1:
+            # The largest size at which the mesh of this shape can be moved to every design without remeshing.
+            self.meshes = {**FINGER_MESHES, "published": MeshTier(7.9e-3)}
+        super().__init__(
+            mesh=mesh,
+            mesh_size=mesh_size,
+            element=element,
+            fillet=fillet,
+            meshing=meshing,
+            material=material,
+            gravity=gravity,
+            **options,
+        )
         self.cables = cables
         self.contacts = contacts
         self.slope = math.radians(45.0 if cables == 2 else 30.0)
@@ -109,16 +148,31 @@ class SoftFinger(MeshedRobot):
     def drawing(self, design: Mapping[str, float]) -> Drawing:
         lengths = self.lengths(design)
         check_finger(lengths)
+        if self.fillet:
+            return draw_rounded_finger, {**lengths, "fillet": round(1e3 * self.fillet, 9)}
         return draw_finger, lengths
 
+    @property
+    def reference_design(self) -> Design:
+        """The baseline; for graded meshes the middle of the dimensions, from where every design can be reached."""
+        if not is_half(self.tier):
+            return super().reference_design
+        middle = {v.name: 0.5 * (v.low + v.high) for v in self.design_space if v.unit == "m"}
+        return self.design_space.complete(middle)
+
     def mesh(self, design: Mapping[str, float]) -> BodyMesh:
-        """Mesh the body of a complete design."""
-        draw, lengths = self.drawing(design)
-        return mesh_geometry(draw, lengths, mesh_size=self.mesh_size)
+        """Mesh the body of a complete design, or the half that `unfold` completes."""
+        lengths = self.lengths(design)
+        check_finger(lengths)
+        return mesh_finger(lengths, self.tier)
+
+    def unfold(self, part: BodyMesh) -> BodyMesh:
+        """Complete the body of a graded mesh."""
+        return whole_finger(part, self.tier)
 
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
         """Return the surfaces of the shape of a complete design."""
-        return finger_features(self.lengths(design))
+        return graded_features(self.lengths(design), self.tier)
 
     @staticmethod
     def tip(design: Mapping[str, float]) -> np.ndarray:
@@ -152,14 +206,14 @@ class SoftFinger(MeshedRobot):
         """Clamp the flange, route the cables past the notches, put the effector at the middle of the tip."""
         model = self.solid(mesh, design, fixed=in_flange(mesh.nodes))
         for actuator, (pull_point, points) in zip(self.actuators, self.routes(design), strict=True):
-            model.add_cable(actuator.name, points, pull_point, unilateral=actuator.unilateral)
+            model.add_cable(actuator.name, points, pull_point, unilateral=actuator.unilateral, radius=self.guide_radius)
         # The effector lies in front of the slanted tip, outside the body.
         hint = self.reference_element(mesh, self.tip(self.reference_design))
-        model.add_effector("tip", self.tip(design), hint=hint)
+        model.add_effector("tip", self.tip(design), hint=hint, radius=TIP_RADIUS if self.guide_radius else 0.0)
         if self.contacts:
             reference = self.contact_points(self.reference_design)
             for i, point in enumerate(self.contact_points(design)):
-                embedding = model.embed(point, self.reference_element(mesh, reference[i]))
+                embedding = model.embed(point, self.reference_element(mesh, reference[i]), radius=self.guide_radius)
                 model.add("c", Point(f"contact_{i + 1}", embedding))
         return model
 

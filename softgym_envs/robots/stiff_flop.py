@@ -23,6 +23,7 @@ from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import tube_skin
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.mesh_tiers import choose_mesh
 
 STIFF_MODULUS = 1.875e6
 """Young's modulus of the end pieces [Pa]."""
@@ -44,12 +45,16 @@ INERTIA_SHARE = 0.363
 CIRCLE_DISTANCE = 0.108
 """Distance of the reference circle's plane from the base [m]."""
 
+MESHES = {"published": 5, "accurate": 10, "reference": 20}
+"""Number of beam elements of each module, by name of the mesh."""
+
 
 class StiffFlop(Robot):
     """Pneumatic trunk.
 
     Args:
-        elements: quadratic beam elements along the chambers of each module.
+        mesh: ``"published"``, ``"accurate"`` or ``"reference"``: how many elements (`MESHES`).
+        elements: quadratic beam elements along the chambers of each module, instead of that of the mesh.
         gravity: acceleration [m/s2]; the published work has none.
         unilateral: whether pressures must not be negative (default): a chamber that the others stretch beyond its
             commanded volume is open, without pressure.
@@ -66,7 +71,8 @@ class StiffFlop(Robot):
     def __init__(
         self,
         *,
-        elements: int = 5,
+        mesh: str = "published",
+        elements: int | None = None,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         unilateral: bool = True,
         largest_volume: float = 30e-9,
@@ -75,6 +81,7 @@ class StiffFlop(Robot):
         super().__init__(gravity=gravity, **options)
         if not 0.0 < largest_volume <= 100e-9:
             raise ValueError(f"largest_volume = {largest_volume!r} m3 is out of bounds; allowed: up to 1e-7 (100 mm3)")
+        elements = choose_mesh(MESHES, mesh) if elements is None else elements
         if not isinstance(elements, int) or elements < 1:
             raise ValueError(f"elements = {elements!r} is out of bounds; allowed: integers from 1")
         self.elements = elements

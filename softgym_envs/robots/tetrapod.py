@@ -23,6 +23,7 @@ from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.mesh_tiers import choose_mesh
 
 HORN = 22.5e-3
 """Distance of a leg's root from its servo's axis, outwards [m]."""
@@ -34,6 +35,9 @@ HANGING = -0.150
 """Published height of the centre at rest [m], from which the search for the equilibrium starts."""
 UP = np.array([0.0, 0.0, 1.0])
 
+MESHES = {"published": 6, "accurate": 12, "reference": 24}
+"""Number of beam elements of a leg, by name of the mesh."""
+
 
 class Tetrapod(Robot):
     """Four servo-driven legs and a rigid centre.
@@ -44,7 +48,8 @@ class Tetrapod(Robot):
 
     Args:
         payload: mass at the centre [kg].
-        elements: quadratic beam elements per leg.
+        mesh: ``"published"``, ``"accurate"`` or ``"reference"``: how many elements (`MESHES`).
+        elements: quadratic beam elements per leg, instead of that of the mesh.
         gravity: acceleration [m/s2].
         **options: options of `Robot`.
     """
@@ -58,11 +63,13 @@ class Tetrapod(Robot):
         self,
         *,
         payload: float = 0.0,
-        elements: int = 6,
+        mesh: str = "published",
+        elements: int | None = None,
         gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
         **options: Any,
     ) -> None:
         super().__init__(gravity=gravity, **options)
+        elements = choose_mesh(MESHES, mesh) if elements is None else elements
         if not (np.isfinite(payload) and payload >= 0.0):
             raise ValueError(f"payload = {payload} kg must be finite and not negative")
         if not isinstance(elements, int) or elements < 2:

@@ -111,7 +111,12 @@ class BodyMesh:
 
 
 def mesh_geometry(
-    build: Callable[..., None], parameters: dict[str, float], *, mesh_size: float, time_limit: float = 60.0
+    build: Callable[..., None],
+    parameters: dict[str, float],
+    *,
+    mesh_size: float,
+    uses: Sequence[Callable[..., object]] = (),
+    time_limit: float = 60.0,
 ) -> BodyMesh:
     """Return the mesh of a geometry, from the cache if it is stored there.
 
@@ -119,6 +124,7 @@ def mesh_geometry(
         build: module-level function that draws one volume with ``gmsh.model.occ`` in millimetres.
         parameters: its keyword arguments.
         mesh_size: target edge length [m].
+        uses: other functions that the drawing calls; editing them makes a new mesh, as editing the drawing does.
         time_limit: wall-clock limit of the meshing process [s].
 
     Raises:
@@ -128,7 +134,7 @@ def mesh_geometry(
     name = f"{build.__module__}:{build.__qualname__}"
     parameters = {key: float(value) for key, value in sorted(parameters.items())}
     request = {"build": name, "parameters": parameters, "mesh_size": float(mesh_size)}
-    key = _cache_key(build, parameters, mesh_size)
+    key = _cache_key(build, parameters, mesh_size, uses)
     for folder in (_SHIPPED, cache_directory("meshes")):
         path = folder / f"{key}.npz"
         if path.exists():
@@ -149,11 +155,30 @@ def mesh_geometry(
     return mesh
 
 
-def _cache_key(build: Callable[..., None], parameters: dict[str, float], mesh_size: float) -> str:
-    """Return the cache key of a mesh: a hash of the drawing's code, constants and parameters.
+def _cache_key(
+    build: Callable[..., None],
+    parameters: dict[str, float],
+    mesh_size: float,
+    uses: Sequence[Callable[..., object]] = (),
+) -> str:
+    """Return the cache key of a mesh: a hash of the code and constants of its drawing functions, and its parameters."""
+    code, constants = _source(build)
+    parts = {
+        "code": code,
+        "constants": constants,
+        "parameters": parameters,
+        "mesh_size": float(mesh_size),
+        "format": _FORMAT,
+    }
+    if uses:
+        parts["uses"] = [_source(function) for function in uses]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
 
-    Editing the drawing function changes the key. Comments, its docstring, white space and the path of the file do not
-    count, because they do not change the shape.
+
+def _source(build: Callable[..., object]) -> tuple[str, dict[str, float]]:
+    """Return the code of a function and the numbers that its module defines.
+
+    Comments, its docstring, white space and the path of the file do not count, because they do not change the shape.
     """
     code = ast.parse(textwrap.dedent(inspect.getsource(build)))
     function = code.body[0]
@@ -163,14 +188,7 @@ def _cache_key(build: Callable[..., None], parameters: dict[str, float], mesh_si
     constants = {
         k: v for k, v in vars(sys.modules[build.__module__]).items() if k.isupper() and isinstance(v, int | float)
     }
-    parts = {
-        "code": "".join(ast.unparse(code).split()),
-        "constants": constants,
-        "parameters": parameters,
-        "mesh_size": float(mesh_size),
-        "format": _FORMAT,
-    }
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
+    return "".join(ast.unparse(code).split()), constants
 
 
 def run_gmsh(request: dict, *, time_limit: float) -> None:

@@ -55,7 +55,8 @@ def mould_parts(robot: Robot, design: Mapping[str, float] | None = None) -> dict
         wires = [[1e3 * x, 1e3 * robot.cable_height] for x in robot.cable_offsets]
     else:
         raise ValueError(f"robot '{robot.name}' has no moulds; allowed: finger, sensorized_finger")
-    lengths = {"split": 0.0, **robot.drawing(complete)[1]}
+    robot.drawing(complete)  # raises if the finger cannot exist
+    lengths = {"split": 0.0, **robot.lengths(complete)}
     return {
         "box": (draw_box, {"lengths": lengths, "wires": wires}),
         "lid": (draw_lid, {"lengths": lengths}),

@@ -1,0 +1,128 @@
+"""Meshes by name: options, keys, and what each mesh of a robot must keep."""
+
+from __future__ import annotations
+
+import json
+
+import gmsh
+import numpy as np
+import pytest
+
+from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.geometry.graded_finger import draw_half_finger
+from softgym_envs.robots.mesh_tiers import MeshTier
+from softgym_envs.robots.registry import make_robot
+
+NAMES = ("published", "accurate", "reference")
+ROBOTS = (
+    "finger",
+    "diamond",
+    "cable_trunk",
+    "sensorized_finger",
+    "trunk",
+    "tetrapod",
+    "contact_aided_finger",
+    "two_finger_gripper",
+    "grasping_finger",
+)
+
+
+@pytest.fixture(scope="module")
+def finger():
+    return make_robot("finger", mesh="accurate", mesh_size=16e-3)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_every_robot_has_three_meshes_with_keys_of_their_own(name):
+    keys = [make_robot(name, mesh=mesh).mechanics_key for mesh in NAMES]
+    assert len({json.dumps(key, sort_keys=True) for key in keys}) == len(NAMES)
+    assert "mesh" not in keys[0]  # weights that were learned before meshes had names
+    with pytest.raises(ValueError, match="unknown mesh 'accurat'; did you mean 'accurate'"):
+        make_robot(name, mesh="accurat")
+
+
+def test_options_replace_parts_of_a_mesh():
+    tier = MeshTier(0.010, "quadratic", feature_size=0.002, fillet=1e-3, guide_radius=1e-3)
+    same = {"size": None, "element": None, "fillet": None}
+    assert tier.changed("arm", **same) == tier
+    finer = tier.changed("arm", **same | {"size": 0.005})
+    assert finer == MeshTier(0.005, "quadratic", feature_size=0.001, fillet=1e-3, guide_radius=1e-3)
+    assert tier.changed("arm", **same | {"element": "linear", "fillet": 0.0}).fillet == 0.0
+    for change, message in (
+        ({"size": 0.0}, "'arm': mesh_size = 0.0 m must be positive"),
+        ({"fillet": -1e-3}, "'arm': fillet = -0.001 m must be finite"),
+        ({"element": "linaer"}, "unknown element 'linaer'; did you mean 'linear'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            tier.changed("arm", **same | change)
+
+
+def test_a_robot_that_cannot_be_drawn_with_fillets_says_so():
+    with pytest.raises(ValueError, match="'diamond' cannot be drawn with a fillet"):
+        make_robot("diamond", fillet=1e-3)
+
+
+def test_a_graded_finger_is_symmetric(finger):
+    mesh = finger.body()
+    left = mesh.nodes[mesh.nodes[:, 0] < -1e-9] * [-1, 1, 1]
+    right = mesh.nodes[mesh.nodes[:, 0] > 1e-9]
+    assert np.array_equal(left[np.lexsort(left.T)], right[np.lexsort(right.T)])
+    state = Statics(finger.build()).solve([0.0, 0.0])
+    one, other = state.condensed.W.aa[0, 0], state.condensed.W.aa[1, 1]
+    assert one == pytest.approx(other, rel=1e-9)
+    assert np.allclose(state.condensed.delta.e, finger.effector_rest, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("cables", [1, 2])
+def test_the_accurate_finger_moves_its_mesh_to_every_corner_of_the_design_space(cables):
+    robot = make_robot("finger", mesh="accurate", cables=cables)
+    for joint_height in (0.005, 0.008):
+        for height in (0.020, 0.022):
+            mesh = robot.body({"length": 0.042, "height": height, "joint_height": joint_height})
+            assert mesh.origin == "morphed"
+
+
+def test_elements_are_small_at_the_joints(finger):
+    nodes, tetrahedra = finger.body().nodes, finger.body().tetrahedra
+    edges = np.linalg.norm(nodes[tetrahedra[:, 1]] - nodes[tetrahedra[:, 0]], axis=1)
+    z = nodes[tetrahedra].mean(axis=1)[:, 2]
+    near = np.abs(z + 0.0405) < 0.004
+    assert np.median(edges[near]) < 0.6 * np.median(edges[z < -0.1])
+
+
+def drawn_volume(draw, **parameters):
+    """Volume [mm3] of what a function draws."""
+    gmsh.initialize()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        draw(**parameters)
+        gmsh.model.occ.synchronize()
+        ((_, body),) = gmsh.model.getEntities(3)
+        return gmsh.model.occ.getMass(3, body), len(gmsh.model.getEntities(2))
+    finally:
+        gmsh.finalize()
+
+
+def test_fillets_add_material_in_proportion_to_the_square_of_their_radius():
+    robot = make_robot("finger")
+    lengths = robot.lengths(robot.design_space.baseline)
+    half = {**lengths, "size": 8.0, "feature_size": 8.0}
+    sharp, faces = drawn_volume(draw_half_finger, **half, fillet=0.0)
+    small, rounded_faces = drawn_volume(draw_half_finger, **half, fillet=0.5)
+    large, _ = drawn_volume(draw_half_finger, **half, fillet=1.0)
+    assert rounded_faces > faces
+    # Exactly four times, but for the corners at which edges meet.
+    assert (large - sharp) / (small - sharp) == pytest.approx(4.0, rel=0.05)
+
+
+def test_a_fillet_makes_the_finger_stiffer():
+    sharp, rounded = (make_robot("finger", mesh="accurate", mesh_size=30e-3, fillet=r) for r in (0.0, 1.5e-3))
+    assert rounded.meshing == "remesh" and rounded.mechanics_key != sharp.mechanics_key
+    compliance = [float(Statics(r.build()).solve([0.0, 0.0]).condensed.W.aa.sum()) for r in (sharp, rounded)]
+    assert compliance[1] < 0.8 * compliance[0]
+
+
+def test_a_fillet_that_does_not_fit_is_infeasible():
+    with pytest.raises(InfeasibleDesign):
+        make_robot("finger", mesh="accurate", mesh_size=30e-3, fillet=20e-3).body()
