@@ -8,6 +8,7 @@ from scipy.sparse import csc_matrix, random_array, tril
 
 from softgym_envs.mechanics.solvers.linear import CholmodSolver, LinearSolver, SuperLUSolver, make_solver
 from softgym_envs.mechanics.solvers.ordering import nested_dissection
+from softgym_envs.mechanics.solvers.split import SplitCholesky
 
 NAMES = ["cholmod", "superlu"]
 SIZE = 60
@@ -149,3 +150,40 @@ def test_an_order_that_fills_the_factor_is_not_used(cabled, rng):
     for solver in (plain, ordered):
         assert solver.factorise(lower.data)
     assert ordered.operations == plain.operations
+
+
+def shifted(matrix, negative):
+    """The matrix less a multiple of one, so that this many eigenvalues are negative."""
+    values = np.linalg.eigvalsh(matrix)
+    low = values[negative - 1] if negative else 0.0
+    return matrix - 0.5 * (low + values[negative]) * np.eye(len(matrix))
+
+
+@pytest.mark.parametrize("negative", [0, 1, 2, 6])
+def test_split_cholesky_solves_indefinite_systems_and_counts_negative_eigenvalues(cabled, rng, negative):
+    matrix = shifted(cabled + np.diag(rng.uniform(0.0, 2.0, len(cabled))), negative)
+    lower = lower_of(matrix)
+    cholesky = CholmodSolver(lower.indptr, lower.indices)
+    assert cholesky.factorise(lower.data) is (negative == 0)
+    solver = SplitCholesky(cholesky)
+    for _ in range(2):  # the second time with the equations that were split off before
+        assert solver.factorise(lower.data)
+        assert solver.negative_eigenvalues == negative
+        assert solver.positive_definite is (negative == 0)
+        rhs = np.asfortranarray(rng.standard_normal((len(matrix), 3)))
+        exact = np.linalg.solve(matrix, rhs)
+        scale = np.abs(exact).max()
+        np.testing.assert_allclose(solver.solve(rhs), exact, atol=1e-10 * scale)
+        gram, half = solver.condense(rhs[:, :2], csc_matrix(rhs[:, 2:]))
+        np.testing.assert_allclose(gram, rhs.T @ exact, atol=1e-10 * scale * len(rhs))
+        effort = rng.standard_normal(3)
+        np.testing.assert_allclose(solver.expand(half @ effort), exact @ effort, atol=1e-10 * scale)
+
+
+def test_split_cholesky_says_when_it_cannot_factorise(indefinite):
+    lower = lower_of(indefinite)
+    cholesky = CholmodSolver(lower.indptr, lower.indices)
+    assert SplitCholesky(cholesky).factorise(lower.data)
+    assert not SplitCholesky(cholesky, most=10).factorise(lower.data)  # 20 eigenvalues are negative
+    singular = np.zeros_like(lower.data)
+    assert not SplitCholesky(cholesky).factorise(singular)

@@ -9,7 +9,7 @@ import pytest
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solvers.linear import CholmodSolver, make_solver
+from softgym_envs.mechanics.solvers.linear import CholmodSolver, SuperLUSolver, make_solver
 from softgym_envs.mechanics.solvers.statics import NewtonFailure, Statics
 
 # -- reference ------------------------------------------------------------------------------------------------------
@@ -49,18 +49,22 @@ def test_the_linear_solver_does_not_matter(notched, solver):
     np.testing.assert_allclose(found.x, notched.positions[3], rtol=0, atol=1e-8)
 
 
-def test_an_indefinite_tangent_falls_back_to_lu(notched, monkeypatch):
-    model = notched_beam(notched, solver="cholmod")
-    statics = Statics(model)
-    expected = statics.solve([0.002])
-    attempts = []
-    # The mesh's Laplacian is factorised already.
-    monkeypatch.setattr(CholmodSolver, "factorise", lambda self, values: bool(attempts.append(1)))
-    statics.reset()
-    found = statics.solve([0.002])
-    assert attempts
+def test_a_buckled_column_is_factorised_without_lu(notched, monkeypatch):
+    """Free to move sideways, the compressed beam would buckle in both directions; its driven tip does not let it."""
+
+    def press(solver):
+        model = MechanicalModel.from_mesh(notched.nodes, notched.tetrahedra, fixed=notched.fixed, solver=solver)
+        tip = np.array([0.1, 0.01, 0.01])
+        model.add_contact("tip", tip)
+        return Statics(model).solve([], contact=tip - [0.002, 0.0, 0.0], contact_mode="displacement")
+
+    expected = press("superlu")
+    monkeypatch.setattr(SuperLUSolver, "factorise", lambda self, values: pytest.fail("LU is far slower"))
+    found = press("cholmod")
+    assert not found.stable
+    assert (np.linalg.eigvalsh(found.condensed.compliance) < 0.0).sum() == 2
     np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found.condensed.compliance, expected.condensed.compliance, rtol=1e-9)
+    np.testing.assert_allclose(found.condensed.compliance, expected.condensed.compliance, rtol=1e-7)
 
 
 # -- commands -------------------------------------------------------------------------------------------------------

@@ -74,8 +74,9 @@ class CholmodSolver(LinearSolver):
 
         self._cholmod, self._matrix, self._spmatrix = cholmod, matrix, spmatrix
         columns = np.repeat(np.arange(self.size), np.diff(indptr))
-        diagonal = (indices == columns).astype(float)
-        self._lower = spmatrix(matrix(diagonal), matrix(indices.astype(np.int64)), matrix(columns.astype(np.int64)))
+        self._identity = matrix((indices == columns).astype(float))
+        self._lower = spmatrix(self._identity, matrix(indices.astype(np.int64)), matrix(columns.astype(np.int64)))
+        self._order: np.ndarray | None = None
         options = {} if order is None else {"p": matrix(order.tolist())}
         self._factor = cholmod.symbolic(self._lower, **options)
 
@@ -90,9 +91,20 @@ class CholmodSolver(LinearSolver):
         self._lower.V = self._matrix(values)
         try:
             self._cholmod.numeric(self._lower, self._factor)
-        except ArithmeticError:
+        except ArithmeticError as failure:
+            self._failed = int(failure.args[0])
             return False
         return True
+
+    def failed_at(self, count: int) -> np.ndarray:
+        """Return where the last factorisation failed: up to ``count`` equations in the order of elimination."""
+        if self._order is None:
+            self._lower.V = self._identity
+            self._cholmod.numeric(self._lower, self._factor)
+            order = self._matrix(np.arange(self.size, dtype=float))
+            self._cholmod.solve(self._factor, order, sys=7)  # P
+            self._order = np.asarray(order)[:, 0].astype(np.int64)
+        return self._order[self._failed : self._failed + count]
 
     @property
     def positive_definite(self) -> bool:

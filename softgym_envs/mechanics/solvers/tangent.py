@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_matrix, tril
 
-from softgym_envs.mechanics.solvers.linear import LinearSolver, SuperLUSolver, make_solver
+from softgym_envs.mechanics.solvers.linear import CholmodSolver, LinearSolver, make_solver
 from softgym_envs.mechanics.solvers.ordering import nested_dissection
+from softgym_envs.mechanics.solvers.split import SplitCholesky
 
 
 def _distinct(keys: np.ndarray) -> np.ndarray:
@@ -36,7 +37,7 @@ class Tangent:
         self._size = len(indptr) - 1
         self._order = nested_dissection(indptr, indices)
         self._preferred: LinearSolver = make_solver(solver, indptr, indices, self._order)
-        self._fallback: SuperLUSolver | None = None
+        self._fallback: LinearSolver | None = None
         self._base: np.ndarray | None = None
         self._own = (indptr, indices)
         self.solver = self._preferred
@@ -53,11 +54,11 @@ class Tangent:
         self.solver = self._preferred
         if self._preferred.factorise(values):
             return True
-        if not fallback:
+        if not fallback or not isinstance(self._preferred, CholmodSolver):
             return False
         # Cholesky fails on a tangent that is indefinite although the constrained problem is stable.
         if self._fallback is None:
-            self._fallback = SuperLUSolver(self._preferred.indptr, self._preferred.indices)
+            self._fallback = SplitCholesky(self._preferred)
         self.solver = self._fallback
         return self._fallback.factorise(values)
 
