@@ -12,7 +12,8 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
-from softgym_envs.mechanics.solvers.statics import Equilibrium, Statics
+from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 
 

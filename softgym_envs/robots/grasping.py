@@ -187,7 +187,7 @@ def evaluate_grasp(
         )
         if crossing := contact.intersections(model.nodes):
             raise InfeasibleDesign(f"{crossing} at rest")
-        statics = Statics(model, tolerance=TOLERANCE, max_iterations=60, max_halvings=5)
+        statics = Statics(model, tolerance=TOLERANCE, max_iterations=60, max_halvings=5, exact_compliance=False)
         for theta in angle * np.arange(1, angles + 1) / angles:
             found = statics.solve([theta])
             limited = bool(abs(found.effort[0]) > limit)

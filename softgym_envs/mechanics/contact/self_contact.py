@@ -40,10 +40,9 @@ def load_ipctk() -> ModuleType:
     return ipctk
 
 
-def _relative_motion(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _relative(motion: np.ndarray) -> np.ndarray:
     """Motion [m] (m, 3) of the vertices less a common translation, which changes no distance."""
-    moved = end - start
-    return moved - 0.5 * (moved.min(axis=0) + moved.max(axis=0))
+    return motion - 0.5 * (motion.min(axis=0) + motion.max(axis=0))
 
 
 def _longest(vectors: np.ndarray) -> float:
@@ -154,7 +153,7 @@ class SelfContact:
         self._broad_phase = ipctk.LBVH()
         self._ccd = ipctk.AdditiveCCD(MAX_CCD_STEPS, CCD_SHARE)
         self._candidates: Any = None
-        self._centre = rest
+        self._path = rest, np.zeros_like(rest)
         self._collisions: Any = None
         self._at = np.empty((0, 3))
         self._memory = SelfContactMemory()
@@ -178,17 +177,22 @@ class SelfContact:
     def _near(self, v: np.ndarray) -> bool:
         """Whether every pair closer than ``distance`` is among the candidates.
 
-        Boxes grown by ``reach`` hold all pairs closer than twice that, and a distance shrinks by at most twice the
-        largest motion.
+        They are the pairs that come closer than twice ``reach`` somewhere on a straight path. A distance shrinks by at
+        most twice the largest motion away from that path.
         """
-        return _longest(_relative_motion(self._centre, v)) <= self.reach - 0.5 * self.distance
+        if self._candidates is None:
+            return False
+        start, way = self._path
+        moved, square = _relative(v - start), float(np.vdot(way, way))
+        along = min(max(float(np.vdot(moved, way)) / square, 0.0), 1.0) if square > 0.0 else 0.0
+        return _longest(_relative(moved - along * way)) <= self.reach - 0.5 * self.distance
 
-    def _candidates_at(self, v: np.ndarray) -> Any:
-        """Pairs that can meet while no vertex moves farther than ``reach`` less half of ``distance``."""
-        if self._candidates is None or not self._near(v):
+    def _candidates_on(self, start: np.ndarray, way: np.ndarray) -> Any:
+        """Pairs that can meet within ``reach`` less half of ``distance`` of the path from ``start`` along ``way``."""
+        if not (self._near(start) and self._near(start + way)):
             self._candidates = self._ipctk.Candidates()
-            self._candidates.build(self.mesh, v, self.reach, self._broad_phase)
-            self._centre = v.copy()
+            self._candidates.build(self.mesh, start, np.asfortranarray(start + way), self.reach, self._broad_phase)
+            self._path = start.copy(), way.copy()
         return self._candidates
 
     def _collisions_at(self, v: np.ndarray) -> Any:
@@ -197,7 +201,7 @@ class SelfContact:
             collisions = self._ipctk.NormalCollisions()
             collisions.use_area_weighting = True
             collisions.collision_set_type = self._kind
-            collisions.build(self._candidates_at(v), self.mesh, v, self.distance)
+            collisions.build(self._candidates_on(v, np.zeros_like(v)), self.mesh, v, self.distance)
             self._collisions, self._at = collisions, v.copy()
         return self._collisions
 
@@ -285,14 +289,11 @@ class SelfContact:
     def max_step(self, v0: np.ndarray, v1: np.ndarray) -> float:
         """Part of the straight step from ``v0`` to ``v1`` that can be taken without an intersection, in [0, 1]."""
         v0 = np.asfortranarray(v0)
-        motion = _relative_motion(v0, v1)
+        motion = _relative(v1 - v0)
         if 2.0 * _longest(motion) <= CCD_SHARE * min(self.minimum_distance(v0), self.distance):
             return 1.0
+        candidates = self._candidates_on(v0, motion)
         v1 = np.asfortranarray(v0 + motion)
-        candidates = self._candidates
-        if candidates is None or not (self._near(v0) and self._near(v1)):
-            candidates = self._ipctk.Candidates()
-            candidates.build(self.mesh, v0, v1, 0.0, self._broad_phase)
         return float(candidates.compute_collision_free_stepsize(self.mesh, v0, v1, 0.0, self._ccd))
 
     def intersects(self, v: np.ndarray) -> bool:

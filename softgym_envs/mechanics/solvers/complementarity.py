@@ -123,3 +123,25 @@ def solve_complementarity(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray
         row = np.flatnonzero(~found)[0]
         raise np.linalg.LinAlgError(f"no consistent set of taut actuators in row {row}: W is not positive definite")
     return y
+
+
+def complementary_step(W: np.ndarray, gap: np.ndarray, effort: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
+    """Return steps of driven efforts that close ``gap`` in bilateral rows and make no unilateral row push."""
+    if not unilateral.any():
+        return np.linalg.solve(W, -gap)
+    if unilateral.all():
+        return solve_complementarity(W[None], (gap - W @ effort)[None], unilateral)[0] - effort
+    one_way, both_ways = np.flatnonzero(unilateral), np.flatnonzero(~unilateral)
+    offset = gap - W @ effort
+    # Eliminate the bilateral rows: only the few others can be taut or slack.
+    below, right = both_ways[:, None], one_way[:, None]
+    reduced = np.linalg.solve(W[below, both_ways], np.column_stack([W[below, one_way], offset[both_ways]]))
+    across = W[right, both_ways] @ reduced
+    new = np.empty_like(effort)
+    new[one_way] = solve_complementarity(
+        (W[right, one_way] - across[:, :-1])[None],
+        (offset[one_way] - across[:, -1])[None],
+        np.ones(len(one_way), dtype=bool),
+    )[0]
+    new[both_ways] = -(reduced[:, :-1] @ new[one_way] + reduced[:, -1])
+    return new - effort

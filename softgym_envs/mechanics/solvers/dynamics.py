@@ -26,8 +26,9 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.equilibrium import AppliedLoads, Equilibrium
 from softgym_envs.mechanics.solvers.schemes import SCHEMES, GeneralisedAlpha, ImplicitEuler, StartingAcceleration
-from softgym_envs.mechanics.solvers.statics import AppliedLoads, Equilibrium, NewtonFailure, Statics
+from softgym_envs.mechanics.solvers.statics import NewtonFailure, Statics
 
 
 @dataclass(frozen=True)

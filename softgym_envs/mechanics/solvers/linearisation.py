@@ -124,6 +124,19 @@ class Linearisation:
         self.current = True
         return True
 
+    def follow(self, assembled: Assembled) -> None:
+        """Take over the equations of an equilibrium that is so near that the factorised tangent still serves.
+
+        ``W`` stays what it was.
+        """
+        self.residual, _, self.H, self.delta, self.elastic = assembled
+        self.shift = np.zeros_like(self.shift)
+        self._half[:, self.H.shape[1]] = 0.0
+        if self._slips:
+            self._slip[:, self.H.shape[1]] = 0.0
+        if self.contact is not None and self._terms is not None:
+            self.contact.hold(self._terms)
+
     def solve(self, residual: np.ndarray) -> np.ndarray:
         """Return ``A^-1 residual``, shape (N,)."""
         solution = self._tangent.solver.solve(residual[:, None])[:, 0]

@@ -14,82 +14,24 @@ violation of driven rows. A barrier grows too fast for the monotonicity test.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TypedDict
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.assembly import Assembled
 from softgym_envs.mechanics.condensation import CondensedModel, Row
-from softgym_envs.mechanics.contact.contact import ContactMemory, Contacts
+from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
+from softgym_envs.mechanics.solvers.complementarity import complementary_step
+from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
-
-
-@dataclass(frozen=True)
-class Equilibrium:
-    """A solved state.
-
-    Attributes:
-        x: node positions [m], shape (n, 3).
-        condensed: the condensed model at the state; bonds are eliminated from it.
-        delta: constraint values of all rows, bonds last, shape (size,).
-        effort: efforts of all rows, bonds last, shape (size,).
-        slack: per actuator row, True where a unilateral actuator hangs slack.
-        stable: whether the tangent is positive definite. Then the state is stable however its actuators are driven;
-            otherwise it can still be stable while they are driven in displacement.
-        iterations: Newton iterations spent, over all load increments.
-        increments: load increments used.
-        contacts: where the body touches; None if it cannot.
-        memory: what friction remembers, for `Statics.restore`; None without contact.
-    """
-
-    x: np.ndarray
-    condensed: CondensedModel
-    delta: np.ndarray
-    effort: np.ndarray
-    slack: np.ndarray
-    stable: bool
-    iterations: int
-    increments: int
-    contacts: Contacts | None = None
-    memory: ContactMemory | None = None
-
-
-class AppliedLoads(TypedDict, total=False):
-    """Loads besides those of the actuators: keyword arguments of `Statics.solve`, which describes them."""
-
-    effector_force: Sequence[float] | np.ndarray | None
-    contact: Sequence[float] | np.ndarray | None
-    contact_mode: str
+from softgym_envs.mechanics.solvers.prediction import LARGEST_BEND, Bend
 
 
 class NewtonFailure(Exception):
     """Newton's method did not converge on one increment; solvers catch it."""
-
-
-def _complementary_step(W: np.ndarray, gap: np.ndarray, effort: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
-    """Return steps of driven efforts that close ``gap`` in bilateral rows and make no unilateral row push."""
-    if not unilateral.any():
-        return np.linalg.solve(W, -gap)
-    if unilateral.all():
-        return solve_complementarity(W[None], (gap - W @ effort)[None], unilateral)[0] - effort
-    one_way, both_ways = np.flatnonzero(unilateral), np.flatnonzero(~unilateral)
-    offset = gap - W @ effort
-    # Eliminate the bilateral rows: only the few others can be taut or slack.
-    below, right = both_ways[:, None], one_way[:, None]
-    reduced = np.linalg.solve(W[below, both_ways], np.column_stack([W[below, one_way], offset[both_ways]]))
-    across = W[right, both_ways] @ reduced
-    new = np.empty_like(effort)
-    new[one_way] = solve_complementarity(
-        (W[right, one_way] - across[:, :-1])[None],
-        (offset[one_way] - across[:, -1])[None],
-        np.ones(len(one_way), dtype=bool),
-    )[0]
-    new[both_ways] = -(reduced[:, :-1] @ new[one_way] + reduced[:, -1])
-    return new - effort
 
 
 class Statics:
@@ -100,6 +42,8 @@ class Statics:
         tolerance: largest remaining correction of any node at convergence [m].
         max_iterations: limit of Newton iterations per load increment.
         max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the whole step.
+        exact_compliance: compute ``W`` at each equilibrium. Otherwise, with contact, ``W`` may be that of the last
+            iterate, which saves one factorisation per increment.
 
     Attributes:
         x: current node positions [m], shape (n, 3).
@@ -115,8 +59,10 @@ class Statics:
         tolerance: float = 1e-10,
         max_iterations: int = 30,
         max_halvings: int = 8,
+        exact_compliance: bool = True,
     ) -> None:
         self.model = model
+        self.exact_compliance = exact_compliance
         self.tolerance = tolerance
         self.max_iterations = max_iterations
         self.max_halvings = max_halvings
@@ -133,7 +79,8 @@ class Statics:
         self._bonds = self._assembly.size - sizes.get("b", 0) + np.arange(sizes.get("b", 0))
         self.unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
         self._elasticity_version = model.elasticity_version
-        extent = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+        used = np.unique(np.concatenate([block.nodes_used for block in model.blocks]))  # not the directors of frames
+        extent = float(np.linalg.norm(np.ptp(model.nodes[used], axis=0)))
         self._longest_step = 0.2 * extent  # with contact
         self._round_off = 1e-6 * extent  # steps this short no longer change the energy
         self.reset()
@@ -166,6 +113,7 @@ class Statics:
 
     def _remember(self, memory: ContactMemory | None) -> None:
         """Set the memory of friction; without one, friction starts anew at the current state."""
+        self._bend: Bend | None = None
         contact = self.linearisation.contact
         if contact is not None and memory is not None:
             contact.memory = memory
@@ -204,7 +152,7 @@ class Statics:
             unilateral = np.zeros(len(effort), dtype=bool)
             unilateral[: self._actuators] = self.unilateral
             try:
-                step_effort[driven] = _complementary_step(W, gap, effort[driven], unilateral[driven])
+                step_effort[driven] = complementary_step(W, gap, effort[driven], unilateral[driven])
             except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (two actuators act alike)
                 raise NewtonFailure from None
         step_q = linear.response(step_effort, 1.0) if Ar is None else linear.response(step_effort) - Ar
@@ -273,9 +221,11 @@ class Statics:
         raise NewtonFailure
 
     def _newton_in_contact(self, target: np.ndarray, driven: np.ndarray) -> int:
-        """Converge as `_newton` does, on the way that contact leaves free."""
+        """Converge as `_newton` does, on the way that contact leaves free.
+
+        The first step adds what was corrected in the last increment, if that was alike.
+        """
         linear = self.linearisation
-        assert linear.contact is not None
         forced = np.setdiff1d(np.arange(len(target)), driven)
         loose = np.zeros(len(target), dtype=bool)
         loose[: self._actuators] = self.unilateral
@@ -288,7 +238,11 @@ class Statics:
         def penalty(delta: np.ndarray) -> float:
             return float(weight @ violation(delta)) - float(target[forced] @ delta[forced])
 
-        full = False
+        change = target - self.effort
+        change[driven] = (target - linear.delta)[driven]
+        last, self._bend = self._bend, None
+        expected = None if last is None or linear.inertia is not None else last.expected(change)
+        straight, corrections, full = 0.0, np.zeros(self.model.equations), False
         for iteration in range(self.max_iterations + 1):
             step_q, step_effort = self._correction(None, linear.delta, self.effort, target, driven)
             norm = self._norm(step_q)
@@ -297,52 +251,135 @@ class Statics:
             if full and norm <= self.tolerance:
                 if not linear.exact and not self._linearise(exact=True):
                     raise NewtonFailure
+                self._note_bend(change, corrections, straight)
                 return iteration
             if norm > self._longest_step:
                 step_q = step_q * (self._longest_step / norm)
                 norm = self._longest_step
             weight = np.maximum(weight, 1.5 * np.abs((self.effort + step_effort)[driven]) + 1e-9)
-            before = linear.energy(self.x, linear.elastic + linear.contact.energy(self.x)) + penalty(linear.delta)
             pull = linear.residual + linear.H @ self.effort  # derivative of the energy
             slope = float((pull - linear.H[:, forced] @ target[forced]) @ step_q)
             slope -= float(weight @ violation(linear.delta))
-            length = 1.0
-            while True:
-                x = self.x + self._displacement(self.x, length * step_q)
-                effort = self.effort + step_effort * (1.0 if length > 0.1 else length)
-                part = linear.contact.free_path(self.x, x)
-                if part < 1.0:
-                    length *= max(part, 0.05)  # the way bends, so it is tested again
-                else:
-                    barrier = linear.contact.energy(x)
-                    assembled = linear.assemble(x, effort) if np.isfinite(barrier) else None
-                    if assembled is not None:
-                        after = linear.energy(x, assembled.energy + barrier) + penalty(assembled.delta)
-                        after += linear.inertial_work(self.x, x)
-                        allowed = before + 1e-4 * length * min(slope, 0.0) + 1e-12 * abs(before) + 1e-14
-                        if after <= allowed or norm < self._round_off:
-                            break
-                    length *= 0.5
-                if length < 1e-6:
-                    raise NewtonFailure
-            assert assembled is not None
+            found = None
+            if iteration == 0 and expected is not None:
+                found = self._search(step_q + expected, step_effort, penalty, slope, shortest=1.0)
+                if found is None:
+                    expected = None
+            if found is None:
+                found = self._search(step_q, step_effort, penalty, slope, anyway=norm < self._round_off)
+            if found is None:
+                raise NewtonFailure
+            x, effort, assembled, length = found
             full = length == 1.0
+            if iteration:
+                corrections += length * step_q
+            elif full:
+                straight = norm
+                if expected is not None:
+                    corrections += expected
+            remaining = np.inf
             if full and norm**2 <= 1e2 * self.tolerance * self._longest_step:
-                # The simplified correction alone may reach the tolerance: this saves a factorisation.
-                Ar = linear.solve(assembled.residual)
-                next_q, next_effort = self._correction(Ar, assembled.delta, effort, target, driven)
-                remaining = self._norm(next_q)
-                if self.tolerance < remaining and remaining**2 <= 0.1 * self.tolerance * norm:
-                    closer = x + self._displacement(x, next_q)
-                    if linear.contact.free_path(x, closer) == 1.0:
-                        x, effort = closer, effort + next_effort
-                        assembled = linear.assemble(x, effort)
-                        if assembled is None:
-                            raise NewtonFailure
+                x, effort, assembled, added, remaining = self._polish(x, effort, assembled, norm, target, driven)
+                corrections += added
             self.x, self.effort = x, effort
+            if iteration and remaining <= self.tolerance and linear.exact and not self.exact_compliance:
+                linear.follow(assembled)
+                self._note_bend(change, corrections, straight)
+                return iteration + 1
             if not linear.factorise(assembled, x):
                 raise NewtonFailure
         raise NewtonFailure
+
+    def _note_bend(self, change: np.ndarray, corrections: np.ndarray, straight: float) -> None:
+        """Keep the corrections (N,) of an increment whose first step was ``straight`` [m], or zero if it was cut."""
+        if self._norm(corrections) <= LARGEST_BEND * straight:
+            self._bend = Bend(change, corrections)
+
+    def _polish(
+        self,
+        x: np.ndarray,
+        effort: np.ndarray,
+        assembled: Assembled,
+        norm: float,
+        target: np.ndarray,
+        driven: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, Assembled, np.ndarray, float]:
+        """Apply simplified Newton corrections, if they alone can reach the tolerance: this saves a factorisation.
+
+        Args:
+            x: rows (n, 3) after a whole Newton step.
+            effort: efforts (size,) after it.
+            assembled: the equations there.
+            norm: largest displacement of that step [m].
+            target: see `_correction`.
+            driven: see `_correction`.
+
+        Returns:
+            Rows, efforts and equations; the sum of the corrections (N,); the largest displacement of the next [m].
+        """
+        linear = self.linearisation
+        assert linear.contact is not None
+        total = np.zeros_like(assembled.residual)
+        while True:
+            Ar = linear.solve(assembled.residual)
+            step_q, step_effort = self._correction(Ar, assembled.delta, effort, target, driven)
+            remaining = self._norm(step_q)
+            if remaining <= self.tolerance or remaining**2 > 0.1 * self.tolerance * norm:
+                break
+            closer = x + self._displacement(x, step_q)
+            if linear.contact.free_path(x, closer) < 1.0:
+                break
+            x, effort, total, norm = closer, effort + step_effort, total + step_q, remaining
+            found = linear.assemble(x, effort)
+            if found is None:
+                raise NewtonFailure
+            assembled = found
+        return x, effort, assembled, total, remaining
+
+    def _search(
+        self,
+        step_q: np.ndarray,
+        step_effort: np.ndarray,
+        penalty: Callable[[np.ndarray], float],
+        slope: float,
+        *,
+        shortest: float = 1e-6,
+        anyway: bool = False,
+    ) -> tuple[np.ndarray, np.ndarray, Assembled, float] | None:
+        """Find how far a step can go: nothing collides on the way, and energy plus penalty decrease.
+
+        Args:
+            step_q: of the equations, shape (N,).
+            step_effort: of the efforts, shape (size,).
+            penalty: function of the values of all constraints (size,) [J].
+            slope: derivative of energy plus penalty at the start [J].
+            shortest: smallest part of the step to try.
+            anyway: accept any change of the energy, for steps that it cannot resolve.
+
+        Returns:
+            Rows (n, 3), efforts (size,) and equations at the end of the step, and the part of it; None if the part
+            would be smaller than the shortest.
+        """
+        linear = self.linearisation
+        assert linear.contact is not None
+        before = linear.energy(self.x, linear.elastic + linear.contact.energy(self.x)) + penalty(linear.delta)
+        length = 1.0
+        while length >= shortest:
+            x = self.x + self._displacement(self.x, length * step_q)
+            effort = self.effort + step_effort * (1.0 if length > 0.1 else length)
+            part = linear.contact.free_path(self.x, x)
+            if part < 1.0:
+                length *= max(part, 0.05)  # the way bends, so it is tested again
+                continue
+            barrier = linear.contact.energy(x)
+            assembled = linear.assemble(x, effort) if np.isfinite(barrier) else None
+            if assembled is not None:
+                after = linear.energy(x, assembled.energy + barrier) + penalty(assembled.delta)
+                after += linear.inertial_work(self.x, x)
+                if anyway or after <= before + 1e-4 * length * min(slope, 0.0) + 1e-12 * abs(before) + 1e-14:
+                    return x, effort, assembled, length
+            length *= 0.5
+        return None
 
     def _values(self, x: np.ndarray) -> np.ndarray:
         """Values of all constraints (size,) at rows ``x`` (n, 3)."""

@@ -17,7 +17,8 @@ import numpy as np
 
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign, unknown_name
-from softgym_envs.mechanics.solvers.statics import Equilibrium, Statics
+from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.features import learned_variables
 

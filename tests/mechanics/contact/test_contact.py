@@ -16,6 +16,7 @@ from softgym_envs.mechanics.contact.obstacles import Plane, RoundedPrism, Sphere
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
+from softgym_envs.mechanics.solvers.prediction import Bend
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.testing import box_mesh, contact_slope
 
@@ -280,6 +281,45 @@ def test_result_without_friction_does_not_depend_on_the_way():
             found = statics.solve([], effector_force=np.array([0.8, 0.1, -1.6]) * (k + 1) / count)
         ends.append(found.x)
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-10)
+
+
+def test_equal_increments_predict_each_other():
+    """The corrections of one increment start the next closer to its end; the end stays the same."""
+    plane = Plane((0.0, 0.0, -4e-4), (0.05, 0.0, 1.0))
+    force, counts, ends = np.array([0.2, 0.03, -0.4]), [], []
+    for forget in (False, True):
+        statics, count = Statics(clamped_block([plane]), tolerance=1e-10), 0
+        for k in range(1, 7):
+            if forget:
+                statics.restore(statics.x, statics.effort, memory=statics.memory)
+            found = statics.solve([], effector_force=k * force)
+            count += found.iterations
+        counts.append(count)
+        ends.append(found.x)
+    assert counts[0] < counts[1]
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
+
+
+def test_bend_grows_with_the_square_of_the_increment():
+    bend = Bend(np.array([1.0, 2.0]), np.array([0.1, 0.0, 0.3]))
+    np.testing.assert_allclose(bend.expected(np.array([0.5, 1.0])), [0.025, 0.0, 0.075])
+    assert bend.expected(np.array([-1.0, -2.0])) is None
+    assert bend.expected(np.array([1.0, 2.1])) is None
+    assert bend.expected(np.array([3.0, 6.0])) is None
+    assert Bend(np.zeros(2), np.zeros(3)).expected(np.zeros(2)) is None
+
+
+def test_equilibria_without_exact_compliance_are_as_accurate():
+    plane = Plane((0.0, 0.0, -4e-4), (0.05, 0.0, 1.0), friction=0.5)
+    force, found = np.array([0.2, 0.03, -0.4]), {}
+    for exact in (False, True):
+        statics = Statics(clamped_block([plane]), tolerance=1e-9, exact_compliance=exact)
+        found[exact] = [statics.solve([], effector_force=k * force) for k in range(1, 5)]
+    for near, exact in zip(found[False], found[True], strict=True):
+        np.testing.assert_allclose(near.x, exact.x, atol=5e-9)
+        np.testing.assert_allclose(near.delta, exact.delta, atol=5e-9)
+        difference = np.abs(near.condensed.compliance - exact.condensed.compliance).max()
+        assert difference < 0.02 * np.abs(exact.condensed.compliance).max()
 
 
 def test_friction_remembers_where_it_stuck():
