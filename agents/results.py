@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -21,8 +22,10 @@ if TYPE_CHECKING:
 RESULTS = Path(__file__).parent / "results"
 """Stored runs of the configurations in ``configs/agents``."""
 
-AGENTS = {
-    "sac": "SAC",
+LEARNERS = {"sac": "SAC", "analytic": "analytic gradient"}
+"""Titles of the learners. The analytic gradient uses the learned model; SAC is model-free."""
+
+AGENTS = LEARNERS | {
     "qp": "QP",
     "qp_model": "QP, model",
     "qp_pi": "QP, model, PI",
@@ -30,6 +33,10 @@ AGENTS = {
     "force": "force control",
     "random": "random",
 }
+
+
+#: Colours of the curves of each learner: single seeds, and their mean.
+_COLOURS = {"sac": ("#99d0ca", "#0f766e"), "analytic": ("#f3c49a", "#c2570c")}
 
 
 class StoredEvaluation(TypedDict):
@@ -52,6 +59,7 @@ class StoredRun:
     """A training with one seed and the evaluations of its policy."""
 
     seed: int
+    learner: str
     environment: EnvironmentConfig
     curve: list[CurvePoint]
     evaluations: Evaluations
@@ -68,16 +76,17 @@ class StoredRun:
         if not isinstance(run, dict) or not expected <= run.keys():
             raise DataError(f"'{path}' is not the result of a training: it must contain {', '.join(sorted(expected))}")
         environment = EnvironmentConfig.model_validate(run["config"]["environment"])
-        return cls(run["seed"], environment, run["curve"], run["evaluations"])
+        learner = run["config"].get("learner", "sac")  # the only one there was before
+        return cls(run["seed"], learner, environment, run["curve"], run["evaluations"])
 
 
 @dataclass(frozen=True)
 class StoredRuns:
-    """All seeds of one configuration, and the baselines on the same goals.
+    """All trainings in one environment, and the baselines on the same goals.
 
     Attributes:
-        name: name of the configuration.
-        runs: the trainings, by seed.
+        name: name of the first of the configurations that share the environment.
+        runs: the trainings, by configuration and seed.
         baselines: evaluations of the baselines, empty if they were not run.
     """
 
@@ -94,12 +103,13 @@ class StoredRuns:
         """Return one column of the final evaluation, shape (seeds, goals), or None if there is no such evaluation.
 
         Args:
-            agent: ``"sac"``, or the name of a baseline, which has a single row.
+            agent: name of a learner, or of a baseline, which has a single row.
             backend: ``"own"`` for that of the environment, or ``"fem"``.
             column: ``"distances"``, ``"mean_distances"``, ``"returns"`` or ``"successes"``.
         """
         backend = self.environment.backend if backend == "own" else backend
-        sources = [run.evaluations for run in self.runs] if agent == "sac" else [self.baselines]
+        own = [run.evaluations for run in self.runs if run.learner == agent]
+        sources = own if agent in LEARNERS else [self.baselines]
         rows = [source.get(backend, {}).get(agent) for source in sources]
         found = [row[column] for row in rows if row is not None]  # type: ignore[literal-required]
         return np.array(found, dtype=float) if found else None
@@ -122,12 +132,19 @@ def load_runs(folder: str | Path = RESULTS) -> list[StoredRuns]:
         DataError: if there are no such files, or one cannot be read.
     """
     folder = Path(folder)
-    found = []
+    found: list[StoredRuns] = []
     for place in sorted(path for path in folder.glob("*") if path.is_dir()):
         runs = sorted(map(StoredRun.read, place.glob("seed*.json")), key=lambda run: run.seed)
-        if runs:
-            path = place / "baselines.json"
-            found.append(StoredRuns(place.name, runs, read_json(path)["evaluations"] if path.exists() else {}))
+        if not runs:
+            continue
+        path = place / "baselines.json"
+        baselines = read_json(path)["evaluations"] if path.exists() else {}
+        same = next((entry for entry in found if entry.environment == runs[0].environment), None)
+        if same is None:
+            found.append(StoredRuns(place.name, runs, baselines))
+        else:
+            same.runs.extend(runs)
+            same.baselines.update(baselines)
     if not found:
         raise DataError(
             f"'{folder}' contains no results (<config>/seed<k>.json); create them with python -m agents.sweep"
@@ -137,7 +154,8 @@ def load_runs(folder: str | Path = RESULTS) -> list[StoredRuns]:
 
 def table(runs: list[StoredRuns]) -> str:
     """Return Markdown tables of distances and success rates on the backend of the training and on FEM, and overall."""
-    seeds = sorted({len(entry.runs) for entry in runs})
+    counts = [Counter(run.learner for run in entry.runs) for entry in runs]
+    seeds = sorted({count for each in counts for count in each.values()})
     text = [
         f"Interquartile means over all seeds ({' or '.join(map(str, seeds))}) and goals, with 95 % bootstrap intervals "
         "over both (with three seeds that differ much, they cover only about 80 %). Distances are in mm, errors of "
@@ -146,7 +164,7 @@ def table(runs: list[StoredRuns]) -> str:
     ]
     for backend, title in (("own", "On the backend of the training"), ("fem", "The same policies on FEM")):
         shown = [entry for entry in runs if backend == "own" or entry.environment.backend != "fem"]
-        if any(entry.scores("sac", backend, "distances") is not None for entry in shown):
+        if any(entry.scores(learner, backend, "distances") is not None for entry in shown for learner in LEARNERS):
             text += [f"\n## {title}\n", _grid(shown, partial(_distance, backend=backend))]
             text += ["\nGoals reached [%]:\n", _grid(shown, partial(_success, backend=backend))]
     text += ["\n## All environments\n", _together(runs)]
@@ -214,8 +232,8 @@ def _together(runs: list[StoredRuns]) -> str:
 def draw_curves(runs: list[StoredRuns], path: str | Path, columns: int = 4) -> Path:
     """Draw the learning curves of every seed and their mean, in a panel for each configuration.
 
-    The curves are mean returns of the evaluations during training; the dashed line is the inverse QP on the goals of
-    the final evaluation.
+    The curves are mean returns of the evaluations during training, green for SAC and orange for the analytic gradient;
+    the dashed line is the inverse QP on the goals of the final evaluation.
 
     Args:
         runs: the runs.
@@ -233,15 +251,19 @@ def draw_curves(runs: list[StoredRuns], path: str | Path, columns: int = 4) -> P
     for panel in panels[len(runs) :]:
         panel.remove()
     for panel, entry in zip(panels, runs, strict=False):
-        curves = [
-            ([row["step"] for row in run.curve], [row["mean_return"] / entry.horizon for row in run.curve])
-            for run in entry.runs
-        ]
-        for steps, returns in curves:
-            panel.plot(steps, returns, color="#99d0ca", linewidth=1.0)
-        common = min(len(steps) for steps, _ in curves)
-        mean = np.mean([returns[:common] for _, returns in curves], axis=0)
-        panel.plot(curves[0][0][:common], mean, color="#0f766e", linewidth=2.0)
+        for learner, (light, dark) in _COLOURS.items():
+            curves = [
+                ([row["step"] for row in run.curve], [row["mean_return"] / entry.horizon for row in run.curve])
+                for run in entry.runs
+                if run.learner == learner
+            ]
+            if not curves:
+                continue
+            for steps, returns in curves:
+                panel.plot(steps, returns, color=light, linewidth=1.0)
+            common = min(len(steps) for steps, _ in curves)
+            mean = np.mean([returns[:common] for _, returns in curves], axis=0)
+            panel.plot(curves[0][0][:common], mean, color=dark, linewidth=2.0)
         qp = entry.scores("qp", "own", "returns")
         if qp is not None:
             panel.axhline(qp.mean() / entry.horizon, color="#64748b", linestyle="--", linewidth=1.0)

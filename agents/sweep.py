@@ -146,7 +146,7 @@ def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goal
             "cpu_seconds": card.get("cpu_seconds"),
             "horizon": config.environment.row.max_episode_steps,
             "curve": card["curve"],
-            "evaluations": _evaluations(config.environment, {"sac": policy}, goals, fem_goals),
+            "evaluations": _evaluations(config.environment, {config.learner: policy}, goals, fem_goals),
             "provenance": provenance(),
         },
     )
@@ -189,7 +189,8 @@ def _attempt(function: Callable[..., Path], arguments: tuple[Any, ...]) -> tuple
 def _cost(config: TrainConfig) -> float:
     """Return the rough CPU time of a training [s]; the longest trainings run first."""
     step = 0.02 if config.environment.backend == "fem" else 1e-4
-    return config.steps * (step + 0.005 * config.sac.gradient_steps / config.num_envs)
+    update = 0.005 * config.sac.gradient_steps if config.learner == "sac" else 0.001
+    return config.steps * (step + update / config.num_envs)
 
 
 def sweep(
@@ -222,15 +223,22 @@ def sweep(
                 f"fem_goals = {fem_goals}, but the environment of '{path}' runs on FEM; allowed: 1 or more"
             )
     jobs: list[tuple[float, Callable[..., Path], tuple[Any, ...]]] = []
+    environments: list[EnvironmentConfig] = []
+    total = 0
     for path, config in loaded.items():
         place = folder / "results" / path.stem
         for seed in seeds:
             seeded = config.model_copy(update={"seed": seed})
             if not _finished(place / f"seed{seed}.json", seeded, goals, fem_goals):
                 jobs.append((_cost(config), train_and_evaluate, (path, seed, folder, goals, fem_goals)))
+        total += len(seeds)
+        if config.environment in environments:
+            continue  # the baselines are evaluated once for all learners in an environment
+        environments.append(config.environment)
+        total += 1
         if not _finished(place / "baselines.json", config, goals, fem_goals):
             jobs.append((0.0, evaluate_baselines, (path, folder, goals, fem_goals)))
-    before = len(loaded) * (len(seeds) + 1) - len(jobs)
+    before = total - len(jobs)
     if before:
         print(f"{before} jobs are already finished", flush=True)
     jobs.sort(key=lambda job: -job[0])
