@@ -17,6 +17,7 @@ from benchmarks import (
     codesign_scale,
     contact,
     contact_control,
+    convergence,
     design_tools,
     dynamics,
     export,
@@ -70,6 +71,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "strategies": strategies.strategies,
     "codesign_kills": codesign_scale.kills,
     "codesign_profile": codesign_scale.profile,
+    **convergence.BENCHMARKS,
 }
 """Registry of benchmarks."""
 
@@ -77,17 +79,16 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
 def run(names: Sequence[str], output: str | Path) -> dict[str, dict[str, object]]:
     """Run the named benchmarks (default: all) and write each result with its provenance to a JSON file.
 
-    The file keeps its results of other benchmarks, with the commit that made them.
+    The file keeps its results of other benchmarks, with the commit that made them. A name also stands for all
+    benchmarks that begin with it and an underscore: ``convergence`` for those of every robot.
 
     Raises:
         ConfigError: for an unknown name, or a file with other contents.
     """
-    for name in names:
-        if name not in BENCHMARKS:
-            raise ConfigError(unknown_name("benchmark", name, BENCHMARKS))
+    chosen = [full for name in names for full in matching(name)] or list(BENCHMARKS)
     kept = _read(Path(output))
     results: dict[str, dict[str, object]] = {}
-    for name in names or BENCHMARKS:
+    for name in chosen:
         click.echo(f"\n{name}: {(BENCHMARKS[name].__doc__ or '').splitlines()[0]}")
         results[name] = BENCHMARKS[name]()
         for key, value in results[name].items():
@@ -97,6 +98,14 @@ def run(names: Sequence[str], output: str | Path) -> dict[str, dict[str, object]
         write_json(output, kept)
     click.echo(f"\nwrote {output}")
     return results
+
+
+def matching(name: str) -> list[str]:
+    """Return the benchmarks that a name stands for."""
+    found = [full for full in BENCHMARKS if full == name or full.startswith(f"{name}_")]
+    if not found:
+        raise ConfigError(unknown_name("benchmark", name, BENCHMARKS))
+    return [name] if name in BENCHMARKS else found
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from PIL import Image
 from site_writing import DOCS, environment_pages
 
 from agents.evaluation import make_agent
+from benchmarks import convergence_tables
 from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
 from softgym_envs.robots import ROBOTS
@@ -143,6 +144,7 @@ def draw_report() -> np.ndarray:
 def main(names: list[str]) -> None:
     """Draw the named pictures, or all but the report."""
     table: dict[str, Callable[[], np.ndarray]] = {"codesign": draw_codesign, "arm": draw_arm, "grasp": draw_grasp}
+    table["convergence"] = convergence_tables.draw
     table |= {name: partial(draw_robot, name) for name in ROBOTS}
     table |= {name: partial(draw_environment, name) for name in environment_pages()}
     for name in names or [*table, "episodes"]:

@@ -1,0 +1,160 @@
+"""Tables and picture of the page on convergence, from the recorded results of `benchmarks.convergence`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.convergence import STUDIES
+from benchmarks.recorded import records, results
+from benchmarks.tables import markdown
+
+TITLES = {
+    "finger": "Soft Finger, 2 cables",
+    "finger_1cable": "Soft Finger, 1 cable",
+    "diamond": "Diamond",
+    "cable_trunk": "cable trunk",
+    "contact_aided_finger": "contact-aided finger",
+    "trunk": "Stiff-Flop trunk",
+    "tetrapod": "Tetrapod",
+}
+"""Readable names of the studies."""
+
+
+def studied() -> list[str]:
+    """Return the studies that have recorded results."""
+    return [name for name in STUDIES if f"convergence_{name}" in records()]
+
+
+def convergence() -> str:
+    """Errors of each robot on each mesh, against the converged value: baseline, and the worst of all bodies."""
+    rows = []
+    for name in studied():
+        found = results(f"convergence_{name}")
+        baseline = [row for row in found["rows"] if row["body"] == "baseline"]
+        for k, row in enumerate(baseline):
+            errors = found["errors"]
+            cells = []
+            for quantity in ("tip", "effort"):
+                all_bodies = [
+                    body["meshes"][row["mesh"]][quantity]
+                    for body in errors.values()
+                    if np.isfinite(body["meshes"][row["mesh"]][quantity])
+                ]
+                own = errors.get("baseline", {}).get("meshes", {}).get(row["mesh"], {}).get(quantity, np.nan)
+                worst = max(all_bodies, key=abs, default=np.nan)
+                form = "{:.1%}" if quantity == "tip" else "{:+.1%}"
+                cells += [form.format(own), f"{form.format(worst)} of {len(all_bodies)}"]
+            title = "" if k else TITLES[name]
+            rows.append([title, row["mesh"], f"{row['unknowns']:,}", *cells, f"{row['seconds']:.2g}"])
+    head = ["robot", "mesh", "unknowns", "tip", "worst body", "effort", "worst body", "CPU [s]"]
+    return markdown(head, rows, "llrrrrrr")
+
+
+def convergence_limits() -> str:
+    """Converged values of each robot's baseline with the observed orders, and the bodies that failed."""
+    rows = []
+    for name in studied():
+        found = results(f"convergence_{name}")
+        failed = [row for row in found["rows"] if row["failure"]]
+        body = found["errors"].get("baseline")
+        if body is None:
+            continue
+        tip = ", ".join(f"{x:.2f}" for x in body["tip [mm]"])
+        orders = [f"{body[f'{quantity}, order']:.1f}" for quantity in ("tip", "effort")]
+        rows.append([TITLES[name], f"({tip})", orders[0], f"{body['effort']:.4g}", orders[1], str(len(failed))])
+    head = ["robot", "tip, converged [mm]", "order", "effort, converged", "order", "failures"]
+    return markdown(head, rows, "llrrrr")
+
+
+def convergence_guides() -> str:
+    """Compliance of a cable against the mesh, for single points and averaged guides."""
+    found = results("convergence_guides")
+    rows = [
+        [f"cube, guide of {radius}", *(f"{1e3 * value:.4f}" for value in values), ""]
+        for radius, values in found["cube [m/N]"].items()
+    ]
+    table = markdown(
+        ["W_aa [mm/N]", *(f"{cells} cells" for cells in found["cube, cells"])], [row[:-1] for row in rows], "lrrrr"
+    )
+    finger = [
+        [f"finger, guides of {radius}", *(f"{1e3 * value:.3f}" for value in values)]
+        for radius, values in found["finger [m/N]"].items()
+    ]
+    head = ["W_aa [mm/N]", *(f"{count:,} unknowns" for count in found["finger, unknowns"])]
+    return f"{table}\n\n{markdown(head, finger, 'lrrr')}"
+
+
+def convergence_fillets() -> str:
+    """Tension and tip of the finger against the radius of its re-entrant edges."""
+    rows = [
+        [row["body"], f"{row['effort']:.2f}", f"{row['tip'][1]:.2f}, {row['tip'][2]:.2f}", f"{row['unknowns']:,}"]
+        for row in results("convergence_fillets")["rows"]
+    ]
+    return markdown(["radius", "tension of each cable [N]", "tip y, z [mm]", "unknowns"], rows, "rrrr")
+
+
+def convergence_scatter() -> str:
+    """Deviations of the finger's tension and tip from a smooth function of the segments' length."""
+    found = results("convergence_scatter")
+    rows = [
+        [
+            title,
+            *(
+                f"{found[f'{meshing}: {name}, {kind} deviation']:.2%}"
+                for name in ("tension", "tip")
+                for kind in ("standard", "largest")
+            ),
+        ]
+        for meshing, title in (("morph", "mesh moved"), ("remesh", "new mesh for each design"))
+    ]
+    head = ["meshing", "tension, standard", "tension, largest", "tip, standard", "tip, largest"]
+    return markdown(head, rows, "lrrrr")
+
+
+CONVERGENCE_TABLES = {
+    "convergence": convergence,
+    "convergence_limits": convergence_limits,
+    "convergence_guides": convergence_guides,
+    "convergence_fillets": convergence_fillets,
+    "convergence_scatter": convergence_scatter,
+}
+"""Tables of the page by name."""
+
+
+def draw() -> np.ndarray:
+    """Return a picture (h, w, 3) of the errors of tip and effort over the number of unknowns, a panel per robot."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    names = studied()
+    columns = min(len(names), 4)
+    lines = -(-len(names) // columns)
+    figure = Figure(figsize=(3.2 * columns, 2.8 * lines), layout="constrained", dpi=110)
+    canvas = FigureCanvasAgg(figure)
+    for place, name in enumerate(names):
+        axes = figure.add_subplot(lines, columns, place + 1)
+        found = results(f"convergence_{name}")
+        for body, errors in found["errors"].items():
+            rows = [row for row in found["rows"] if row["body"] == body and row["mesh"] in errors["meshes"]]
+            unknowns = [row["unknowns"] for row in rows]
+            for quantity, colour in (("tip", "tab:blue"), ("effort", "tab:red")):
+                values = [100.0 * abs(errors["meshes"][row["mesh"]][quantity]) for row in rows]
+                strong = body == "baseline"
+                axes.loglog(
+                    unknowns,
+                    values,
+                    marker="o",
+                    markersize=4 if strong else 2,
+                    linewidth=1.8 if strong else 0.6,
+                    color=colour,
+                    alpha=1.0 if strong else 0.5,
+                    label=quantity if strong else None,
+                )
+        axes.axhline(2.0, color="grey", linewidth=0.8, linestyle=":")
+        axes.set_title(TITLES[name], fontsize=9)
+        axes.set_xlabel("unknowns", fontsize=8)
+        axes.set_ylabel("error [%]", fontsize=8)
+        axes.tick_params(labelsize=7, which="both")
+        axes.legend(fontsize=7)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
