@@ -17,7 +17,7 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.contact.contact import Contacts
+from softgym_envs.mechanics.contact.contact import Contacts, ContactSettings
 from softgym_envs.mechanics.contact.obstacles import Cylinder, Plane, Sphere
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
@@ -125,8 +125,7 @@ class Indentation:
         self.model.add("a", Point("sphere", EmbeddedPoints.in_frame(frame, np.zeros(3), self.model.nodes)))
         self.model.set_contact(
             obstacles=[Sphere((0.0, 0.0, 0.0), 1.0, frame=frame, friction=friction)],
-            distance=self.distance,
-            stiffness=0.01,
+            settings=ContactSettings(distance=self.distance, stiffness=0.01),
         )
         self.solver = Statics(self.model, tolerance=1e-9, max_iterations=60)
         self.share = 2.0 if half else 4.0
@@ -252,7 +251,9 @@ def patch(distances: Sequence[float] = (1e-4,), pressure: float = 1e4) -> list[R
             faces = faces[(model.nodes[faces, 2] > top - 1e-9).all(axis=1)]
             np.add.at(model.nodal_loads[:, 2], faces, -pressure * size[0] * size[1] / len(faces) / 3.0)
             obstacles = [] if between else [Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))]
-            model.set_contact(obstacles=obstacles, self_contact=between, distance=distance, stiffness=young)
+            model.set_contact(
+                obstacles=obstacles, settings=ContactSettings(self_contact=between, distance=distance, stiffness=young)
+            )
             found = Statics(model, tolerance=1e-11, max_iterations=60).solve([])
             ratio = -_strains(model, found.x) * young / pressure
             case = f"patch test, {'two meshes' if between else 'plane'}"
@@ -309,7 +310,7 @@ def signorini(
     for distance in distances:
         model = _cantilever(cells)
         plane = Plane((0.0, 0.0, PLANE_BELOW), (0.0, 0.0, 1.0))
-        model.set_contact(obstacles=[plane], distance=distance)
+        model.set_contact(obstacles=[plane], settings=ContactSettings(distance=distance))
         found = Statics(model, max_iterations=60).solve([], effector_force=[0.0, 0.0, load])
         assert found.contacts is not None
         force = float(found.contacts.total[0, 2])
@@ -343,7 +344,7 @@ def beam_on_cylinder(loads: Sequence[float] = (0.02, 0.04), elements: int = 10, 
         radius = 0.02
         centre = (at * length, 0.0, -0.5 * width - clearance - radius)
         cylinder = Cylinder(centre, (0.0, 1.0, 0.0), radius)
-        model.set_contact(obstacles=[cylinder], distance=1e-5, stiffness=1e6)
+        model.set_contact(obstacles=[cylinder], settings=ContactSettings(distance=1e-5, stiffness=1e6))
         found = Statics(model, max_iterations=60).solve([], effector_force=[0.0, 0.0, -load])
         assert found.contacts is not None
         force, s = float(found.contacts.total[0, 2]), at * length
@@ -382,7 +383,7 @@ def block_on_incline(
         model = builder.build()
         model.add("e", Point("centre", model.embed(centre)))
     plane = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), friction=friction)
-    model.set_contact(obstacles=[plane], distance=distance, stiffness=1e5)
+    model.set_contact(obstacles=[plane], settings=ContactSettings(distance=distance, stiffness=1e5))
     return model
 
 
@@ -474,7 +475,7 @@ def collision(step: float = 2e-4, steps: int = 60) -> list[Row]:
         fixed = np.zeros(len(nodes), dtype=bool)
         starts.append(builder.add_solid(nodes + shift, tetrahedra, fixed=fixed, young_modulus=1e5, poisson_ratio=0.3))
     model = builder.build()
-    model.set_contact(self_contact=True, distance=5e-4)
+    model.set_contact(settings=ContactSettings(self_contact=True, distance=5e-4))
     solver = Dynamics(model, step=step)
     velocity = np.zeros_like(model.nodes)
     velocity[: starts[1], 2], velocity[starts[1] :, 2] = 0.3, -0.2
@@ -519,7 +520,7 @@ def creep(increments: int = 20, degrees: float = 15.0, friction: float = 0.5) ->
         builder.add_solid(nodes + shift, tetrahedra, fixed=fixed, young_modulus=1e6, poisson_ratio=0.3)
     model = builder.build()
     model.add("e", Point("top", model.embed(np.array([0.009, 0.01, 0.008]), block=1)))
-    model.set_contact(self_contact=True, self_friction=friction, distance=3e-4, stiffness=1e4)
+    model.set_contact(settings=ContactSettings(self_contact=True, self_friction=friction, distance=3e-4, stiffness=1e4))
     solver = Statics(model, tolerance=1e-12, max_iterations=60)
     places = [float(solver.solve([]).delta[0]) for _ in range(increments)]
     value = (places[-1] - places[increments // 2]) / (increments - 1 - increments // 2)

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
+from softgym_envs.mechanics.contact.contact import ContactSettings
+
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.obstacles import Cylinder
     from softgym_envs.surrogate.chain.model import ChainModel
@@ -103,7 +105,7 @@ def close_fem(model: ChainModel, scene: Scene, self_contact: bool) -> tuple[np.n
     from softgym_envs.mechanics.solvers.statics import Statics
 
     body = model.robot.build(dict(zip(model.robot.design_space.names, map(float, scene.design), strict=True)))
-    body.set_contact(obstacles=scene.bars, self_contact=self_contact)
+    body.set_contact(obstacles=scene.bars, settings=ContactSettings(self_contact=self_contact))
     statics = Statics(body)
     start = time.process_time()
     for part in range(1, INCREMENTS + 1):

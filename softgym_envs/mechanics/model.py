@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.contact.contact import Contact
+from softgym_envs.mechanics.contact.contact import Contact, ContactSettings
 from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
 from softgym_envs.mechanics.contact.surface import surface_of
 from softgym_envs.mechanics.elements.block import ElementBlock
@@ -356,12 +357,8 @@ class MechanicalModel:
         self,
         *,
         obstacles: Sequence[Obstacle | MeshObstacle] = (),
-        self_contact: bool = False,
-        self_friction: float = 0.0,
         excluded: Sequence[int] | np.ndarray = (),
-        distance: float = 5e-4,
-        stiffness: float | None = None,
-        stick: float | None = None,
+        settings: ContactSettings | None = None,
     ) -> Contact:
         """Let the surface of the body touch obstacles and itself; solvers made afterwards include it.
 
@@ -369,30 +366,19 @@ class MechanicalModel:
 
         Args:
             obstacles: what the body touches, each with its coefficient of friction.
-            self_contact: whether surfaces of the body touch each other.
-            self_friction: coefficient of friction between them.
             excluded: rows whose triangles touch nothing, e.g. nodes clamped inside a mount that is not modelled.
-            distance: gap below which there are forces [m]. It must be smaller than the thinnest wall.
-            stiffness: of the barrier [Pa], about the pressure at 0.8 of the distance; default a tenth of the largest
-                Young's modulus of the body. It is never adapted to the load.
-            stick: stiffness of friction before sliding, per area [Pa/m]; default 5 ``stiffness / distance``.
+            settings: self-contact, and the law of contact; default `ContactSettings`.
 
         Raises:
-            ValueError: for a value that is not positive, or if there is no Young's modulus to choose a stiffness from.
+            ValueError: if there is no Young's modulus to choose the stiffness of contact from.
         """
-        if stiffness is None:
+        settings = ContactSettings() if settings is None else settings
+        if settings.stiffness is None:
             stiffness = 0.1 * max((block.largest_young_modulus for block in self.blocks), default=0.0)
             if not stiffness:
                 raise ValueError("a body without elastic parts needs the 'stiffness' [Pa] of its contact")
-        self.contact = Contact(
-            surface_of(self.nodes, self.blocks, self.skins, excluded),
-            obstacles=obstacles,
-            self_contact=self_contact,
-            self_friction=self_friction,
-            distance=distance,
-            stiffness=stiffness,
-            stick=stick,
-        )
+            settings = replace(settings, stiffness=stiffness)
+        self.contact = Contact(surface_of(self.nodes, self.blocks, self.skins, excluded), obstacles, settings)
         return self.contact
 
     # -- loads ------------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import numpy as np
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.errors import InfeasibleDesign, SoftGymError
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.contact.obstacles import Obstacle, obstacle_from
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
@@ -259,11 +260,13 @@ class Robot(ABC):
             raise ValueError(f"robot '{self.name}' adds its own contact and does not take obstacles or self_contact")
         model.set_contact(
             obstacles=obstacles,
-            self_contact=self.self_contact,
-            self_friction=self.self_friction,
             excluded=np.flatnonzero(model.fixed),
-            distance=self.contact_distance,
-            stiffness=self.contact_stiffness,
+            settings=ContactSettings(
+                self_contact=self.self_contact,
+                self_friction=self.self_friction,
+                distance=self.contact_distance,
+                stiffness=self.contact_stiffness,
+            ),
         )
         assert model.contact is not None
         crossing = model.contact.intersections(model.nodes)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign, unknown_name
-from softgym_envs.mechanics.contact.contact import Contacts
+from softgym_envs.mechanics.contact.contact import Contacts, ContactSettings
 from softgym_envs.mechanics.contact.obstacles import IDENTITY, Obstacle, Plane, RoundedPrism, Sphere
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.contact_aided_finger import HELD, ContactAidedFinger
@@ -181,9 +181,8 @@ def evaluate_grasp(
         nodes = len(model.nodes) - 4 * len(model.frames)
         contact = model.set_contact(
             obstacles=[target.obstacle(robot.width)],
-            self_contact=True,
-            self_friction=self_friction,
             excluded=np.flatnonzero(model.nodes[:nodes, 1] < HELD + 1e-9),
+            settings=ContactSettings(self_contact=True, self_friction=self_friction),
         )
         if crossing := contact.intersections(model.nodes):
             raise InfeasibleDesign(f"{crossing} at rest")

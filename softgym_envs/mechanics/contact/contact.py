@@ -107,6 +107,37 @@ class ContactRow(NamedTuple):
     compliance: float
 
 
+@dataclass(frozen=True)
+class ContactSettings:
+    """Which surfaces of a body touch, and the law of contact.
+
+    Attributes:
+        self_contact: whether surfaces of the body touch each other.
+        self_friction: coefficient of friction between them.
+        distance: gap below which there are forces [m]. It must be smaller than the thinnest wall.
+        stiffness: of the barrier [Pa], about the pressure at 0.8 of the distance. It is never adapted to the load.
+            None: a tenth of the largest Young's modulus of the body.
+        stick: stiffness of friction before sliding, per area [Pa/m]; None: 5 ``stiffness / distance``.
+
+    Raises:
+        ValueError: for a value that is not positive.
+    """
+
+    self_contact: bool = False
+    self_friction: float = 0.0
+    distance: float = 5e-4
+    stiffness: float | None = None
+    stick: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, unit in (("distance", "m"), ("stiffness", "Pa"), ("stick", "Pa/m")):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} = {value} {unit} of contact must be positive and finite")
+        if not (np.isfinite(self.self_friction) and self.self_friction >= 0.0):
+            raise ValueError(f"self_friction = {self.self_friction} must be finite and not negative")
+
+
 class Contact:
     """What a model touches.
 
@@ -114,49 +145,26 @@ class Contact:
         surface: of the model.
         obstacles: what the model touches, each with its coefficient of friction. With self-contact, an obstacle on a
             frame stands for the skin of that frame, which then touches no other surface.
-        self_contact: whether the surfaces of the model touch each other.
-        self_friction: coefficient of friction between them.
-        distance: gap below which there are forces [m]. It must be smaller than the thinnest wall.
-        stiffness: of the barrier [Pa]. It is never adapted.
-        stick: stiffness of friction before sliding, per area [Pa/m]; default 5 ``stiffness / distance``.
+        settings: self-contact and the law of contact, with a stiffness.
 
     Raises:
-        ValueError: for a value that is not positive, or if a skin has to touch a meshed obstacle itself, because an
-            obstacle without a mesh stands for it in self-contact.
+        ValueError: if the stiffness is missing, or if a skin has to touch a meshed obstacle itself, because an obstacle
+            without a mesh stands for it in self-contact.
     """
 
     def __init__(
-        self,
-        surface: Surface,
-        *,
-        obstacles: Sequence[Obstacle | MeshObstacle] = (),
-        self_contact: bool = False,
-        self_friction: float = 0.0,
-        distance: float = 5e-4,
-        stiffness: float,
-        stick: float | None = None,
+        self, surface: Surface, obstacles: Sequence[Obstacle | MeshObstacle], settings: ContactSettings
     ) -> None:
-        if stick is None:
-            stick = 5.0 * stiffness / distance
-        for name, value, unit in (
-            ("distance", distance, "m"),
-            ("stiffness", stiffness, "Pa"),
-            ("stick", stick, "Pa/m"),
-        ):
-            if not (np.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} = {value} {unit} of contact must be positive and finite")
-        if not (np.isfinite(self_friction) and self_friction >= 0.0):
-            raise ValueError(f"self_friction = {self_friction} must be finite and not negative")
+        if settings.stiffness is None:
+            raise ValueError("contact needs a stiffness [Pa]")
         self.obstacles = tuple(obstacles)
-        self.self_contact = self_contact
-        self.self_friction = float(self_friction)
-        self.distance = float(distance)
-        self.stiffness = float(stiffness)
-        self.stick = float(stick)
+        self.self_contact, self.self_friction = settings.self_contact, settings.self_friction
+        self.distance, self.stiffness = settings.distance, settings.stiffness
+        self.stick = 5.0 * self.stiffness / self.distance if settings.stick is None else settings.stick
         self.surface = surface
         frames = [each.frame for each in self.obstacles if each.frame is not None]
         self.surfaces = surface_set(surface, self.meshes, self.self_contact, frames)
-        for each in self.obstacles if self_contact and self.meshes else ():
+        for each in self.obstacles if self.self_contact and self.meshes else ():
             if not isinstance(each, MeshObstacle) and not self.not_carried(each).all():
                 raise ValueError(
                     f"obstacle '{each.name}' stands for the skin of its frame in self-contact and cannot touch meshed "
@@ -331,39 +339,41 @@ class ContactState:
             self._kinematics.map.linearise(x)
         n = self._kinematics.equations
         gradient = np.zeros(self._shape)
-        tangent = csr_matrix((n, n))
         directions, loading = [csc_matrix((n, 0))], [csc_matrix((n, 0))]
-        limits: list[np.ndarray | None] = []
-        for pair, anchors in zip(self.pairs, self._anchors, strict=True):
-            touch = pair.touch(x, anchors, convex=convex)
-            limits.append(None if anchors is None else pair.limits(touch))
-            if not len(touch.points):
-                continue
+        touches = [
+            pair.touch(x, anchors, convex=convex) for pair, anchors in zip(self.pairs, self._anchors, strict=True)
+        ]
+        for pair, touch in zip(self.pairs, touches, strict=True):
             pair.add_to_rows(touch, gradient)
-            tangent = tangent + touch.hessian()
             if touch.sliding.any():
                 directions.append(touch.columns(touch.direction, touch.sliding))
                 loading.append(touch.columns(touch.loading, touch.sliding))
-        if self._surfaces is not None:
-            slope, curvature = self._surfaces.derivatives(self._corners(x), project=convex)
-            if curvature.nnz:
-                gradient += self.contact.surfaces.weights.T @ slope
-                tangent = tangent + self._to_equations(curvature)
         return ContactTerms(
-            gradient, tangent.tocsr(), hstack(directions, format="csc"), hstack(loading, format="csc"), tuple(limits)
+            gradient,
+            self._tangent(x, touches, gradient, convex=convex),
+            hstack(directions, format="csc"),
+            hstack(loading, format="csc"),
+            tuple(
+                None if anchors is None else pair.limits(touch)
+                for pair, anchors, touch in zip(self.pairs, self._anchors, touches, strict=True)
+            ),
         )
 
     def forces_held(self, x: np.ndarray) -> csr_matrix:
         """Return the tangent (N, N) at rows ``x`` (n, 3) if the normal forces of obstacles did not change."""
+        touches = [pair.touch(x, None, held=True) for pair in self.pairs]
+        return self._tangent(x, touches, np.zeros(self._shape))
+
+    def _tangent(
+        self, x: np.ndarray, touches: list[Touch], gradient: np.ndarray, *, convex: bool = False
+    ) -> csr_matrix:
+        """Return the tangent (N, N) of touched obstacles and surfaces; add the forces of the latter to ``gradient``."""
         n = self._kinematics.equations
-        tangent = csr_matrix((n, n))
-        for pair in self.pairs:
-            touch = pair.touch(x, None, held=True)
-            if len(touch.points):
-                tangent = tangent + touch.hessian()
+        tangent = sum((touch.hessian() for touch in touches if len(touch.points)), start=csr_matrix((n, n)))
         if self._surfaces is not None:
-            curvature = self._surfaces.derivatives(self._corners(x))[1]
+            slope, curvature = self._surfaces.derivatives(self._corners(x), project=convex)
             if curvature.nnz:
+                gradient += self.contact.surfaces.weights.T @ slope
                 tangent = tangent + self._to_equations(curvature)
         return tangent.tocsr()
 

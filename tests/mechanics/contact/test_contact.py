@@ -10,7 +10,7 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.contact.contact import ContactState
+from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
 from softgym_envs.mechanics.contact.law import barrier, friction, friction_energy
 from softgym_envs.mechanics.contact.obstacles import Plane, RoundedPrism, Sphere
 from softgym_envs.mechanics.elements.rigid import box_inertia
@@ -78,7 +78,7 @@ def pressed(rng):
             RoundedPrism.box((0.012, 0.009, 0.0095), 0.002, frame=frame, friction=0.4),
             Plane((0.0, 0.0, 0.0242), (0.0, 0.02, -1.0), friction=0.3),
         ],
-        distance=6e-4,
+        settings=ContactSettings(distance=6e-4),
     )
     step = 1e-4 * rng.normal(size=model.equations)
     step[-3:] = 0.006 * rng.normal(size=3)
@@ -153,7 +153,7 @@ def block_on_incline(
         model = builder.build()
         model.add("e", Point("centre", model.embed(centre)))
     plane = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), friction=coefficient, name="plane")
-    model.set_contact(obstacles=[plane], distance=distance, stiffness=stiffness)
+    model.set_contact(obstacles=[plane], settings=ContactSettings(distance=distance, stiffness=stiffness))
     return model
 
 
@@ -236,7 +236,7 @@ def clamped_block(obstacles, *, distance=5e-4):
     builder.add_solid(nodes, tetrahedra, fixed=fixed, young_modulus=2e5, poisson_ratio=0.4)
     model = builder.build()
     model.add_effector("middle", (0.01, 0.01, 0.01))
-    model.set_contact(obstacles=obstacles, distance=distance)
+    model.set_contact(obstacles=obstacles, settings=ContactSettings(distance=distance))
     return model
 
 

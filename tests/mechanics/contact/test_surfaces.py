@@ -9,7 +9,7 @@ import pytest
 from scipy.sparse import csc_matrix
 
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.contact.contact import ContactState
+from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
 from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Plane, RoundedPrism
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
@@ -40,7 +40,7 @@ def pressed(rng):
     model = builder.build()
     model.skins.append(box_skin(frame, (0.006, 0.005, 0.004), model.nodes))
     lid = mesh_box((0.008, 0.007, 0.0096), (2, 2, 2), friction=0.4, frame=frame)
-    model.set_contact(obstacles=[FLOOR, lid], distance=6e-4)
+    model.set_contact(obstacles=[FLOOR, lid], settings=ContactSettings(distance=6e-4))
     step = 1e-5 * rng.normal(size=model.equations)
     step[-3:] = 0.004 * rng.normal(size=3)
     state = ContactState(model.contact, model.kinematics, model.nodes)
@@ -93,7 +93,7 @@ def block_on(floor, degrees):
     builder.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] > 0.0099, young_modulus=1e4, poisson_ratio=0.3)
     model = builder.build()
     model.add_effector("middle", (0.01, 0.01, 0.003))
-    model.set_contact(obstacles=[floor], distance=4e-4)
+    model.set_contact(obstacles=[floor], settings=ContactSettings(distance=4e-4))
     return model
 
 
@@ -121,7 +121,7 @@ def two_blocks():
     builder.add_solid(upper, tetrahedra, fixed=upper[:, 2] > 0.0222, young_modulus=1e5, poisson_ratio=0.4)
     model = builder.build()
     model.add_effector("inside", (0.01, 0.01, 0.007))
-    model.set_contact(self_contact=True, distance=4e-4)
+    model.set_contact(settings=ContactSettings(self_contact=True, distance=4e-4))
     return model
 
 
@@ -190,7 +190,9 @@ def box_on_a_block(shape, *, self_contact, obstacles=()):
     builder.add_mass(frame, 0.02, box_inertia(0.02, np.array(half)))
     model = builder.build()
     model.skins.append(box_skin(frame, half, model.nodes))
-    model.set_contact(obstacles=[shape(half, frame), *obstacles], self_contact=self_contact, distance=4e-4)
+    model.set_contact(
+        obstacles=[shape(half, frame), *obstacles], settings=ContactSettings(self_contact=self_contact, distance=4e-4)
+    )
     return model
 
 

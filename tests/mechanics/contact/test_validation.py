@@ -12,7 +12,7 @@ from benchmarks import contact as cases
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.contact.contact import ContactState
+from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
 from softgym_envs.mechanics.contact.obstacles import Cylinder, MeshObstacle, Plane, RoundedPrism, Sphere
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
@@ -99,7 +99,9 @@ def carried_ball(obstacle, *, friction_above=0.0):
     model = builder.build()
     model.add("a", Point("ball", EmbeddedPoints.in_frame(frame, np.zeros(3), model.nodes)))
     model.add_effector("inside", (0.0, 0.0, -0.003))
-    model.set_contact(obstacles=[replace(obstacle, frame=frame)], distance=4e-4, stiffness=1e4)
+    model.set_contact(
+        obstacles=[replace(obstacle, frame=frame)], settings=ContactSettings(distance=4e-4, stiffness=1e4)
+    )
     return model
 
 
@@ -225,7 +227,7 @@ def test_compliance_of_a_bending_finger_with_cables_on_a_cylinder(friction, tole
         model.add_cable(f"cable {y}", [(0.055, y, 0.001), (0.03, y, 0.001)], (-0.005, y, 0.001))
     model.add_effector("tip", (0.06, 0.005, 0.005))
     cylinder = Cylinder((0.035, 0.0, -0.0085), (0.1, 1.0, 0.0), 0.008, friction=friction)
-    model.set_contact(obstacles=[cylinder], distance=4e-4)
+    model.set_contact(obstacles=[cylinder], settings=ContactSettings(distance=4e-4))
     h = np.array([1e-5, 1e-5, 1e-5, 1e-5, 1e-5])
     found = check_compliance(model, [0.45, 0.5, 0, 0, 0], [0.5, 0.6, 0.0, 0.003, 0.002], h, tolerance)
     assert found.contacts.count > 2 and found.contacts.sliding.any() == (friction > 0.0)
@@ -249,8 +251,7 @@ def test_compliance_of_a_beam_whose_skin_touches(friction, tolerance):
             Sphere((0.0505, 0.001, -0.0132), 0.01, friction=friction, name="ball"),
             Plane((0.1, 0.0, -0.0085), (0.02, 0.03, 1.0), friction=friction, name="floor"),
         ],
-        distance=4e-4,
-        stiffness=1e4,
+        settings=ContactSettings(distance=4e-4, stiffness=1e4),
     )
     found = check_compliance(model, [0, 0, -0.07], [0.01, 0.01, -0.08], 1e-5 * np.ones(3), tolerance)
     assert set(found.contacts.obstacle) == {0, 1} and found.contacts.sliding.any() == (friction > 0.0)
@@ -267,7 +268,7 @@ def test_compliance_with_self_contact_and_an_obstacle():
     model.add("e", Point("left", model.embed(np.array([0.003, 0.004, 0.029]), block=0)))
     model.add("e", Point("right", model.embed(np.array([0.009, 0.004, 0.027]), block=1)))
     wall = Plane((0.0145, 0.0, 0.0), (-1.0, 0.05, 0.0), name="wall")
-    model.set_contact(obstacles=[wall], self_contact=True, distance=4e-4)
+    model.set_contact(obstacles=[wall], settings=ContactSettings(self_contact=True, distance=4e-4))
     efforts = [0.2, 0.01, 0.0, 0.02, 0.005, 0.0]
     found = check_compliance(model, np.zeros(6), efforts, 1e-5 * np.ones(6), 1e-6)
     assert found.contacts.self_force > 0.1 and found.contacts.count > 3
@@ -309,7 +310,7 @@ def test_a_soft_and_a_rigid_block_exchange_momentum():
     model = builder.build()
     model.skins.append(box_skin(frame, half.tolist(), model.nodes))
     box = RoundedPrism.box(half.tolist(), 1e-3, frame=frame, friction=0.3)
-    model.set_contact(obstacles=[box], distance=5e-4)
+    model.set_contact(obstacles=[box], settings=ContactSettings(distance=5e-4))
     solver = Dynamics(model, step=2e-4)
     speed = np.zeros(model.equations)
     # The equations hold three components of each free row first, among them the frame's origin, and the spins last.
