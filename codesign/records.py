@@ -153,7 +153,7 @@ class FinalistTest(Record):
     EVALUATIONS = ("evaluation",)
 
     trial: int
-    agent: str  # "sac" or "qp"
+    agent: str  # "policy" or "qp"
     backend: str  # "fem" or "surrogate"
     goals: str  # "unseen" or "selection"
     seed: int = 0  # of the training of the policy; 0 for the policy of the trial itself
@@ -185,7 +185,7 @@ class Finalist(Record):
     @property
     def agents(self) -> tuple[str, ...]:
         """Controllers to test; that of the trial first."""
-        return ("qp",) if self.policy is None else ("sac", "qp")
+        return ("qp",) if self.policy is None else ("policy", "qp")
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ class StudySnapshot:
     def seeds(self, agent: str) -> range:
         """Return the seeds of the policies that a finalist is tested with; 0 is the policy of its trial."""
         count = self.config.finalists.seeds
-        return range(1, count + 1) if agent == "sac" and count else range(1)
+        return range(1, count + 1) if agent == "policy" and count else range(1)
 
     @cached_property
     def planned_tests(self) -> list[PlannedTest]:

@@ -65,7 +65,7 @@ def _environment(config: StudyConfig, backend: str, options: Mapping[str, float]
 def _test(folder: StudyFolder, plan: PlannedTest) -> FinalistTest:
     config, finalist = folder.config, plan.finalist
     controller: str | Path = plan.agent
-    if plan.agent == "sac" and finalist.policy:
+    if plan.agent == "policy" and finalist.policy:
         controller = _trained_policy(folder, finalist, plan.seed) if plan.seed else folder.path / finalist.policy
     test = FinalistTest(finalist.trial, plan.agent, plan.backend, plan.goals, plan.seed)
     environment = _environment(config, plan.backend, finalist.options)

@@ -143,7 +143,7 @@ def _transfer(groups: list[TestGroup], objective: Objective) -> list[Transfer]:
         return group.value(name) if name in group.tests[0].values else float(getattr(group.mean, name))
 
     rows = []
-    for agent in ("sac", "qp"):
+    for agent in ("policy", "qp"):
         values = {
             backend: {group.trial: value(group) for group in groups if (group.agent, group.backend) == (agent, backend)}
             for backend in ("surrogate", "fem")

@@ -22,11 +22,11 @@ from codesign.snapshot import StudySnapshot, load_study
 from softgym_envs.storage import atomic_write
 
 CONTROLLERS = {
-    "warm_start": "SAC, fine-tuned in each trial from one design-conditioned policy",
-    "scratch": "SAC, trained from scratch in each trial",
-    "policy": "SAC, one design-conditioned policy shared by all bodies",
-    "critic": "SAC, one policy trained together with bodies that its critic proposes, then shared by all bodies",
-    "distribution": "SAC, one policy trained together with a distribution of bodies, then shared by all bodies",
+    "warm_start": "a policy fine-tuned in each trial from one design-conditioned policy",
+    "scratch": "a policy trained from scratch in each trial",
+    "policy": "one design-conditioned policy shared by all bodies",
+    "critic": "one policy trained together with bodies that its critic proposes, then shared by all bodies",
+    "distribution": "one policy trained together with a distribution of bodies, then shared by all bodies",
     "qp": "inverse QP on the condensed model, no training",
 }
 IMAGE_SIZE = (420, 420)
@@ -297,8 +297,8 @@ def _interval_note(snapshot: StudySnapshot, results: StudyResults) -> str:
     note = "Intervals of 95 % are Student's for means and differences, and Wilson's for rates"
     if seeds > 1:
         note += (
-            f". For SAC they are over goals and over {seeds} trainings of each body, each with its own seed; for the "
-            "inverse QP over goals."
+            f". For policies they are over goals and over {seeds} trainings of each body, each with its own seed; "
+            "for the inverse QP over goals."
         )
     else:
         note += ", over goals, for the controllers as trained: they do not include the effect of another training seed."

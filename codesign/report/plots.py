@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 BASELINE, WINNER, OTHER, MUTED, VIOLATES = "#64748b", "#0f766e", "#cbd5e1", "#94a3b8", "#dc2626"
 COLOURS = {"baseline": BASELINE, "winner": WINNER}
-AGENTS = {"sac": ("SAC", "o"), "qp": ("inverse QP", "s")}
+AGENTS = {"policy": ("policy", "o"), "qp": ("inverse QP", "s")}
 SILHOUETTE_HEIGHT = 700  # pixels
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -293,7 +293,7 @@ def screen(snapshot: StudySnapshot, results: StudyResults) -> str | None:
             ax.scatter(
                 x, y, 80 if role else 26, colour, marker="*" if role else "o", label=role, zorder=4 if role else 3
             )
-        ax.set(xlabel=f"inverse QP: {objective.axis_inside}", ylabel=f"SAC: {objective.axis_inside}")
+        ax.set(xlabel=f"inverse QP: {objective.axis_inside}", ylabel=f"policy: {objective.axis_inside}")
         if roles:
             ax.legend(fontsize=8)
     return out[0]

@@ -11,7 +11,7 @@ from codesign.report.results import Comparison, Cost, StudyResults, Transfer, Va
 from codesign.report.units import present, shown_unit
 from codesign.snapshot import StudySnapshot
 
-AGENTS = {"sac": "SAC policy", "qp": "Inverse QP"}
+AGENTS = {"policy": "Policy", "qp": "Inverse QP"}
 BACKENDS = {"fem": "FEM", "surrogate": "Surrogate"}
 SHOWN_ALWAYS = ("mean_distance", "success_rate")
 """Objectives that every comparison shows, whatever the objective of the study."""

@@ -132,15 +132,15 @@ def test_finalists_are_trained_anew_with_several_seeds(run):
         for seed in (1, 2):
             card = json.loads((folder.path / "finalists" / f"trial000{body}-seed{seed}" / "policy.json").read_text())
             assert card["config"]["seed"] == seed and card["steps"] == 240
-            assert f"trial000{body}-sac-seed{seed}-fem-unseen.json" in names
-    both = [group for group in load_study(folder).tests if (group.agent, group.backend) == ("sac", "surrogate")]
+            assert f"trial000{body}-policy-seed{seed}-fem-unseen.json" in names
+    both = [group for group in load_study(folder).tests if (group.agent, group.backend) == ("policy", "surrogate")]
     assert len(both) == 2
     for group in both:
-        files = (f"trial{group.trial:04d}-sac-seed{seed}-surrogate-unseen.json" for seed in (1, 2))
+        files = (f"trial{group.trial:04d}-policy-seed{seed}-surrogate-unseen.json" for seed in (1, 2))
         parts = [FinalistTest.read(folder.path / "finalists" / name).evaluation.distances for name in files]
         np.testing.assert_allclose(group.mean.distances, np.mean(parts, axis=0))
         np.testing.assert_array_equal(group.table("distances"), parts)
-    assert {row.agent for row in results.comparison} == {"sac", "qp"}
+    assert {row.agent for row in results.comparison} == {"policy", "qp"}
     assert results.cost.retraining_steps == 2 * 2 * 240
     assert results.cost.retraining_report_steps == 2 * 2 * 3 * 2 * 50
     curves = {(training.trial, training.seed): training.curve for training in results.trainings}

@@ -126,7 +126,7 @@ def test_average_over_seeds():
 
     def test(seed, distance):
         found = evaluation([distance], steps=2700, seconds=0.5)
-        return FinalistTest(1, "sac", "fem", "unseen", seed, found, {"mean_distance": distance}, [distance])
+        return FinalistTest(1, "policy", "fem", "unseen", seed, found, {"mean_distance": distance}, [distance])
 
     group = TestGroup([test(1, 1e-3), test(2, 3e-3)])
     assert group.mean.steps == 5400 and isinstance(group.mean.steps, int)
