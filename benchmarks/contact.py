@@ -363,7 +363,9 @@ def block_on_incline(
     friction: float = 0.5,
     size: tuple[float, float, float] = (0.02, 0.02, 0.01),
     rigid: bool = True,
+    cells: tuple[int, int, int] = (4, 4, 2),
     distance: float = 1e-4,
+    stiffness: float = 1e5,
 ) -> MechanicalModel:
     """Return a block on a plane, whose axes are those of the plane; gravity is turned."""
     angle = np.radians(degrees)
@@ -377,13 +379,13 @@ def block_on_incline(
         model.skins.append(box_skin(frame, half.tolist(), model.nodes))
         model.add("e", Point("centre", EmbeddedPoints.in_frame(frame, np.zeros(3), model.nodes)))
     else:
-        nodes, tetrahedra = box_mesh(size, (4, 4, 2))
+        nodes, tetrahedra = box_mesh(size, cells)
         nodes = nodes + [0.0, 0.0, 0.95 * distance]
         builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e6, poisson_ratio=0.3)
         model = builder.build()
         model.add("e", Point("centre", model.embed(centre)))
     plane = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), friction=friction)
-    model.set_contact(obstacles=[plane], settings=ContactSettings(distance=distance, stiffness=1e5))
+    model.set_contact(obstacles=[plane], settings=ContactSettings(distance=distance, stiffness=stiffness))
     return model
 
 
@@ -449,8 +451,7 @@ def bouncing(steps: Sequence[float] = (2e-4, 1e-4, 5e-5)) -> list[Row]:
     """Part of its energy that a block loses when it bounces without friction: of the order of the step."""
     rows = []
     for h in steps:
-        model = block_on_incline(0.0, friction=0.0, distance=2e-3)
-        model.contact.stiffness = 2e3  # type: ignore[union-attr]
+        model = block_on_incline(0.0, friction=0.0, distance=2e-3, stiffness=2e3)
         solver = Dynamics(model, step=h)
         velocity = np.zeros(model.equations)
         velocity[2] = -0.3

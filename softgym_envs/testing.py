@@ -149,6 +149,36 @@ def contact_slope(model: MechanicalModel, state: ContactState, x: np.ndarray) ->
     return slope + kinematics.map.transposed @ gradient[kinematics.frames.carried].ravel()
 
 
+def contact_errors(model: MechanicalModel, state: ContactState, x: np.ndarray, h: float) -> tuple[float, float]:
+    """Relative errors of gradient and tangent of the contact of a model with frames against central differences.
+
+    Args:
+        model: the model.
+        state: its contact. For the energy, limits of friction are held.
+        x: rows [m], shape (n, 3).
+        h: step of the differences [m].
+    """
+    kinematics, assembly = model.kinematics, model.assembly
+    assert kinematics.map is not None
+    ways = [[kinematics.displacement(x, s * h * e) for s in (1, -1)] for e in np.eye(kinematics.equations)]
+    slope = contact_slope(model, state, x)
+    terms = state.evaluate(x)
+    state.hold(terms)
+    differences = np.array([state.energy(x + plus) - state.energy(x + minus) for plus, minus in ways]) / (2 * h)
+    gradient_error = np.abs(differences - slope).max() / np.abs(slope).max()
+
+    tangent = (terms.tangent + terms.directions @ terms.loading.T).toarray()
+    # The curvature of frames, which the assembly adds.
+    values = np.zeros(len(assembly.keys))
+    arms = kinematics.map.linearise(x)
+    kinematics.map.add_curvature(values, arms, terms.gradient[kinematics.frames.carried], assembly.spin_target)
+    tangent += dense_tangent(model, values[: len(assembly.indices)])
+    differences = np.array(
+        [contact_slope(model, state, x + plus) - contact_slope(model, state, x + minus) for plus, minus in ways]
+    )
+    return float(gradient_error), float(np.abs(differences.T / (2 * h) - tangent).max() / np.abs(tangent).max())
+
+
 @dataclass(frozen=True)
 class DerivativeErrors:
     """Relative errors of a model's derivatives against central differences.

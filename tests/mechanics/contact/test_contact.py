@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.sparse import csc_matrix
 
+from benchmarks.contact import block_on_incline, bouncing
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
 from softgym_envs.mechanics.contact.law import barrier, friction, friction_energy
 from softgym_envs.mechanics.contact.obstacles import Plane, RoundedPrism, Sphere
-from softgym_envs.mechanics.elements.rigid import box_inertia
-from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.prediction import Bend
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh, contact_slope
+from softgym_envs.testing import box_mesh, contact_errors
 
 GRAVITY = 9.81
 
@@ -63,15 +59,9 @@ def test_friction_is_a_spring_that_slides(rng):
 
 
 @pytest.fixture
-def pressed(rng):
-    """A soft block between a fixed plane and a rigid box that carries an obstacle, turned and pushed a little."""
-    nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2))
-    builder = ModelBuilder(floating=True)
-    builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e6, poisson_ratio=0.3)
-    frame = builder.add_frame([0.01, 0.012, 0.0199])
-    builder.add_mass(frame, 0.01, 1e-6 * np.eye(3))
-    model = builder.build()
-    model.skins.append(box_skin(frame, (0.006, 0.005, 0.004), model.nodes))
+def pressed(rng, block_and_box):
+    """The block between a fixed plane and the box, which carries an obstacle; all turned and pushed a little."""
+    model, frame = block_and_box
     model.set_contact(
         obstacles=[
             Plane((0.0, 0.0, -2e-4), (0.1, 0.0, 1.0), friction=0.5),
@@ -91,26 +81,8 @@ def test_gradient_and_tangent_are_exact(pressed):
     model, state, x = pressed
     contacts = state.contacts(x)
     assert set(contacts.obstacle) == {0, 1, 2} and 0 < contacts.sliding.sum() < contacts.count
-    kinematics, h = model.kinematics, 1e-8
-    ways = [[kinematics.displacement(x, s * h * e) for s in (1, -1)] for e in np.eye(kinematics.equations)]
-    exact = contact_slope(model, state, x)
-    terms = state.evaluate(x)
-    state.hold(terms)
-    differences = np.array([state.energy(x + plus) - state.energy(x + minus) for plus, minus in ways]) / (2 * h)
-    assert np.abs(differences - exact).max() < 1e-7 * np.abs(exact).max()
-
-    tangent = (terms.tangent + terms.directions @ terms.loading.T).toarray()
-    # The curvature of frames, which the assembly adds.
-    assembly, values = model.assembly, np.zeros(len(model.assembly.keys))
-    arms = kinematics.map.linearise(x)
-    kinematics.map.add_curvature(values, arms, terms.gradient[kinematics.frames.carried], assembly.spin_target)
-    n = kinematics.equations
-    lower = csc_matrix((values[: len(assembly.indices)], assembly.indices, assembly.indptr), shape=(n, n)).toarray()
-    tangent += lower + np.tril(lower, -1).T
-    differences = np.array(
-        [contact_slope(model, state, x + plus) - contact_slope(model, state, x + minus) for plus, minus in ways]
-    )
-    assert np.abs(differences.T / (2 * h) - tangent).max() < 1e-6 * np.abs(tangent).max()
+    gradient, tangent = contact_errors(model, state, x, 1e-8)
+    assert gradient < 1e-7 and tangent < 1e-6
 
 
 def test_nothing_passes_through_an_obstacle(rng):
@@ -131,30 +103,6 @@ def test_nothing_passes_through_an_obstacle(rng):
 
 
 # -- blocks on planes -------------------------------------------------------------------------------------------------
-
-
-def block_on_incline(
-    degrees, *, coefficient=0.5, size=(0.02, 0.02, 0.01), rigid=False, cells=(5, 5, 3), distance=1e-4, stiffness=1e5
-):
-    angle = np.radians(degrees)
-    builder = ModelBuilder(floating=True, gravity=GRAVITY * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
-    half = 0.5 * np.array(size)
-    centre = half + [0.0, 0.0, 0.95 * distance]
-    if rigid:
-        frame = builder.add_frame(centre)
-        builder.add_mass(frame, 0.0044, box_inertia(0.0044, half))
-        model = builder.build()
-        model.skins.append(box_skin(frame, half, model.nodes))
-        model.add("e", Point("centre", EmbeddedPoints.in_frame(frame, np.zeros(3), model.nodes)))
-    else:
-        nodes, tetrahedra = box_mesh(size, cells)
-        nodes = nodes + [0.0, 0.0, 0.95 * distance]
-        builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e6, poisson_ratio=0.3)
-        model = builder.build()
-        model.add("e", Point("centre", model.embed(centre)))
-    plane = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), friction=coefficient, name="plane")
-    model.set_contact(obstacles=[plane], settings=ContactSettings(distance=distance, stiffness=stiffness))
-    return model
 
 
 @pytest.mark.parametrize("rigid", [False, True], ids=["soft", "rigid"])
@@ -179,9 +127,9 @@ def test_tall_block_tips_over_at_the_analytical_angle():
     """
     size = (0.008, 0.02, 0.02)
     limit = np.degrees(np.arctan(size[0] / size[2]))
-    Statics(block_on_incline(limit - 0.3, size=size, rigid=True, coefficient=0.8, distance=1e-5)).solve([])
+    Statics(block_on_incline(limit - 0.3, size=size, rigid=True, friction=0.8, distance=1e-5)).solve([])
     with pytest.raises(ConvergenceError):
-        Statics(block_on_incline(limit + 0.3, size=size, rigid=True, coefficient=0.8, distance=1e-5)).solve([])
+        Statics(block_on_incline(limit + 0.3, size=size, rigid=True, friction=0.8, distance=1e-5)).solve([])
 
 
 @pytest.mark.parametrize("rigid", [False, True], ids=["soft", "rigid"])
@@ -204,18 +152,7 @@ def test_sliding_block_accelerates_as_coulomb_says(rigid):
 
 def test_bouncing_block_returns_its_energy_as_steps_shrink():
     """Without friction and damping a dropped rigid block comes back; the first-order scheme loses energy like h."""
-    lost = []
-    for h in (2e-4, 1e-4, 5e-5):
-        model = block_on_incline(0.0, rigid=True, coefficient=0.0, distance=2e-3, stiffness=2e3)
-        solver = Dynamics(model, step=h)
-        velocity = np.zeros(model.equations)
-        velocity[2] = -0.3
-        solver.launch(velocity)
-        start = sum(solver.energies())
-        for _ in range(int(0.04 / h)):
-            motion = solver.advance([])
-        lost.append((start - motion.energy) / (0.5 * model.mass * 0.3**2))
-        assert motion.equilibrium.contacts.count == 0
+    lost = [row.value for row in bouncing((2e-4, 1e-4, 5e-5))]
     assert 0.0 < lost[2] < lost[1] < lost[0] < 0.5
     assert lost[1] / lost[2] == pytest.approx(2.0, rel=0.15)
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.sparse import csc_matrix
 
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
@@ -15,7 +14,7 @@ from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh, contact_slope
+from softgym_envs.testing import box_mesh, contact_errors
 
 
 def mesh_box(half, cells, centre=(0.0, 0.0, 0.0), **options):
@@ -30,15 +29,9 @@ FLOOR = mesh_box((0.03, 0.03, 0.005), (3, 3, 1), (0.01, 0.01, -0.0052), friction
 
 
 @pytest.fixture
-def pressed(rng):
-    """A soft block between a meshed floor and a rigid box that carries a meshed obstacle around it, moved a little."""
-    nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2))
-    builder = ModelBuilder(floating=True)
-    builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e6, poisson_ratio=0.3)
-    frame = builder.add_frame([0.01, 0.012, 0.0199])
-    builder.add_mass(frame, 0.01, 1e-6 * np.eye(3))
-    model = builder.build()
-    model.skins.append(box_skin(frame, (0.006, 0.005, 0.004), model.nodes))
+def pressed(rng, block_and_box):
+    """The block between a meshed floor and the box, which carries a meshed obstacle around it; all moved a little."""
+    model, frame = block_and_box
     lid = mesh_box((0.008, 0.007, 0.0096), (2, 2, 2), friction=0.4, frame=frame)
     model.set_contact(obstacles=[FLOOR, lid], settings=ContactSettings(distance=6e-4))
     step = 1e-5 * rng.normal(size=model.equations)
@@ -52,23 +45,8 @@ def test_gradient_and_tangent_are_exact(pressed):
     assert model.contact.intersections(x) is None
     total = state.contacts(x).total
     assert total[0, 2] > 0.01 and total[1, 2] < -0.01
-    kinematics, h = model.kinematics, 1e-9
-    ways = [[kinematics.displacement(x, s * h * e) for s in (1, -1)] for e in np.eye(kinematics.equations)]
-    exact = contact_slope(model, state, x)
-    differences = np.array([state.energy(x + plus) - state.energy(x + minus) for plus, minus in ways]) / (2 * h)
-    assert np.abs(differences - exact).max() < 1e-6 * np.abs(exact).max()
-
-    terms = state.evaluate(x)
-    assembly, values = model.assembly, np.zeros(len(model.assembly.keys))
-    arms = kinematics.map.linearise(x)
-    kinematics.map.add_curvature(values, arms, terms.gradient[kinematics.frames.carried], assembly.spin_target)
-    n = kinematics.equations
-    lower = csc_matrix((values[: len(assembly.indices)], assembly.indices, assembly.indptr), shape=(n, n)).toarray()
-    tangent = terms.tangent.toarray() + lower + np.tril(lower, -1).T
-    differences = np.array(
-        [contact_slope(model, state, x + plus) - contact_slope(model, state, x + minus) for plus, minus in ways]
-    )
-    assert np.abs(differences.T / (2 * h) - tangent).max() < 1e-6 * np.abs(tangent).max()
+    gradient, tangent = contact_errors(model, state, x, 1e-9)
+    assert gradient < 1e-6 and tangent < 1e-6
 
 
 def test_a_part_does_not_touch_the_obstacle_that_it_carries(pressed):
