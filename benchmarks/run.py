@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,10 @@ from benchmarks import (
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, unknown_name
 from softgym_envs.storage import write_json
+
+ROOT = Path(__file__).resolve().parent.parent
+RECORDS = ROOT / "benchmarks" / "results.json"
+"""Recorded results: each of a commit that anyone can run again."""
 
 BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "fem_step": speed.fem_step,
@@ -87,6 +92,7 @@ def run(names: Sequence[str], output: str | Path) -> dict[str, dict[str, object]
     """
     chosen = [full for name in names for full in matching(name)] or list(BENCHMARKS)
     kept = _read(Path(output))
+    origin = _origin(Path(output))
     results: dict[str, dict[str, object]] = {}
     for name in chosen:
         click.echo(f"\n{name}: {(BENCHMARKS[name].__doc__ or '').splitlines()[0]}")
@@ -94,7 +100,7 @@ def run(names: Sequence[str], output: str | Path) -> dict[str, dict[str, object]
         for key, value in results[name].items():
             click.echo(f"  {key:58s} {value:.6g}" if isinstance(value, float) else f"  {key:58s} {value}")
         machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
-        kept[name] = {"results": results[name], "machine": machine, **provenance()}
+        kept[name] = {"results": results[name], "machine": machine, **origin, "time": provenance()["time"]}
         write_json(output, kept)
     click.echo(f"\nwrote {output}")
     return results
@@ -106,6 +112,22 @@ def matching(name: str) -> list[str]:
     if not found:
         raise ConfigError(unknown_name("benchmark", name, BENCHMARKS))
     return [name] if name in BENCHMARKS else found
+
+
+def _origin(output: Path) -> dict[str, Any]:
+    """Return the origin of results before any are written; earlier ones in the records do not count as changes."""
+    origin = provenance()
+    if output.resolve() == RECORDS:
+        command = ["git", "-C", str(ROOT), "status", "--porcelain", "--untracked-files=no", "--", "."]
+        command.append(f":!{RECORDS.relative_to(ROOT)}")
+        changed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\n")
+        if changed != [""]:
+            raise ConfigError(
+                f"'{RECORDS.name}' holds results of committed code only, but {changed[0][3:]} is changed; "
+                "commit first, or name another --output"
+            )
+        origin["commit"] = origin["commit"].removesuffix("-dirty")
+    return origin
 
 
 def _read(path: Path) -> dict[str, Any]:
