@@ -93,25 +93,24 @@ _GAUSS = np.full((4, 4), _B) + (_A - _B) * np.eye(4)
 @njit(cache=True, error_model="numpy")
 def _add_tangent(connectivity, points, gradients, weights, tangent, scatter, out):
     k = connectivity.shape[1]
-    half = np.empty((3 * k, 9))
+    half = np.empty(9)
     element = np.empty((3 * k, 3 * k))
     for e in range(connectivity.shape[0]):
         element[:, :] = 0.0
         for q in range(e * points, (e + 1) * points):
             g = gradients[q]
             c = tangent[q]
+            w = weights[q]
             for a in range(k):
+                g0, g1, g2 = w * g[a, 0], w * g[a, 1], w * g[a, 2]
                 for i in range(3):
                     for p in range(9):
-                        half[3 * a + i, p] = weights[q] * (
-                            g[a, 0] * c[3 * i, p] + g[a, 1] * c[3 * i + 1, p] + g[a, 2] * c[3 * i + 2, p]
-                        )
-            for r in range(3 * k):
-                for b in range(r // 3 + 1):
-                    for j in range(3):
-                        element[r, 3 * b + j] += (
-                            half[r, 3 * j] * g[b, 0] + half[r, 3 * j + 1] * g[b, 1] + half[r, 3 * j + 2] * g[b, 2]
-                        )
+                        half[p] = g0 * c[3 * i, p] + g1 * c[3 * i + 1, p] + g2 * c[3 * i + 2, p]
+                    for b in range(a + 1):
+                        for j in range(3):
+                            element[3 * a + i, 3 * b + j] += (
+                                half[3 * j] * g[b, 0] + half[3 * j + 1] * g[b, 1] + half[3 * j + 2] * g[b, 2]
+                            )
         m = 0
         for r in range(3 * k):
             for s in range(r + 1):

@@ -45,28 +45,22 @@ def add_forces(connectivity, points, gradients, weights, stress, out):
 @njit(cache=True, error_model="numpy")
 def _add_tangent(gradients, volumes, tangent, scatter, out):
     """Add the lower triangle of each 12 x 12 element matrix to the CSC values ``out`` through ``scatter``."""
-    half = np.empty((12, 9))
+    half = np.empty(9)  # one row of the element matrix before the second product with gradients
     for e in range(gradients.shape[0]):
-        v = volumes[e]
         g = gradients[e]
         c = tangent[e]
+        k = 0
         for a in range(4):
+            g0, g1, g2 = volumes[e] * g[a, 0], volumes[e] * g[a, 1], volumes[e] * g[a, 2]
             for i in range(3):
                 for q in range(9):
-                    half[3 * a + i, q] = v * (
-                        g[a, 0] * c[3 * i, q] + g[a, 1] * c[3 * i + 1, q] + g[a, 2] * c[3 * i + 2, q]
-                    )
-        k = 0
-        for r in range(12):
-            for s in range(r + 1):
-                b = s // 3
-                j = s - 3 * b
-                target = scatter[e, k]
-                k += 1
-                if target >= 0:
-                    out[target] += (
-                        half[r, 3 * j] * g[b, 0] + half[r, 3 * j + 1] * g[b, 1] + half[r, 3 * j + 2] * g[b, 2]
-                    )
+                    half[q] = g0 * c[3 * i, q] + g1 * c[3 * i + 1, q] + g2 * c[3 * i + 2, q]
+                for b in range(a + 1):
+                    for j in range(3 if b < a else i + 1):
+                        target = scatter[e, k]
+                        k += 1
+                        if target >= 0:
+                            out[target] += half[3 * j] * g[b, 0] + half[3 * j + 1] * g[b, 1] + half[3 * j + 2] * g[b, 2]
 
 
 @njit(cache=True, error_model="numpy")
