@@ -124,7 +124,7 @@ class EnvironmentConfig(Config):
         row = self.row
         if row.robot is None:
             raise ValueError(f"environment '{self.id}' needs a robot: give robot and task in place of the id")
-        return make_robot(row.robot, **{**row.robot_options, **self.robot_options})
+        return make_robot(row.robot, **{**row.robot_options_on(self.backend), **self.robot_options})
 
     def _spec(self) -> EnvSpec:
         return self.row.spec(self.id or "SoftGym/Configured-v0")

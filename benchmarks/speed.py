@@ -200,10 +200,11 @@ def fem_speed() -> dict[str, object]:
 
     result: dict[str, object] = {}
     for identifier, row in ENVIRONMENTS.items():
-        finer = _finer(make_robot(row.robot, **row.robot_options))
+        own = row.robot_options_on("fem")
+        finer = _finer(make_robot(row.robot, **own))
         cases = [("", {}, 20, 5), *([(", fine", finer, 5, 3)] if finer else [])]
         for label, more, steps, repeats in cases:
-            found = _environment_speed(identifier, {**row.robot_options, **more}, steps, repeats)
+            found = _environment_speed(identifier, {**own, **more}, steps, repeats)
             result |= {f"{identifier.removeprefix('SoftGym/')}{label}: {key}": value for key, value in found.items()}
     return result
 

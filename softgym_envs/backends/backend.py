@@ -11,7 +11,7 @@ import numpy as np
 
 from softgym_envs.designs import Design
 from softgym_envs.mechanics.condensation import CondensedModel
-from softgym_envs.mechanics.contact.contact import ContactMemory, Contacts
+from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.mechanics.solvers.dynamics import Motion
 from softgym_envs.robots.base import Robot
 
@@ -51,7 +51,7 @@ class State:
         trusted: the state lies where the learned model may be trusted; always True for FEM.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
         contacts: where the body touches, with forces and gaps; None if it cannot touch anything.
-        memory: what friction remembers; None without finite elements or contact.
+        memory: what the backend needs to go on from here where friction depends on the path; None without contact.
     """
 
     command: np.ndarray
@@ -68,7 +68,7 @@ class State:
     uncertainty: float = 0.0
     trusted: bool = True
     contacts: Contacts | None = None
-    memory: ContactMemory | None = None
+    memory: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy holds the condensed model itself, not the learned model that evaluates it.

@@ -21,6 +21,17 @@ BACKENDS = Registry(
 )
 """Backends by name."""
 
+CHAINS = Registry(
+    "backend",
+    {
+        "fem": "softgym_envs.backends.fem:FEMBackend",
+        "surrogate": "softgym_envs.backends.chain:ChainBackend",
+        "hybrid": "softgym_envs.backends.hybrid_chain:HybridChainBackend",
+    },
+    base="softgym_envs.backends.backend:Backend",
+)
+"""Backends of robots that are learned as chains, by the same names."""
+
 
 def make_backend(name: str, robot: Robot, **options: object) -> Backend:
     """Return the backend with a name, for a robot.
@@ -28,4 +39,4 @@ def make_backend(name: str, robot: Robot, **options: object) -> Backend:
     Raises:
         ValueError: for an unknown name or option.
     """
-    return BACKENDS.make(name, robot, **options)
+    return (CHAINS if robot.learned == "chain" else BACKENDS).make(name, robot, **options)

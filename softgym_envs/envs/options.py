@@ -30,8 +30,8 @@ class EnvironmentOptions:
         robot_options: options of the robot.
         task_options: options of the task.
         backend_options: options of the backend; in batched environments ``weights`` and ``members``.
-        defaults: options of the environment's ID, which those above override one by one; its ``backend_options`` apply
-            to its ``backend`` only.
+        defaults: options of the environment's ID, which those above override one by one; its ``backend_options``
+            and ``backend_mesh`` (options of the robot) apply to its ``backend`` only.
     """
 
     design: Mapping[str, float] | None = None
@@ -110,7 +110,10 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
     defaults = options.defaults or {}
     if robot is None:
         raise ValueError("robot is missing; allowed: a registered name, 'module:class', a class or an object")
-    made = make_robot(robot, **{**defaults.get("robot_options", {}), **(options.robot_options or {})})
+    robot_options = {**defaults.get("robot_options", {}), **(options.robot_options or {})}
+    if backend in (None, defaults.get("backend")):
+        robot_options = {**defaults.get("backend_mesh", {}), **robot_options}
+    made = make_robot(robot, **robot_options)
     backend_options = dict(options.backend_options or {})
     if backend is None:
         backend = default_backend(made, backend_options)

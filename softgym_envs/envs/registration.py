@@ -30,6 +30,7 @@ class EnvironmentRow:
         robot_options: options of the robot.
         task_options: options of the task.
         backend_options: options of that backend.
+        backend_mesh: options of the robot on that backend only, such as a coarse mesh for finite elements.
     """
 
     robot: RobotSource | None
@@ -39,6 +40,7 @@ class EnvironmentRow:
     robot_options: Mapping[str, Any] = field(default_factory=dict)
     task_options: Mapping[str, Any] = field(default_factory=dict)
     backend_options: Mapping[str, Any] = field(default_factory=dict)
+    backend_mesh: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def defaults(self) -> dict[str, Any]:
@@ -47,8 +49,13 @@ class EnvironmentRow:
         They are passed as one option because ``gymnasium.make`` replaces whole mappings: the user's ``robot_options``
         would otherwise replace all of these.
         """
-        options = ("robot_options", "task_options", "backend_options")
+        options = ("robot_options", "task_options", "backend_options", "backend_mesh")
         return {"defaults": {"backend": self.backend, **{name: dict(getattr(self, name)) for name in options}}}
+
+    def robot_options_on(self, backend: str | None) -> dict[str, Any]:
+        """Return the options of the robot on a backend; None for that of this row."""
+        mesh = self.backend_mesh if backend in (None, self.backend) else {}
+        return {**mesh, **self.robot_options}
 
     def spec(self, id: str) -> EnvSpec:
         """Return Gymnasium's specification of the environment, under an ID."""
@@ -88,7 +95,7 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/FingerPress-v0": _row("press_finger", "track", 100),
     "SoftGym/GripperPinch-v0": _row("two_finger_gripper", "track", 100),
     "SoftGym/GripperManipulate-v0": _row("three_finger_gripper", "track", 100),
-    "SoftGym/FingerGrasp-v0": _row("grasping_finger", "grasp", 25, backend="fem", robot_options=COARSE),
+    "SoftGym/FingerGrasp-v0": _row("grasping_finger", "grasp", 25, backend="fem", backend_mesh=COARSE),
     "SoftGym/GripperLift-v0": _row(
         "contact_aided_gripper", "lift", 50, backend="fem", robot_options=COARSE, backend_options=SLOW
     ),

@@ -7,6 +7,7 @@ faces the object, which is at larger x.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,6 +18,7 @@ from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
+from softgym_envs.mechanics.contact.obstacles import Obstacle
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
@@ -70,6 +72,7 @@ class ContactAidedFinger(MeshedRobot):
     goal_axes = np.array([1.0, 1.0, 0.0])
     rest_mode = "displacement"
     convex = False
+    learned = "chain"
     meshes = {
         "published": MeshTier(3.0e-3),
         "accurate": MeshTier(8.0e-3, "quadratic"),
@@ -126,6 +129,25 @@ class ContactAidedFinger(MeshedRobot):
         self.actuators = (
             Actuator("servo", 0.0, math.radians(40.0), math.radians(1.0), "rad", unilateral=False, max_effort=1.2),
         )
+
+    # -- what it touches --------------------------------------------------------------------------------------------
+
+    @property
+    def alone(self) -> ContactAidedFinger:
+        """The same finger without anything to touch: what learned chains stand for."""
+        own = inspect.signature(ContactAidedFinger).parameters
+        return ContactAidedFinger(**{name: value for name, value in self.mechanics_key.items() if name in own})
+
+    def surroundings(self, design: Mapping[str, float]) -> tuple[Obstacle, ...]:
+        """Return the obstacles of a complete design, those among the options included, for a learned chain.
+
+        Raises:
+            ValueError: for meshed obstacles, which chains cannot touch.
+        """
+        solid = tuple(each for each in self.obstacles if isinstance(each, Obstacle))
+        if len(solid) < len(self.obstacles):
+            raise ValueError(f"robot '{self.name}' touches meshed obstacles, which needs backend='fem'")
+        return solid
 
     # -- shape ------------------------------------------------------------------------------------------------------
 

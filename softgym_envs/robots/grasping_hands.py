@@ -75,11 +75,18 @@ class GraspingFinger(ContactAidedFinger):
 
     def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> tuple[Obstacle, ...]:
         """Return the object in front of the finger."""
+        return (self.target(design).obstacle(self.width),)
+
+    def surroundings(self, design: Mapping[str, float]) -> tuple[Obstacle, ...]:
+        return (self.target(design).obstacle(self.width), *super().surroundings(design))
+
+    def target(self, design: Mapping[str, float]) -> GraspObject:
+        """Return the object of a complete design."""
         kind = self.object if self.object != "any" else KINDS[min(int(design["object_kind"]), len(KINDS) - 1)]
         place = {"distance": design["object_gap"], "friction": design["friction"]}
         if self.object != "plane":
             place |= {"height": design["object_height"], "size": design["object_size"]}
-        return (GraspObject(kind, **place).obstacle(self.width),)
+        return GraspObject(kind, **place)
 
 
 class ContactAidedGripper(Robot):

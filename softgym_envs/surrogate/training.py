@@ -55,6 +55,7 @@ class DataConfig(Config):
     vary: tuple[str, ...] | None = None
     design: dict[str, float] = {}
     bounds: dict[str, tuple[float, float]] = {}
+    alike: tuple[str, ...] = ()
 
     @model_validator(mode="before")
     @classmethod

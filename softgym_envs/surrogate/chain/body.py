@@ -38,6 +38,8 @@ class ChainBodies:
         areas: of the points [m2], shape (S, P).
         effector_arms: from the node of each effector to it [m], shape (S, e, 2).
         markers: points whose compliance is learned [m], shape (S, m, 2).
+        fold_arms: from their nodes to the corners that can touch each other [m], shape (S, c, 2).
+        fold_sides: on which side of the edge the corner of each fold is, 1 or -1, shape (S, f).
     """
 
     nodes: np.ndarray
@@ -48,6 +50,8 @@ class ChainBodies:
     areas: np.ndarray
     effector_arms: np.ndarray
     markers: np.ndarray
+    fold_arms: np.ndarray
+    fold_sides: np.ndarray
 
     @cached_property
     def spans(self) -> np.ndarray:
@@ -74,6 +78,8 @@ class FingerChain:
         skin_heights: z of the points [m], shape (P,).
         effectors: node of each effector, shape (1,).
         marker_nodes: node of each marker, shape (m,).
+        fold_nodes: node of each corner that can touch another part of the finger, shape (c,).
+        folds: corners, each with both corners of an edge that it can touch, shape (f, 3).
 
     Raises:
         ValueError: for another robot.
@@ -104,6 +110,9 @@ class FingerChain:
         zigzag = self.first + 1 + np.arange(n)
         leg = np.arange(LEG_SEGMENTS, 0, -1)
         self.marker_nodes = np.concatenate([[self.first, self.first], zigzag, [self.first], zigzag, leg])
+        line = self.first + np.arange(n + 2)
+        self.fold_nodes = np.concatenate([line, line, np.arange(LEG_SEGMENTS + 1)])
+        self.folds = _folds(n + 2)
 
     def bodies(self, designs: np.ndarray) -> ChainBodies:
         """Divide bodies, given as designs (S, len(space)) in the order of the design space."""
@@ -158,9 +167,13 @@ class FingerChain:
         drive = np.concatenate([np.tile(axis, (count, 1)), nodes[:, 0] - axis], axis=1)
         tip = np.stack([zero + robot.width, robot.length - 0.5 * e2], axis=1)
         # The face of the left leg that the zigzag can touch.
-        leg_face = np.stack([widths, top[:, None] * up], axis=2)[:, :0:-1]
+        leg_face = np.stack([widths, top[:, None] * up], axis=2)
+        corners = np.concatenate([outer, inner, leg_face], axis=1)
+        corner, start, end = (corners[:, self.folds[:, k]] for k in range(3))
+        edge, way = end - start, corner - start
         markers = np.concatenate(
-            [edge_corners[:, :2], outer[:, 1 : n + 1], inner[:, :1], inner[:, 1 : n + 1], leg_face], axis=1
+            [edge_corners[:, :2], outer[:, 1 : n + 1], inner[:, :1], inner[:, 1 : n + 1], leg_face[:, :0:-1]],
+            axis=1,
         )
         return ChainBodies(
             nodes=nodes,
@@ -171,6 +184,8 @@ class FingerChain:
             areas=np.repeat(areas, rows, axis=1),
             effector_arms=(tip - nodes[:, self.first])[:, None],
             markers=markers,
+            fold_arms=corners - nodes[:, self.fold_nodes],
+            fold_sides=np.sign(edge[..., 0] * way[..., 1] - edge[..., 1] * way[..., 0]),
         )
 
     def _features(
@@ -208,3 +223,23 @@ class FingerChain:
                 ]
             ),
         }
+
+
+def _folds(count: int) -> np.ndarray:
+    """Return which corners can touch which edges, shape (f, 3): a corner, and both corners of the edge.
+
+    Corners are those of the outer face of the zigzag leg, of its inner face (``count`` each, from the top), and of the
+    left leg from below. A corner of a face can touch every edge of that face that does not end there; one of the inner
+    face can also touch the left leg below its uppermost part.
+    """
+    rows = [
+        (start + k, start + edge, start + edge + 1)
+        for start in (0, count)
+        for k in range(count)
+        for edge in range(count - 1)
+        if k not in (edge, edge + 1)
+    ]
+    rows += [
+        (count + k, 2 * count + edge, 2 * count + edge + 1) for k in range(1, count) for edge in range(LEG_SEGMENTS)
+    ]
+    return np.array(rows)

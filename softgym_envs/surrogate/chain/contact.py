@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane, RoundedPrism, Sphere
-from softgym_envs.surrogate.chain.equilibrium import advance, condense, touching
+from softgym_envs.surrogate.chain.equilibrium import advance, clearances, condense, touching
 from softgym_envs.surrogate.chain.kernels import PARAMETERS, PLANE, PRISM, ROUND
 from softgym_envs.surrogate.chain.model import PreparedChains, carried_points
 
@@ -81,6 +81,8 @@ class ChainStates:
         points: number of points of the skin in contact, shape (B,).
         sliding: number of those whose friction has reached its limit, shape (B,).
         gap: smallest distance to an obstacle [m], shape (B,); inf without obstacles.
+        clearance: smallest distance between parts of the body that a fold can bring together [m], shape (B,). Forces
+            between them are not part of a chain: where it is smaller than the distance of contact, they are missing.
         found: shape (B,).
     """
 
@@ -91,6 +93,7 @@ class ChainStates:
     points: np.ndarray
     sliding: np.ndarray
     gap: np.ndarray
+    clearance: np.ndarray
     found: np.ndarray
 
 
@@ -211,6 +214,7 @@ class ChainBatch:
             points=near.any(axis=1).sum(axis=1),
             sliding=(near & touch.sliding).any(axis=1).sum(axis=1),
             gap=touch.gaps.min(axis=(1, 2), initial=np.inf),
+            clearance=self._clearance(),
             found=self._found.copy(),
         )
 
@@ -236,9 +240,18 @@ class ChainBatch:
         )  # fmt: skip
         return found
 
+    def _clearance(self) -> np.ndarray:
+        chain, bodies, found = self.prepared.chain, self.prepared.bodies, np.empty(len(self.slot))
+        clearances(self._q, self.slot, chain.fold_nodes, bodies.fold_arms, chain.folds, bodies.fold_sides, found)
+        return found
+
     def _tips(self) -> np.ndarray:
         chain, bodies = self.prepared.chain, self.prepared.bodies
         return carried_points(self._q, chain.effectors, bodies.effector_arms[self.slot])
+
+    def scene(self, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return copies of the obstacles of a row, as the solver takes them, and of its law of contact."""
+        return self._table[row].copy(), self._edges[row].copy(), self._law[row].copy()
 
     @property
     def memory(self) -> Memory:

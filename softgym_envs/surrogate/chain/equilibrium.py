@@ -15,13 +15,17 @@ from softgym_envs.surrogate.chain.kernels import (
     energy_of,
     factorise,
     gap_of,
+    points_near,
     skin_point,
     substitute,
     touch,
+    turns,
 )
 
 TOLERANCE = 1e-9
 """A search ends when its last step moves no node further than this [m]."""
+DEEPEST = 3e-3
+"""Distance [m] up to which a corner on the wrong side of an edge has gone through it."""
 MAX_HALVINGS = 6
 """An increment that fails is cut in halves this many times."""
 
@@ -96,12 +100,15 @@ def find(q, angle, target, drive, length, along, stiffness, skin, obstacles, edg
         part = min(1.0, min(MAX_STEP / max(far_step, 1e-30), MAX_TURN / max(turn, 1e-30)))
         part = min(part, MAX_TURN / max(abs(left), 1e-30))
         limits[:, :] = 0.0
+        turned = turns(q)
+        near = points_near(q, turned, skin, obstacles, edges, law[0])
         for k in range(len(areas)):
             for o in range(len(obstacles)):
-                if obstacles[o, 1] > 0.0:
+                if near[k] and obstacles[o, 1] > 0.0:
                     skin_point(
-                        q, nodes[k, 0], nodes[k, 1], shares[k], arms[k, :2], arms[k, 2:], heights[k], p, arm, far
-                    )
+                        q, turned, nodes[k, 0], nodes[k, 1], shares[k], arms[k, :2], arms[k, 2:], heights[k], p, arm,
+                        far,
+                    )  # fmt: skip
                     pressing = touch(p, areas[k], obstacles[o], edges[o], anchors[o, k], law, True, pull, tangent)[2]
                     limits[o, k] = obstacles[o, 1] * pressing
         accepted = False
@@ -128,8 +135,9 @@ def commit(q, skin, obstacles, edges, anchors, law):
     nodes, shares, arms, heights, areas = skin
     p, arm, far, pull, tangent = np.empty(3), np.empty(2), np.empty(2), np.empty(2), np.empty((2, 2))
     normal, curvature = np.empty(3), np.empty((3, 3))
+    turned = turns(q)
     for k in range(len(areas)):
-        skin_point(q, nodes[k, 0], nodes[k, 1], shares[k], arms[k, :2], arms[k, 2:], heights[k], p, arm, far)
+        skin_point(q, turned, nodes[k, 0], nodes[k, 1], shares[k], arms[k, :2], arms[k, 2:], heights[k], p, arm, far)
         for o in range(len(obstacles)):
             anchor = anchors[o, k]
             pressing = touch(p, areas[k], obstacles[o], edges[o], anchor, law, True, pull, tangent)[2]
@@ -275,10 +283,21 @@ def touching(
     arm, far, pull, tangent = np.empty(2), np.empty(2), np.empty(2), np.empty((2, 2))
     for b in range(len(q)):
         s = slot[b]
+        turned = turns(q[b])
         for k in range(len(heights)):
             p = points[b, k]
             skin_point(
-                q[b], nodes[k, 0], nodes[k, 1], shares[k], arms[s, k, :2], arms[s, k, 2:], heights[k], p, arm, far
+                q[b],
+                turned,
+                nodes[k, 0],
+                nodes[k, 1],
+                shares[k],
+                arms[s, k, :2],
+                arms[s, k, 2:],
+                heights[k],
+                p,
+                arm,
+                far,
             )
             for o in range(obstacles.shape[1]):
                 _, gap, normal, slides = touch(
@@ -286,3 +305,33 @@ def touching(
                 )
                 gaps[b, o, k], pressing[b, o, k], sliding[b, o, k] = gap, normal, slides
                 forces[b, o, k, 0], forces[b, o, k, 1] = -pull[0], -pull[1]
+
+
+@njit(cache=True, error_model="numpy")
+def clearances(q, slot, nodes, arms, folds, sides, found):
+    """Fill the smallest distance (B,) [m] between corners and edges of the same body; negative if a corner is through.
+
+    ``nodes`` (c,) carry the corners on ``arms`` (S, c, 2); ``folds`` (f, 3) are corners with both ends of an edge, and
+    ``sides`` (S, f) tell on which side of the edge the corner is at rest.
+    """
+    count = len(nodes)
+    p = np.empty((count, 2))
+    for b in range(len(q)):
+        body = slot[b]
+        for k in range(count):
+            node = nodes[k]
+            x, y = arms[body, k]
+            c, s = math.cos(q[b, node, 2]), math.sin(q[b, node, 2])
+            p[k, 0], p[k, 1] = q[b, node, 0] + c * x - s * y, q[b, node, 1] + s * x + c * y
+        smallest = np.inf
+        for f in range(len(folds)):
+            k, i, j = folds[f]
+            ex, ey = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1]
+            dx, dy = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1]
+            part = (dx * ex + dy * ey) / (ex * ex + ey * ey)
+            near = min(1.0, max(0.0, part))
+            gap = math.sqrt((dx - near * ex) ** 2 + (dy - near * ey) ** 2)
+            if gap < DEEPEST and part == near and (ex * dy - ey * dx) * sides[body, f] < 0.0:
+                gap = -gap
+            smallest = min(smallest, gap)
+        found[b] = smallest

@@ -49,6 +49,7 @@ class PreparedChains:
         relative: Young's modulus relative to the baseline, shape (S,).
         known: whether the design lies where the chain was trained and the members agree about it, shape (S,).
         uncertainty: bound on the relative error of the compliance, shape (S,).
+        tip_uncertainty: bound on 95 % of the errors of the tip in contact [m], shape (S,).
         depth: compliance of the tip along z at the baseline modulus [m/N], shape (S,).
     """
 
@@ -58,6 +59,7 @@ class PreparedChains:
     relative: np.ndarray
     known: np.ndarray
     uncertainty: np.ndarray
+    tip_uncertainty: np.ndarray
     depth: np.ndarray
 
     def __len__(self) -> int:
@@ -123,6 +125,7 @@ class ChainModel:
         self.card = dict(card)
         domain = self.card.get("domain", {})
         self._inflation, self._limit = float(domain.get("inflation", 1.0)), float(domain.get("limit", np.inf))
+        self._tip_inflation = float(domain.get("tip_inflation", 1.0))
         names = robot.design_space.names
         self._low, self._high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
         for name, (low, high) in domain.get("design", {}).items():
@@ -148,6 +151,7 @@ class ChainModel:
             relative=relative_stiffness(self.robot, designs),
             known=inside & (spread <= self._limit),
             uncertainty=self._inflation * spread,
+            tip_uncertainty=self._tip_inflation * spread,
             depth=self.depth(designs),
         )
 

@@ -102,9 +102,10 @@ class ChainNet(nn.Module):
         blocks = frame.strain.mT @ self.stiffness(frame) @ frame.strain
         count, segments = blocks.shape[:2]
         size = 3 * (segments + 1)
-        K = blocks.new_zeros(count, size, size)
-        for k in range(segments):
-            K[:, 3 * k : 3 * k + 6, 3 * k : 3 * k + 6] += blocks[:, k]
+        # Where the entries of all blocks lie in the flattened matrix.
+        rows = 3 * torch.arange(segments)[:, None] + torch.arange(6)
+        places = (size * rows[:, :, None] + rows[:, None]).ravel()
+        K = blocks.new_zeros(count, size * size).index_add(1, places, blocks.reshape(count, -1)).view(count, size, size)
         free = slice(3, size - 3)
         drive = frame.drive[:, :, None]
         across = K[:, free, :3] @ drive

@@ -18,9 +18,12 @@ import numpy as np
 from pydantic import Field
 
 from softgym_envs.executors import parallel_map
+from softgym_envs.robots.grasping_hands import GraspingFinger
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.chain.body import FingerChain
+from softgym_envs.surrogate.chain.closings import closing_errors, kept_closings, summary
+from softgym_envs.surrogate.chain.contact import DISTANCE
 from softgym_envs.surrogate.chain.model import ChainModel, depth_features, relative_stiffness, save_chain
 from softgym_envs.surrogate.data.states import full_compliance
 from softgym_envs.surrogate.trainer import History, Trainer, TrainingOptions
@@ -43,9 +46,15 @@ class Options(TrainingOptions):
 
 
 class ChainConfig(FitConfig):
-    """Configuration of a learned chain: data of `MarkedFinger` and the networks of the segments."""
+    """Configuration of a learned chain: data of `MarkedFinger` and the networks of the segments.
+
+    Attributes:
+        closings: number of bodies of the validation set, and of the test set, that finite elements also close on
+            objects.
+    """
 
     network: Options = Options()
+    closings: int = Field(default=12, gt=0)
 
 
 class Rows(NamedTuple):
@@ -218,6 +227,11 @@ def domain_of(
     }
 
 
+def _bodies(data: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the bodies of a dataset, shape (S, len(space))."""
+    return data["design"][data["rest"].astype(bool)]
+
+
 def fit_chain(
     config: ChainConfig, folder: str | Path, data_folder: str | Path, *, progress: bool = True
 ) -> dict[str, float]:
@@ -250,9 +264,26 @@ def fit_chain(
     seconds = time.perf_counter() - start
     model = ChainModel(chain.robot, tensors, {})
     errors = measure_errors(model, data["test"])
+    finger = GraspingFinger(object="any", **config.robot_options)
+    contact = {
+        split: kept_closings(
+            data_folder / split / "closings.npz", finger, _bodies(data[split])[: config.closings], config.seed
+        )
+        for split in ("validation", "test")
+    }
+    domain = domain_of(model, data["train"], data["validation"])
+    # The box and the limit of the spread decide which closings count.
+    model = ChainModel(chain.robot, tensors, {"domain": domain})
+    found = closing_errors(model, finger, contact["validation"])
+    trusted = np.isfinite(found.tip) & (found.clearance > DISTANCE) & found.known[:, None]
+    domain["tip_inflation"] = float(np.quantile((found.tip / found.spread[:, None])[trusted], 0.95))
+    errors |= {
+        f"contact_{name}": value
+        for name, value in summary(closing_errors(model, finger, contact["test"]), contact["test"], DISTANCE).items()
+    }
     card = {
         **inputs,
-        "domain": domain_of(model, data["train"], data["validation"]),
+        "domain": domain,
         "states": {split: len(columns["rest"]) for split, columns in data.items()},
         "training_seconds": round(seconds, 1),
         "best_validation": {part: min(row["validation"] for row in rows) for part, rows in histories.items()},

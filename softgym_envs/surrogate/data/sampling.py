@@ -39,6 +39,8 @@ class SamplingPlan:
         vary: design variables that are drawn, an empty tuple for none; default all that the surrogate learns.
         design: values of other variables; default their baseline.
         bounds: narrower bounds of drawn variables.
+        alike: drawn variables with the same bounds that lie close together in some groups: each group moves them
+            towards the first of them by a part that it draws, from not at all to altogether.
     """
 
     groups: int
@@ -49,6 +51,7 @@ class SamplingPlan:
     vary: tuple[str, ...] | None = None
     design: Mapping[str, float] = field(default_factory=dict)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    alike: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.sequence not in SEQUENCES:
@@ -105,8 +108,15 @@ class SamplingPlan:
                 own = f"[{space[name].low:g}, {space[name].high:g}]"
                 raise DesignError(f"bounds of '{name}' = [{low:g}, {high:g}] must be inside {own}")
             box.append((low, high))
+        for name in self.alike:
+            if name not in names:
+                raise DesignError(f"'{name}' is in `alike` but is not drawn; drawn: {', '.join(names) or 'none'}")
         ends = np.array(box).reshape(-1, 2)
-        points = self.unit_points(len(names), first, count, self.groups, 0)
+        points = self.unit_points(len(names) + bool(self.alike), first, count, self.groups, 0)
+        if self.alike:
+            points, part = points[:, :-1], points[:, -1:]
+            group = [names.index(name) for name in self.alike]
+            points[:, group] += part * (points[:, group[:1]] - points[:, group])
         values = ends[:, 0] + points * (ends[:, 1] - ends[:, 0])
         return [space.complete({**self.design, **dict(zip(names, map(float, row), strict=True))}) for row in values]
 
