@@ -22,6 +22,7 @@ from softgym_envs.mechanics.contact.contact import ContactSettings
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.obstacles import Cylinder
+    from softgym_envs.surrogate.chain.contact import ChainBatch
     from softgym_envs.surrogate.chain.model import ChainModel
 
 INCREMENTS = 12
@@ -45,7 +46,10 @@ class Scene:
 
 
 def draw_scene(model: ChainModel, contacts: int, rng: np.random.Generator) -> Scene:
-    """Draw a body and bars so that its free motion would enter each bar by 10 to 40 % of its way there.
+    """Draw a body and bars, all of which the closed chain presses.
+
+    One bar after another is placed so that it enters the outer corner of the zigzag, where it lies among the bars
+    before, by 0.2 to 0.6 mm. Half of the bodies have zigzags that are moved towards a straight line.
 
     Raises:
         RuntimeError: if no scene is found in which the body at rest is free.
@@ -53,47 +57,71 @@ def draw_scene(model: ChainModel, contacts: int, rng: np.random.Generator) -> Sc
     from softgym_envs.errors import InfeasibleDesign
     from softgym_envs.mechanics.contact.obstacles import Cylinder
     from softgym_envs.surrogate.chain.contact import ChainBatch
+    from softgym_envs.surrogate.chain.model import carried_points
 
     robot, chain = model.robot, model.chain
     space = robot.design_space
     domain = model.card["domain"]["design"]
+    corners = slice(1, 2 + chain.points)
     for _ in range(BUILDS * 50):
         values = {name: rng.uniform(*box) for name, box in domain.items()}
+        part = rng.choice([1.0, rng.uniform()])
+        for k in range(1, chain.points):
+            values[f"d{k}"] = values["d0"] + part * (values[f"d{k}"] - values["d0"])
         design = space.complete(values)
         try:
             robot.outline(design)  # type: ignore[attr-defined]
         except InfeasibleDesign:
             continue
-        angle = np.radians(rng.uniform(15.0, 35.0))
+        angle = float(np.radians(rng.uniform(15.0, 35.0)))
         friction = float(rng.uniform(0.0, 0.85))
         row = design.array[None]
-        free = model.markers(row, np.array([angle]))
-        corners = free.markers[0, 1 : 2 + chain.points]
-        start = model.chain.bodies(row).markers[0, 1 : 2 + chain.points]
-        chosen = np.sort(rng.choice(len(corners) - 1, size=contacts, replace=False))
-        entered = rng.uniform(0.1, 0.4, contacts) * (corners - start)[chosen, 0]
-        radius = rng.uniform(0.002, 0.004 if contacts > 4 else 0.008, size=contacts)
-        centres = corners[chosen] + np.column_stack([radius - entered, np.zeros(contacts)])
-        bars = tuple(
-            Cylinder(point=(x, y, 0.0), axis=(0.0, 0.0, 1.0), radius=float(r), friction=friction, name=f"bar {k + 1}")
-            for k, ((x, y), r) in enumerate(zip(centres, radius, strict=True))
-        )
-        at_rest = ChainBatch(model.prepare(row), [bars])
-        if free.found[0] and at_rest.states.gap[0] > 0.001:
-            return Scene(design.array, bars, float(angle))
+        prepared = model.prepare(row)
+        if not prepared.known[0]:
+            continue
+        arms = (prepared.bodies.markers - prepared.bodies.nodes[:, chain.marker_nodes])[:, corners]
+        rest = prepared.bodies.markers[0, corners]
+        bars: list[Cylinder] = []
+        for k in rng.permutation(len(rest)):
+            batch = _closed(model, row, bars, angle)
+            if batch is None:
+                break
+            x, y = carried_points(batch.memory.q, chain.marker_nodes[corners], arms)[0, k]
+            radius = float(rng.uniform(0.002, 0.0025 if contacts > 4 else 0.008))
+            centre = (float(x + radius - rng.uniform(2e-4, 6e-4)), float(y), 0.0)
+            bar = Cylinder(centre, (0.0, 0.0, 1.0), radius, friction=friction, name=f"bar {len(bars) + 1}")
+            if ChainBatch(prepared, [[*bars, bar]]).states.gap[0] < 0.001:
+                continue
+            found = _closed(model, row, [*bars, bar], angle)
+            if found is None:
+                break
+            touch = found.touching()
+            if not (touch.pressing[0].sum(axis=1) > 0.005).all() or found.states.clearance[0] < 0.002:
+                continue
+            bars.append(bar)
+            if len(bars) == contacts:
+                return Scene(design.array, tuple(bars), angle)
     raise RuntimeError(f"no scene with {contacts} contacts was found")
+
+
+def _closed(model: ChainModel, row: np.ndarray, bars: Sequence[Cylinder], angle: float) -> ChainBatch | None:
+    """Return the chain of one body after closing on bars; None if it does not close."""
+    from softgym_envs.surrogate.chain.contact import ChainBatch
+
+    batch = ChainBatch(model.prepare(row), [bars])
+    for part in range(1, INCREMENTS + 1):
+        if not batch.close(np.array([angle * part / INCREMENTS])).found[0]:
+            return None
+    return batch
 
 
 def close_chain(model: ChainModel, scene: Scene) -> tuple[np.ndarray, np.ndarray, float, bool]:
     """Return the forces of the bars [N] (k, 2), the tip [m] (2,), the torque [N m], and whether all was found."""
-    from softgym_envs.surrogate.chain.contact import ChainBatch
-
-    batch = ChainBatch(model.prepare(scene.design[None]), [scene.bars])
-    found = True
-    for part in range(1, INCREMENTS + 1):
-        states = batch.close(np.array([scene.angle * part / INCREMENTS]))
-        found &= bool(states.found[0])
-    return states.force[0], states.tip[0], float(states.torque[0]), found
+    batch = _closed(model, scene.design[None], scene.bars, scene.angle)
+    if batch is None:
+        return np.zeros((len(scene.bars), 2)), np.zeros(2), 0.0, False
+    states = batch.states
+    return states.force[0], states.tip[0], float(states.torque[0]), True
 
 
 def close_fem(model: ChainModel, scene: Scene, self_contact: bool) -> tuple[np.ndarray, np.ndarray, float, float]:

@@ -130,7 +130,7 @@ class ChainBody:
         full = np.concatenate([effort, np.zeros(3)])
         W = compliance[0]
         free = np.concatenate([displacement, effector]) - W @ full
-        folded = self._self_contact and bool(states.clearance[0] < self._distance)
+        folded = self._self_contact and bool(states.folded[0])
         return State(
             command=command.copy(),
             displacement=displacement,

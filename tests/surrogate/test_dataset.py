@@ -126,6 +126,20 @@ def test_designs():
     assert np.ptp(ratios) > 0.8 * (space["poisson_ratio"].high - space["poisson_ratio"].low)
 
 
+def test_variables_that_are_drawn_alike():
+    robot = make_robot("contact_aided_finger")
+    names = tuple(f"d{k}" for k in range(12))
+    plan = SamplingPlan(40, 0, vary=("e1", *names), alike=names)
+    values = np.array([[design[name] for name in names] for design in plan.designs(robot, 0, 40)])
+    independent = SamplingPlan(40, 0, vary=("e1", *names)).designs(robot, 0, 40)
+    spread = np.ptp(values, axis=1)
+    assert spread.min() < 0.002 < 0.012 < spread.max()
+    assert np.ptp(values[:, 0]) > 0.015
+    assert min(np.ptp([design[name] for name in names]) for design in independent) > 0.008
+    with pytest.raises(DesignError, match="'d1' is in `alike` but is not drawn; drawn: d0"):
+        SamplingPlan(1, 0, vary=("d0",), alike=("d0", "d1")).designs(robot, 0, 1)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

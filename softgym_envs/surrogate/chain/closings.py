@@ -93,7 +93,7 @@ class ClosingErrors(NamedTuple):
         force: of the contact force, relative; NaN where it is smaller than `PRESSED`; shape (c, a).
         tip: [m], shape (c, a).
         torque: relative to the largest of the closing, shape (c, a).
-        clearance: of the chain [m], shape (c, a).
+        folded: whether the chain touches itself, shape (c, a).
         spread: of the members, shape (c,).
         known: whether the chain knows the body, shape (c,).
     """
@@ -101,7 +101,7 @@ class ClosingErrors(NamedTuple):
     force: np.ndarray
     tip: np.ndarray
     torque: np.ndarray
-    clearance: np.ndarray
+    folded: np.ndarray
     spread: np.ndarray
     known: np.ndarray
 
@@ -128,28 +128,28 @@ def closing_errors(model: ChainModel, robot: GraspingFinger, closings: Closings)
         force=np.where(found, force_error, np.nan),
         tip=np.where(found, tip_error, np.nan),
         torque=np.where(found, torque_error, np.nan),
-        clearance=np.stack([state.clearance for state in states], axis=1),
+        folded=np.stack([state.folded for state in states], axis=1),
         spread=model.spread(bodies),
         known=prepared.known,
     )
 
 
-def summary(errors: ClosingErrors, closings: Closings, distance: float) -> dict[str, float]:
+def summary(errors: ClosingErrors, closings: Closings) -> dict[str, float]:
     """Return what a card says about closings.
 
-    Errors are those of trusted states: of bodies that the chain knows, where no fold is closer than the distance of
-    contact [m]. ``folds_missed`` is the part of the trusted states in which the finger touches itself with more than
-    `PRESSED`, and ``folds_flagged`` the part of the others that are not trusted because of a fold.
+    Errors are those of trusted states: of bodies that the chain knows and that do not touch themselves.
+    ``folds_missed`` is the part of the trusted states in which the finger of finite elements touches itself with more
+    than `PRESSED`, and ``folds_flagged`` the part of the states without such contact that are not trusted because of a
+    fold.
     """
     solved = np.isfinite(closings.torque) & np.isfinite(errors.tip)
-    folded = errors.clearance < distance
-    trusted = solved & ~folded & errors.known[:, None]
+    trusted = solved & ~errors.folded & errors.known[:, None]
     touches = closings.self_force > PRESSED
     found: dict[str, float] = {
         "states": int(solved.sum()),
         "trusted": float(trusted.sum() / solved.sum()),
         "folds_missed": float((trusted & touches).sum() / max(trusted.sum(), 1)),
-        "folds_flagged": float((solved & folded & ~touches).sum() / max((solved & ~touches).sum(), 1)),
+        "folds_flagged": float((solved & errors.folded & ~touches).sum() / max((solved & ~touches).sum(), 1)),
     }
     for name, values in (("force", errors.force), ("tip", errors.tip), ("torque", errors.torque)):
         good = values[trusted & np.isfinite(values)]

@@ -22,6 +22,12 @@ STIFFNESS = 0.1
 STICK = 5.0
 """Stiffness of friction before sliding, in units of the barrier's stiffness over its distance."""
 
+FOLDED = 2.0
+"""Clearance below which a body is taken to touch itself, in units of the distance of contact.
+
+In finite elements, folds of 0.1 to 0.5 mm more than the distance of contact already pressed.
+"""
+
 DEPTH_ROWS = 11
 """Rows of skin points across the thickness where obstacles change along z."""
 
@@ -81,8 +87,9 @@ class ChainStates:
         points: number of points of the skin in contact, shape (B,).
         sliding: number of those whose friction has reached its limit, shape (B,).
         gap: smallest distance to an obstacle [m], shape (B,); inf without obstacles.
-        clearance: smallest distance between parts of the body that a fold can bring together [m], shape (B,). Forces
-            between them are not part of a chain: where it is smaller than the distance of contact, they are missing.
+        clearance: smallest distance between parts of the body that a fold can bring together [m], shape (B,).
+        folded: whether the body would touch itself, or has gone beyond the angle at which it did, shape (B,). Forces
+            between parts of the body are not part of a chain, so such states are wrong.
         found: shape (B,).
     """
 
@@ -94,6 +101,7 @@ class ChainStates:
     sliding: np.ndarray
     gap: np.ndarray
     clearance: np.ndarray
+    folded: np.ndarray
     found: np.ndarray
 
 
@@ -116,13 +124,14 @@ class Memory(NamedTuple):
     found: np.ndarray
     anchors: np.ndarray
     before: np.ndarray
+    fold: np.ndarray
 
 
 class ChainBatch:
     """Bodies that close on obstacles, each with its own obstacles and with the memory of friction.
 
     The law of contact is that of the finite elements (`softgym_envs.mechanics.contact.law`), on the points of the outer
-    face of the zigzag leg and of the end of the top wall. The body does not touch itself.
+    face of the zigzag leg and of the end of the top wall. The body does not touch itself: `ChainStates.folded`.
 
     Args:
         prepared: bodies; one row of points is enough for obstacles that do not change along z (`rows_for`).
@@ -165,6 +174,9 @@ class ChainBatch:
         self._angle, self._torque, self._found = np.zeros(rows), np.zeros(rows), np.zeros(rows, dtype=bool)
         self._anchors = np.zeros((rows, count, len(prepared.chain.skin_heights), 3))
         self._before = np.zeros_like(self._anchors)
+        # The angle at which each row began to touch itself.
+        self._fold = np.full(rows, np.inf)
+        self._reach = FOLDED * distance
         self.reset()
 
     # -- states -----------------------------------------------------------------------------------------------------
@@ -174,6 +186,7 @@ class ChainBatch:
         rows = np.arange(len(self.slot))[index]
         self._q[rows] = self.prepared.at_rest[self.slot[rows]]
         self._angle[rows] = self._torque[rows] = 0.0
+        self._fold[rows] = np.inf
         rest = self._touch(rows)
         self._anchors[rows] = self._before[rows] = rest.points[:, None]
         self._found[rows] = (rest.gaps > 0.0).all(axis=(1, 2))
@@ -200,6 +213,9 @@ class ChainBatch:
         self._angle[rows] = np.where(found, angles, self._angle[rows])
         self._torque[rows] = np.where(found, torque, self._torque[rows])
         self._found[rows] = found
+        now = self._angle[rows]
+        fold = np.where(now >= self._fold[rows], self._fold[rows], np.inf)
+        self._fold[rows] = np.where(self._clearance()[rows] < self._reach, np.minimum(fold, now), fold)
 
     @property
     def states(self) -> ChainStates:
@@ -215,6 +231,7 @@ class ChainBatch:
             sliding=(near & touch.sliding).any(axis=1).sum(axis=1),
             gap=touch.gaps.min(axis=(1, 2), initial=np.inf),
             clearance=self._clearance(),
+            folded=np.isfinite(self._fold),
             found=self._found.copy(),
         )
 
@@ -256,12 +273,14 @@ class ChainBatch:
     @property
     def memory(self) -> Memory:
         """Copies of all that the batch remembers; assign it to go back."""
-        parts = self._q, self._angle, self._torque, self._found, self._anchors, self._before
+        parts = self._q, self._angle, self._torque, self._found, self._anchors, self._before, self._fold
         return Memory(*(part.copy() for part in parts))
 
     @memory.setter
     def memory(self, kept: Memory) -> None:
-        self._q, self._angle, self._torque, self._found, self._anchors, self._before = (part.copy() for part in kept)
+        (
+            self._q, self._angle, self._torque, self._found, self._anchors, self._before, self._fold
+        ) = (part.copy() for part in kept)  # fmt: skip
 
     # -- condensed models -------------------------------------------------------------------------------------------
 

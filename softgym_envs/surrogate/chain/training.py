@@ -23,7 +23,6 @@ from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.chain.body import FingerChain
 from softgym_envs.surrogate.chain.closings import closing_errors, kept_closings, summary
-from softgym_envs.surrogate.chain.contact import DISTANCE
 from softgym_envs.surrogate.chain.model import ChainModel, depth_features, relative_stiffness, save_chain
 from softgym_envs.surrogate.data.states import full_compliance
 from softgym_envs.surrogate.trainer import History, Trainer, TrainingOptions
@@ -190,7 +189,7 @@ def measure_errors(model: ChainModel, data: Mapping[str, np.ndarray]) -> dict[st
         "marker": distance, "tip": tip, "held": held, "jacobian": jacobian, "torsion": torsion, "depth": depth,
         "effort": effort,
     }.items():  # fmt: skip
-        if name in ("marker", "tip", "effort") and not data["displacement"].any():
+        if name in ("marker", "tip", "effort") and np.abs(data["displacement"]).max() < 1e-9:
             continue  # all states are at rest, where these are exact
         good = values[found.found]
         errors |= {
@@ -275,11 +274,11 @@ def fit_chain(
     # The box and the limit of the spread decide which closings count.
     model = ChainModel(chain.robot, tensors, {"domain": domain})
     found = closing_errors(model, finger, contact["validation"])
-    trusted = np.isfinite(found.tip) & (found.clearance > DISTANCE) & found.known[:, None]
+    trusted = np.isfinite(found.tip) & ~found.folded & found.known[:, None]
     domain["tip_inflation"] = float(np.quantile((found.tip / found.spread[:, None])[trusted], 0.95))
     errors |= {
         f"contact_{name}": value
-        for name, value in summary(closing_errors(model, finger, contact["test"]), contact["test"], DISTANCE).items()
+        for name, value in summary(closing_errors(model, finger, contact["test"]), contact["test"]).items()
     }
     card = {
         **inputs,
