@@ -13,7 +13,7 @@ from softgym_envs.errors import ConfigError
 
 ENTRIES = [(path.name, name, entry) for path in SOURCES for name, entry in json.loads(path.read_text()).items()]
 
-WAITING = ("calibration", "contact", "design_optima", "shared_finger")
+WAITING = ("calibration", "design_optima", "shared_finger")
 """Results of uncommitted code whose times an idle machine has to measure again."""
 
 
