@@ -97,7 +97,7 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/GripperManipulate-v0": _row("three_finger_gripper", "track", 100),
     "SoftGym/FingerGrasp-v0": _row("grasping_finger", "grasp", 25, backend="fem", backend_mesh=COARSE),
     "SoftGym/GripperLift-v0": _row(
-        "contact_aided_gripper", "lift", 50, backend="fem", robot_options=COARSE, backend_options=SLOW
+        "contact_aided_gripper", "lift", 30, backend="fem", robot_options=COARSE, backend_options=SLOW
     ),
     "SoftGym/TetrapodReach-v0": _row("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
     "SoftGym/TetrapodTrack-v0": _row("tetrapod", "track", 100, backend="fem", backend_options=MOVING),

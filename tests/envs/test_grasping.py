@@ -71,15 +71,32 @@ def test_force_control_reaches_the_wanted_force():
 
 def test_a_box_that_is_left_behind_ends_the_episode():
     env = lift(design={"friction": 0.1, "object_mass": 0.5})
-    infos = episode(env, make_baseline("close"), 50, seed=0, options={"goal": (0.0, 0.0, 0.035)})
-    assert len(infos) < 50 and infos[-1]["lost"] and infos[-1]["converged"] and not infos[-1]["is_success"]
+    infos = episode(env, make_baseline("close"), 30, seed=0, options={"goal": (0.0, 0.0, 0.035)})
+    assert len(infos) < 30 and infos[-1]["lost"] and infos[-1]["converged"] and not infos[-1]["is_success"]
     assert not any(info["lost"] for info in infos[:-1])
+
+
+def test_a_box_that_is_dropped_ends_the_episode():
+    env = lift()
+    hold = make_baseline("force")
+
+    def drop(observation, unwrapped):
+        if unwrapped.state.effector[0, 2] - 0.025 < 0.006 and not dropped:
+            return hold(observation, unwrapped)
+        dropped.append(True)
+        return np.array([-1.0, -1.0, 0.0], dtype=np.float32)
+
+    dropped: list[bool] = []
+    infos = episode(env, drop, 30, seed=0, options={"goal": (0.0, 0.0, 0.033)})
+    assert dropped and len(infos) < 30 and infos[-1]["lost"] and infos[-1]["reward_terms"]["hold"] == 0.8
+    env.reset()
+    assert not env.step(np.zeros(3, dtype=np.float32))[4]["lost"]  # the next episode begins anew
 
 
 def test_force_control_lifts_the_box_and_holds_it():
     env = lift()
-    infos = episode(env, make_baseline("force"), 40, seed=0, options={"goal": (0.0, 0.0, 0.033)})
-    assert len(infos) == 40 and not infos[-1]["lost"]
+    infos = episode(env, make_baseline("force"), 30, seed=0, options={"goal": (0.0, 0.0, 0.033)})
+    assert len(infos) == 30 and not infos[-1]["lost"]
     assert infos[-1]["is_success"] and infos[-1]["reward_terms"]["hold"] == 1.0
     assert infos[0]["reward_terms"]["hold"] == pytest.approx(0.8)
 

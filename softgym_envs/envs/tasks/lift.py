@@ -14,8 +14,8 @@ class Lift(Task):
     """Raise the object to a height above the table and hold it; only z counts.
 
     The reward has a further factor, ``1 - 0.2 s``, where s is the share of the object's weight that the table carries.
-    An episode is lost, and terminates, when the hand has risen by ``lost_height`` and the object is on the table:
-    it was left behind, or dropped.
+    An episode is lost, and terminates, when the object was raised by ``lost_height`` and is on the table again
+    (dropped), or when the hand has risen by twice that height while the object is still there (left behind).
 
     Args:
         robot: a robot whose last actuator is the drive ``"lift"``, with contacts ``"table"`` and then the object.
@@ -25,7 +25,7 @@ class Lift(Task):
     """
 
     name = "lift"
-    max_episode_steps = 50
+    max_episode_steps = 30
     needs_state = True
 
     def __init__(
@@ -40,6 +40,10 @@ class Lift(Task):
         self.heights = (low, high)
         self.lost_height = check_length(lost_height, "lost_height", robot)
         self.axes = np.array([0.0, 0.0, 1.0])
+        self._raised = False
+
+    def begin(self, rng: np.random.Generator) -> None:
+        self._raised = False
 
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
         goals = np.tile(np.asarray(self.robot.effector_rest), (count, 1, 1))
@@ -53,9 +57,11 @@ class Lift(Task):
         return np.where(self.axes > 0.0, measured, self.robot.effector_rest), (height >= low) & (height <= high)
 
     def lost(self, state: State) -> bool:
-        """Whether the hand has risen without the object."""
+        """Whether the object was dropped or left behind; states must come in the order of the episode."""
         height = float(state.effector[0, 2] - self.robot.effector_rest[2])
-        return bool(state.displacement[-1] > self.lost_height and height < 0.25 * self.lost_height)
+        self._raised |= height > self.lost_height
+        risen = self._raised or state.displacement[-1] > 2.0 * self.lost_height
+        return bool(risen and height < 0.25 * self.lost_height)
 
     def state_terms(self, state: State) -> dict[str, float]:
         """Return the factor of the reward for taking the weight off the table, in [0.8, 1]."""
