@@ -82,11 +82,33 @@ def zigzag_front() -> str:
     return markdown(head, rows, "lrrrrrr")
 
 
+def zigzag_sensitivity() -> str:
+    """Finger B with one design variable at a time at both ends, most important variables for the force first."""
+    found = results("zigzag_sensitivity")
+    spans: dict[str, list[list[float]]] = {}
+    for label, span in found.items():
+        spans.setdefault(label.split(", ")[1].removesuffix(": low"), []).append(span)
+    order = sorted(spans, key=lambda name: spans[name][0][0] - spans[name][0][1])
+    rows = [
+        [
+            name,
+            *(
+                f"{low:.{digits}f} to {high:.{digits}f}"
+                for (low, high), digits in zip(spans[name], (2, 2, 3), strict=True)
+            ),
+        ]
+        for name in order
+    ]
+    return markdown(["variable", "force [N]", "energy [N m]", "resistance [m]"], rows, "lrrr")
+
+
 def _value(row: dict[str, Any], key: str) -> str:
     if row["status"] != "ok":
         return "-"
     return f"{row[key]:.3f}" if key == "resistance" else f"{row[key]:.2f}"
 
 
-ZIGZAG_TABLES = {table.__name__: table for table in (zigzag_measured, zigzag_effects, zigzag_force, zigzag_front)}
+ZIGZAG_TABLES = {
+    table.__name__: table for table in (zigzag_measured, zigzag_effects, zigzag_force, zigzag_front, zigzag_sensitivity)
+}
 """Tables by the name in a marked place."""
