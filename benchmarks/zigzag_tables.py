@@ -102,6 +102,24 @@ def zigzag_sensitivity() -> str:
     return markdown(["variable", "force [N]", "energy [N m]", "resistance [m]"], rows, "lrrr")
 
 
+def zigzag_step() -> str:
+    """Design B and the design one step further, on both meshes."""
+    found = results("zigzag_step")
+    rows = [
+        [
+            "B" if design == "B" else "one step further",
+            *(
+                f"{found[f'{design}, {mesh}: force, resistance, energy'][k]:.{digits}f}"
+                for k, digits in ((0, 2), (2, 2), (1, 3))
+                for mesh in ("accurate", "published")
+            ),
+        ]
+        for design in ("B", "step")
+    ]
+    head = ["finger", "force [N]", "3 mm", "energy [N m]", "3 mm", "resistance [m]", "3 mm"]
+    return markdown(head, rows, "lrrrrrr")
+
+
 def _value(row: dict[str, Any], key: str) -> str:
     if row["status"] != "ok":
         return "-"
@@ -109,6 +127,7 @@ def _value(row: dict[str, Any], key: str) -> str:
 
 
 ZIGZAG_TABLES = {
-    table.__name__: table for table in (zigzag_measured, zigzag_effects, zigzag_force, zigzag_front, zigzag_sensitivity)
+    table.__name__: table
+    for table in (zigzag_measured, zigzag_effects, zigzag_force, zigzag_front, zigzag_sensitivity, zigzag_step)
 }
 """Tables by the name in a marked place."""
