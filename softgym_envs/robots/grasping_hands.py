@@ -183,9 +183,8 @@ class ContactAidedGripper(Robot):
         model.add("a", Slide("lift", table, np.array([0.0, 0.0, -1.0]), model.nodes))
         above_table = EmbeddedPoints.from_weights(np.array([[frame, table]]), np.array([[1.0, -1.0]]), model.nodes)
         model.add("e", Point("box", above_table))
-        # Fingers touch the prism of `own_obstacles`; they must not feel this skin as well, so it stays back further
-        # than contact between surfaces reaches.
-        model.skins.append(box_skin(frame, (half - ROUNDING).tolist(), model.nodes))
+        # The table acts on this skin; for the fingers, the prism of `own_obstacles` stands for it.
+        model.skins.append(box_skin(frame, half.tolist(), model.nodes))
         return model
 
     def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> tuple[Obstacle, ...]:
@@ -193,8 +192,7 @@ class ContactAidedGripper(Robot):
         box = len(model.nodes) - 4  # frames of four rows each: that of the table comes before that of the box
         half, friction = [0.5 * length for length in self.box], design["friction"]
         return (
-            # The skin of the box, on which the table acts, stands back from its faces.
-            Plane((ROUNDING, 0.0, 0.0), (1.0, 0.0, 0.0), name="table", friction=friction, frame=box - 4),
+            Plane((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), name="table", friction=friction, frame=box - 4),
             RoundedPrism.box(half, ROUNDING, name="box", friction=friction, frame=box),
         )
 

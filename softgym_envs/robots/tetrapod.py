@@ -29,6 +29,9 @@ HORN = 22.5e-3
 """Distance of a leg's root from its servo's axis, outwards [m]."""
 CENTRE_RADIUS = 13e-3
 """Distance of the legs' tips from the middle of the centre part [m]; published as about 10 to 16 mm."""
+
+JOINT_GAP = 1.0e-3
+"""Gap between the skins of the centre and of a leg where they are joined [m]: more than the distance of contact."""
 CENTRE_MASS = 0.020
 """Mass of the centre part [kg]; not published."""
 HANGING = -0.150
@@ -139,7 +142,9 @@ class Tetrapod(Robot):
         half = 0.5 * np.array([design["leg_width"], design["leg_thickness"]])
         outline = half * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
         model.skins += [tube_skin(leg, model.nodes, outline) for leg in model.blocks if isinstance(leg, Beam)]
-        model.skins.append(box_skin(centre, (CENTRE_RADIUS, CENTRE_RADIUS, 0.4 * CENTRE_RADIUS), model.nodes))
+        # The legs begin on the sides of the centre: it stays back, so that its skin and theirs do not touch there.
+        side = CENTRE_RADIUS - JOINT_GAP
+        model.skins.append(box_skin(centre, (side, side, 0.4 * CENTRE_RADIUS), model.nodes))
         return model
 
     def _printed(

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
+from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics import MechanicalModel, Plane, Statics
+from softgym_envs.robots.registry import ROBOTS
 from softgym_envs.robots.soft_finger import SoftFinger
 
 #: Share of the range of each actuator, chosen so that no cable is slack.
@@ -63,6 +65,19 @@ def test_robot_presses_a_wall(name):
     assert pressing > 1e-3
     np.testing.assert_allclose(force, pressing * normal, atol=1e-9 * pressing)
     assert (potential[h] - potential[-h]) / (2 * h) == pytest.approx(pressing, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", [name for name in ROBOTS if name != "press_finger"])
+def test_robot_may_touch_itself(name):
+    model = make_robot(name, self_contact=True).build()
+    surfaces = model.contact.between_surfaces(model.nodes)
+    assert surfaces.minimum_distance(model.contact.surfaces.places(model.nodes)) > 1e-4
+
+
+def test_surfaces_that_touch_at_rest_are_refused():
+    """The bar lies flat on the finger."""
+    with pytest.raises(InfeasibleDesign, match="'press_finger' at rest: surfaces of the body touch each other"):
+        make_robot("press_finger", self_contact=True).build()
 
 
 class FineFinger(SoftFinger):

@@ -59,6 +59,10 @@ class Contacts:
         return out
 
 
+SMALLEST_GAP = 1e-6
+"""Smallest gap between surfaces at rest, over the distance of contact: less cannot be told from touching."""
+
+
 class ContactMemory(NamedTuple):
     """What friction remembers.
 
@@ -188,8 +192,12 @@ class Contact:
             if not (obstacle.gap(points[own]) > 0.0).all():
                 return f"the body is inside obstacle {obstacle.name or number + 1}"
         surfaces = self.between_surfaces(x)
-        if surfaces is not None and surfaces.intersects(self.surfaces.places(x)):
-            return "surfaces of the body cross each other" + (" or a meshed obstacle" if self.meshes else "")
+        if surfaces is not None:
+            places, other = self.surfaces.places(x), " or a meshed obstacle" if self.meshes else ""
+            if surfaces.intersects(places):
+                return f"surfaces of the body cross each other{other}"
+            if (gap := surfaces.minimum_distance(places)) < SMALLEST_GAP * self.distance:
+                return f"surfaces of the body touch each other{other} (gap {gap:.1g} m)"
         return None
 
     def not_carried(self, obstacle: Obstacle) -> np.ndarray:
