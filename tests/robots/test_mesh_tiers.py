@@ -126,3 +126,25 @@ def test_a_fillet_makes_the_finger_stiffer():
 def test_a_fillet_that_does_not_fit_is_infeasible():
     with pytest.raises(InfeasibleDesign):
         make_robot("finger", mesh="accurate", mesh_size=30e-3, fillet=20e-3).body()
+
+
+def test_fingers_of_a_gripper_are_tied_by_averaged_points():
+    robot = make_robot("two_finger_gripper", mesh="accurate", mesh_size=30e-3)
+    model = robot.build()
+    (bond,) = model.constraints["b"]
+    assert len(bond.dofs) > 3 * 2 * 10  # a single point depends on the ten nodes of an element
+    state = Statics(model).solve(np.zeros(4))
+    assert np.allclose(bond.value(state.x), 0.0, rtol=0.0, atol=1e-9)
+    # Both fingers bend alike: the bar stays in the middle.
+    assert np.allclose(state.condensed.delta.e[:2], robot.effector_rest[:2], rtol=0.0, atol=1e-6)
+
+
+def test_cavities_of_the_accurate_sensorized_finger_are_those_of_the_published_mesh():
+    volumes = {
+        mesh: [sensor.rest_volume for sensor in make_robot("sensorized_finger", **options).build().constraints["s"]]
+        for mesh, options in {"published": {}, "accurate": {"mesh": "accurate", "mesh_size": 20e-3}}.items()
+    }
+    assert len(volumes["accurate"]) == 2
+    # Facets of different sizes cut off different parts of the round cavities.
+    assert np.allclose(volumes["accurate"], volumes["published"], rtol=0.1)
+    assert volumes["accurate"][0] == pytest.approx(volumes["accurate"][1], rel=0.01)
