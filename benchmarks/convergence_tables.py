@@ -25,6 +25,11 @@ def studied() -> list[str]:
     return [name for name in STUDIES if f"convergence_{name}" in records()]
 
 
+def percent(share: float) -> str:
+    """Write a share with two significant digits, or as a whole number of percent."""
+    return f"{100.0 * share:.2g}%" if abs(share) < 0.1 else f"{share:.0%}"
+
+
 def convergence() -> str:
     """Errors of each robot on each mesh, against the converged value: baseline, and the worst of all bodies."""
     rows = []
@@ -42,8 +47,7 @@ def convergence() -> str:
                 ]
                 own = errors.get("baseline", {}).get("meshes", {}).get(row["mesh"], {}).get(quantity, np.nan)
                 worst = max(all_bodies, key=abs, default=np.nan)
-                form = "{:.1%}" if quantity == "tip" else "{:+.1%}"
-                cells += [form.format(own), f"{form.format(worst)} of {len(all_bodies)}"]
+                cells += [percent(own), f"{percent(worst)} of {len(all_bodies)}"]
             title = "" if k else TITLES[name]
             rows.append([title, row["mesh"], f"{row['unknowns']:,}", *cells, f"{row['seconds']:.2g}"])
     head = ["robot", "mesh", "unknowns", "tip", "worst body", "effort", "worst body", "CPU [s]"]
@@ -100,7 +104,7 @@ def convergence_scatter() -> str:
         [
             title,
             *(
-                f"{found[f'{meshing}: {name}, {kind} deviation']:.2%}"
+                percent(found[f"{meshing}: {name}, {kind} deviation"])
                 for name in ("tension", "tip")
                 for kind in ("standard", "largest")
             ),
@@ -125,6 +129,7 @@ def draw() -> np.ndarray:
     """Return a picture (h, w, 3) of the errors of tip and effort over the number of unknowns, a panel per robot."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     names = studied()
     columns = min(len(names), 4)
@@ -135,25 +140,23 @@ def draw() -> np.ndarray:
         axes = figure.add_subplot(lines, columns, place + 1)
         found = results(f"convergence_{name}")
         for body, errors in found["errors"].items():
-            rows = [row for row in found["rows"] if row["body"] == body and row["mesh"] in errors["meshes"]]
-            unknowns = [row["unknowns"] for row in rows]
+            rows = [row for row in found["rows"] if row["body"] == body]
+            strong = body == "baseline"
             for quantity, colour in (("tip", "tab:blue"), ("effort", "tab:red")):
                 values = [100.0 * abs(errors["meshes"][row["mesh"]][quantity]) for row in rows]
-                strong = body == "baseline"
-                axes.loglog(
-                    unknowns,
-                    values,
-                    marker="o",
-                    markersize=4 if strong else 2,
-                    linewidth=1.8 if strong else 0.6,
-                    color=colour,
-                    alpha=1.0 if strong else 0.5,
-                    label=quantity if strong else None,
-                )
+                unknowns = [row["unknowns"] for row in rows]
+                # The published mesh of solids has other elements than the levels: no line leads to it.
+                first = 1 if len(rows) > 3 else 0
+                style = {"color": colour, "alpha": 1.0 if strong else 0.5, "markersize": 4 if strong else 2}
+                width = 1.8 if strong else 0.6
+                label = quantity if strong else None
+                axes.loglog(unknowns[first:], values[first:], marker="o", linewidth=width, label=label, **style)
+                axes.loglog(unknowns[:first], values[:first], marker="s", linestyle="none", **style)
         axes.axhline(2.0, color="grey", linewidth=0.8, linestyle=":")
         axes.set_title(TITLES[name], fontsize=9)
         axes.set_xlabel("unknowns", fontsize=8)
         axes.set_ylabel("error [%]", fontsize=8)
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.tick_params(labelsize=7, which="both")
         axes.legend(fontsize=7)
     canvas.draw()
