@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 INCREMENTS = 12
 BUILDS = 20
 """Scenes that are drawn before giving up on one."""
+BLOCK, STATES = 1000, 50
+"""Bodies of a batch, and states of each body, in which W is checked."""
 
 
 @dataclass(frozen=True)
@@ -192,18 +194,96 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, float]:
     return found
 
 
+def definiteness(model: ChainModel, draws: int, seed: int) -> dict[str, float]:
+    """Smallest eigenvalue of W in random states without friction, relative to the largest one of the same W.
+
+    Each of the bodies from the box of the training closes on a wall at a random distance, through `STATES` angles.
+    """
+    from softgym_envs.mechanics.contact.obstacles import Plane
+    from softgym_envs.surrogate.chain.contact import ChainBatch
+
+    rng = np.random.default_rng(seed)
+    space, box = model.robot.design_space, model.card["domain"]["design"]
+    base = space.baseline.array
+    low, high = (np.array([box.get(n, [b, b])[k] for n, b in zip(space.names, base, strict=True)]) for k in range(2))
+    total = missing = unstable = pressed = 0
+    smallest, seconds = np.inf, time.process_time()
+    while total < draws:
+        designs = rng.uniform(low, high, (BLOCK, len(low)))
+        walls = [[Plane((x, 0.0, 0.0), (-1.0, 0.0, 0.0))] for x in rng.uniform(0.045, 0.075, BLOCK)]
+        batch = ChainBatch(model.prepare(designs), walls)
+        angles = np.sort(rng.uniform(0.0, model.robot.upper[0], (STATES, BLOCK)), axis=0)
+        for row in angles:
+            batch.move(row)
+            W, stable = batch.compliance()
+            found = batch.found
+            eigenvalues = np.linalg.eigvalsh(0.5 * (W + W.mT)[found & stable])
+            smallest = min(smallest, float((eigenvalues[:, 0] / eigenvalues[:, -1]).min()))
+            total += BLOCK
+            missing += int((~found).sum())
+            unstable += int((found & ~stable).sum())
+            pressed += int((found & (batch.touching().pressing > 0.0).any(axis=(1, 2))).sum())
+    return {
+        "draws": total,
+        "not_found": missing,
+        "unstable": unstable,
+        "pressed": pressed,
+        "smallest_eigenvalue_ratio": smallest,
+        "cpu_seconds": time.process_time() - seconds,
+    }
+
+
+def speed(model: ChainModel, sizes: Sequence[int], seed: int) -> dict[str, float]:
+    """Steps of 2 degrees per CPU second, of bodies that close on walls, for each size of batch."""
+    from softgym_envs.mechanics.contact.obstacles import Plane
+    from softgym_envs.surrogate.chain.contact import ChainBatch
+
+    rng = np.random.default_rng(seed)
+    space, box = model.robot.design_space, model.card["domain"]["design"]
+    results = {}
+    for size in sizes:
+        for friction in (0.0, 0.5):
+            designs = np.array(
+                [space.complete({n: rng.uniform(*b) for n, b in box.items()}).array for _ in range(size)]
+            )
+            places = rng.uniform(0.045, 0.065, size)
+            walls = [[Plane((x, 0.0, 0.0), (-1.0, 0.0, 0.0), friction=friction)] for x in places]
+            batch = ChainBatch(model.prepare(designs), walls)
+            batch.move(np.full(size, 1e-3))  # compiles
+            repeats = max(1, 500 // size)
+            seconds = 0.0
+            for _ in range(repeats):
+                batch.reset()
+                start = time.process_time()
+                for k in range(1, 16):
+                    batch.move(np.full(size, np.radians(2.0 * k)))
+                seconds += time.process_time() - start
+            results[f"batch {size}, friction {friction}"] = 15 * size * repeats / seconds
+    return results
+
+
 @click.command()
 @click.option("--weights", type=click.Path(path_type=Path), help="Folder of the weights (default: the shipped ones).")
 @click.option("--contacts", default="1-10", show_default=True, help="Numbers of contacts, such as 1-10 or 1,3.")
 @click.option("--scenes", default=3, show_default=True, help="Scenes for each number of contacts.")
 @click.option("--seed", default=0, show_default=True)
 @click.option("--self-contact", is_flag=True, help="Let the finite elements touch themselves, which chains do not.")
-def main(weights: Path | None, contacts: str, scenes: int, seed: int, self_contact: bool) -> None:
-    """Compare the learned chain with finite elements."""
+@click.option("--draws", default=0, show_default=True, help="Random states in which W is checked, instead of scenes.")
+@click.option("--speed", "speeds", is_flag=True, help="Measure steps per CPU second, instead of scenes.")
+def main(
+    weights: Path | None, contacts: str, scenes: int, seed: int, self_contact: bool, draws: int, speeds: bool
+) -> None:
+    """Compare the learned chain with finite elements, or check its W, or measure its speed."""
     from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.chain.model import load_chain
 
     model = load_chain(make_robot("contact_aided_finger"), weights)
+    if draws:
+        print(json.dumps(definiteness(model, draws, seed), indent=1))
+        return
+    if speeds:
+        print(json.dumps(speed(model, (1, 10, 100, 1000), seed), indent=1))
+        return
     if "-" in contacts:
         low, high = map(int, contacts.split("-"))
         counts = list(range(low, high + 1))

@@ -16,7 +16,7 @@ from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel, Row, point_rows
 from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
-from softgym_envs.surrogate.chain.contact import ChainBatch, Memory, rows_for
+from softgym_envs.surrogate.chain.contact import ChainBatch, Memory, Touching, rows_for
 from softgym_envs.surrogate.chain.model import ChainModel, load_chain
 from softgym_envs.surrogate.chain.rows import contact_rows
 
@@ -51,7 +51,7 @@ class ChainBody:
         self._batch = ChainBatch(
             self._prepared, [obstacles], distance=robot.contact_distance, stiffness=robot.contact_stiffness
         )
-        if not self._batch.states.found[0]:
+        if not self._batch.found[0]:
             raise InfeasibleDesign(f"robot '{robot.name}' at rest: the body is inside obstacle {self._names[0]}")
         self._rest = self._state(np.zeros(1))
 
@@ -103,10 +103,10 @@ class ChainBody:
     def _close(self, start: State, angle: float) -> float:
         """Turn the servo to an angle [rad] in one increment from a state; return its torque [N m]."""
         self._go_to(start)
-        states = self._batch.close(np.array([angle]))
-        if not states.found[0]:
+        self._batch.move(np.array([angle]))
+        if not self._batch.found[0]:
             raise ConvergenceError(f"the learned chain finds no equilibrium at {angle:.4g} rad", fraction=0.0)
-        return float(states.torque[0])
+        return float(self._batch.torque[0])
 
     def _reach_torque(self, start: State, torque: float) -> None:
         """Turn the servo to the angle at which it has a torque [N m], in one increment from a state."""
@@ -123,7 +123,8 @@ class ChainBody:
 
     def _state(self, command: np.ndarray) -> State:
         batch, memory = self._batch, self._batch.memory
-        states, contacts = batch.states, self._contacts()
+        touch = batch.touching()
+        states = batch.states_of(touch)
         compliance, stable = batch.compliance()
         effort, displacement = states.torque.copy(), states.angle.copy()
         effector = np.append(states.tip[0], 0.0)
@@ -141,15 +142,14 @@ class ChainBody:
             stable=bool(stable[0]),
             uncertainty=float(self._prepared.tip_uncertainty[0]),
             trusted=bool(self._prepared.known[0]) and bool(stable[0]) and not folded,
-            contacts=contacts,
+            contacts=self._contacts(touch, float(states.clearance[0])),
             memory=memory,
         )
 
     def _labels(self) -> tuple[Row, ...]:
         return (Row("servo", "rad", "N m"), *point_rows("tip"))
 
-    def _contacts(self) -> Contacts:
-        touch, clearance = self._batch.touching(), float(self._batch.states.clearance[0])
+    def _contacts(self, touch: Touching, clearance: float) -> Contacts:
         obstacle, point = np.nonzero(touch.pressing[0] > 0.0)
         force = np.column_stack([touch.forces[0, obstacle, point], np.zeros(len(point))])
         gap = touch.gaps[0, obstacle, point]

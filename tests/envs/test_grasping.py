@@ -11,7 +11,7 @@ from softgym_envs.envs import SoftRobotEnv
 from softgym_envs.envs.tasks.grasp import Grasp
 from softgym_envs.envs.tasks.lift import Lift
 from softgym_envs.envs.tasks.registry import make_task
-from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.errors import InfeasibleDesign, WeightsError
 
 COARSE = {"element": "linear", "mesh_size": 0.015}
 
@@ -67,6 +67,26 @@ def test_force_control_reaches_the_wanted_force():
     infos = episode(env, make_baseline("force"), 25, options={"goal": (0.8, 0.0, 0.0)})
     assert infos[-1]["is_success"] and infos[-1]["distance"] < 0.01
     assert infos[-1]["measured"][0] == pytest.approx(0.8, rel=0.01)
+
+
+def test_force_control_on_the_learned_chain():
+    """Goals of the default task, on bodies and objects that are drawn."""
+    env = gymnasium.make("SoftGym/FingerGrasp-v0", backend="surrogate", sample_design=["object_gap", "friction"])
+    for seed in range(3):
+        infos = episode(env, make_baseline("force"), 25, seed=seed)
+        assert infos[-1]["is_success"] and infos[-1]["distance"] < 0.01
+        assert infos[-1]["trusted"] and infos[-1]["converged"]
+
+
+def test_each_backend_has_its_own_mesh():
+    """The chain stands for the accurate mesh; finite elements take a coarse one unless told otherwise."""
+    sizes = {
+        backend: gymnasium.make("SoftGym/FingerGrasp-v0", backend=backend).unwrapped.robot.mesh_size
+        for backend in ("fem", "surrogate", "hybrid")
+    }
+    assert sizes == {"fem": 0.020, "surrogate": 0.008, "hybrid": 0.008}
+    with pytest.raises(WeightsError, match="mesh_size = 0.008, needed 0.02"):
+        gymnasium.make("SoftGym/FingerGrasp-v0", backend="surrogate", robot_options={"mesh_size": 0.020})
 
 
 def test_a_box_that_is_left_behind_ends_the_episode():

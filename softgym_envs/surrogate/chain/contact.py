@@ -199,8 +199,22 @@ class ChainBatch:
 
         Rows that are not found stay where they were.
         """
-        self._move(np.arange(len(self.slot)), np.asarray(angles, dtype=float))
+        self.move(angles)
         return self.states
+
+    def move(self, angles: np.ndarray) -> None:
+        """Move the servos as `close` does, without returning the states."""
+        self._move(np.arange(len(self.slot)), np.asarray(angles, dtype=float))
+
+    @property
+    def found(self) -> np.ndarray:
+        """Whether the present state of each row was found, shape (B,)."""
+        return self._found.copy()
+
+    @property
+    def torque(self) -> np.ndarray:
+        """Torques of the servos [N m], shape (B,)."""
+        return self._torque * self._relative
 
     def _move(self, rows: np.ndarray, angles: np.ndarray) -> None:
         parts = [self._q[rows], self._anchors[rows], self._before[rows]]
@@ -220,11 +234,14 @@ class ChainBatch:
     @property
     def states(self) -> ChainStates:
         """The present states."""
-        touch = self.touching()
+        return self.states_of(self.touching())
+
+    def states_of(self, touch: Touching) -> ChainStates:
+        """Return the present states, given what obstacles do to the skin."""
         near = touch.pressing > 0.0
         return ChainStates(
             angle=self._angle.copy(),
-            torque=self._torque * self._relative,
+            torque=self.torque,
             tip=self._tips()[:, 0],
             force=touch.forces.sum(axis=2),
             points=near.any(axis=1).sum(axis=1),
