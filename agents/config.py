@@ -110,6 +110,11 @@ class EnvironmentConfig(Config):
         """Whether surrogate weights ship for the robot."""
         return (self.row.backend or default_backend(self.make_robot(), {})) == "surrogate"
 
+    @property
+    def batched(self) -> bool:
+        """Whether many episodes run at once: on surrogates, except for tasks that read whole states."""
+        return self.backend == "surrogate" and not self.task_class.needs_state
+
     def on(self, backend: str) -> EnvironmentConfig:
         """Return the same environment on another backend, without the options of the present backend."""
         options = self.backend_options if backend == self.backend else {}
@@ -146,10 +151,10 @@ class EnvironmentConfig(Config):
         return ResidualQP(env, self.residual_scale)
 
     def make_vec(self, num_envs: int, **overrides: Any) -> gymnasium.vector.VectorEnv:
-        """Return the batched environment on the surrogate, or one process per environment on other backends."""
+        """Return the batched environment if there is one, else one process per environment."""
         import gymnasium
 
-        if self.backend == "surrogate":
+        if self.batched:
             envs = gymnasium.make_vec(self._spec(), num_envs=num_envs, **self._options(overrides))
             if not self.residual_scale:
                 return envs

@@ -234,7 +234,7 @@ def _evaluate(
     else:
         policy = Policy(agent)
         policy.check_environment(environment)
-        if environment.backend == "surrogate":
+        if environment.batched:
             return _evaluate_batch(policy, environment, goals, design, seed)
         act = _acting(policy)
     env = environment.make(sample_design=False)

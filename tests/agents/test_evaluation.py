@@ -5,7 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from agents.config import EnvironmentConfig
 from agents.evaluation import Evaluation
+from agents.vec_env import SB3VecEnv
 from softgym_envs.errors import DataError
 
 
@@ -59,3 +61,12 @@ def test_a_damaged_file_is_named():
     del data["returns"]
     with pytest.raises(DataError, match="KeyError 'returns'"):
         Evaluation.from_json(data)
+
+
+def test_tasks_that_read_states_run_one_environment_at_a_time():
+    grasp = EnvironmentConfig(id="SoftGym/FingerGrasp-v0", backend="surrogate")
+    assert not grasp.batched and EnvironmentConfig(id="SoftGym/FingerReach-v0").batched
+    envs = SB3VecEnv(grasp.make_vec(1))  # refuses environments that reset themselves a step late
+    envs.reset()
+    _, rewards, done, infos = envs.step(np.ones((1, 1), dtype=np.float32))
+    assert rewards.shape == done.shape == (1,) and infos == [{}]
