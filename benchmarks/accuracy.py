@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+
+from softgym_envs.robots.base import Robot
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "surrogate"
 
@@ -188,9 +191,6 @@ def trajectories() -> dict[str, object]:
     The goals are the FEM tip at 25 cable displacements from 0 to 20 mm. The error is that of the predicted tip
     positions, sqrt(sum |p_surrogate - p_FEM|^2) / sqrt(sum |p_FEM - p_rest|^2).
     """
-    from softgym_envs.backends.fem import FEMBackend
-    from softgym_envs.backends.surrogate import SurrogateBackend
-    from softgym_envs.control.inverse_qp import InverseQP
     from softgym_envs.robots.registry import make_robot
 
     robot = make_robot("finger", cables=1)
@@ -208,24 +208,38 @@ def trajectories() -> dict[str, object]:
     ]
     result: dict[str, object] = {}
     for name, values, unit, published in cases:
-        design = {key: value * unit for key, value in values.items()}
-        fem, surrogate = FEMBackend(robot, design), SurrogateBackend(robot, design)
-        rest = fem.state.effector[0]
-        goals = [fem.step(np.array([d])).effector[0] for d in np.linspace(0.0, 0.02, 25)]
-        fem.reset()
-        controller = InverseQP.for_robot(robot)
-        errors, moves = [], []
-        for goal in goals:
-            for _ in range(6):
-                state = surrogate.state
-                surrogate.step(controller.solve(state.condensed, goal, state.command, state.slack))
-            truth = fem.step(surrogate.state.command).effector[0]
-            errors.append(np.linalg.norm(truth - surrogate.state.effector[0]))
-            moves.append(np.linalg.norm(truth - rest))
-        relative = 100.0 * np.linalg.norm(errors) / np.linalg.norm(moves)
-        result[f"{name}: error [%] (thesis {published} %)"] = float(relative)
-        result[f"{name}: worst [mm]"] = 1e3 * float(np.max(errors))
+        relative, worst = closing_error(robot, {key: value * unit for key, value in values.items()})
+        result[f"{name}: error [%] (thesis {published} %)"] = relative
+        result[f"{name}: worst [mm]"] = worst
     return result
+
+
+def closing_error(robot: Robot, design: Mapping[str, float], weights: str | Path | None = None) -> tuple[float, float]:
+    """Error of the predicted tip on the closing trajectory (see `trajectories`) [%], and its largest distance [mm].
+
+    Args:
+        robot: finger with one cable.
+        design: its body.
+        weights: name or folder of the surrogate's weights; default those that ship.
+    """
+    from softgym_envs.backends.fem import FEMBackend
+    from softgym_envs.backends.surrogate import SurrogateBackend
+    from softgym_envs.control.inverse_qp import InverseQP
+
+    fem, surrogate = FEMBackend(robot, design), SurrogateBackend(robot, design, weights=weights)
+    rest = fem.state.effector[0]
+    goals = [fem.step(np.array([d])).effector[0] for d in np.linspace(0.0, 0.02, 25)]
+    fem.reset()
+    controller = InverseQP.for_robot(robot)
+    errors, moves = [], []
+    for goal in goals:
+        for _ in range(6):
+            state = surrogate.state
+            surrogate.step(controller.solve(state.condensed, goal, state.command, state.slack))
+        truth = fem.step(surrogate.state.command).effector[0]
+        errors.append(np.linalg.norm(truth - surrogate.state.effector[0]))
+        moves.append(np.linalg.norm(truth - rest))
+    return float(100.0 * np.linalg.norm(errors) / np.linalg.norm(moves)), float(1e3 * np.max(errors))
 
 
 def slack_states() -> dict[str, object]:

@@ -15,6 +15,8 @@ from softgym_envs.config import Config
 from softgym_envs.errors import DataError
 from softgym_envs.storage import atomic_write, write_json
 
+PATIENCE = 5
+
 History = list[dict[str, float]]
 """Rows of ``step``, ``train`` and ``validation``: losses along a training."""
 
@@ -24,9 +26,13 @@ class TrainingOptions(Config):
 
     SOAP (Vyas et al. 2024, arXiv:2409.11321) is Adam in the eigenbasis of Shampoo's preconditioner. The networks are
     small and their losses ill-conditioned: SOAP reaches in 4000 steps what Adam needs more than 24,000 for.
+
+    The learning rate follows one cycle, or with ``"plateau"`` is halved whenever the validation loss has not fallen for
+    `PATIENCE` of the 100 times it is computed.
     """
 
     optimiser: Literal["soap", "adam"] = "soap"
+    schedule: Literal["cycle", "plateau"] = "cycle"
     steps: int = Field(default=4000, gt=0)
     batch_size: int = Field(default=128, gt=0)
     learning_rate: float = Field(default=1e-2, gt=0)
@@ -57,7 +63,7 @@ class Trainer:
         self.progress, self.workers = progress, workers
 
     def optimise(self, name: str, net: Any, loss: Callable, train_size: int, seed: int | None = None) -> History:
-        """Train a network with a one-cycle learning rate, leave it at its best validation loss and return the history.
+        """Train a network, leave it at its best validation loss and return the history.
 
         Args:
             name: what the part is called in messages and file names.
@@ -86,9 +92,13 @@ class Trainer:
                 print(f"'{path}' is damaged ({error}): renamed to '{aside.name}'; training the part again")
         generator = torch.Generator().manual_seed(self.seed if seed is None else seed)
         optimiser = _optimiser(options, net.parameters())
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, options.learning_rate, total_steps=options.steps, pct_start=0.05, final_div_factor=1e3
-        )
+        rates = torch.optim.lr_scheduler
+        plateau = rates.ReduceLROnPlateau(optimiser, factor=0.5, patience=PATIENCE)
+        cycle = None
+        if options.schedule == "cycle":
+            cycle = rates.OneCycleLR(
+                optimiser, options.learning_rate, total_steps=options.steps, pct_start=0.05, final_div_factor=1e3
+            )
         batch = min(options.batch_size, train_size)
         check = max(1, options.steps // 100)
         best, best_state, total, since, history = float("inf"), net.state_dict(), 0.0, 0, []
@@ -103,12 +113,17 @@ class Trainer:
                 value.backward()
                 torch.nn.utils.clip_grad_norm_(net.parameters(), 10.0)
                 optimiser.step()
-                schedule.step()
+                if cycle is not None:
+                    cycle.step()
                 total, since = total + value.item(), since + 1
                 if (step + 1) % check and step + 1 < options.steps:
                     continue
+                net.eval()  # without dropout
                 with torch.no_grad():
                     validation = float(loss(None))
+                net.train()
+                if cycle is None:
+                    plateau.step(validation)
                 if not math.isfinite(validation):
                     raise DataError(
                         f"training of '{name}' diverged at step {step}: the validation loss is {validation}"

@@ -23,8 +23,20 @@ def layers(tensors: Mapping[str, np.ndarray], prefix: str) -> list[tuple[np.ndar
     return found
 
 
-def perceptron(inputs: int, outputs: int, width: int, depth: int, activation: str, seed: int) -> Any:
-    """Return a torch perceptron with seeded weights; ``activation`` is "algebraic" or "relu"."""
+def perceptron(
+    inputs: int, outputs: int, width: int, depth: int, activation: str, seed: int, dropout: float = 0.0
+) -> Any:
+    """Return a torch perceptron with seeded weights.
+
+    Args:
+        inputs: number of inputs.
+        outputs: number of outputs.
+        width: units of each hidden layer.
+        depth: number of hidden layers.
+        activation: ``"algebraic"`` or ``"relu"``.
+        seed: seed of the weights.
+        dropout: share of the units of each hidden layer that is left out at a training step.
+    """
     import torch
     from torch import nn
 
@@ -37,6 +49,8 @@ def perceptron(inputs: int, outputs: int, width: int, depth: int, activation: st
     parts: list[nn.Module] = []
     for a, b in zip(sizes[:-1], sizes[1:], strict=True):
         parts += [nn.Linear(a, b), AlgebraicSigmoid() if activation == "algebraic" else nn.ReLU()]
+        if dropout:
+            parts.append(nn.Dropout(dropout))
     parts.append(nn.Linear(width, outputs))
     return nn.Sequential(*parts)
 

@@ -26,6 +26,7 @@ class Options(TrainingOptions):
     steps: int = Field(default=20000, gt=0)
     batch_size: int = Field(default=512, gt=0)
     learning_rate: float = Field(default=1e-3, gt=0)
+    dropout: float = Field(default=0.0, ge=0.0, lt=1.0)
 
 
 class Model(DirectModel):
@@ -81,8 +82,9 @@ def train(
     rest = {k: tensor(standardise(y[k][v.rest_of], rest_mean, rest_scale)) for k, v in arrays.items()}
     main_in = {k: torch.cat([tensor(v.actuation), rest[k]], dim=1) for k, v in arrays.items()}
     main_out = {k: tensor(standardise(y[k], main_mean, main_scale)) for k in arrays}
-    net_rest = perceptron(training.design.shape[1], len(rest_mean), options.width, options.depth, "relu", trainer.seed)
-    net_main = perceptron(main_in["train"].shape[1], len(main_mean), options.width, options.depth, "relu", trainer.seed)
+    shape = (options.width, options.depth, "relu", trainer.seed, options.dropout)
+    net_rest = perceptron(training.design.shape[1], len(rest_mean), *shape)
+    net_main = perceptron(main_in["train"].shape[1], len(main_mean), *shape)
 
     def loss_of(net, x, target, rows_of=None):
         def loss(rows):
