@@ -1,8 +1,7 @@
-"""The design tools on problems of the thesis: optima (sec. 4.5.3), calibration, and the front of fig. 3.6."""
+"""The design tools on problems of the thesis: optima (sec. 4.5.3) and calibration."""
 
 from __future__ import annotations
 
-import csv
 import tempfile
 import time
 from dataclasses import replace
@@ -11,10 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.storage import atomic_write
-
 ROOT = Path(__file__).resolve().parent
-FRONT = ROOT / "data" / "sensorized_finger_front.csv"
 PUBLISHED = {
     "bending_angle": {"length": 0.038, "height": 0.0206, "joint_height": 0.0063},
     "contact_force": {"length": 0.042, "height": 0.022, "joint_height": 0.0079},
@@ -136,61 +132,4 @@ def calibration() -> dict[str, object]:
             widths.append(high - low)
         result[f"{fit}, 1 % noise, {len(data)} states: 95 % intervals that cover the truth"] = f"{covered} of {runs}"
         result[f"{fit}, 1 % noise, {len(data)} states: median width of the interval"] = float(np.median(widths))
-    return result
-
-
-def sensor_front() -> dict[str, object]:
-    """Front of the sensorized finger (thesis, fig. 3.6): 1500 designs with NSGA-II; resumes.
-
-    Volume changes are in mm3, angles in degrees. Files are kept in ``results/sensorized_finger_front``.
-    """
-    from benchmarks.sensor_finger import DESIGNS
-    from codesign.tools.config import OptimiseConfig
-    from codesign.tools.metrics import METRICS
-    from codesign.tools.plots import draw_front
-    from codesign.tools.search import search
-    from softgym_envs.config import load_config
-
-    folder = Path("results/sensorized_finger_front")
-    config = load_config(ROOT.parent / "configs" / "design" / "sensorized_finger_front.yaml", OptimiseConfig)
-    began = time.perf_counter()
-    found = search(config, folder)
-    metrics = ("volume_change", "angular_displacement")
-    evaluator = config.bodies.evaluator(metrics)
-
-    def shown(values: dict[str, float]) -> list[float]:
-        return [round(1e9 * values[metrics[0]], 1), round(float(np.degrees(values[metrics[1]])), 2)]
-
-    built = {name: evaluator(config.bodies.make_robot().design_space.complete(d)) for name, d in DESIGNS.items()}
-    with open(folder / "trials.csv", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    names = ["trial", *config.bodies.box().names, *metrics]
-    with atomic_write(FRONT, "w") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*names, "status"])
-        for row in rows:
-            numbers = [f"{float(row[name]):.7g}" if row[name] else "" for name in names]
-            writer.writerow([*numbers, row["infeasible"].split(":")[0] or "ok"])
-    feasible = [row for row in rows if not row["infeasible"]]
-    values = np.array([[float(row[metric]) for metric in metrics] for row in feasible])
-    on_front = {row.trial for row in found.front}
-    front = np.array([k for k, row in enumerate(feasible) if int(row["trial"]) in on_front])
-    references = {name: [row[metric] for metric in metrics] for name, row in built.items()}
-    draw_front(folder / "front_with_built_fingers.png", [METRICS[name] for name in metrics], values, front, references)
-    result: dict[str, object] = {
-        "designs: feasible, infeasible, repeated": [found.feasible, found.infeasible, found.repeated],
-        "evaluation, over all processes [s]": round(found.busy_seconds, 1),
-        "wall time of this run [s]": round(time.perf_counter() - began, 1),
-        "designs on the front": len(found.front),
-    }
-    for end, row in (("sensing", found.front[0]), ("bending", found.front[-1])):
-        design = {
-            name: round(value if name == "slope" else 1e3 * value, 3)
-            for name, value in row.design.items()
-            if name in config.bodies.box().names
-        }
-        result[f"end for {end} [mm3, deg]"] = shown(row.metrics)
-        result[f"end for {end} [mm, rad]"] = design
-    for name, row in built.items():
-        result[f"{name} [mm3, deg]"] = shown(row)
     return result
