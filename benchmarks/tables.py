@@ -304,6 +304,18 @@ def _path_errors(benchmark: str, head: str) -> str:
     return markdown([head, "largest error [mm]", "mean [mm]"], rows, "lrr")
 
 
+def side_by_side() -> str:
+    """The same problems in several codes."""
+    rows = []
+    for key, row in results("side_by_side").items():
+        if key != "versions":
+            error = "reference" if abs(row["error"]) < 1e-8 else f"{row['error']:.2g}"
+            rows.append([*key.split(" | "), str(row["unknowns"]), error, f"{row['seconds']:.2g}"])
+    table = markdown(["case", "code", "element", "mesh", "unknowns", "error", "CPU time [s]"], rows, "llllrrr")
+    versions = results("side_by_side")["versions"].items()
+    return f"{table}\n\nVersions: {', '.join(f'{code} {number}' for code, number in versions if number)}."
+
+
 def stiff_flop() -> str:
     """Rest compliance of the Stiff-Flop trunk."""
     rows = []
@@ -389,7 +401,8 @@ TABLES: dict[str, Callable[[], str]] = {
     for function in (
         headlines, codesign, codesign_goals, codesign_bodies, strategies, kills, profile, agents, carry, test_set,
         buckling, predicted_tracking, trajectories, design_gradients, networks, design_optima,
-        tracking, closed_loop, stiff_flop, validation, contact, surrogate_speed, fem_speed, deployed, provenance,
+        tracking, closed_loop, side_by_side, stiff_flop, validation, contact, surrogate_speed, fem_speed, deployed,
+        provenance,
     )
 }  # fmt: skip
 """Tables by the name in a marked place."""
