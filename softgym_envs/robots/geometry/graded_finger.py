@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from softgym_envs.robots.mesh_tiers import MeshTier
 
 GRADING = 1.0  # growth of the edge length per distance from where it is smallest
-ZONE = 4.0  # elements have their smallest size up to this distance from the joints along z [mm]
 MARGIN = 2.0  # edges are rounded up to this distance from the bellows along z [mm]
 PROBES = 36  # directions in which an edge is probed for material
 PROBE_DISTANCE = 0.05  # [mm]
@@ -87,7 +86,8 @@ def draw_half_finger(*, size: float, feature_size: float, fillet: float, **lengt
     curves = round_joints(lengths, fillet) if fillet else []
     occ.synchronize()
     field = gmsh.model.mesh.field
-    away = f"max(0, min(fabs(z + {length}), fabs(z + {2.0 * length})) - {ZONE})"
+    # Elements have their smallest size along the bellows.
+    away = f"max(0, min(fabs(z + {length}), fabs(z + {2.0 * length})) - {0.5 * lengths['bellow_height']})"
     sizes = [field.add("MathEval")]
     field.setString(sizes[0], "F", f"min({size}, {feature_size} + {GRADING} * {away})")
     if curves:
