@@ -25,8 +25,7 @@ import numpy as np
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConvergenceError, DataError, InfeasibleDesign
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.geometry.finger_shape import draw_finger
-from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
+from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.sensorized_finger import SensorizedFinger
 from softgym_envs.storage import atomic_write, write_json
 
@@ -83,45 +82,17 @@ FIELDS = (
 )
 
 
-def draw_refined(**lengths: float) -> None:
-    """Draw the finger, with elements of 2 mm around the bellows and of 10 mm elsewhere."""
-    import gmsh
-
-    draw_finger(**lengths)
-    field, boxes = gmsh.model.mesh.field, []
-    for joint in (1, 2):
-        box = field.add("Box")
-        middle, half = -joint * lengths["length"], lengths["bellow_height"] / 2
-        sizes = {"VIn": 2.0, "VOut": 10.0, "Thickness": 0.3}
-        limits = {"XMin": -20.0, "XMax": 20.0, "YMin": -1.0, "YMax": 20.0, "ZMin": middle - half, "ZMax": middle + half}
-        for name, value in (sizes | limits).items():
-            field.setNumber(box, name, value)
-        boxes.append(box)
-    smallest = field.add("Min")
-    field.setNumbers(smallest, "FieldsList", boxes)
-    field.setAsBackgroundMesh(smallest)
-    gmsh.option.setNumber("Mesh.MeshSizeMin", 0.0)
-    gmsh.option.setNumber("Mesh.MeshSizeMax", 1e22)
-
-
 class SourceFinger(SensorizedFinger):
     """The finger as in the scenes of the study.
 
     Args:
         mass: total mass under gravity along -z [kg]; the scenes have 0.1 kg for every volume.
-        refined: mesh as `draw_refined` does.
         **options: as for `SensorizedFinger`.
     """
 
-    def __init__(self, *, mass: float = 0.1, refined: bool = False, **options) -> None:
-        super().__init__(meshing="remesh", **options)
+    def __init__(self, *, mass: float = 0.1, **options) -> None:
+        super().__init__(**options)
         self.mass = mass
-        self.refined = refined
-
-    def mesh(self, design: Mapping[str, float]) -> BodyMesh:
-        if not self.refined:
-            return super().mesh(design)
-        return mesh_geometry(draw_refined, self.drawing(design)[1], mesh_size=self.mesh_size)
 
     def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         model = super().equip(mesh, design)
@@ -135,10 +106,10 @@ class SourceFinger(SensorizedFinger):
 def published() -> dict[str, object]:
     """Sensorized finger: table 3.1 and table 3.5 of the thesis, and the time of a design."""
     kinds = {
-        "7 mm": SensorizedFinger(meshing="remesh"),
+        "7 mm": SensorizedFinger(),
         # Settings of the scene of the built fingers.
-        "as built": SourceFinger(refined=True, cable_clearance=1.0 * MM),
-        "3 mm": SensorizedFinger(meshing="remesh", mesh_size=3.0 * MM),
+        "as built": SourceFinger(mesh="local", cable_clearance=1.0 * MM),
+        "3 mm": SensorizedFinger(mesh_size=3.0 * MM),
     }
     result: dict[str, object] = {}
     for name, design in DESIGNS.items():
@@ -149,13 +120,13 @@ def published() -> dict[str, object]:
             angle = math.degrees(readings.bending_angle)
             result[f"{name}: {kind} [uL, deg]"] = [round(1e9 * readings.volume_change, 1), round(angle, 2)]
     # The study keeps the cable of the initial finger at 17.75 mm, 3 mm above the bellows.
-    readings = SensorizedFinger(meshing="remesh", cable_clearance=3.0 * MM).readings()
+    readings = SensorizedFinger(cable_clearance=3.0 * MM).readings()
     angle = math.degrees(readings.bending_angle)
     result["baseline: 7 mm, cable at 17.75 mm [uL, deg]"] = [round(1e9 * readings.volume_change, 1), round(angle, 2)]
 
     result["large, wall 3 -> 2.6 mm: thesis, 3209 nodes [uL]"] = [175.2, 217.0]
     for size in (2.8, 2.5, 2.2):
-        robot = SensorizedFinger(meshing="remesh", mesh_size=size * MM)
+        robot = SensorizedFinger(mesh_size=size * MM)
         changes = [
             round(1e9 * robot.readings(DESIGNS["large"] | {"wall_thickness": wall * MM}).volume_change, 1)
             for wall in (3.0, 2.6)
@@ -164,7 +135,7 @@ def published() -> dict[str, object]:
         result[f"large, wall 3 -> 2.6 mm: {nodes} nodes [uL]"] = changes
 
     for size in (7.0, 3.0):
-        robot = SensorizedFinger(meshing="remesh", mesh_size=size * MM)
+        robot = SensorizedFinger(mesh_size=size * MM)
         times = []
         for design in DESIGNS.values():
             nodes = len(robot.body(design).nodes)  # meshing is not counted
@@ -199,7 +170,7 @@ def read_trials(path: str | Path) -> list[dict[str, float]]:
 
 def evaluate(design: Mapping[str, float]) -> dict[str, object]:
     """Evaluate one design; see `FIELDS`."""
-    low, middle = SensorizedFinger(meshing="remesh"), SensorizedFinger(meshing="remesh", tip_height=0.010)
+    low, middle = SensorizedFinger(), SensorizedFinger(tip_height=0.010)
     weighted = SourceFinger(tip_height=0.010)
     complete = low.design_space.complete(design)
     try:
