@@ -86,7 +86,7 @@ def sensor_front() -> dict[str, object]:
 
 
 def sensor_front_published() -> dict[str, object]:
-    """Bending against sensing (thesis, fig. 3.6), bellows up to 10 mm high as published: 400 designs."""
+    """Bending against sensing (thesis, fig. 3.6), bellows up to 10 mm high as published: 1500 designs."""
     return front("sensorized_finger_front_published")
 
 
