@@ -56,6 +56,9 @@ DESIGNS: dict[str, dict[str, float]] = {
 TABLE = {"baseline": (41.5, 21.1), "slim": (29.7, 28.13), "large": (153.1, 19.1)}
 """Simulated values of the thesis (table 3.1): volume change [mm3] and bending angle [deg]."""
 
+MEASURED = {"slim": (45.7, 26.1), "large": (300.7, 16.9)}
+"""Measured on prototypes (thesis, tables 3.2 and 3.4): volume change [mm3] and bending angle [deg]."""
+
 NAMES = {
     "JointSlopeAngle": "slope",
     "OuterRadius": "outer_radius",

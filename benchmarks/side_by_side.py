@@ -473,6 +473,7 @@ def draw(rows: list[Row], folder: Path) -> None:
 
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     cases = list(dict.fromkeys(row.case for row in rows))
     figure, panels = plt.subplots(1, len(cases), figsize=(3.4 * len(cases), 3.2), layout="constrained")
@@ -485,6 +486,8 @@ def draw(rows: list[Row], folder: Path) -> None:
             x, y = [row.seconds for row in found], [abs(row.error) for row in found]
             panel.loglog(x, y, dashes, marker="o", markersize=4, color=colours[code], label=f"{code}, {element}")
         panel.set(title=case, xlabel="CPU time [s]")
+        for axis in (panel.xaxis, panel.yaxis):
+            axis.set_minor_formatter(NullFormatter())
     panels[0].set_ylabel("relative error")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right", fontsize="small")
     folder.mkdir(parents=True, exist_ok=True)

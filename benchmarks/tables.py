@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from benchmarks.recorded import figure, number, records, results
@@ -316,6 +316,37 @@ def side_by_side() -> str:
     return f"{table}\n\nVersions: {', '.join(f'{code} {number}' for code, number in versions if number)}."
 
 
+def sensor_accuracy() -> str:
+    """The published sensorized fingers on three meshes and at three Poisson's ratios, beside the thesis."""
+    from benchmarks.sensor_finger import MEASURED, TABLE
+
+    found = results("sensor_accuracy")
+    cases: dict[str, Mapping[str, Sequence[float]]] = {"thesis, simulated": TABLE, "thesis, measured": MEASURED}
+    for key, values in found.items():
+        case, _, design = key.rpartition(": ")
+        if design in TABLE:
+            cases.setdefault(case.replace("nu", "ν"), {})
+            cases[case.replace("nu", "ν")] = {**cases[case.replace("nu", "ν")], design: values}
+    rows = []
+    for case, row in cases.items():
+        cells = [f"{row[name][0]:.1f} µL, {row[name][1]:.1f}°" if name in row else "" for name in TABLE]
+        rows.append([case, *cells, f"{row['large'][0] / row['slim'][0]:.2f}"])
+    return markdown(["mesh, Poisson's ratio", *TABLE, "volume, large / slim"], rows, "lrrrr")
+
+
+def sensor_convergence() -> str:
+    """Volume change of two sensorized fingers on finer and finer meshes."""
+    rows = []
+    for key, (nodes, change) in results("sensor_accuracy").items():
+        if key.startswith("convergence, "):
+            element, size, name = (
+                key.removeprefix("convergence, ").removesuffix(" [nodes, uL]").replace(":", ",").split(", ")
+            )
+            rows.append([name, element, size, f"{nodes:,}", f"{change:.1f}"])
+    rows.sort(key=lambda row: (row[0], row[1], int(row[3].replace(",", ""))))
+    return markdown(["finger", "elements", "size away from the cavities", "nodes", "volume change [µL]"], rows, "lllrr")
+
+
 def stiff_flop() -> str:
     """Rest compliance of the Stiff-Flop trunk."""
     rows = []
@@ -401,7 +432,7 @@ TABLES: dict[str, Callable[[], str]] = {
     for function in (
         headlines, codesign, codesign_goals, codesign_bodies, strategies, kills, profile, agents, carry, test_set,
         buckling, predicted_tracking, trajectories, design_gradients, networks, design_optima,
-        tracking, closed_loop, side_by_side, stiff_flop, validation, contact, surrogate_speed, fem_speed, deployed,
+        tracking, closed_loop, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop, validation, contact, surrogate_speed, fem_speed, deployed,
         provenance,
     )
 }  # fmt: skip
