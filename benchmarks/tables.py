@@ -432,7 +432,8 @@ TABLES: dict[str, Callable[[], str]] = {
     for function in (
         headlines, codesign, codesign_goals, codesign_bodies, strategies, kills, profile, agents, carry, test_set,
         buckling, predicted_tracking, trajectories, design_gradients, networks, design_optima,
-        tracking, closed_loop, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop, validation, contact, surrogate_speed, fem_speed, deployed,
+        tracking, closed_loop, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop, validation, contact,
+        surrogate_speed, fem_speed, deployed,
         provenance,
     )
 }  # fmt: skip
