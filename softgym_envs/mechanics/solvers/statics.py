@@ -29,6 +29,9 @@ from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.mechanics.solvers.prediction import LARGEST_BEND, Bend
 
+SHORT_STEP, MOST_SHORT_STEPS = 0.05, 6
+"""In contact, an increment is divided after this number of steps in a row of less than this part of Newton's."""
+
 
 class NewtonFailure(Exception):
     """Newton's method did not converge on one increment; solvers catch it."""
@@ -242,7 +245,7 @@ class Statics:
         change[driven] = (target - linear.delta)[driven]
         last, self._bend = self._bend, None
         expected = None if last is None or linear.inertia is not None else last.expected(change)
-        straight, corrections, full = 0.0, np.zeros(self.model.equations), False
+        straight, corrections, full, crawls = 0.0, np.zeros(self.model.equations), False, 0
         for iteration in range(self.max_iterations + 1):
             step_q, step_effort = self._correction(None, linear.delta, self.effort, target, driven)
             norm = self._norm(step_q)
@@ -271,6 +274,9 @@ class Statics:
                 raise NewtonFailure
             x, effort, assembled, length = found
             full = length == 1.0
+            crawls = crawls + 1 if length < SHORT_STEP else 0
+            if crawls == MOST_SHORT_STEPS:
+                raise NewtonFailure
             if iteration:
                 corrections += length * step_q
             elif full:
@@ -306,13 +312,8 @@ class Statics:
     ) -> tuple[np.ndarray, np.ndarray, Assembled, np.ndarray, float]:
         """Apply simplified Newton corrections, if they alone can reach the tolerance: this saves a factorisation.
 
-        Args:
-            x: rows (n, 3) after a whole Newton step.
-            effort: efforts (size,) after it.
-            assembled: the equations there.
-            norm: largest displacement of that step [m].
-            target: see `_correction`.
-            driven: see `_correction`.
+        Rows ``x`` (n, 3), efforts (size,) and equations are those after a whole Newton step of largest displacement
+        ``norm`` [m]; for the rest see `_correction`.
 
         Returns:
             Rows, efforts and equations; the sum of the corrections (N,); the largest displacement of the next [m].
