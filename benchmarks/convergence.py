@@ -70,7 +70,7 @@ def beams(counts: Sequence[int]) -> tuple[dict[str, dict[str, Any]], tuple[float
 TRUNK_LEVELS = {
     "coarser": {"mesh": "accurate", "layers": 12, "rings": 1},
     "accurate": {"mesh": "accurate"},
-    "finer": {"mesh": "accurate", "layers": 36, "rings": 3},
+    "finer": {"mesh": "reference"},
 }
 
 STUDIES = {
