@@ -60,16 +60,20 @@ def sensor_accuracy() -> dict[str, object]:
     return result
 
 
-def compare(trials: Path, limit: int) -> dict[str, object]:
+def compare(trials: Path, limit: int, mesh_size: float | None = None) -> dict[str, object]:
     """Rank correlation with recorded trials on two meshes, for designs that all three can solve.
 
-    The finger has the weight and the tip of the recorded scene.
+    The finger has the weight and the tip of the recorded scene; ``mesh_size`` is that of the accurate mesh [mm].
     """
     from scipy.stats import spearmanr
 
     recorded = [trial for trial in read_trials(trials) if math.isfinite(trial["obj0"])]
     recorded = recorded[:: max(1, len(recorded) // limit)][:limit]
-    robots = {mesh: SourceFinger(mesh=mesh, tip_height=0.010) for mesh in ("published", "accurate")}
+    size = None if mesh_size is None else mesh_size * MM
+    robots = {
+        "published": SourceFinger(tip_height=0.010),
+        "accurate": SourceFinger(mesh="accurate", mesh_size=size, tip_height=0.010),
+    }
     found: dict[str, list[list[float]]] = {mesh: [] for mesh in robots}
     with click.progressbar(recorded, label="designs") as bar:
         for trial in bar:
@@ -97,12 +101,12 @@ def compare(trials: Path, limit: int) -> dict[str, object]:
 @click.option(
     "--output", type=click.Path(path_type=Path), default=Path("results/sensor_trials.json"), show_default=True
 )
-def main(trials: Path, limit: int, output: Path) -> None:
+def main(trials: Path, limit: int, mesh_size: float | None, output: Path) -> None:
     """Compare with recorded TRIALS on the published and the accurate mesh."""
     from softgym_envs.config import provenance
     from softgym_envs.storage import write_json
 
-    result = compare(trials, limit)
+    result = compare(trials, limit, mesh_size)
     for key, value in result.items():
         click.echo(f"{key}: {value}")
     write_json(output, {**provenance(), "results": result})

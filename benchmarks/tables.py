@@ -316,6 +316,26 @@ def side_by_side() -> str:
     return f"{table}\n\nVersions: {', '.join(f'{code} {number}' for code, number in versions if number)}."
 
 
+def design_networks() -> str:
+    """The thesis' network and ours over the lengths of the finger."""
+    found = results("design_networks")
+    names = list(dict.fromkeys(key.partition(": ")[0] for key in found))
+    rows = []
+    for name in names:
+        row = {key.removeprefix(f"{name}: "): value for key, value in found.items() if key.startswith(f"{name}: ")}
+        errors = [value for key, value in row.items() if key.startswith("trajectory")]
+        loss = f"{row['loss as in the thesis']:.2g}"
+        effector = [f"{1e3 * row[key]:.2g}" for key in ("effector_mean", "effector_worst")]
+        definite = f"{100.0 * row['positive_definite']:.3g}%"
+        span = f"{min(errors):.2g} to {max(errors):.2g}%"
+        rows.append(
+            [name, f"{row['training states']:,}", f"{row['training, CPU [s]']:.0f}", loss, *effector, definite, span]
+        )
+    published = ["thesis, as published", "50,000", "", "0.13 (F), 0.19 (G)", "", "about 3", "", "1.03 to 7.02%"]
+    head = ["network", "states", "training, CPU [s]", "loss", "effector error, mean [mm]", "worst [mm]"]
+    return markdown([*head, "`W` positive definite", "closing trajectory"], [published, *rows], "lrrrrrrr")
+
+
 def sensor_accuracy() -> str:
     """The published sensorized fingers on three meshes and at three Poisson's ratios, beside the thesis."""
     from benchmarks.sensor_finger import MEASURED, TABLE
@@ -432,9 +452,8 @@ TABLES: dict[str, Callable[[], str]] = {
     for function in (
         headlines, codesign, codesign_goals, codesign_bodies, strategies, kills, profile, agents, carry, test_set,
         buckling, predicted_tracking, trajectories, design_gradients, networks, design_optima,
-        tracking, closed_loop, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop, validation, contact,
-        surrogate_speed, fem_speed, deployed,
-        provenance,
+        tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop,
+        validation, contact, surrogate_speed, fem_speed, deployed, provenance,
     )
 }  # fmt: skip
 """Tables by the name in a marked place."""
