@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.contact import block_on_incline, bouncing
+from benchmarks.contact import block_on_incline
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
@@ -148,13 +148,6 @@ def test_sliding_block_accelerates_as_coulomb_says(rigid):
     # Implicit Euler loses h/2 of the gained kinetic energy per step, nothing else.
     lost, gained = total[29] - total[-1], motions[-1].kinetic - motions[29].kinetic
     assert 0.0 <= lost < 0.04 * gained
-
-
-def test_bouncing_block_returns_its_energy_as_steps_shrink():
-    """Without friction and damping a dropped rigid block comes back; the first-order scheme loses energy like h."""
-    lost = [row.value for row in bouncing((2e-4, 1e-4, 5e-5))]
-    assert 0.0 < lost[2] < lost[1] < lost[0] < 0.5
-    assert lost[1] / lost[2] == pytest.approx(2.0, rel=0.15)
 
 
 def test_energy_growing_scheme_is_refused():
