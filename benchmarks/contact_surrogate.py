@@ -282,7 +282,7 @@ def main(
         print(json.dumps(definiteness(model, draws, seed), indent=1))
         return
     if speeds:
-        print(json.dumps(speed(model, (1, 10, 100, 1000), seed), indent=1))
+        print(json.dumps(speed(model, (1, 100, 1000), seed), indent=1))
         return
     if "-" in contacts:
         low, high = map(int, contacts.split("-"))

@@ -129,7 +129,9 @@ def test_tangent_in_contact(beam, friction):
     def gradient(q, blocks=False):
         g, d = np.empty((count, 3)), np.empty((count, 3, 3))
         u, lo = np.empty((count - 1, 3, 3)), np.empty((count - 1, 3, 3))
-        assemble(q, length, along, stiffness, skin, table, edges, memory.before[0], law, False, g, d, u, lo)
+        anchors = memory.before[0]
+        limits = np.empty(anchors.shape[:2])
+        assemble(q, length, along, stiffness, skin, table, edges, anchors, law, False, g, d, u, lo, limits)
         return (d, u, lo) if blocks else g
 
     diagonal, upper, lower = gradient(memory.q[0], blocks=True)

@@ -204,7 +204,7 @@ class ChainBatch:
 
     def move(self, angles: np.ndarray) -> None:
         """Move the servos as `close` does, without returning the states."""
-        self._move(np.arange(len(self.slot)), np.asarray(angles, dtype=float))
+        self._move(slice(None), np.asarray(angles, dtype=float))
 
     @property
     def found(self) -> np.ndarray:
@@ -216,9 +216,10 @@ class ChainBatch:
         """Torques of the servos [N m], shape (B,)."""
         return self._torque * self._relative
 
-    def _move(self, rows: np.ndarray, angles: np.ndarray) -> None:
+    def _move(self, rows: np.ndarray | slice, angles: np.ndarray) -> None:
+        # A slice moves the rows in place, chosen rows are copies.
         parts = [self._q[rows], self._anchors[rows], self._before[rows]]
-        torque, found = np.zeros(len(rows)), np.zeros(len(rows), dtype=bool)
+        torque, found = np.zeros(len(angles)), np.zeros(len(angles), dtype=bool)
         advance(
             parts[0], self._angle[rows], angles, self.slot[rows], *self.prepared.segments, *self.prepared.skin,
             self._table[rows], self._edges[rows], parts[1], parts[2], self._law[rows], torque, found,

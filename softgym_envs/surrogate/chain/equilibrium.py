@@ -15,7 +15,6 @@ from softgym_envs.surrogate.chain.kernels import (
     energy_of,
     factorise,
     gap_of,
-    points_near,
     skin_point,
     substitute,
     touch,
@@ -60,16 +59,14 @@ def find(q, angle, target, drive, length, along, stiffness, skin, obstacles, edg
     upper, lower = np.empty((count - 1, 3, 3)), np.empty((count - 1, 3, 3))
     pivots, step = np.empty((count, 3, 3)), np.empty((count, 3, 1))
     limits = np.zeros(anchors.shape[:2])
-    p, arm, far, pull, tangent = np.empty(3), np.empty(2), np.empty(2), np.empty(2), np.empty((2, 2))
     trial = np.empty_like(q)
-    nodes, shares, arms, heights, areas = skin
     system = (length, along, stiffness, skin, obstacles, edges, anchors, law)
     for iteration in range(MAX_ITERATIONS):
         left = target - angle
         direction = drive_direction(drive, angle)
         energy = np.inf
         for convex in (False, True):
-            energy = assemble(q, *system, convex, gradient, diagonal, upper, lower)
+            energy = assemble(q, *system, convex, gradient, diagonal, upper, lower, limits)
             if not energy < np.inf:
                 return False, 0.0, iteration
             if not factorise(diagonal, upper, lower, pivots):
@@ -99,18 +96,6 @@ def find(q, angle, target, drive, length, along, stiffness, skin, obstacles, edg
             return True, direction @ (gradient[0] + upper[0] @ np.ascontiguousarray(step[1, :, 0])), iteration
         part = min(1.0, min(MAX_STEP / max(far_step, 1e-30), MAX_TURN / max(turn, 1e-30)))
         part = min(part, MAX_TURN / max(abs(left), 1e-30))
-        limits[:, :] = 0.0
-        turned = turns(q)
-        near = points_near(q, turned, skin, obstacles, edges, law[0])
-        for k in range(len(areas)):
-            for o in range(len(obstacles)):
-                if near[k] and obstacles[o, 1] > 0.0:
-                    skin_point(
-                        q, turned, nodes[k, 0], nodes[k, 1], shares[k], arms[k, :2], arms[k, 2:], heights[k], p, arm,
-                        far,
-                    )  # fmt: skip
-                    pressing = touch(p, areas[k], obstacles[o], edges[o], anchors[o, k], law, True, pull, tangent)[2]
-                    limits[o, k] = obstacles[o, 1] * pressing
         accepted = False
         for _ in range(30):
             trial[:] = q + part * step[:, :, 0]
@@ -211,12 +196,13 @@ def condense(
     gradient, diagonal = np.empty((count, 3)), np.empty((count, 3, 3))
     upper, lower = np.empty((count - 1, 3, 3)), np.empty((count - 1, 3, 3))
     pivots, right = np.empty((count, 3, 3)), np.empty((count, 3, rows + 1))
+    limits = np.empty(anchors.shape[1:3])
     for b in range(len(q)):
         s = slot[b]
         skin = (nodes, shares, arms[s], heights, areas[s])
         assemble(
             q[b], length[s], along[s], stiffness[s], skin, obstacles[b], edges[b], anchors[b], law[b], False, gradient,
-            diagonal, upper, lower,
+            diagonal, upper, lower, limits,
         )  # fmt: skip
         found[b] = factorise(diagonal, upper, lower, pivots)
         if not found[b]:

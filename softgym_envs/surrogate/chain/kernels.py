@@ -262,12 +262,13 @@ def touch(p, area, obstacle, edges, anchor, law, convex, pull, tangent):
 
 @njit(cache=True, error_model="numpy")
 def assemble(
-    q, length, along, stiffness, skin, obstacles, edges, anchors, law, convex, gradient, diagonal, upper, lower
+    q, length, along, stiffness, skin, obstacles, edges, anchors, law, convex, gradient, diagonal, upper, lower, limits
 ):
     """Return the energy of a chain in contact; fill its gradient (N, 3) and the blocks of its tangent.
 
     ``skin`` holds nodes (P, 2), shares (P,), arms (P, 4), heights (P,) and areas (P,). The energy is inf if a point is
-    inside an obstacle. Blocks: diagonal (N, 3, 3), upper and lower (N - 1, 3, 3).
+    inside an obstacle. Blocks: diagonal (N, 3, 3), upper and lower (N - 1, 3, 3). The limits of friction [N] (O, P) are
+    filled too.
     """
     nodes, shares, arms, heights, areas = skin
     count = len(q)
@@ -275,6 +276,7 @@ def assemble(
     diagonal[:, :, :] = 0.0
     upper[:, :, :] = 0.0
     lower[:, :, :] = 0.0
+    limits[:, :] = 0.0
     g, h = np.empty(6), np.empty((6, 6))
     energy = 0.0
     for k in range(count - 1):
@@ -305,6 +307,7 @@ def assemble(
             energy += part
             if pressing == 0.0:
                 continue
+            limits[o, k] = obstacles[o, 1] * pressing
             # Derivatives of the point by (x, y, rotation) of both nodes.
             near = 1.0 - share
             by_x = (near, 0.0, -near * arm[1], share, 0.0, -share * far[1])

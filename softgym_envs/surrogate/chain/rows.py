@@ -69,7 +69,8 @@ def contact_rows(batch: ChainBatch, row: int) -> ContactRows | None:
     upper, lower = np.empty((count - 1, 3, 3)), np.empty((count - 1, 3, 3))
     anchors = memory.anchors[row]
     assemble(
-        q, length, along, stiffness, skin, table, edges, anchors, law, False, gradient, diagonal, upper, lower
+        q, length, along, stiffness, skin, table, edges, anchors, law, False, gradient, diagonal, upper, lower,
+        np.empty(anchors.shape[:2]),
     )  # fmt: skip
     tangent = np.zeros((count, 3, count, 3))
     each, pairs = np.arange(count), np.arange(count - 1)
