@@ -50,7 +50,7 @@ class ConfigError(SoftGymError, ValueError):
     """A configuration file or command-line override is malformed."""
 
 
-MAX_NAMES = 12
+MAX_NAMES = 16
 """Largest number of allowed names that a message lists besides the nearest one."""
 
 

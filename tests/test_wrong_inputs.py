@@ -109,7 +109,7 @@ MISTAKES = {
     ),
     "robot option": (
         lambda _: make_robot("finger", cabels=1),
-        "robot 'finger': unknown option 'cabels'; did you mean 'cables'? allowed: cables, mesh_size, *",
+        "robot 'finger': unknown option 'cabels'; did you mean 'cables'? allowed: cables, mesh, mesh_size, *",
     ),
     "robot option of the wrong type": (
         lambda _: make_robot("finger", cables="two"),
@@ -141,7 +141,7 @@ MISTAKES = {
     ),
     "configuration key": (
         lambda f: config(f, TrainConfig, TRAIN, "sac.gama=0.9"),
-        "config '*': sac: unknown key 'gama'; did you mean 'gamma'?",
+        "config '*': sac: unknown key 'gama'; did you mean 'gamma'? allowed: learning_rate, *",
     ),
     "variable of a study": (
         lambda f: config(f, StudyConfig, FINGER, "variables=[heigth]"),
