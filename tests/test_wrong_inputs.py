@@ -105,7 +105,7 @@ MISTAKES = {
     # Names
     "robot": (
         lambda _: make_robot("fingr"),
-        "unknown robot 'fingr'; did you mean 'finger'?",
+        "unknown robot 'fingr'; did you mean 'finger'? allowed: finger, diamond, *",
     ),
     "robot option": (
         lambda _: make_robot("finger", cabels=1),
