@@ -30,6 +30,9 @@ class SplitCholesky(LinearSolver):
     Args:
         cholesky: factorises the positive definite part. Its own factorisations are lost.
         most: number of equations that are split off at most.
+
+    Attributes:
+        singular: whether the last matrix was singular to rounding: a part of the body moves freely.
     """
 
     name = "split"
@@ -42,8 +45,8 @@ class SplitCholesky(LinearSolver):
         self._split = np.empty(0, dtype=np.int64)
 
     def factorise(self, values: np.ndarray) -> bool:
-        """Factorise the matrix. False if it is singular, or if too many equations would have to be split off."""
-        more = 3
+        """Factorise the matrix. False if it is `singular`, or if too many equations would have to be split off."""
+        more, self.singular = 3, False
         while len(self._split) <= self._most:
             if not self._factorise(values):
                 further = self._cholesky.failed_at(more)
@@ -85,7 +88,8 @@ class SplitCholesky(LinearSolver):
         schur = corner - self._rows @ self._bridge
         self._eigenvalues, vectors = np.linalg.eigh(0.5 * (schur + schur.T))
         sizes = np.abs(self._eigenvalues)
-        if len(sizes) and sizes.min() <= 1e-14 * np.abs(corner).max():
+        self.singular = bool(len(sizes) and sizes.min() <= 1e-14 * np.abs(corner).max())
+        if self.singular:
             return False
         self._inverse = vectors / self._eigenvalues @ vectors.T
         return True

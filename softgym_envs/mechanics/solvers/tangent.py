@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_matrix, tril
 
-from softgym_envs.mechanics.solvers.linear import CholmodSolver, LinearSolver, make_solver
+from softgym_envs.mechanics.solvers.linear import CholmodSolver, LinearSolver, SuperLUSolver, make_solver
 from softgym_envs.mechanics.solvers.ordering import nested_dissection
 from softgym_envs.mechanics.solvers.split import SplitCholesky
 
@@ -37,7 +37,7 @@ class Tangent:
         self._size = len(indptr) - 1
         self._order = nested_dissection(indptr, indices)
         self._preferred: LinearSolver = make_solver(solver, indptr, indices, self._order)
-        self._fallback: LinearSolver | None = None
+        self._fallback: SplitCholesky | None = None
         self._base: np.ndarray | None = None
         self._own = (indptr, indices)
         self.solver = self._preferred
@@ -60,7 +60,13 @@ class Tangent:
         if self._fallback is None:
             self._fallback = SplitCholesky(self._preferred)
         self.solver = self._fallback
-        return self._fallback.factorise(values)
+        if self._fallback.factorise(values):
+            return True
+        if not self._fallback.singular:
+            return False
+        # Parts that move freely matter only if something loads them, and LU passes over them.
+        self.solver = SuperLUSolver(self._preferred.indptr, self._preferred.indices)
+        return self.solver.factorise(values)
 
     def _merge(self, values: np.ndarray, extra: csr_matrix) -> np.ndarray:
         """Return the values of the sum in the pattern, which grows if it has to."""
