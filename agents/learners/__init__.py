@@ -22,10 +22,5 @@ def make_learner(config: TrainConfig) -> Learner:
     Raises:
         ValueError: if the environment cannot be made, or the method cannot learn in it.
     """
-    return learner_class(config.learner)(config)
-
-
-def learner_class(name: str) -> type[Learner]:
-    """Return the class of a learning method."""
-    module, _, cls = LEARNERS[name].partition(":")
-    return getattr(import_module(module), cls)
+    module, _, name = LEARNERS[config.learner].partition(":")
+    return getattr(import_module(module), name)(config)

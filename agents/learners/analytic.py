@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 
 from agents.config import TrainConfig
-from agents.learners.base import Learner, Tensors
+from agents.learners.base import Learner, Tensors, check_weights
 from softgym_envs.envs.gradients import StepGradient
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
-from softgym_envs.errors import WeightsError
 
 #: Smallest reward whose logarithm is followed; below, gradients would be without bound.
 SMALLEST_REWARD = 1e-6
@@ -36,8 +35,6 @@ class AnalyticLearner(Learner):
     Raises:
         ValueError: for an environment without derivatives: not on the surrogate, or a correction of the QP.
     """
-
-    model_based = True
 
     def __init__(self, config: TrainConfig) -> None:
         import torch
@@ -118,14 +115,7 @@ class AnalyticLearner(Learner):
     def load_weights(self, tensors: Mapping[str, np.ndarray], path: Path) -> None:
         import torch
 
-        for name, value in self._parameters.items():
-            if name not in tensors:
-                raise WeightsError(f"policy '{path}' lacks tensor '{name}'")
-            if tensors[name].shape != tuple(value.shape):
-                raise WeightsError(
-                    f"policy '{path}' does not fit: '{name}' has shape {tensors[name].shape}, needed "
-                    f"{tuple(value.shape)}; train it with the same net_arch, cables and design_in_observation"
-                )
+        check_weights({name: value.shape for name, value in self._parameters.items()}, tensors, path)
         with torch.no_grad():
             for name, value in self._parameters.items():
                 value.copy_(torch.as_tensor(tensors[name]))

@@ -3,15 +3,32 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from agents.config import TrainConfig
+from softgym_envs.errors import WeightsError
 
 Tensors = dict[str, np.ndarray]
+
+
+def check_weights(shapes: Mapping[str, Sequence[int]], tensors: Mapping[str, np.ndarray], path: Path) -> None:
+    """Check that the tensors of a file have the shapes of a learner's weights.
+
+    Raises:
+        WeightsError: if one is missing or does not fit.
+    """
+    for name, shape in shapes.items():
+        if name not in tensors:
+            raise WeightsError(f"policy '{path}' lacks tensor '{name}'")
+        if tensors[name].shape != tuple(shape):
+            raise WeightsError(
+                f"policy '{path}' does not fit: '{name}' has shape {tensors[name].shape}, needed {tuple(shape)}; "
+                "train it with the same net_arch, cables and design_in_observation"
+            )
 
 
 class Learner(ABC):
@@ -27,13 +44,11 @@ class Learner(ABC):
     Attributes:
         config: configuration of the training.
         step: environment steps so far, over all sub-environments.
-        model_based: whether the method differentiates the mechanical model.
 
     Raises:
         ValueError: for an environment in which the method cannot learn.
     """
 
-    model_based: ClassVar[bool] = False
     step: int
 
     @abstractmethod

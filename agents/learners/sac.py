@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.config import TrainConfig
-from agents.learners.base import Learner, Tensors
-from softgym_envs.errors import WeightsError
+from agents.learners.base import Learner, Tensors, check_weights
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
@@ -65,14 +64,7 @@ class SACLearner(Learner):
 
         model = self.model
         own = model.policy.state_dict()
-        for name, value in own.items():
-            if name not in tensors:
-                raise WeightsError(f"policy '{path}' lacks tensor '{name}'")
-            if tuple(tensors[name].shape) != tuple(value.shape):
-                raise WeightsError(
-                    f"policy '{path}' does not fit: '{name}' has shape {tuple(tensors[name].shape)}, needed "
-                    f"{tuple(value.shape)}; train it with the same net_arch, cables and design_in_observation"
-                )
+        check_weights({name: value.shape for name, value in own.items()}, tensors, path)
         model.policy.load_state_dict({name: torch.as_tensor(tensors[name]) for name in own})
         if "log_ent_coef" in tensors and model.log_ent_coef is not None:
             with torch.no_grad():

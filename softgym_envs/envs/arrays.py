@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+import copy
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
+
+T = TypeVar("T")
 
 #: A NumPy array, or a torch tensor in `TorchVectorEnv`.
 Array = Any
@@ -19,6 +23,15 @@ def namespace(array: Array) -> Any:
     import torch
 
     return torch
+
+
+def with_tensors(original: T, put: Callable[[np.ndarray], Any]) -> T:
+    """Return a copy of an object whose arrays are tensors, made by ``put``."""
+    twin = copy.copy(original)
+    for name, value in vars(original).items():
+        if isinstance(value, np.ndarray):
+            setattr(twin, name, put(value))
+    return twin
 
 
 def pick_rows(values: Array, index: Array) -> Array:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.envs.arrays import with_tensors
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.base import Task
 
@@ -53,8 +53,10 @@ class RewardGradient:
     """
 
     def __init__(self, task: Task, spaces: AgentSpaces) -> None:
+        import torch
+
         self._axes = task.axes
-        self._task, self._spaces = _with_tensors(task), _with_tensors(spaces)
+        self._task, self._spaces = with_tensors(task, torch.as_tensor), with_tensors(spaces, torch.as_tensor)
 
     def __call__(self, effector: np.ndarray, effort: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivatives of the rewards in effectors (B, 3) and efforts (B, n_a), for goals (B, 3)."""
@@ -66,14 +68,3 @@ class RewardGradient:
         # A distance of exactly zero has no derivative; the reward is at its peak there.
         met = (self._axes * (effector - goal) == 0.0).all(axis=1)
         return np.where(met[:, None], 0.0, by_effector.numpy()), by_effort.numpy()
-
-
-def _with_tensors(original):
-    """Return a copy of an object whose arrays are tensors."""
-    import torch
-
-    twin = copy.copy(original)
-    for name, value in vars(original).items():
-        if isinstance(value, np.ndarray):
-            setattr(twin, name, torch.as_tensor(value))
-    return twin

@@ -10,15 +10,15 @@ Internally, reached displacements ``u`` are scaled to [-1, 1] over the actuators
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from softgym_envs.backends.torch_batch import MAX_NEWTON_STEPS, Bodies, TorchBatch, put_rows, repeat_body, take_rows
+from softgym_envs.envs.arrays import with_tensors
 from softgym_envs.envs.options import (
     EnvironmentOptions,
     check_batchable,
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 NEWTON_STEPS = 4
 
 Result = dict[str, Any]
-T = TypeVar("T")
 
 
 class TorchVectorEnv:
@@ -104,7 +103,7 @@ class TorchVectorEnv:
         self.max_episode_steps = row.max_episode_steps if max_episode_steps is None else max_episode_steps
         self.single_action_space = self.spaces.action_space
         self.single_observation_space = self.spaces.observation_space
-        self._task, self._spaces = self._on_device(self.task), self._on_device(self.spaces)
+        self._task, self._spaces = with_tensors(self.task, self._put), with_tensors(self.spaces, self._put)
         self._model = TorchBatch(pretrained_model(self.robot, **setup.backend_options), self.device, dtype)
 
         # Designs are kept in double precision: near 0.5 a Poisson's ratio needs its digits.
@@ -136,14 +135,6 @@ class TorchVectorEnv:
 
     def _put_double(self, values: Any) -> Tensor:
         return torch.as_tensor(np.array(values, dtype=float), device=self.device)
-
-    def _on_device(self, original: T) -> T:
-        """Return a copy of an object whose arrays are tensors."""
-        twin = copy.copy(original)
-        for name, value in vars(original).items():
-            if isinstance(value, np.ndarray):
-                setattr(twin, name, self._put(value))
-        return twin
 
     # -- bodies -----------------------------------------------------------------------------------------------------
 
