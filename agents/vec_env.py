@@ -13,6 +13,9 @@ from stable_baselines3.common.vec_env import VecEnv
 class SB3VecEnv(VecEnv):
     """Adapter from a `gymnasium.vector.VectorEnv` with same-step autoreset to a stable-baselines3 `VecEnv`.
 
+    Options of `set_options` hold for one episode, as for stable-baselines3's own environments. A body for the whole
+    training is an option ``design`` of the environment.
+
     Raises:
         ValueError: for other autoreset modes, whose resets stable-baselines3 would count as steps.
     """
@@ -29,12 +32,29 @@ class SB3VecEnv(VecEnv):
         self.on_episode: Callable[[int, float], None] = lambda index, total: None
 
     def reset(self) -> np.ndarray:
-        observation, info = self.env.reset(seed=self._seed)
+        observation, info = self.env.reset(seed=self._seed, options=self._joined_options())
         self._seed = None
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._reset_options()
+        self.reset_infos = self._infos(info)
         self._return = np.zeros(self.num_envs)
         self._length = np.zeros(self.num_envs, dtype=np.int64)
         return observation
+
+    def _joined_options(self) -> dict[str, Any]:
+        """Return the options of all sub-environments as one mapping of bodies and goals."""
+        first = self._options[0]
+        if len(self._options) != self.num_envs or any(options.keys() != first.keys() for options in self._options):
+            names = [sorted(options) for options in self._options]
+            raise ValueError(f"options must be {self.num_envs} mappings with the same names, got names {names}")
+        joined: dict[str, Any] = {name: [options[name] for options in self._options] for name in first}
+        if "goal" in joined:
+            joined["goal"] = np.stack([np.atleast_2d(goal) for goal in joined["goal"]])
+        return joined
+
+    def _infos(self, info: dict[str, Any]) -> list[dict[str, Any]]:
+        """Return the present values of each sub-environment."""
+        names = [name for name in info if not name.startswith(("_", "final_"))]
+        return [dict(zip(names, row, strict=True)) for row in zip(*(info[name] for name in names), strict=True)]
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         self._seed = seed
@@ -48,13 +68,14 @@ class SB3VecEnv(VecEnv):
         done = terminated | truncated
         self._return += reward
         self._length += 1
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for i in np.flatnonzero(done):
-            infos[i] = {
+        infos = self._infos(info)
+        ended = np.flatnonzero(done)
+        final = self._infos(info["final_info"]) if len(ended) else []
+        for i in ended:
+            infos[i] = final[i] | {
                 "terminal_observation": info["final_obs"][i],
                 "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
                 "episode": {"r": float(self._return[i]), "l": int(self._length[i])},
-                "is_success": bool(info["final_info"]["is_success"][i]),
             }
             self.on_episode(int(i), float(self._return[i]))
             self._return[i] = 0.0

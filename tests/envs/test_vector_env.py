@@ -105,10 +105,37 @@ def test_stable_baselines_adapter():
         observation, reward, done, infos = env.step(rng.uniform(-1, 1, (3, 2)).astype(np.float32))
         assert reward.dtype == np.float32
         assert done.all() == (step == 49)
+        if step < 49:
+            state = env.env.unwrapped._state
+            assert [info["effort"].tolist() for info in infos] == state.effort.tolist()
+            assert all(set(info) >= {"distance", "is_success", "reward_effort"} for info in infos)
     for info in infos:
-        assert info["TimeLimit.truncated"] is True
+        assert info["TimeLimit.truncated"] is True and info["distance"] > 0.0
+        assert info["is_success"] == (info["distance"] < env.env.unwrapped.task.success_distance)
         assert info["terminal_observation"].shape == (15,)
         assert info["episode"]["l"] == 50
+    assert all(not info["displacement"].any() for info in env.reset_infos)
     sync = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("SoftGym/FingerReach-v0")])
     with pytest.raises(ValueError, match="autoreset"):
         SB3VecEnv(sync)
+
+
+def test_options_of_stable_baselines_hold_one_episode():
+    env = SB3VecEnv(gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2))
+    designs = env.get_attr("designs")[0]
+    env.set_options({"design": {"length": 0.0385}})
+    env.reset()
+    assert (designs[:, 0] == 0.0385).all()
+    goals = [np.array([0.0, 0.05, -0.1]), np.array([0.0, 0.04, -0.11])]
+    env.set_options(
+        [{"design": {"length": length}, "goal": goal} for length, goal in zip((0.039, 0.041), goals, strict=True)]
+    )
+    env.reset()
+    assert designs[:, 0].tolist() == [0.039, 0.041]
+    assert [info["goal"].tolist() for info in env.reset_infos] == [goal.tolist() for goal in goals]
+    env.reset()
+    assert (designs[:, 0] == 0.040).all()
+    for wrong in ([{"design": {"length": 0.039}}, {}], [{}]):
+        env.set_options(wrong)
+        with pytest.raises(ValueError, match="2 mappings with the same names"):
+            env.reset()
