@@ -107,7 +107,8 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
             f"* effort: `1 - 0.05 min(1, mean effort / {effort_scale})`."
         )
         return (
-            '`reward = distance term x effort term`, each in [0, 1] and reported in `info["reward_terms"]`:\n\n' + terms
+            "`reward = distance term x effort term`, each in [0, 1] and reported in `info` as `reward_distance` and "
+            "`reward_effort`:\n\n" + terms
         )
 
     def start() -> str:
@@ -147,7 +148,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         return (
             f"`effector` [m], `goal` [{goal_unit}], `measured` [{goal_unit}] (what is compared with the goal), "
             f"`distance` ({error.strip()}), `is_success` (`distance` < "
-            f"{limit}), `lost`, `reward_terms`, `displacement` [{unit}], `effort` "
+            f"{limit}), `lost`, `reward_*` (the terms of the reward), `displacement` [{unit}], `effort` "
             f"[{effort_unit}], `stable` (FEM: the tangent is positive definite), `converged`. `env.unwrapped.state` is "
             "the whole mechanical state, with the condensed model at `env.unwrapped.state.condensed` (`W.ea`, "
             "`delta_free.e`, ...)."

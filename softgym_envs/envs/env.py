@@ -134,7 +134,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             self._path = self.task.check_paths(goal)
         self.task.begin(self.np_random)
         self._step = 0
-        return self._observe()
+        observation, _, info = self._observe()
+        return observation, info
 
     def _draw_body(self) -> Design:
         """Draw the sampled variables and go to the rest state of that body; bodies that cannot exist are drawn again.
@@ -173,42 +174,43 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         except ConvergenceError:
             converged = False
         self._step += 1
-        observation, info = self._observe()
-        reward = prod(info["reward_terms"].values()) if converged else 0.0
-        return observation, reward, info["lost"], not converged, info | {"converged": converged}
+        observation, reward, info = self._observe(converged)
+        return observation, reward, bool(info["lost"]), not converged, info
 
-    def _observe(self) -> tuple[np.ndarray, dict[str, Any]]:
+    def _observe(self, converged: bool = True) -> tuple[np.ndarray, float, dict[str, Any]]:
+        """Return observation, reward and info of the present state."""
         state, goal = self.backend.state, self.goal
         measured = self.task.measure(state)
         distance, terms, _ = self.task.rate(measured, goal, self.spaces.effort_share(state.effort))
         terms |= self.task.state_terms(state)
-        info = {
+        reward = float(prod(terms.values())) if converged else 0.0
+        info: dict[str, Any] = {
             "effector": state.effector[0].copy(),
             "measured": measured.copy(),
             "goal": goal.copy(),
-            "distance": float(distance),
-            "is_success": bool(distance < self.task.success_distance),
+            "distance": distance,
+            "is_success": distance < self.task.success_distance,
             "lost": self.task.lost(state),
-            "reward_terms": {name: float(term) for name, term in terms.items()},
+            **{f"reward_{name}": term for name, term in terms.items()},
             "displacement": state.displacement.copy(),
             "effort": state.effort.copy(),
             "stable": state.stable,
             "uncertainty": state.uncertainty,
             "trusted": state.trusted,
-            "converged": True,
+            "converged": converged,
         }
         if state.contacts is not None:
             contacts = state.contacts
             info |= {
                 "contact_force": contacts.total,
                 "smallest_gap": contacts.smallest_gap,
-                "sliding": float(contacts.sliding.mean()) if contacts.count else 0.0,
+                "sliding": contacts.sliding.mean() if contacts.count else 0.0,
             }
         velocity = state.velocity[0] if self.spaces.moving else None
         observation = self.spaces.observe(
             state.command, state.displacement, state.effort, measured, goal, self._unit_design, velocity
         )
-        return observation, info
+        return observation, reward, {name: _with_dtype(value) for name, value in info.items()}
 
     def _kinematics(self, commands: np.ndarray) -> np.ndarray:
         """Return the effectors [m] (1, 3) that commands (1, n_a) lead to; NaN without an equilibrium."""
@@ -239,3 +241,10 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+
+def _with_dtype(value: Any) -> Any:
+    """Return a value of ``info`` with a dtype, which TorchRL reads."""
+    if isinstance(value, (bool, np.bool_)):
+        return np.array(value)  # Gymnasium batches arrays of booleans, but not NumPy's boolean scalars
+    return np.float64(value) if isinstance(value, float) else value

@@ -399,7 +399,7 @@ class TorchVectorEnv:
             "goal": goal.clone(),
             "distance": distance,
             "is_success": distance < self.task.success_distance,
-            "reward_terms": terms,
+            **{f"reward_{name}": term for name, term in terms.items()},
             "displacement": displacement,
             "effort": effort.clone(),
             "stable": torch.ones_like(state["converged"]),

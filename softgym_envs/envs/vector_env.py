@@ -332,7 +332,7 @@ class SoftRobotVectorEnv(VectorEnv):
             "goal": goals.copy(),
             "distance": distance,
             "is_success": distance < self.task.success_distance,
-            "reward_terms": terms,
+            **{f"reward_{name}": term for name, term in terms.items()},
             "stable": every,
         }
         for name in ("displacement", "effort", "uncertainty", "trusted", "converged"):

@@ -142,16 +142,36 @@ def test_bounds_time_limit_and_info(identifier, options, episodes, action_mode):
             assert 0.0 <= reward <= 1.0
             assert (np.abs(env.unwrapped.state.command - before) <= env.unwrapped.robot.rates + 1e-15).all()
         assert steps == limit or terminated
-    assert set(info) >= {"effector", "goal", "distance", "is_success", "reward_terms", "displacement", "effort"}
+    assert set(info) >= {"effector", "goal", "distance", "is_success", "displacement", "effort"}
     task = env.unwrapped.task
     if task.name not in ("carry", "grasp"):  # whose distances count one side only, and relative to the goal
         error = task.axes * (info["effector"] - info["goal"])
         assert info["distance"] == pytest.approx(np.linalg.norm(error), abs=1e-12)
     assert info["is_success"] == (info["distance"] < env.unwrapped.task.success_distance)
     assert info["converged"]
-    assert reward == pytest.approx(np.prod(list(info["reward_terms"].values())))
+    check_info(info)
+    terms = [value for name, value in info.items() if name.startswith("reward_")]
+    assert len(terms) >= 2 and reward == pytest.approx(np.prod(terms))
     unilateral = env.unwrapped.robot.unilateral
     assert (info["effort"][unilateral] >= 0.0).all()
+
+
+def check_info(info):
+    """TorchRL reads the dtype of every value; Gymnasium batches booleans only if they are arrays."""
+    flags = ("is_success", "lost", "stable", "trusted", "converged")
+    assert {name for name, value in info.items() if value.dtype == bool} == set(flags)
+    assert all(value.dtype == float for name, value in info.items() if name not in flags)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_information_is_flat_and_has_dtypes(backend):
+    env = make("SoftGym/FingerReach-v0", backend=backend)
+    infos = [env.reset(seed=0)[1], env.step(env.action_space.sample())[4]]
+    for info in infos:
+        check_info(info)
+    assert infos[0].keys() == infos[1].keys()
+    batched = gymnasium.vector.SyncVectorEnv([lambda: env])
+    assert batched.reset()[1]["is_success"].dtype == bool
 
 
 def test_rows_choose_the_backend_and_make_vec_follows():
@@ -322,7 +342,7 @@ def test_unsolvable_step_ends_the_episode(monkeypatch):
     before = env.unwrapped.state
     observation, reward, terminated, truncated, info = env.step(np.ones(2, dtype=np.float32))
     assert truncated and not terminated and reward == 0.0
-    assert info["converged"] is False and np.isfinite(observation).all()
+    assert not info["converged"] and np.isfinite(observation).all()
     assert env.unwrapped.state is before
 
 
