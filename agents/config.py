@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from pydantic import Field, field_validator, model_validator
 
-from softgym_envs.config import Config
+from softgym_envs.config import BesideConfig, Config
 from softgym_envs.envs.options import default_backend
 from softgym_envs.envs.registration import EnvironmentRow, find_row
 from softgym_envs.envs.tasks.registry import TASKS
@@ -54,9 +54,9 @@ class EnvironmentConfig(Config):
     sample_design: bool | list[str] = False
     design_in_observation: bool | list[str] = False
     action_mode: str = "increment"
-    robot_options: dict[str, Any] = {}
-    task_options: dict[str, Any] = {}
-    backend_options: dict[str, Any] = {}
+    robot_options: Annotated[dict[str, Any], BesideConfig()] = {}
+    task_options: Annotated[dict[str, Any], BesideConfig()] = {}
+    backend_options: Annotated[dict[str, Any], BesideConfig()] = {}
     residual_scale: float = Field(default=0.0, ge=0, le=2)
 
     @model_validator(mode="before")
@@ -273,7 +273,7 @@ class TrainConfig(Config):
     steps: int = Field(default=40_000, gt=0)
     num_envs: int = Field(default=16, gt=0)
     seed: int = Field(default=0, ge=0)
-    initial: str | None = None
+    initial: Annotated[str | None, BesideConfig()] = None
     evaluation_episodes: int = Field(default=64, gt=0)
     report_every: int = Field(default=4_000, gt=0)
 

@@ -171,6 +171,57 @@ def table(runs: list[StoredRuns]) -> str:
     return "\n".join(text) + "\n"
 
 
+@dataclass(frozen=True)
+class Summary:
+    """How well one agent does in one environment, over all seeds and goals.
+
+    Attributes:
+        configuration: name of the configuration.
+        environment: ID of the environment.
+        backend: backend of the evaluation.
+        agent: name of a learner or a baseline.
+        quantity: ``"distance"`` to the goal at the end, ``"tracking_distance"`` along a path, both in metres, or
+            ``"relative_error"``, of a force.
+        mean: interquartile mean.
+        low: lower end of the 95 % bootstrap interval; None if there is nothing to resample.
+        high: its upper end.
+        success_rate: share of goals reached.
+        seeds: number of trainings; 1 for a baseline.
+    """
+
+    configuration: str
+    environment: str
+    backend: str
+    agent: str
+    quantity: str
+    mean: float
+    low: float | None
+    high: float | None
+    success_rate: float
+    seeds: int
+
+
+def summary(runs: list[StoredRuns]) -> list[Summary]:
+    """Return the numbers of `table` in SI units: a row for each environment, backend and agent."""
+    rows = []
+    for entry in runs:
+        metres = entry.environment.task_class.goal_unit == "m"
+        quantity = ("tracking_distance" if entry.follows else "distance") if metres else "relative_error"
+        for backend in sorted({entry.environment.backend, "fem"}):
+            for agent in AGENTS:
+                scores = entry.scores(agent, backend, "mean_distances" if entry.follows else "distances")
+                successes = entry.scores(agent, backend, "successes")
+                if scores is None or successes is None:
+                    continue
+                estimate = crossed_estimate(scores)
+                low, high = (None if np.isnan(end) else end for end in (estimate.low, estimate.high))
+                title, rate = entry.environment.title, float(successes.mean())
+                rows.append(
+                    Summary(entry.name, title, backend, agent, quantity, estimate.value, low, high, rate, len(scores))
+                )
+    return rows
+
+
 def _grid(runs: Iterable[StoredRuns], cell: Callable[[StoredRuns, str], str]) -> str:
     lines = ["| configuration | " + " | ".join(AGENTS.values()) + " |", "|---" * (len(AGENTS) + 1) + "|"]
     for entry in runs:

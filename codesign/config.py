@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -24,6 +24,7 @@ from codesign.parts import (
 from codesign.problem import StudyProblem, refuse
 from codesign.sampling import SamplerConfig
 from codesign.variables import is_option
+from softgym_envs.config import BesideConfig
 from softgym_envs.envs.tasks.reach import Reach
 
 JOURNAL = "journal"
@@ -71,7 +72,7 @@ class StudyConfig(StudyProblem):
     """
 
     strategy: Literal["policy", "warm_start", "scratch", "critic", "distribution", "qp"] = "policy"
-    policy: str | None = None
+    policy: Annotated[str | None, BesideConfig()] = None
     joint: JointConfig = Field(default_factory=JointConfig)
     trials: int = Field(ge=1)
     workers: int = Field(default=1, ge=1)

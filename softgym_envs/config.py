@@ -7,6 +7,7 @@ import re
 import reprlib
 import subprocess
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -25,6 +26,11 @@ class Config(BaseModel):
     """Base class of all configurations: immutable, without unknown keys, finite numbers only."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=False, allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class BesideConfig:
+    """Marks a key whose value, or each string in a mapping, may be a path relative to the configuration's file."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -56,6 +62,9 @@ ModelT = TypeVar("ModelT", bound=Config)
 def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequence[str] = ()) -> ModelT:
     """Return the configuration in a YAML file, with overrides.
 
+    Paths in the file are relative to the file, or to the working directory where nothing is found beside the file;
+    paths in overrides are relative to the working directory.
+
     Args:
         path: the file, or None to start from the defaults.
         model: class of the configuration.
@@ -78,6 +87,7 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
         data = {} if data is None else data
         if not isinstance(data, dict):
             raise ConfigError(f"config '{path}' must be a mapping of keys to values, got a {type(data).__name__}")
+        _find_files(model, data, path.parent)
     for override in overrides:
         key, separator, text = override.partition("=")
         if not separator or not key:
@@ -93,6 +103,29 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
         except yaml.YAMLError:
             raise ConfigError(f"override '{override}': the value is not valid YAML") from None
     return check_config(model, data, f"config '{path}'" if path is not None else "config")
+
+
+def _find_files(model: type[BaseModel], data: dict[str, Any], folder: Path) -> None:
+    """Replace paths in plain data that are relative to a folder, and exist there, by absolute ones."""
+    for name, field in model.model_fields.items():
+        value = data.get(name)
+        if value is None:
+            continue
+        if any(isinstance(mark, BesideConfig) for mark in field.metadata):
+            if isinstance(value, dict):
+                data[name] = {key: _found_beside(folder, each) for key, each in value.items()}
+            else:
+                data[name] = _found_beside(folder, value)
+        elif isinstance(value, dict) and isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            _find_files(field.annotation, value, folder)
+
+
+def _found_beside(folder: Path, value: Any) -> Any:
+    """Return the absolute path of a file in a folder; any other value, such as a name, unchanged."""
+    if not isinstance(value, str) or not ("/" in value or Path(value).suffix):
+        return value
+    path = (folder / value).resolve()
+    return str(path) if path.exists() else value
 
 
 def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> ModelT:

@@ -37,6 +37,26 @@ def test_rollout_evaluate_and_record(softgym, tmp_path):
     assert table["results"][0]["success_rate"] == 1.0
 
 
+def test_results_as_json(softgym):
+    status, out, _ = softgym("list", "--json")
+    tables = json.loads(out)
+    assert status == 0 and "finger" in tables["robots"]
+    assert tables["environments"]["SoftGym/FingerReach-v0"]["task"] == "reach"
+    status, out, _ = softgym("show", "finger", "--json", "--design", "length=0.041")
+    robot = json.loads(out)
+    length = next(each for each in robot["design_variables"] if each["name"] == "length")
+    assert status == 0 and length["value"] == 0.041 and length["unit"] == "m"
+    assert robot["nodes"] > 100 and 0.0 < robot["mass"] < 1.0
+    status, out, err = softgym("evaluate", "--config", "finger_reach", "--agent", "qp", "--goals", 2, "--json")
+    table = json.loads(out)
+    assert status == 0 and table["goals"] == 2 and table["results"][0]["agent"] == "qp"
+    assert "qp" in err  # the table, for whoever watches
+    status, out, _ = softgym("results", "--json")
+    rows = json.loads(out)
+    assert status == 0 and all(row["low"] is None or row["low"] <= row["mean"] <= row["high"] for row in rows)
+    assert {"backend": "fem", "agent": "sac"}.items() <= rows[0].items()
+
+
 def test_dataset_fit_and_train(softgym, tmp_path):
     tiny = ["workers=1", "network.steps=3", "network.width=16", "robot_options.cables=1"]
     tiny += [f"data.{s}.groups=2" for s in ("train", "validation", "test")]

@@ -14,7 +14,7 @@ from codesign.tools.grasps import GraspConfig
 from codesign.tools.metrics import METRICS, Metric, find_metric
 from codesign.tools.nuisance import ContactConfig, OffsetConfig, check_nuisances
 from codesign.variables import OptionRange, change_options
-from softgym_envs.config import Config
+from softgym_envs.config import BesideConfig, Config
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 
@@ -49,14 +49,16 @@ class RobotConfig(Config):
     """
 
     robot: str = Field(description="registered name, or path my_module:MyRobot")
-    robot_options: dict[str, Any] = Field(default_factory=dict)
+    robot_options: Annotated[dict[str, Any], BesideConfig()] = Field(default_factory=dict)
     ranges: dict[str, OptionRange] = Field(default_factory=dict, description="bounds of free robot.<option>s")
     bounds: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="narrower bounds of free design variables, {name: [low, high]}"
     )
     design: dict[str, float] = Field(default_factory=dict)
     backend: Literal["fem", "surrogate"] = "surrogate"
-    weights: str | None = Field(default=None, description="folder of the surrogate's weights; default pretrained ones")
+    weights: Annotated[str | None, BesideConfig()] = Field(
+        default=None, description="folder of the surrogate's weights; default pretrained ones"
+    )
 
     @model_validator(mode="after")
     def _makes_a_robot(self) -> RobotConfig:
@@ -264,8 +266,7 @@ class CalibrationConfig(RobotConfig):
         fit: design variables to fit, and robot options as ``robot.<option>``.
         nuisances: unknowns of the measurement that are fitted too, by name: offsets of columns and the distance of an
             object.
-        data: CSV or JSON file of measurements, with a column for each actuator and effector coordinate. The command
-            line also looks for it beside the configuration file.
+        data: CSV or JSON file of measurements, with a column for each actuator and effector coordinate.
         method: ``"gradient"`` (least squares) or ``"tpe"`` (Optuna).
         starts: first values ``{name: value}`` of variables and nuisance parameters, one fit from each; default: the
             reference design.
@@ -280,7 +281,7 @@ class CalibrationConfig(RobotConfig):
     nuisances: dict[str, Annotated[OffsetConfig | ContactConfig, Field(discriminator="kind")]] = Field(
         default_factory=dict
     )
-    data: str
+    data: Annotated[str, BesideConfig()]
     method: Literal["gradient", "tpe"] = "gradient"
     starts: tuple[dict[str, float], ...] = Field(default=({},), min_length=1)
     trials: int = Field(default=250, ge=1)

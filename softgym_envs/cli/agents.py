@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,7 @@ from softgym_envs.errors import ConfigError
 
 
 @click.command()
-@options.run_options
+@options.run_options("agents")
 @options.folder
 @click.option("--initial", type=options.PATH, help="Policy to start from.")
 def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
@@ -31,7 +34,7 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
 
 
 @click.command()
-@options.config
+@options.config("agents")
 @click.option(
     "--agent", "agents", multiple=True, default=("qp", "random"), show_default=True, help=AGENT_HELP + " Repeatable."
 )
@@ -40,6 +43,7 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
 @click.option("--goals", default=200, show_default=True, help="Number of unseen goals.")
 @click.option("--seed", default=2_000_003, show_default=True, help="Seed of the goals.")
 @click.option("--output", type=options.PATH, help="Write all results as JSON to this file.")
+@options.as_json
 @options.overrides
 def evaluate(
     config: Path,
@@ -49,6 +53,7 @@ def evaluate(
     goals: int,
     seed: int,
     output: Path | None,
+    as_json: bool,
     overrides: tuple[str, ...],
 ) -> None:
     """Evaluate agents on the same unseen goals.
@@ -72,32 +77,37 @@ def evaluate(
             Policy(agent).check_environment(environment)
     points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
     results: list[dict[str, Any]] = []
-    click.echo(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean mm':>9s} {'worst mm':>9s} {'return':>8s}")
+    say = partial(click.echo, err=as_json)  # stdout is for the JSON
+    say(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean mm':>9s} {'worst mm':>9s} {'return':>8s}")
     for backend in backends or (environment.backend,):
         for agent in agents:
             outcome = run(agent, environment.on(backend), points, design=chosen, seed=seed)
             results.append({"agent": agent, "backend": backend, **outcome.to_json()})
-            click.echo(
+            say(
                 f"{agent[-34:]:34s} {backend:10s} {outcome.success_rate:8.1%} {1e3 * outcome.mean_distance:9.3f} "
                 f"{1e3 * outcome.worst_distance:9.3f} {outcome.mean_return:8.2f}"
             )
+    inputs = {"environment": environment.model_dump(mode="json"), "goals": goals, "seed": seed, "design": chosen}
+    document = {**inputs, **provenance(), "results": results}
+    if as_json:
+        click.echo(json.dumps(document))
     if output is not None:
-        inputs = {"environment": environment.model_dump(mode="json"), "goals": goals, "seed": seed, "design": chosen}
-        write_json(output, {**inputs, **provenance(), "results": results})
-        click.echo(f"wrote {output}")
+        write_json(output, document)
+        say(f"wrote {output}")
 
 
 @click.command()
 @click.option("--folder", type=options.PATH, help="Folder of stored runs (default: the shipped runs).")
-@click.option("--output", type=options.PATH, help="Write the table to this Markdown file instead of printing it.")
+@click.option("--output", type=options.PATH, help="Write the table to this file instead of printing it.")
 @click.option("--curves", type=options.PATH, help="Draw the learning curves to this file (.png, .svg or .pdf).")
-def results(folder: Path | None, output: Path | None, curves: Path | None) -> None:
+@options.as_json
+def results(folder: Path | None, output: Path | None, curves: Path | None, as_json: bool) -> None:
     """Print a table of training runs and draw their learning curves."""
-    from agents.results import RESULTS, draw_curves, load_runs, table
+    from agents.results import RESULTS, draw_curves, load_runs, summary, table
     from softgym_envs.storage import atomic_write
 
     runs = load_runs(folder or RESULTS)
-    text = table(runs)
+    text = json.dumps([asdict(row) for row in summary(runs)]) if as_json else table(runs)
     if output is None:
         click.echo(text)
     else:

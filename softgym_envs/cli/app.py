@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import click
 
-from softgym_envs.cli import agents, bench, codesign, environments, robots, surrogates
+from softgym_envs.cli import agents, bench, codesign, configs, environments, robots, surrogates
 from softgym_envs.cli.options import Resumable
 from softgym_envs.errors import SoftGymError, unknown_name
 from softgym_envs.version import __version__
@@ -19,6 +19,7 @@ SECTIONS = {
     "Surrogates": (surrogates.dataset, surrogates.fit, surrogates.deploy),
     "Agents": (agents.train, agents.evaluate, agents.results, agents.deploy_policy),
     "Design and control": (codesign.codesign, codesign.optimise, codesign.sensitivity, codesign.calibrate),
+    "Configurations": (configs.configs,),
     "Development": (bench.bench,),
 }
 

@@ -12,7 +12,7 @@ from softgym_envs.cli import options
 
 
 @click.command()
-@options.run_options
+@options.run_options("codesign")
 @options.results_folder
 @click.option("--workers", type=int, help="Number of worker processes (default: the config's).")
 @click.option("--storage", help="PostgreSQL database shared by several machines (default: the config's).")
@@ -42,7 +42,7 @@ def codesign(
 
 
 @click.command()
-@options.run_options
+@options.run_options("design")
 @options.results_folder
 def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
     """Rank design variables by their effect.
@@ -67,7 +67,7 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
 
 
 @click.command()
-@options.run_options
+@options.run_options("design")
 @options.results_folder
 def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
     """Search for the best bodies without a controller.
@@ -98,7 +98,7 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
 
 
 @click.command()
-@options.config
+@options.config("design")
 @options.results_folder
 @options.overrides
 def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> None:
@@ -108,8 +108,6 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
     from softgym_envs.config import load_config
 
     study = load_config(config, CalibrationConfig, overrides)
-    if not Path(study.data).exists() and (beside := config.parent / study.data).exists():
-        study = study.model_copy(update={"data": str(beside)})
     folder = Path("results") / study.name if folder is None else folder
     result = run(study, folder)
     for name, value in {**{name: result.design[name] for name in study.fit}, **result.nuisances}.items():

@@ -15,17 +15,24 @@ AGENT_HELP = "qp, qp_static, qp_model, qp_pi, random, or a policy (a file or the
 
 
 @click.command("list")
-def list_() -> None:
+@options.as_json
+def list_(as_json: bool) -> None:
     """List environments, robots, backends and tasks."""
     from softgym_envs.backends.registry import BACKENDS
     from softgym_envs.envs.registration import ENVIRONMENTS
     from softgym_envs.envs.tasks.registry import TASKS
     from softgym_envs.robots.registry import ROBOTS
 
+    tables = {"robots": ROBOTS, "backends": BACKENDS, "tasks": TASKS}
+    if as_json:
+        columns = ("robot", "task", "max_episode_steps")
+        rows = {name: {key: getattr(row, key) for key in columns} for name, row in ENVIRONMENTS.items()}
+        click.echo(json.dumps({"environments": rows, **{title: list(table) for title, table in tables.items()}}))
+        return
     click.echo("environments:")
     for identifier, row in ENVIRONMENTS.items():
         click.echo(f"  {identifier:28s} robot {row.robot}, task {row.task}, {row.max_episode_steps} steps")
-    for title, table in (("robots", ROBOTS), ("backends", BACKENDS), ("tasks", TASKS)):
+    for title, table in tables.items():
         click.echo(f"{title}: {', '.join(table)}")
 
 

@@ -8,21 +8,59 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
-from softgym_envs.errors import ConfigError
+from softgym_envs.errors import ConfigError, unknown_name
 
 if TYPE_CHECKING:
     from softgym_envs.robots.base import Robot
 
 PATH: Any = click.Path(path_type=Path)
 
-config = click.option("--config", type=PATH, required=True, help="YAML file of the run.")
+CONFIGS = Path(__file__).parents[1] / "configs"
+"""Folder of the shipped configurations."""
+
+
+def shipped_configs(folder: str) -> list[str]:
+    """Return the names of the shipped configurations of one kind: ``"agents"``, ``"codesign"``, ..."""
+    return sorted(path.stem for path in (CONFIGS / folder).glob("*.yaml"))
+
+
+class ConfigFile(click.ParamType):
+    """A YAML file, or the name of a shipped configuration of one kind."""
+
+    name = "file|name"
+
+    def __init__(self, folder: str) -> None:
+        self.folder = folder
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        path = Path(value)
+        if path.exists() or path.suffix in (".yaml", ".yml") or path.name != str(value):
+            return path
+        names = shipped_configs(self.folder)
+        if value not in names:
+            raise ConfigError(unknown_name("configuration file or name", value, names))
+        return CONFIGS / self.folder / f"{value}.yaml"
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        found = [CompletionItem(name) for name in shipped_configs(self.folder) if name.startswith(incomplete)]
+        return found or [CompletionItem(incomplete, type="file")]
+
+
+def config(folder: str) -> Callable[[Callable], Callable]:
+    """Add ``--config``: a file, or the name of a shipped configuration in a folder of `CONFIGS`."""
+    text = "YAML file of the run, or the name of a shipped one (softgym configs)."
+    return click.option("--config", type=ConfigFile(folder), required=True, help=text)
+
+
 folder = click.option("--folder", type=PATH, required=True, help="Folder for the results.")
 results_folder = click.option(
     "--folder", type=PATH, help="Folder for the results (default: results/NAME, with the config's name)."
 )
 overrides = click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
 quiet = click.option("--quiet", is_flag=True, help="Hide progress bars.")
+as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 design = click.option(
     "--design", multiple=True, metavar="NAME=VALUE", help="Design variable in SI units; repeat for several."
 )
@@ -31,9 +69,9 @@ robot_option = click.option(
 )
 
 
-def run_options(command: Callable) -> Callable:
+def run_options(folder: str) -> Callable[[Callable], Callable]:
     """Add the options of a verb that runs a configuration: ``--config``, ``--quiet`` and overrides."""
-    return config(quiet(overrides(command)))
+    return lambda command: config(folder)(quiet(overrides(command)))
 
 
 class Resumable(click.Abort):

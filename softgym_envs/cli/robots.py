@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import math
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -15,37 +18,57 @@ from softgym_envs.errors import ConfigError
 @options.robot_option
 @options.design
 @click.option("--picture", type=options.PATH, help="Write a PNG image of the body to this file.")
-def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture: Path | None) -> None:
+@options.as_json
+def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture: Path | None, as_json: bool) -> None:
     """Show a robot: its design variables, actuators and mesh."""
     from softgym_envs.robots.base import MeshedRobot
 
     body = options.robot_of(robot, options_)
-    click.echo(f"{robot} ({body.weights_name})\n\ndesign variables:")
-    for variable in body.design_space:
-        unit = "" if variable.unit == "1" else f" {variable.unit}"
-        bounds = f"[{variable.low:g}, {variable.high:g}]{unit}"
-        click.echo(f"  {variable.name:16s} {variable.baseline:<10g} {bounds:24s} {variable.description}")
-    click.echo("\nactuators:")
-    for actuator in body.actuators:
-        click.echo(
-            f"  {actuator.name:16s} {actuator.low:g} to {actuator.high:g} {actuator.unit}, "
-            f"at most {actuator.rate:g} {actuator.unit} per step"
-        )
     chosen = options.design_of(design)
     model = body.build(chosen)
-    if isinstance(body, MeshedRobot):
-        mesh = body.body(chosen)
-        text = f"mesh: {len(mesh.nodes)} nodes, {len(mesh.tetrahedra)} tetrahedra ({mesh.origin})"
+    mesh = body.body(chosen) if isinstance(body, MeshedRobot) else None
+    if as_json:
+        values = body.design_space.complete(chosen)
+        description = {
+            "robot": robot,
+            "weights_name": body.weights_name,
+            "design_variables": [asdict(each) | {"value": values[each.name]} for each in body.design_space],
+            "actuators": [
+                asdict(each) | {"max_effort": each.max_effort if math.isfinite(each.max_effort) else None}
+                for each in body.actuators
+            ],
+            "effectors": list(body.effectors),
+            "nodes": None if mesh is None else len(mesh.nodes),
+            "tetrahedra": None if mesh is None else len(mesh.tetrahedra),
+            "equations": model.equations,
+            "volume": model.volume,
+            "mass": model.mass,
+        }
+        click.echo(json.dumps(description))
     else:
-        text = f"model: {model.equations} equations"
-    click.echo(f"\n{text}, volume {1e9 * model.volume:.0f} mm3, mass {1e3 * model.mass:.1f} g")
+        click.echo(f"{robot} ({body.weights_name})\n\ndesign variables:")
+        for variable in body.design_space:
+            unit = "" if variable.unit == "1" else f" {variable.unit}"
+            bounds = f"[{variable.low:g}, {variable.high:g}]{unit}"
+            click.echo(f"  {variable.name:16s} {variable.baseline:<10g} {bounds:24s} {variable.description}")
+        click.echo("\nactuators:")
+        for actuator in body.actuators:
+            click.echo(
+                f"  {actuator.name:16s} {actuator.low:g} to {actuator.high:g} {actuator.unit}, "
+                f"at most {actuator.rate:g} {actuator.unit} per step"
+            )
+        if mesh is not None:
+            text = f"mesh: {len(mesh.nodes)} nodes, {len(mesh.tetrahedra)} tetrahedra ({mesh.origin})"
+        else:
+            text = f"model: {model.equations} equations"
+        click.echo(f"\n{text}, volume {1e9 * model.volume:.0f} mm3, mass {1e3 * model.mass:.1f} g")
     if picture is not None:
         from PIL import Image
 
         from softgym_envs.viewer.image import render_body
 
         Image.fromarray(render_body(body, chosen, size=(960, 960))).save(picture)
-        click.echo(f"wrote {picture}")
+        click.echo(f"wrote {picture}", err=as_json)
 
 
 @click.command()

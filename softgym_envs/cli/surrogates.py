@@ -12,7 +12,7 @@ from softgym_envs.errors import ConfigError
 
 
 @click.command()
-@options.run_options
+@options.run_options("surrogate")
 @options.folder
 def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...]) -> None:
     """Generate the datasets of a surrogate.
@@ -29,7 +29,7 @@ def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...])
 
 
 @click.command()
-@options.run_options
+@options.run_options("surrogate")
 @options.folder
 @click.option("--data", type=options.PATH, help="Folder of the datasets (default: FOLDER/data).")
 def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:

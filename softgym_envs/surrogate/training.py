@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from softgym_envs.config import Config, save_resolved
+from softgym_envs.config import BesideConfig, Config, save_resolved
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.data.dataset import generate_dataset
@@ -105,7 +105,7 @@ class FitConfig(Config):
     """
 
     robot: str
-    robot_options: dict[str, Any] = {}
+    robot_options: Annotated[dict[str, Any], BesideConfig()] = {}
     data: DataConfig
     network: NetworkOptions = Field(default_factory=network_module("potential").Options)
     workers: int = Field(default=2, gt=0)

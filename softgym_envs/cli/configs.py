@@ -1,0 +1,38 @@
+"""Verb for configurations: configs."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import click
+
+from softgym_envs.cli import options
+from softgym_envs.errors import ConfigError
+
+VERBS = {
+    "agents": "train, evaluate",
+    "codesign": "codesign",
+    "design": "optimise, sensitivity, calibrate",
+    "surrogate": "dataset, fit",
+}
+"""Folder of shipped configurations -> the verbs that read them."""
+
+
+@click.command()
+@click.option("--copy", type=options.PATH, metavar="FOLDER", help="Copy all of them to a new folder, to edit them.")
+def configs(copy: Path | None) -> None:
+    """List the shipped configurations, or copy them.
+
+    Every verb with --config accepts their names.
+    """
+    if copy is None:
+        for folder, verbs in VERBS.items():
+            click.echo(f"{verbs}:")
+            for name in options.shipped_configs(folder):
+                click.echo(f"  {name}")
+        return
+    if copy.exists():
+        raise ConfigError(f"'{copy}' exists; choose a new folder for the configurations")
+    shutil.copytree(options.CONFIGS, copy)
+    click.echo(f"wrote {copy}")

@@ -1,0 +1,74 @@
+"""Shipped configurations: found by name, copied, and paths that are relative to the file they stand in."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from agents.config import TrainConfig
+from codesign.tools.config import CalibrationConfig
+from softgym_envs.cli import configs, options
+from softgym_envs.config import load_config
+
+ROOT = Path(__file__).resolve().parent.parent
+CALIBRATION = ROOT / "configs" / "design" / "finger_calibration.yaml"
+
+
+def test_every_configuration_is_listed_under_its_verbs(softgym):
+    status, out, _ = softgym("configs")
+    assert status == 0
+    assert set(configs.VERBS) == {path.name for path in (ROOT / "configs").iterdir()}
+    listed = {line.strip() for line in out.splitlines()}
+    assert {path.stem for path in (ROOT / "configs").glob("*/*.yaml")} < listed
+
+
+def test_a_name_selects_the_kind_of_the_verb(softgym, monkeypatch):
+    seen = []
+    monkeypatch.setattr("softgym_envs.config.load_config", lambda path, *_: seen.append(path) or 1 / 0)
+    for verb in ("train", "codesign"):
+        with pytest.raises(ZeroDivisionError):
+            softgym(verb, "--config", "finger_reach", "--folder", "x")
+    assert [path.parent.name for path in seen] == ["agents", "codesign"]
+    assert all(path.samefile(ROOT / "configs" / path.parent.name / "finger_reach.yaml") for path in seen)
+
+
+def test_copies_can_be_edited_and_used(softgym, tmp_path):
+    status, out, _ = softgym("configs", "--copy", tmp_path / "mine")
+    assert status == 0 and "mine" in out
+    config = load_config(tmp_path / "mine" / "design" / "finger_calibration.yaml", CalibrationConfig)
+    assert Path(config.data) == tmp_path / "mine" / "design" / "finger_measured.csv"
+    status, _, err = softgym("configs", "--copy", tmp_path / "mine")
+    assert status == 2 and "exists" in err
+
+
+def test_paths_in_a_file_are_relative_to_it_and_in_overrides_to_the_working_directory(tmp_path, monkeypatch):
+    folder, here = tmp_path / "study", tmp_path / "here"
+    folder.mkdir()
+    here.mkdir()
+    monkeypatch.chdir(here)
+    for place in (folder, here):
+        shutil.copy(CALIBRATION.parent / "finger_measured.csv", place)
+    shutil.copy(CALIBRATION, folder)
+    config = folder / CALIBRATION.name
+    assert load_config(config, CalibrationConfig).data == str(folder / "finger_measured.csv")
+    assert load_config(config, CalibrationConfig, ["data=finger_measured.csv"]).data == "finger_measured.csv"
+    (folder / "finger_measured.csv").unlink()  # then the path is relative to the working directory
+    assert load_config(config, CalibrationConfig).data == "finger_measured.csv"
+
+
+def test_paths_in_options_and_names_of_policies(tmp_path):
+    environment = {"id": "SoftGym/FingerReach-v0", "backend_options": {"weights": "./fit", "members": 1}}
+    path = tmp_path / "train.yaml"
+    path.write_text(yaml.safe_dump({"environment": environment, "initial": "finger_reach"}))
+    (tmp_path / "fit").mkdir()
+    (tmp_path / "finger_reach").mkdir()
+    config = load_config(path, TrainConfig)
+    assert config.environment.backend_options == {"weights": str(tmp_path / "fit"), "members": 1}
+    assert config.initial == "finger_reach"
+
+
+def test_names_are_completed(monkeypatch):
+    parameter = options.ConfigFile("codesign")
+    found = parameter.shell_complete(None, None, "finger_reach")
+    assert [item.value for item in found] == ["finger_reach", "finger_reach_scratch", "finger_reach_warm_start"]
