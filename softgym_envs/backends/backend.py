@@ -78,6 +78,23 @@ class State:
         self.__dict__.update(state)
 
 
+@dataclass(frozen=True)
+class Snapshot:
+    """What a backend needs to go on from a state in another object of its class.
+
+    Attributes:
+        backend: name of the class.
+        design: the body.
+        state: the present state.
+        more: what the backend needs beyond that.
+    """
+
+    backend: str
+    design: Design
+    state: State
+    more: Any = None
+
+
 class Backend(ABC):
     """Physics of one robot: ``reset(design)`` and ``step(command)`` return a `State`.
 
@@ -140,3 +157,25 @@ class Backend(ABC):
     @abstractmethod
     def restore(self, state: State) -> None:
         """Go back to a state of the current design."""
+
+    def snapshot(self) -> Snapshot:
+        """Return all that the next steps depend on."""
+        return Snapshot(type(self).__name__, self.design, self.state, self._more())
+
+    def go_on_from(self, kept: Snapshot) -> None:
+        """Go on from a snapshot, also of another backend of the same class and with the same robot.
+
+        Raises:
+            ValueError: for a snapshot of another class.
+        """
+        if kept.backend != type(self).__name__:
+            raise ValueError(f"a state of {kept.backend} cannot go on in {type(self).__name__}")
+        self._put_back(kept)
+
+    def _more(self) -> Any:
+        """Return what the next steps depend on besides body and state."""
+        return None
+
+    def _put_back(self, kept: Snapshot) -> None:
+        self.reset(kept.design)
+        self.restore(kept.state)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.backend import Backend, Snapshot, State
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
@@ -107,7 +107,7 @@ class FEMBackend(Backend):
         if force is not None:
             load = np.zeros(self.state.condensed.delta.e.size)
             load[:3] = self._checked("force", force, 3)
-        kept = self._snapshot
+        kept = self._motion
         try:
             if self._dynamics is None:
                 found = self._drive(self._statics, command, mode, load)
@@ -130,7 +130,7 @@ class FEMBackend(Backend):
 
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
         """Return the static equilibrium under a command without going there."""
-        kept = self._snapshot
+        kept = self._motion
         command = self._checked("command", command, len(self._max_effort))
         try:
             return self._state(self._statics.solve(command, mode), command, still=True)
@@ -157,12 +157,22 @@ class FEMBackend(Backend):
             self._dynamics.restore(state.nodes, effort, velocity, memory=state.memory)
         self.state = state
 
+    def _more(self) -> tuple[str, tuple | None]:
+        return self._mode, self._motion
+
+    def _put_back(self, kept: Snapshot) -> None:
+        self.reset(kept.design)
+        self.state = kept.state
+        self._mode, motion = kept.more
+        self._go_back(motion)
+
     @property
-    def _snapshot(self) -> tuple | None:
+    def _motion(self) -> tuple | None:
+        """The part of a motion that a state does not hold."""
         return None if self._dynamics is None else self._dynamics.snapshot
 
     def _go_back(self, motion: tuple | None) -> None:
-        """Undo everything since the current state; ``motion`` is the part of a motion that a state does not hold."""
+        """Undo everything since the current state."""
         self.restore(self.state)
         if self._dynamics is not None and motion is not None:
             self._dynamics.snapshot = motion

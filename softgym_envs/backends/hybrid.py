@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.backend import Backend, Snapshot, State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBody
 from softgym_envs.errors import ConvergenceError, DataError
@@ -32,6 +33,24 @@ MIN_DISTANCE = 5e-3
 
 #: Kept states are written when there are this many, or at the end of the episode.
 FLUSH_EVERY = 10
+
+
+class _Episode(NamedTuple):
+    """What the next steps of an episode depend on besides body and state.
+
+    Attributes:
+        tensors: weights of the learned model.
+        card: its card.
+        learned: number of states that it has learned.
+        rest: state of the body at rest.
+        known: FEM states of the episode, rest first.
+    """
+
+    tensors: Mapping[str, np.ndarray]
+    card: Mapping[str, Any]
+    learned: int
+    rest: State
+    known: tuple[State, ...]
 
 
 class HybridBackend(Backend):
@@ -159,6 +178,20 @@ class HybridBackend(Backend):
 
     def restore(self, state: State) -> None:
         self.state = state
+
+    def _more(self) -> _Episode:
+        # Without the kept states: a copy collects its own for the ensemble to learn.
+        return _Episode(self.model.tensors, self.model.card, self._learned, self._rest, tuple(self._known))
+
+    def _put_back(self, kept: Snapshot) -> None:
+        self._flush()
+        self.design = self.robot.design_space.complete(kept.design)
+        more: _Episode = kept.more
+        self._learned = min(more.learned, self._store.count)
+        self._use(Model(self.robot, more.tensors, more.card))
+        if more.known:
+            self._build_fem(self.design)
+        self._known, self._rest, self.state = list(more.known), more.rest, kept.state
 
     # -- finite elements --------------------------------------------------------------------------------------------
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
+from dataclasses import dataclass
 from math import prod
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import EzPickle
 
-from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.backend import Backend, Snapshot, State
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.designs import Design
 from softgym_envs.envs.options import EnvironmentOptions, check_reset_options, set_up
@@ -23,12 +25,35 @@ MAX_DRAWS = 100
 """Number of infeasible bodies that are drawn in turn before `reset` gives up."""
 
 
+@dataclass(frozen=True)
+class EpisodeState:
+    """A moment of an episode of `SoftRobotEnv`; it can be pickled.
+
+    Attributes:
+        robot: name of the robot.
+        task: name of the task.
+        physics: body and mechanical state.
+        path: goals of the episode [m, or the unit of the task's goals], shape (p, 3).
+        step: control steps so far.
+        progress: attributes of the task, which may change in an episode.
+        random: state of the random numbers; None if none have been drawn.
+    """
+
+    robot: str
+    task: str
+    physics: Snapshot
+    path: np.ndarray
+    step: int
+    progress: dict[str, Any]
+    random: Mapping[str, Any] | None
+
+
 class SoftRobotEnv(gymnasium.Env, EzPickle):
     """A soft robot with a task. The page of each environment ID has the tables of its spaces.
 
-    A copy or pickle of the environment holds the arguments it was made with and has to be reset before use. Robot and
-    task objects are copied with it; classes and names stay references, so their modules must be importable where it is
-    unpickled. ``spec.to_json`` needs names or paths ``"module:class"``.
+    A copy or pickle of the environment goes on in mid-episode where the original was, random numbers included. Robot
+    and task objects are copied with it; classes and names stay references, so their modules must be importable where it
+    is unpickled. ``spec.to_json`` needs names or paths ``"module:class"``.
 
     Args:
         robot: registered name, path ``"module:class"``, class or object.
@@ -126,8 +151,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         else:
             design = self._fixed_design if given is None else self.design_space.complete(given, self._fixed_design)
             self.backend.reset(design)
-        shown = self.spaces.design_names
-        self._unit_design = np.array([self.design_space[name].to_unit(design[name]) for name in shown], dtype=float)
+        self._show(design)
         if goal is None:
             self._path = self.task.sample(self.np_random, 1, self._kinematics)[0]
         else:
@@ -136,6 +160,54 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self._step = 0
         observation, _, info = self._observe()
         return observation, info
+
+    def _show(self, design: Design) -> None:
+        names = self.spaces.design_names
+        self._unit_design = np.array([self.design_space[name].to_unit(design[name]) for name in names], dtype=float)
+
+    def get_state(self) -> EpisodeState:
+        """Return the present moment of the episode, for `set_state`.
+
+        Wrappers count steps for themselves: a time limit goes on counting after `set_state`.
+        """
+        return EpisodeState(
+            robot=self.robot.name,
+            task=self.task.name,
+            physics=self.backend.snapshot(),
+            path=self._path.copy(),
+            step=self._step,
+            progress=copy.deepcopy({name: value for name, value in vars(self.task).items() if name != "robot"}),
+            random=None if self._np_random is None else self._np_random.bit_generator.state,
+        )
+
+    def set_state(self, state: EpisodeState) -> tuple[np.ndarray, dict[str, Any]]:
+        """Go to a moment of an episode of this environment or of another one with the same robot, task and backend.
+
+        Returns:
+            Observation and info of that moment.
+
+        Raises:
+            ValueError: for a state of another robot, task or backend.
+        """
+        for kind, name, own in (("robot", state.robot, self.robot.name), ("task", state.task, self.task.name)):
+            if name != own:
+                raise ValueError(f"the state belongs to {kind} '{name}', but the environment has {kind} '{own}'")
+        self.backend.go_on_from(state.physics)
+        self._show(self.backend.design)
+        vars(self.task).update(copy.deepcopy(state.progress))
+        self._path, self._step = state.path.copy(), state.step
+        if state.random is not None:
+            self.np_random.bit_generator.state = state.random
+        observation, _, info = self._observe()
+        return observation, info
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**EzPickle.__getstate__(self), "episode": self.get_state(), "action_space": self.action_space}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        EzPickle.__setstate__(self, kept)
+        self.set_state(kept["episode"])
+        self.action_space = self.spaces.action_space = kept["action_space"]  # with its random numbers
 
     def _draw_body(self) -> Design:
         """Draw the sampled variables and go to the rest state of that body; bodies that cannot exist are drawn again.

@@ -130,6 +130,10 @@ class TorchVectorEnv:
         self._state = self._at_rest(self._bodies, num_envs)
         self._started = False
 
+    def __getstate__(self) -> dict[str, Any]:
+        # The prepared step works on the tensors of this object; a copy prepares its own.
+        return {**self.__dict__, "_advance_fast": None}
+
     def _put(self, values: Any) -> Tensor:
         return torch.as_tensor(np.array(values, dtype=float), dtype=self.dtype, device=self.device)
 

@@ -445,6 +445,9 @@ class MeshedRobot(Robot):
         self.meshing = "remesh" if self.fillet else meshing
         self._morpher: Morpher | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_morpher": None}  # holds a factorisation; it is made again when it is needed
+
     # -- what a robot defines ---------------------------------------------------------------------------------------
 
     @abstractmethod
