@@ -56,6 +56,7 @@ class DataConfig(Config):
     design: dict[str, float] = {}
     bounds: dict[str, tuple[float, float]] = {}
     alike: tuple[str, ...] = ()
+    boundary: float = Field(default=0.0, ge=0.0, le=1.0)
 
     @model_validator(mode="before")
     @classmethod

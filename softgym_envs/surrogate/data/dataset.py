@@ -228,6 +228,8 @@ def _shards(folder: Path, manifest: dict[str, Any]) -> list[Path]:
 def _check_manifest(folder: Path, manifest: dict[str, Any]) -> bool:
     """Return whether a folder holds only the first groups; raise `DataError` if it holds another dataset."""
     kept = _read_manifest(folder / "manifest.json")
+    # Options of a plan that are newer than a dataset have their defaults.
+    kept["plan"] = json.loads(json.dumps(asdict(SamplingPlan(1, 0)))) | kept["plan"]
     if kept == manifest:
         return False
     groups, whole = kept["plan"]["groups"], kept["groups_per_shard"]

@@ -10,7 +10,7 @@ it.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,6 +41,8 @@ class SamplingPlan:
         bounds: narrower bounds of drawn variables.
         alike: drawn variables with the same bounds that lie close together in some groups: each group moves them
             towards the first of them by a part that it draws, from not at all to altogether.
+        boundary: share of the groups whose designs and commands lie on faces, edges and vertices of their boxes, where
+            optimisers end; commands at a vertex leave cables slack (see `pushed`).
     """
 
     groups: int
@@ -52,6 +54,7 @@ class SamplingPlan:
     design: Mapping[str, float] = field(default_factory=dict)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     alike: tuple[str, ...] = ()
+    boundary: float = 0.0
 
     def __post_init__(self) -> None:
         if self.sequence not in SEQUENCES:
@@ -62,8 +65,9 @@ class SamplingPlan:
                 raise ValueError(f"{name} = {value!r} must be an integer of at least {least}")
         if self.vary is not None and len(set(self.vary)) < len(self.vary):
             raise ValueError(f"vary = {list(self.vary)} names a variable twice")
-        if not 0.0 <= self.margin <= 1.0:
-            raise ValueError(f"margin = {self.margin} is out of bounds; allowed: [0, 1]")
+        for name in ("margin", "boundary"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} = {getattr(self, name)} is out of bounds; allowed: [0, 1]")
 
     def unit_points(self, dimension: int, first: int, count: int, total: int, stream: int) -> np.ndarray:
         """Points ``first .. first + count`` of ``total`` in [0, 1], shape (count, dimension)."""
@@ -117,8 +121,30 @@ class SamplingPlan:
             points, part = points[:, :-1], points[:, -1:]
             group = [names.index(name) for name in self.alike]
             points[:, group] += part * (points[:, group[:1]] - points[:, group])
+        for row in range(count):
+            if self._on_boundary(first + row):
+                points[row] = pushed(points[row : row + 1], np.random.default_rng([self.seed, 4, first + row]))[0]
         values = ends[:, 0] + points * (ends[:, 1] - ends[:, 0])
         return [space.complete({**self.design, **dict(zip(names, map(float, row), strict=True))}) for row in values]
+
+    def commands(self, robot: Robot, group: int) -> np.ndarray:
+        """Return the commands of a group, shape (states, n_a)."""
+        points = self.unit_points(len(robot.actuators), group * self.states, self.states, self.groups * self.states, 1)
+        if self._on_boundary(group):
+            points = pushed(points, np.random.default_rng([self.seed, 5, group]))
+        return robot.displacements(points)
+
+    def _on_boundary(self, group: int) -> bool:
+        return self.boundary > 0.0 and np.random.default_rng([self.seed, 3, group]).random() < self.boundary
+
+
+def pushed(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Move coordinates of points (N, d) in the unit box to its nearest faces.
+
+    Each point draws the share of its coordinates that move, so that faces, edges and vertices are equally frequent.
+    """
+    share = rng.random((len(points), 1))
+    return np.where(rng.random(points.shape) < share, np.round(points), points)
 
 
 def path_order(points: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -132,6 +158,29 @@ def path_order(points: np.ndarray, start: np.ndarray) -> np.ndarray:
         left[order[k]] = False
         present = points[order[k]]
     return order
+
+
+def solve_path(
+    robot: Robot, statics: Statics, rest: Equilibrium, commands: np.ndarray
+) -> Iterator[tuple[int, Equilibrium | None]]:
+    """Solve commands (n, n_a) of one body, each starting from the nearest one before, or else from rest.
+
+    Yields:
+        The number of a command, and its equilibrium or None if there is none, in the order of the path.
+    """
+    span = robot.upper - robot.lower
+    for k in path_order((commands - robot.lower) / span, -robot.lower / span):
+        try:
+            found = statics.solve(commands[k])
+        except ConvergenceError:
+            try:  # try again from rest
+                statics.restore(rest.x, rest.effort)
+                found = statics.solve(commands[k])
+            except ConvergenceError:
+                statics.restore(rest.x, rest.effort)
+                yield int(k), None
+                continue
+        yield int(k), found
 
 
 def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str, np.ndarray] | None, int]:
@@ -157,22 +206,14 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str
         return None, plan.states
     rows: list[Equilibrium] = [rest]
     span = robot.upper - robot.lower
-    points = plan.unit_points(count, group * plan.states, plan.states, plan.groups * plan.states, 1)
-    commands = robot.displacements(points)
-    order = path_order((commands - robot.lower) / span, -robot.lower / span)
+    commands = plan.commands(robot, group)
     rng = np.random.default_rng([plan.seed, 2, group])
     failed = 0
-    for command in commands[order]:
-        try:
-            equilibrium = statics.solve(command)
-        except ConvergenceError:
-            try:  # try again from rest
-                statics.restore(rest.x, rest.effort)
-                equilibrium = statics.solve(command)
-            except ConvergenceError:
-                failed += 1
-                statics.restore(rest.x, rest.effort)
-                continue
+    for k, equilibrium in solve_path(robot, statics, rest, commands):
+        if equilibrium is None:
+            failed += 1
+            continue
+        command = commands[k]
         if equilibrium.slack.any() and rng.random() < 0.5:
             beyond = np.maximum(equilibrium.delta[:count] - command, 0.0) * equilibrium.slack
             push = np.minimum(rng.uniform(0.0, plan.margin, count) * span, beyond)

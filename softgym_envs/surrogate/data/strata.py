@@ -1,0 +1,244 @@
+"""States on which learned models are judged: FEM equilibria under given commands, in strata of their own.
+
+Environments and optimisers meet a model at commands, and optimisers end at the boundary of the design box. A test set
+of random bodies has hardly any of the states that matter to them, so each kind is drawn on its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.base import Robot
+from softgym_envs.storage import atomic_write, read_npz
+from softgym_envs.surrogate.data.sampling import solve_path
+from softgym_envs.surrogate.features import learned_variables
+
+DRAWN = ("inside", "faces", "corners", "slack corners", "near buckling")
+"""Strata by how they are drawn:
+
+* ``inside``: bodies and commands anywhere in their boxes;
+* ``faces``: one design variable at its bound;
+* ``corners``: bodies at vertices of the design box, any commands;
+* ``slack corners``: bodies at vertices, commands at vertices at which some actuators pull all the way and others not at
+  all; only for robots whose actuators cannot push;
+* ``near buckling``: bodies and commands from any of these whose actuators are expected to be softest; only for robots
+  that can buckle.
+"""
+
+TOUCHING = "touching"
+"""Stratum of all states in which the body touches something, wherever they were drawn."""
+
+STRATA = (*DRAWN, TOUCHING)
+
+CANDIDATES = 40
+"""Candidates for each state near buckling."""
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Bodies and commands to be solved: G bodies with S commands each.
+
+    Attributes:
+        stratum: one of `DRAWN` per body, shape (G,).
+        design: values in the order of the design space, shape (G, d).
+        command: commanded displacements, shape (G, S, n_a).
+    """
+
+    stratum: np.ndarray
+    design: np.ndarray
+    command: np.ndarray
+
+
+@dataclass(frozen=True)
+class JudgedStates:
+    """Commands and the FEM equilibria they lead to, N states.
+
+    Attributes:
+        stratum: one of `STRATA`, shape (N,).
+        body: number of the body, shape (N,).
+        design: shape (N, d).
+        command: commanded displacements, shape (N, n_a).
+        displacement: reached displacements, shape (N, n_a).
+        effort: shape (N, n_a).
+        effector: [m], shape (N, n_e).
+        slack: which actuators are slack, shape (N, n_a).
+        growth: how many times softer the actuators are than at rest, in the softest direction; infinite for states that
+            are stable only while their actuators are held, shape (N,).
+        found: whether there is an equilibrium, shape (N,); other rows hold NaN.
+    """
+
+    stratum: np.ndarray
+    body: np.ndarray
+    design: np.ndarray
+    command: np.ndarray
+    displacement: np.ndarray
+    effort: np.ndarray
+    effector: np.ndarray
+    slack: np.ndarray
+    growth: np.ndarray
+    found: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+    def rows(self, index: np.ndarray) -> JudgedStates:
+        """Return some of the states."""
+        return JudgedStates(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    def save(self, path: str | Path) -> None:
+        """Write the states to an npz file."""
+        with atomic_write(path) as stream:
+            np.savez_compressed(stream, allow_pickle=False, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @classmethod
+    def load(cls, path: str | Path) -> JudgedStates:
+        """Read the states that `save` wrote.
+
+        Raises:
+            DataError: if the file is missing or damaged.
+        """
+        names = tuple(f.name for f in fields(cls))
+        return cls(**read_npz(path, names))
+
+    @classmethod
+    def join(cls, parts: list[JudgedStates]) -> JudgedStates:
+        """Return all states of several sets, with bodies numbered anew."""
+        first = np.cumsum([0, *(part.body.max(initial=-1) + 1 for part in parts)])
+        columns = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)}
+        columns["body"] = np.concatenate([part.body + start for part, start in zip(parts, first, strict=False)])
+        return cls(**columns)
+
+
+def strata_of(robot: Robot, *, buckles: bool) -> tuple[str, ...]:
+    """Return the strata that can be drawn for a robot.
+
+    Args:
+        robot: the robot.
+        buckles: whether it can buckle.
+    """
+    missing = set()
+    if robot.unilateral.sum() < 2 or not robot.convex:
+        missing.add("slack corners")
+    if not buckles:
+        missing.add("near buckling")
+    return tuple(name for name in DRAWN if name not in missing)
+
+
+def draw_commands(
+    robot: Robot,
+    stratum: str,
+    groups: int,
+    states: int,
+    seed: int = 0,
+    softness: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+) -> Commands:
+    """Return random bodies and commands of one stratum.
+
+    Args:
+        robot: the robot.
+        stratum: one of `DRAWN`.
+        groups: number of bodies.
+        states: commands of each body.
+        seed: of the random numbers.
+        softness: for ``near buckling``: returns the expected growth (N,) of bodies (N, d) under commands (N, n_a).
+
+    Raises:
+        ValueError: for an unknown stratum, or one that needs ``softness``.
+    """
+    if stratum not in DRAWN:
+        raise ValueError(f"stratum = {stratum!r} is unknown; allowed: {', '.join(map(repr, DRAWN))}")
+    rng = np.random.default_rng([seed, DRAWN.index(stratum)])
+    space, names, count = robot.design_space, learned_variables(robot), len(robot.actuators)
+    if stratum == "near buckling":
+        if softness is None:
+            raise ValueError("states near buckling need an estimate of the softness")
+        kinds = [k for k in strata_of(robot, buckles=False)]
+        pool = [draw_commands(robot, kind, 2 * groups, CANDIDATES, int(rng.integers(2**31))) for kind in kinds]
+        design, command = (np.concatenate([getattr(p, f) for p in pool]) for f in ("design", "command"))
+        growth = softness(np.repeat(design, CANDIDATES, axis=0), command.reshape(-1, count)).reshape(len(design), -1)
+        # The softest states of a body first; bodies by how soft the last of its chosen states is.
+        order = np.argsort(-growth, axis=1)[:, :states]
+        least = np.take_along_axis(growth, order, axis=1)[:, -1]
+        chosen = np.argsort(-least)[:groups]
+        command = np.take_along_axis(command[chosen], order[chosen][:, :, None], axis=1)
+        return Commands(np.full(groups, stratum), design[chosen], command)
+    points = rng.random((groups, len(names)))
+    if stratum == "faces" and names:
+        which = rng.integers(len(names), size=groups)
+        points[np.arange(groups), which] = np.round(points[np.arange(groups), which])
+    elif stratum in ("corners", "slack corners"):
+        points = np.round(points)
+    fractions = rng.random((groups * states, count))
+    if stratum == "slack corners":
+        fractions = np.round(fractions)
+        alike = (fractions == fractions[:, :1]).all(axis=1)
+        fractions[alike, rng.integers(count, size=alike.sum())] = 1.0 - fractions[alike, 0]
+    design = np.array([space.sample(rng).array for _ in range(groups)])
+    for k, name in enumerate(names):
+        variable = space[name]
+        design[:, space.names.index(name)] = variable.low + points[:, k] * (variable.high - variable.low)
+    command = robot.displacements(fractions).reshape(groups, states, count)
+    return Commands(np.full(groups, stratum), design, command)
+
+
+def solve_commands(robot: Robot, commands: Commands) -> JudgedStates:
+    """Return the FEM equilibria under commands; bodies that are infeasible or have no state at rest are left out.
+
+    Cables of a robot whose energy is not convex can push, as they can in its learned model.
+    """
+    count, size = len(robot.actuators), 3 * len(robot.effectors)
+    parts = []
+    for number in range(len(commands.design)):
+        design = dict(zip(robot.design_space.names, commands.design[number].tolist(), strict=True))
+        wanted = commands.command[number]
+        try:
+            statics = Statics(robot.build(design))
+            if not robot.convex:
+                statics.unilateral = np.zeros(count, dtype=bool)
+            rest = statics.solve(np.zeros(count), robot.rest_mode)
+            if robot.rest_mode == "effort" and statics.model.loads.any():
+                rest = statics.solve(np.zeros(count))
+        except (InfeasibleDesign, ConvergenceError):
+            continue
+        rows = len(wanted)
+        part = JudgedStates(
+            stratum=np.full(rows, commands.stratum[number], dtype=f"<U{max(map(len, STRATA))}"),
+            body=np.zeros(rows, dtype=np.int64),
+            design=np.tile(commands.design[number], (rows, 1)),
+            command=wanted,
+            displacement=np.full((rows, count), np.nan),
+            effort=np.full((rows, count), np.nan),
+            effector=np.full((rows, size), np.nan),
+            slack=np.zeros((rows, count), dtype=bool),
+            growth=np.full(rows, np.nan),
+            found=np.zeros(rows, dtype=bool),
+        )
+        for k, found in solve_path(robot, statics, rest, wanted):
+            if found is None:
+                continue
+            part.displacement[k], part.effort[k] = found.condensed.delta.a, found.condensed.lambda_.a
+            part.effector[k], part.slack[k], part.found[k] = found.condensed.delta.e, found.slack, True
+            part.growth[k] = growth_of(rest, found)
+            if found.contacts is not None and np.isfinite(found.contacts.smallest_gap):
+                part.stratum[k] = TOUCHING
+        parts.append(part)
+    return JudgedStates.join(parts)
+
+
+def growth_of(rest: Equilibrium, found: Equilibrium) -> float:
+    """Return how many times softer the actuators of a state are than at rest; infinite if W is not positive there."""
+    unmoved, W = rest.condensed.W.aa, found.condensed.W.aa
+    try:
+        half = np.linalg.cholesky(0.5 * (unmoved + unmoved.T))
+        np.linalg.cholesky(0.5 * (W + W.T))
+    except np.linalg.LinAlgError:
+        return np.inf
+    inner = np.linalg.solve(half, np.linalg.solve(half, W).T)
+    return float(np.linalg.eigvalsh(0.5 * (inner + inner.T))[-1])

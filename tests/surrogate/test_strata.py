@@ -1,0 +1,166 @@
+"""Strata of test states, and points on the boundary of the boxes in training data."""
+
+import json
+
+import numpy as np
+import pytest
+
+from softgym_envs import make_robot
+from softgym_envs.errors import ConvergenceError, DataError, InfeasibleDesign
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.surrogate.data.dataset import generate_dataset
+from softgym_envs.surrogate.data.sampling import SamplingPlan, pushed
+from softgym_envs.surrogate.data.strata import (
+    TOUCHING,
+    JudgedStates,
+    draw_commands,
+    solve_commands,
+    strata_of,
+)
+from softgym_envs.surrogate.features import learned_variables
+from softgym_envs.surrogate.pretrained import shipped_robots
+
+
+def ends_of(robot, designs):
+    """Which learned variables lie at a bound of their box, shape (N, k)."""
+    columns = [robot.design_space.names.index(name) for name in learned_variables(robot)]
+    bounds = np.array(
+        [[robot.design_space[name].low, robot.design_space[name].high] for name in learned_variables(robot)]
+    )
+    values = designs[:, columns]
+    assert ((values >= bounds[:, 0]) & (values <= bounds[:, 1])).all()
+    return (values == bounds[:, 0]) | (values == bounds[:, 1])
+
+
+@pytest.mark.parametrize("name, options", shipped_robots().values(), ids=shipped_robots())
+def test_every_robot_has_strata_where_they_say(name, options):
+    robot = make_robot(name, **options)
+    for stratum in strata_of(robot, buckles=False):
+        commands = draw_commands(robot, stratum, 30, 5, seed=1)
+        assert commands.design.shape[0] == 30 and commands.command.shape == (30, 5, len(robot.actuators))
+        assert (commands.command >= robot.lower).all() and (commands.command <= robot.upper).all()
+        at_bound = ends_of(robot, commands.design).sum(axis=1)
+        expected = {"inside": 0, "faces": 1}.get(stratum, len(learned_variables(robot)))
+        assert (at_bound == expected).all()
+        if stratum == "slack corners":
+            low, high = (np.isclose(commands.command, end, 1e-9, 0.0) for end in (robot.lower, robot.upper))
+            assert (low | high).all() and low.any(axis=2).all() and high.any(axis=2).all()
+        again = draw_commands(robot, stratum, 30, 5, seed=1)
+        assert (again.design == commands.design).all() and (again.command == commands.command).all()
+
+
+def test_states_near_buckling_are_the_softest():
+    robot = make_robot("diamond")
+
+    def softness(designs, commands):
+        return commands[:, 0]
+
+    commands = draw_commands(robot, "near buckling", 6, 4, seed=0, softness=softness)
+    assert commands.command.shape == (6, 4, 4)
+    assert (commands.command[:, :, 0] > robot.upper[0] - 0.1 * (robot.upper - robot.lower)[0]).all()
+    with pytest.raises(ValueError, match="need an estimate of the softness"):
+        draw_commands(robot, "near buckling", 1, 1)
+    with pytest.raises(ValueError, match="stratum = 'edges' is unknown; allowed: 'inside', 'faces'"):
+        draw_commands(robot, "edges", 1, 1)
+
+
+def test_states_are_the_equilibria_under_their_commands(tmp_path):
+    from softgym_envs.backends.fem import FEMBackend
+
+    robot = make_robot("trunk")
+    states = solve_commands(robot, draw_commands(robot, "slack corners", 3, 4, seed=2))
+    assert len(states) == 12 and states.found.all() and (states.stratum == "slack corners").all()
+    assert states.slack.any(axis=1).mean() > 0.8
+    for row in (0, 5, 11):
+        backend = FEMBackend(robot, dict(zip(robot.design_space.names, states.design[row].tolist(), strict=True)))
+        found = backend.probe(states.command[row])
+        np.testing.assert_allclose(found.effector.ravel(), states.effector[row], atol=1e-7)
+        assert (found.slack == states.slack[row]).all()
+    assert (states.displacement[~states.slack] == pytest.approx(states.command[~states.slack], abs=1e-13)).all()
+    states.save(tmp_path / "states.npz")
+    read = JudgedStates.load(tmp_path / "states.npz")
+    assert (read.effector == states.effector).all() and (read.stratum == states.stratum).all()
+    both = JudgedStates.join([states, read.rows(np.arange(4))])
+    assert len(both) == 16 and np.unique(both.body).tolist() == [0, 1, 2, 3]
+
+
+def test_commands_and_bodies_without_equilibrium_are_marked(monkeypatch):
+    robot = make_robot("trunk")
+    build = robot.build
+    bodies = []
+
+    def some(design):
+        bodies.append(design)
+        if len(bodies) == 1:
+            raise InfeasibleDesign("cannot be built")
+        return build(design)
+
+    monkeypatch.setattr(robot, "build", some)
+    commands = draw_commands(robot, "inside", 2, 3)
+    commands.command[1, 1] = np.nan
+    solve = Statics.solve
+
+    def solved(self, command, *args):
+        if np.isnan(command).any():
+            raise ConvergenceError("no equilibrium")
+        return solve(self, command, *args)
+
+    monkeypatch.setattr(Statics, "solve", solved)
+    states = solve_commands(robot, commands)
+    assert len(bodies) == 2 and len(states) == 3
+    assert states.found.tolist() == [True, False, True]
+    assert np.isnan(states.effector[1]).all() and np.isfinite(states.effector[[0, 2]]).all()
+
+
+def test_states_that_touch_have_a_stratum_of_their_own():
+    wall = {"kind": "plane", "point": [0.0, 0.045, 0.0], "normal": [0.0, -1.0, 0.0]}
+    robot = make_robot("finger", obstacles=[wall])
+    commands = draw_commands(robot, "inside", 1, 2)
+    commands.design[:] = robot.design_space.complete(None).array
+    commands.command[:] = [[[0.0, 0.0], [0.01, 0.01]]]
+    states = solve_commands(robot, commands)
+    assert states.found.all()
+    assert states.stratum.tolist() == ["inside", TOUCHING]
+
+
+def test_pushed_points_lie_on_faces_edges_and_vertices(rng):
+    points = rng.random((4000, 3))
+    moved = pushed(points, rng)
+    count = (moved != points).sum(axis=1)
+    assert ((moved == points) | (moved == np.round(points))).all()
+    # The number of moved coordinates is uniform from none to all.
+    assert np.bincount(count, minlength=4) / 4000 == pytest.approx([0.25] * 4, abs=0.04)
+
+
+def test_a_share_of_the_training_bodies_lies_on_the_boundary():
+    robot = make_robot("finger")
+    plain, half, every = (SamplingPlan(200, 3, "random", seed=1, boundary=share) for share in (0.0, 0.5, 1.0))
+    drawn = [np.array([d.array for d in plan.designs(robot, 0, 200)]) for plan in (plain, half, every)]
+    on_boundary = [ends_of(robot, designs).any(axis=1) for designs in drawn]
+    assert not on_boundary[0].any()
+    assert 0.3 < on_boundary[1].mean() < 0.5 and 0.7 < on_boundary[2].mean() < 0.9
+    # Other bodies are those of the plan without the option, and parts of a plan agree with the whole.
+    columns = [robot.design_space.names.index(name) for name in learned_variables(robot)]
+    same = (drawn[0] == drawn[1])[:, columns].all(axis=1)
+    assert 0.5 < same.mean() < 0.7
+    part = np.array([d.array for d in half.designs(robot, 120, 30)])
+    assert (part == drawn[1][120:150]).all()
+    at_ends = [np.isin(half.commands(robot, group), [0.0, 0.02]).any() for group in range(200)]
+    assert 0.38 < np.mean(at_ends) < 0.58  # 26 of 27 groups of the half
+    assert not any(np.isin(plain.commands(robot, group), [0.0, 0.02]).any() for group in range(200))
+    with pytest.raises(ValueError, match=r"boundary = 1.5 is out of bounds; allowed: \[0, 1\]"):
+        SamplingPlan(1, 1, boundary=1.5)
+
+
+def test_a_dataset_without_the_option_is_continued(tmp_path):
+    plan = SamplingPlan(2, 1, "halton", 3)
+    generate_dataset(tmp_path, "trunk", plan, groups_per_shard=1, progress=False)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    del manifest["plan"]["boundary"]
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    data = generate_dataset(tmp_path, "trunk", SamplingPlan(3, 1, "halton", 3), groups_per_shard=1, progress=False)
+    assert data["rest"].sum() == 3
+    with pytest.raises(DataError, match=r"different: plan\)"):
+        generate_dataset(
+            tmp_path, "trunk", SamplingPlan(3, 1, "halton", 3, boundary=0.5), groups_per_shard=1, progress=False
+        )
