@@ -35,6 +35,7 @@ def ends_of(robot, designs):
 @pytest.mark.parametrize("name, options", shipped_robots().values(), ids=shipped_robots())
 def test_every_robot_has_strata_where_they_say(name, options):
     robot = make_robot(name, **options)
+    columns = [robot.design_space.names.index(name) for name in learned_variables(robot)]
     for stratum in strata_of(robot, buckles=False):
         commands = draw_commands(robot, stratum, 30, 5, seed=1)
         assert commands.design.shape[0] == 30 and commands.command.shape == (30, 5, len(robot.actuators))
@@ -42,6 +43,8 @@ def test_every_robot_has_strata_where_they_say(name, options):
         at_bound = ends_of(robot, commands.design).sum(axis=1)
         expected = {"inside": 0, "faces": 1}.get(stratum, len(learned_variables(robot)))
         assert (at_bound == expected).all()
+        if "corners" in stratum:  # no vertex is drawn twice before all are drawn
+            assert len(np.unique(commands.design[:, columns], axis=0)) == min(30, 2 ** len(columns))
         if stratum == "slack corners":
             low, high = (np.isclose(commands.command, end, 1e-9, 0.0) for end in (robot.lower, robot.upper))
             assert (low | high).all() and low.any(axis=2).all() and high.any(axis=2).all()
@@ -71,12 +74,15 @@ def test_states_are_the_equilibria_under_their_commands(tmp_path):
     states = solve_commands(robot, draw_commands(robot, "slack corners", 3, 4, seed=2))
     assert len(states) == 12 and states.found.all() and (states.stratum == "slack corners").all()
     assert states.slack.any(axis=1).mean() > 0.8
+    # Over-inflated modules bend to one side or the other: some commands have two equilibria.
+    assert (states.apart < 1e-6).any() and (states.apart > 1e-3).any()
     for row in (0, 5, 11):
         backend = FEMBackend(robot, dict(zip(robot.design_space.names, states.design[row].tolist(), strict=True)))
         found = backend.probe(states.command[row])
         np.testing.assert_allclose(found.effector.ravel(), states.effector[row], atol=1e-7)
-        assert (found.slack == states.slack[row]).all()
-    assert (states.displacement[~states.slack] == pytest.approx(states.command[~states.slack], abs=1e-13)).all()
+    beyond = (states.displacement - states.command) / (robot.upper - robot.lower)
+    assert (beyond[states.slack] > 1e-6).all() and np.abs(beyond[~states.slack]).max() <= 1e-6
+    assert np.abs(states.effort[states.slack]).max() < 1e-6 * states.effort.max()
     states.save(tmp_path / "states.npz")
     read = JudgedStates.load(tmp_path / "states.npz")
     assert (read.effector == states.effector).all() and (read.stratum == states.stratum).all()

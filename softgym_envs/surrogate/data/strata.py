@@ -37,6 +37,9 @@ TOUCHING = "touching"
 
 STRATA = (*DRAWN, TOUCHING)
 
+SLACK = 1e-6
+"""Actuators that end farther beyond their commands than this are slack [range]."""
+
 CANDIDATES = 40
 """Candidates for each state near buckling."""
 
@@ -71,6 +74,8 @@ class JudgedStates:
         slack: which actuators are slack, shape (N, n_a).
         growth: how many times softer the actuators are than at rest, in the softest direction; infinite for states that
             are stable only while their actuators are held, shape (N,).
+        apart: distance of the effector from that of the equilibrium found from another start [m], shape (N,): more than
+            round-off if the command has several equilibria.
         found: whether there is an equilibrium, shape (N,); other rows hold NaN.
     """
 
@@ -83,6 +88,7 @@ class JudgedStates:
     effector: np.ndarray
     slack: np.ndarray
     growth: np.ndarray
+    apart: np.ndarray
     found: np.ndarray
 
     def __len__(self) -> int:
@@ -174,7 +180,7 @@ def draw_commands(
         which = rng.integers(len(names), size=groups)
         points[np.arange(groups), which] = np.round(points[np.arange(groups), which])
     elif stratum in ("corners", "slack corners"):
-        points = np.round(points)
+        points = _vertices(len(names), groups, rng)
     fractions = rng.random((groups * states, count))
     if stratum == "slack corners":
         fractions = np.round(fractions)
@@ -188,12 +194,22 @@ def draw_commands(
     return Commands(np.full(groups, stratum), design, command)
 
 
+def _vertices(dimension: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return vertices of the unit cube (count, dimension): all of them before any of them twice, if that is possible."""
+    if dimension > 16:
+        return rng.integers(2, size=(count, dimension)).astype(float)
+    all_of_them = [rng.permutation(2**dimension) for _ in range(-(-count // 2**dimension))]
+    numbers = np.concatenate(all_of_them)[:count]
+    return (numbers[:, None] >> np.arange(dimension) & 1).astype(float)
+
+
 def solve_commands(robot: Robot, commands: Commands) -> JudgedStates:
     """Return the FEM equilibria under commands; bodies that are infeasible or have no state at rest are left out.
 
-    Cables of a robot whose energy is not convex can push, as they can in its learned model.
+    Each state is reached from rest, and once more from the nearest state before it, which leads elsewhere if there are
+    several equilibria. Cables of a robot whose energy is not convex can push, as they can in its learned model.
     """
-    count, size = len(robot.actuators), 3 * len(robot.effectors)
+    count, size, span = len(robot.actuators), 3 * len(robot.effectors), robot.upper - robot.lower
     parts = []
     for number in range(len(commands.design)):
         design = dict(zip(robot.design_space.names, commands.design[number].tolist(), strict=True))
@@ -218,13 +234,22 @@ def solve_commands(robot: Robot, commands: Commands) -> JudgedStates:
             effector=np.full((rows, size), np.nan),
             slack=np.zeros((rows, count), dtype=bool),
             growth=np.full(rows, np.nan),
+            apart=np.full(rows, np.nan),
             found=np.zeros(rows, dtype=bool),
         )
-        for k, found in solve_path(robot, statics, rest, wanted):
-            if found is None:
+        for k, other in solve_path(robot, statics, rest, wanted):
+            if other is None:
                 continue
+            statics.restore(rest.x, rest.effort)
+            try:
+                found = statics.solve(wanted[k])
+            except ConvergenceError:  # too far for one step
+                found = other
+            statics.restore(other.x, other.effort)
+            part.apart[k] = np.abs(found.condensed.delta.e - other.condensed.delta.e).max()
             part.displacement[k], part.effort[k] = found.condensed.delta.a, found.condensed.lambda_.a
-            part.effector[k], part.slack[k], part.found[k] = found.condensed.delta.e, found.slack, True
+            part.effector[k], part.found[k] = found.condensed.delta.e, True
+            part.slack[k] = statics.unilateral & (part.displacement[k] > wanted[k] + SLACK * span)
             part.growth[k] = growth_of(rest, found)
             if found.contacts is not None and np.isfinite(found.contacts.smallest_gap):
                 part.stratum[k] = TOUCHING
