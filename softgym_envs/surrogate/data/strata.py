@@ -195,7 +195,7 @@ def draw_commands(
 
 
 def _vertices(dimension: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return vertices of the unit cube (count, dimension): all of them before any of them twice, if that is possible."""
+    """Return vertices of the unit cube (count, dimension): if possible all before any twice."""
     if dimension > 16:
         return rng.integers(2, size=(count, dimension)).astype(float)
     all_of_them = [rng.permutation(2**dimension) for _ in range(-(-count // 2**dimension))]
