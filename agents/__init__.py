@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from agents.config import TrainConfig as TrainConfig
     from agents.evaluation import evaluate as evaluate
     from agents.export import export_policy_onnx as export_policy_onnx
+    from agents.export_c import export_policy_c as export_policy_c
     from agents.policy import Policy as Policy
     from agents.training import train as train
     from agents.vec_env import SB3VecEnv as SB3VecEnv
@@ -19,6 +20,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "config": ["EnvironmentConfig", "TrainConfig"],
         "evaluation": ["evaluate"],
         "export": ["export_policy_onnx"],
+        "export_c": ["export_policy_c"],
         "policy": ["Policy"],
         "training": ["train"],
         "vec_env": ["SB3VecEnv"],

@@ -50,14 +50,28 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
     except ImportError:
         raise ValueError("ONNX files need the package onnx: pip install 'softgym-envs[onnx]'") from None
     policy = policy if isinstance(policy, Policy) else Policy(policy)
-    config = policy.environment
-    env = config.make()
-    spaces: AgentSpaces = env.unwrapped.spaces  # type: ignore[attr-defined]
-    env.close()
-    data = _graph(policy, spaces, config, onnx).SerializeToString()
+    data = _graph(policy, spaces_of(policy), policy.environment, onnx).SerializeToString()
     with atomic_write(path) as stream:
         stream.write(data)
     return path
+
+
+def spaces_of(policy: Policy) -> AgentSpaces:
+    """Return the observation and action spaces of the environment in which a policy was trained."""
+    env = policy.environment.make()
+    env.close()
+    return env.unwrapped.spaces  # type: ignore[attr-defined]
+
+
+def input_sizes(spaces: AgentSpaces) -> dict[str, int]:
+    """Return the measurements that a policy needs, in their order, with their sizes."""
+    n = len(spaces.robot.actuators)
+    sizes = {"command": n, "displacement": n, "effort": n, "effector": 3, "goal": 3}
+    if spaces.moving:
+        sizes["velocity"] = 3
+    if spaces.design_names:
+        sizes["design"] = len(spaces.design_names)
+    return sizes
 
 
 class _Nodes:
@@ -86,12 +100,7 @@ class _Nodes:
 
 def _graph(policy: Policy, spaces: AgentSpaces, config: EnvironmentConfig, onnx: Any) -> Any:
     robot, n = spaces.robot, len(spaces.robot.actuators)
-    sizes = {"command": n, "displacement": n, "effort": n, "effector": 3, "goal": 3}
-    if spaces.moving:
-        sizes["velocity"] = 3
-    if spaces.design_names:
-        sizes["design"] = len(spaces.design_names)
-
+    sizes = input_sizes(spaces)
     g = _Nodes(onnx)
     middle, half = 0.5 * (spaces.lower + spaces.upper), 0.5 * (spaces.upper - spaces.lower)
     parts = [g("Div", g("Sub", name, middle), half) for name in ("command", "displacement")]

@@ -18,6 +18,7 @@ from agents.learners.base import Learner, Tensors
 from agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.config import difference, load_config, provenance, save_resolved
 from softgym_envs.errors import DataError
+from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_json
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ def train(
         DataError: if the folder holds the training of another configuration.
         WeightsError: if ``initial`` or a checkpoint is damaged or does not fit the configuration.
     """
+    require("train")
     import torch
     from tqdm import tqdm
 

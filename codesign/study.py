@@ -32,6 +32,7 @@ from codesign.scheduling.queue import TrialQueue
 from codesign.snapshot import load_study
 from softgym_envs.envs.options import design_names
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign, SoftGymError
+from softgym_envs.extras import require
 
 MIRROR_INTERVAL = 1.0
 """Time between two copies of results from other machines [s]."""
@@ -70,6 +71,7 @@ def run_study(
         SoftGymError: if an error of the suite ended a worker.
         codesign.scheduling.processes.WorkerError: if any other exception ended a worker; with its traceback.
     """
+    require("codesign")
     if objective is not None:
         config = StudyConfig.model_validate({**config.model_dump(), "objective": objective})
     count = config.workers if workers is None else workers

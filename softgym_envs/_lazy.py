@@ -6,6 +6,9 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 
+from softgym_envs.errors import MissingLibrary
+from softgym_envs.extras import explain
+
 Exports = Mapping[str, Sequence[str]]
 """Module of the package -> the public names that it defines."""
 
@@ -27,7 +30,13 @@ def lazy_exports(package: str, exports: Exports) -> tuple[Callable[[str], object
         if name not in module_of:
             raise AttributeError(f"module '{package}' has no attribute '{name}'; public names: {', '.join(public)}")
         module = module_of[name]
-        value = getattr(import_module(f".{module}", package), name)
+        try:
+            value = getattr(import_module(f".{module}", package), name)
+        except ImportError as error:
+            line = explain(error)
+            if line is None:
+                raise
+            raise MissingLibrary(f"{package}.{name}: {line}") from error
         setattr(sys.modules[package], name, value)
         return value
 

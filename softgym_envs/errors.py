@@ -46,6 +46,10 @@ class WeightsError(DataError):
     """Network weights are missing, truncated, corrupted or of the wrong version."""
 
 
+class MissingLibrary(SoftGymError, ImportError):
+    """An optional library is not installed, or a system library that it loads is missing."""
+
+
 class ConfigError(SoftGymError, ValueError):
     """A configuration file or command-line override is malformed."""
 

@@ -14,6 +14,7 @@ from hypothesis import settings
 
 from softgym_envs import make_robot
 from softgym_envs.cli import main
+from softgym_envs.mechanics.compilation import ANNOUNCED
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -89,6 +90,7 @@ def cache_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOFTGYM_CACHE", str(folder))
+        patch.setenv(ANNOUNCED, "1")  # a first run compiles, and tests of messages read standard error
         yield folder
 
 

@@ -120,13 +120,23 @@ def results(folder: Path | None, output: Path | None, curves: Path | None, as_js
 
 @click.command("deploy-policy")
 @click.argument("policy")
-@click.argument("file", type=options.PATH)
-def deploy_policy(policy: str, file: Path) -> None:
-    """Write a policy as an ONNX graph.
+@click.argument("files", nargs=-1, required=True, type=options.PATH)
+@click.option("--name", default="softgym_policy", show_default=True, help="Prefix of the names that a header defines.")
+def deploy_policy(policy: str, files: tuple[Path, ...], name: str) -> None:
+    """Write a policy as a C header or an ONNX graph.
 
-    POLICY is a file or the name of a shipped policy. The graph in FILE (.onnx) maps sensor values in SI units to
+    POLICY is a file or the name of a shipped policy. FILES end with .h or .onnx. Both map sensor values in SI units to
     commands.
     """
     from agents.export import export_policy_onnx
+    from agents.export_c import export_policy_c
 
-    click.echo(f"wrote {export_policy_onnx(policy, file)}")
+    for file in files:
+        if file.suffix not in (".h", ".onnx"):
+            raise ConfigError(f"'{file}' must end with .h or .onnx")
+    for file in files:
+        if file.suffix == ".h":
+            export_policy_c(policy, file, name=name)
+        else:
+            export_policy_onnx(policy, file)
+        click.echo(f"wrote {file}")

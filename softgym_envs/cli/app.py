@@ -11,6 +11,7 @@ import click
 from softgym_envs.cli import agents, bench, codesign, configs, environments, robots, surrogates
 from softgym_envs.cli.options import Resumable
 from softgym_envs.errors import SoftGymError, unknown_name
+from softgym_envs.extras import explain
 from softgym_envs.version import __version__
 
 SECTIONS = {
@@ -82,6 +83,11 @@ def main() -> None:
         sys.exit(130)
     except click.ClickException as error:
         _fail(error.format_message())
+    except ImportError as error:
+        line = str(error) if isinstance(error, SoftGymError) else explain(error)
+        if line is None:
+            raise
+        _fail(line)
     except (SoftGymError, ValueError, OSError, gymnasium.error.Error) as error:
         if hasattr(error, "__notes__"):  # an error in a robot's code, annotated by `Robot.build`
             raise

@@ -1,6 +1,6 @@
 """The process in which gmsh fills closed shells with tetrahedra: ``python -m ... request.npz output.npz``.
 
-It imports NumPy and gmsh only: loading SciPy and Numba would take longer than a coarse mesh.
+Besides NumPy and gmsh it imports next to nothing: loading SciPy and Numba would take longer than a coarse mesh.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+
+from softgym_envs.extras import explain
 
 UNUSABLE = 3
 """Exit status when gmsh is missing or does not load."""
@@ -79,5 +81,5 @@ if __name__ == "__main__":
     try:
         _fill_shells(Path(sys.argv[1]), Path(sys.argv[2]))
     except (ImportError, OSError) as problem:  # OSError: a system library that gmsh needs is missing
-        print(problem, file=sys.stderr)
+        print(explain(problem) or problem, file=sys.stderr)
         sys.exit(UNUSABLE)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softgym_envs.mechanics.assembly import Assembly
+from softgym_envs.mechanics.compilation import announce_compilation
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.constraints.constraint import Constraint
@@ -30,6 +31,8 @@ from softgym_envs.mechanics.skins import Skin
 from softgym_envs.mechanics.solids import MAX_BODY_SIZE, Fixed, PerElement, check_distance, check_size, solid_part
 from softgym_envs.mechanics.surfaces import cavity_around
 from softgym_envs.mechanics.warping import Warping
+
+announce_compilation()
 
 
 class MechanicalModel:

@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.extras import require
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write, read_npz, write_json
 from softgym_envs.surrogate.data.dataset import COLUMNS
@@ -232,6 +233,7 @@ def fine_tune(
         DataError: if no new state is stable, or the training diverges.
         WeightsError: if the model is not an ensemble with a known domain.
     """
+    require("train")
     import torch
 
     from softgym_envs.surrogate.potential.torch import PotentialNet

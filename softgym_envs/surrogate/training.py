@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from softgym_envs.config import BesideConfig, Config, save_resolved
+from softgym_envs.extras import require
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.data.dataset import generate_dataset
@@ -216,6 +217,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     Returns:
         The errors on the test set.
     """
+    require("train")
     import torch
 
     folder, data_folder = Path(folder), Path(data_folder)

@@ -14,6 +14,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import State
 from softgym_envs.envs.env import SoftRobotEnv
+from softgym_envs.extras import require
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.scene import COLORS, STUB, tension_color
@@ -64,6 +65,7 @@ class RolloutRecorder:
         self._goals: np.ndarray | None = None
 
     def __enter__(self) -> RolloutRecorder:
+        require("viewer")
         import rerun
         import rerun.blueprint as blueprint
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from softgym_envs.backends.backend import State
+from softgym_envs.extras import require
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.surface import BodySurface, cable_lines, surface_kinds
@@ -142,6 +143,7 @@ class Scene:
     """
 
     def __init__(self, robot: Robot, size: tuple[int, int], cloud: np.ndarray) -> None:
+        require("viewer")
         import pyvista
 
         self.robot = robot

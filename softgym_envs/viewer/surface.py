@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extras import require
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
@@ -113,6 +114,7 @@ def body_surface(model: MechanicalModel, x: np.ndarray | None = None) -> pyvista
     Returns:
         A mesh with point normals, the point array ``node`` and the cell array ``clamped``.
     """
+    require("viewer")
     import pyvista
 
     surface = BodySurface(model)

@@ -10,11 +10,8 @@ import pytest
 
 from agents import sweep
 from agents.config import EnvironmentConfig, TrainConfig
-from agents.export import export_policy_onnx
-from agents.policy import Policy
 from agents.results import draw_curves, load_runs, table
 from agents.statistics import crossed_estimate, interquartile_mean, stratified_estimate
-from agents.training import train
 from softgym_envs.config import load_config
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import ConfigError, DataError
@@ -222,70 +219,3 @@ def test_the_table_and_the_curves(swept, tmp_path):
     (tmp_path / "broken" / "seed0.json").write_text("{")
     with pytest.raises(DataError, match=r"seed0\.json' cannot be read"):
         load_runs(tmp_path)
-
-
-POLICIES = {
-    "increment": {"environment": {"id": "SoftGym/FingerReach-v0"}},
-    "absolute, bodies shown": {
-        "environment": {
-            "id": "SoftGym/DiamondReach-v0",
-            "action_mode": "absolute",
-            "design_in_observation": ["young_modulus", "top_height"],
-        }
-    },
-    "one axis": {"environment": {"id": "SoftGym/FingerPress-v0"}},
-    "moving": {"environment": {"id": "SoftGym/TetrapodReach-v0"}, "num_envs": 1},
-    "on the QP": {"environment": {"id": "SoftGym/TrunkReach-v0", "residual_scale": 0.3}},
-}
-
-
-@pytest.mark.parametrize("case", POLICIES)
-def test_the_graph_of_a_policy_agrees_with_the_policy(case, tmp_path):
-    pytest.importorskip("onnx")
-    runtime = pytest.importorskip("onnxruntime")
-    small = {"sac": {"net_arch": [16, 16], "learning_starts": 4}, "steps": 10, "num_envs": 2, "report_every": 10}
-    config = TrainConfig.model_validate({**small, "evaluation_episodes": 1, **POLICIES[case]})
-    policy = Policy(train(config, tmp_path / "run", progress=False))
-    session = runtime.InferenceSession(
-        str(export_policy_onnx(policy, tmp_path / "policy.onnx")), providers=["CPUExecutionProvider"]
-    )
-    env = config.environment.make().unwrapped
-    spaces, robot = env.spaces, env.robot
-    rng = np.random.default_rng(0)
-    count = 40
-    n = len(robot.actuators)
-    state = {
-        "command": rng.uniform(robot.lower, robot.upper, (count, n)),
-        "displacement": rng.uniform(robot.lower, robot.upper, (count, n)),
-        "effort": robot.effort_scale * rng.normal(size=(count, n)),
-        "effector": robot.size * rng.normal(size=(count, 3)),
-        "goal": robot.size * rng.normal(size=(count, 3)),
-        "velocity": robot.size * rng.normal(size=(count, 3)),
-    }
-    units = rng.uniform(-1, 1, (count, len(spaces.design_names)))
-    design = (
-        np.stack(
-            [robot.design_space[name].from_unit(units[:, k]) for k, name in enumerate(spaces.design_names)], axis=1
-        )
-        if spaces.design_names
-        else np.zeros((count, 0))
-    )
-    expected = policy(spaces.observe(*(state[name] for name in list(state)[:5]), units, state["velocity"]))
-    given = {**state, "design": design}
-    feed = {entry.name: given[entry.name].astype(np.float32) for entry in session.get_inputs()}
-    assert ("velocity" in feed) == (case == "moving") and ("design" in feed) == ("bodies" in case)
-    found = dict(zip([entry.name for entry in session.get_outputs()], session.run(None, feed), strict=True))
-    assert np.abs(found["action"] - expected).max() < 2e-5
-    if case == "on the QP":
-        assert set(found) == {"action"}
-    else:
-        command = spaces.command(expected.astype(float), state["command"])
-        assert (np.abs(found["next_command"] - command) / (robot.upper - robot.lower)).max() < 1e-5
-
-
-def test_exports_name_what_is_wrong(tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match=r"must end with \.onnx"):
-        export_policy_onnx("finger_reach", tmp_path / "policy.h")
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ValueError, match="pip install"):
-        export_policy_onnx("finger_reach", tmp_path / "policy.onnx")

@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
+from softgym_envs.extras import explain
 from softgym_envs.mechanics.gmsh_process import set_options
 from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
@@ -278,7 +279,7 @@ def _main() -> int:
     try:
         _draw_here(json.loads(sys.argv[1]))
     except (ImportError, OSError) as problem:  # OSError: a system library that gmsh needs is missing
-        print(problem, file=sys.stderr)
+        print(explain(problem) or problem, file=sys.stderr)
         return _NO_GMSH
     except Exception as problem:
         # gmsh raises plain Exceptions; any other type comes from the drawing's code.

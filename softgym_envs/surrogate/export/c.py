@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from string import Template
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from softgym_envs.designs import Design
 from softgym_envs.storage import atomic_write
+from softgym_envs.surrogate.export.c_text import check_identifier, comment, initialiser, number
 from softgym_envs.surrogate.export.common import actuator_records, check_path, exportable
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
@@ -51,43 +52,13 @@ def export_c(
             weights that are not finite in single precision.
     """
     path = check_path(path, ".h")
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise ValueError(
-            f"name = {name!r} is not a C identifier; allowed: a letter, then letters, digits and underscores"
-        )
+    check_identifier(name)
     potential = exportable(model, members)
     complete = potential.robot.design_space.complete(design)
     text = _header(potential, complete, name)
     with atomic_write(path, "w") as stream:
         stream.write(text)
     return path
-
-
-def _number(value: float) -> str:
-    """Return the shortest decimal that a compiler reads as this float32."""
-    single = np.float32(value)
-    plain = np.format_float_positional(single, unique=True, trim="0")
-    short = np.format_float_scientific(single, unique=True, trim="0", exp_digits=1)
-    return (plain if len(plain) <= len(short) else short) + "f"
-
-
-def _initialiser(array: np.ndarray, indent: str = "    ") -> str:
-    """Return an array as a C initialiser, in lines of at most 120 characters."""
-    if array.ndim > 1:
-        return "{\n" + ",\n".join(indent + _initialiser(part, indent + "    ") for part in array) + "}"
-    lines, line = [], ""
-    for number in map(_number, array):
-        if line and len(indent) + len(line) + len(number) > 114:
-            lines.append(line)
-            line = ""
-        line += f"{number}, "
-    return "{" + f"\n{indent}".join(text.rstrip() for text in [*lines, line.rstrip(", ")]) + "}"
-
-
-def _comment(lines: Iterable[str]) -> str:
-    """Return a C comment; ``/*`` and ``*/`` in the text are separated by a space."""
-    text = "\n".join(f" * {line}".rstrip() for line in (x.replace("*/", "* /").replace("/*", "/ *") for x in lines))
-    return f"/*\n{text}\n */\n"
 
 
 def _constants(model: Model, design: Design) -> dict[str, tuple[str, np.ndarray]]:
@@ -187,14 +158,14 @@ def _header(model: Model, design: Design, name: str) -> str:
         "Compile with -O3 -fno-math-errno if you can: square roots become single instructions, with the same results.",
     ]
     parts = [
-        _comment(about),
+        comment(about),
         f"#ifndef {upper}_H\n#define {upper}_H\n\n#include <math.h>\n",
         "\n".join(f"#define {upper}_{word} {value} /* {meaning} */" for word, value, meaning in sizes.values()),
         "",
     ]
     for key, (shape, array) in constants.items():
         dimensions = re.sub(r"\w", lambda letter: f"{upper}_{sizes[letter.group()][0]}", shape)
-        value = _initialiser(array) if array.ndim else _number(float(array))
+        value = initialiser(array) if array.ndim else number(float(array))
         parts.append(f"static const float {name}_{key}{dimensions} = {value};")
     parts.append(Template(_FUNCTIONS.read_text()).substitute(p=name, P=upper))
     parts.append(f"#endif /* {upper}_H */\n")

@@ -1,0 +1,50 @@
+"""Optional libraries: the extra of the package that installs each, and what to do if one is missing."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from softgym_envs.errors import MissingLibrary
+
+EXTRAS = {
+    "train": ("torch", "stable_baselines3", "pytorch_optimizer", "matplotlib"),
+    "geometry": ("gmsh",),
+    "viewer": ("pyvista", "vtkmodules", "rerun", "PIL"),
+    "codesign": ("optuna", "cmaes", "jinja2"),
+    "onnx": ("onnx",),
+    "design": ("SALib",),
+}
+"""Extra in pyproject.toml -> modules that it installs."""
+
+SYSTEM_PACKAGES = (
+    "libegl1 libfontconfig1 libgl1 libglu1-mesa libgomp1 libx11-6 libxcursor1 libxext6 libxfixes3 libxft2 libxinerama1 "
+    "libxrender1"
+)
+"""Debian packages with the libraries that the wheels of gmsh and vtk load."""
+
+
+def explain(error: ImportError | OSError) -> str | None:
+    """Return one line that says how to install what an import needs, or None for any other error."""
+    module = (getattr(error, "name", None) or "").partition(".")[0]
+    if isinstance(error, ModuleNotFoundError):
+        extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
+        return None if extra is None else _missing(module, extra)
+    if "cannot open shared object file" in str(error):
+        library = str(error).partition(":")[0]
+        return f"{library}, a system library, is missing; on Debian or Ubuntu: apt-get install {SYSTEM_PACKAGES}"
+    return None
+
+
+def require(extra: str) -> None:
+    """Check that an extra is installed, before work that needs it begins.
+
+    Raises:
+        MissingLibrary: one line that says what to install.
+    """
+    for module in EXTRAS[extra]:
+        if find_spec(module) is None:
+            raise MissingLibrary(_missing(module, extra))
+
+
+def _missing(module: str, extra: str) -> str:
+    return f"{module} is not installed; install it with: pip install 'softgym-envs[{extra}]'"

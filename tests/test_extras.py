@@ -1,0 +1,77 @@
+"""Core without extras: one line says what to install; the first use says that it compiles."""
+
+import sys
+
+import numba
+import pytest
+
+from softgym_envs.errors import MissingLibrary
+from softgym_envs.extras import EXTRAS, explain, require
+from softgym_envs.mechanics.compilation import ANNOUNCED
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """Function ``without(module)``: make a module look as if it were not installed."""
+
+    return lambda module: monkeypatch.setitem(sys.modules, module, None)
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "arguments"),
+    [
+        ("torch", "train", ["train", "--config", "finger_reach", "--folder", "x"]),
+        ("pyvista", "viewer", ["show", "finger", "--picture", "x.png"]),
+        ("rerun", "viewer", ["rollout", "SoftGym/FingerReach-v0", "--record", "x.rrd"]),
+        ("optuna", "codesign", ["codesign", "--config", "finger_reach"]),
+        ("gmsh", "geometry", ["show", "finger", "--option", "mesh_size=0.0061"]),
+    ],
+)
+def test_a_missing_library_is_one_line_that_names_its_extra(
+    module, extra, arguments, softgym, without, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    if module == "gmsh":  # which another process imports
+        (tmp_path / "gmsh.py").write_text("raise ModuleNotFoundError(\"No module named 'gmsh'\", name='gmsh')\n")
+        monkeypatch.syspath_prepend(tmp_path)
+    else:
+        without(module)
+    status, _, err = softgym(*arguments)
+    assert status == 2 and len(err.strip().splitlines()) == 1
+    assert f"{module} is not installed; install it with: pip install 'softgym-envs[{extra}]'" in err
+
+
+def test_the_same_line_in_python(without):
+    without("torch")
+    with pytest.raises(MissingLibrary, match=r"torch is not installed; .*\[train\]"):
+        require("train")
+    require("viewer")
+    assert explain(ModuleNotFoundError("No module named 'nonsense'", name="nonsense")) is None
+    assert explain(OSError("disk full")) is None
+
+
+def test_a_missing_system_library_is_named_with_the_packages_to_install():
+    problem = OSError("libGLU.so.1: cannot open shared object file: No such file or directory")
+    assert explain(problem).startswith("libGLU.so.1, a system library, is missing; on Debian")
+    assert "libglu1-mesa" in explain(problem)
+
+
+def test_extras_are_those_of_the_package():
+    import tomllib
+    from pathlib import Path
+
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    assert set(EXTRAS) <= set(project["optional-dependencies"])
+
+
+def test_the_first_compilation_is_announced_once(monkeypatch, capfd):
+    monkeypatch.delenv(ANNOUNCED)
+
+    def kernel(x):
+        return x + 1
+
+    kernel.__module__ = "softgym_envs.kernels"
+    compiled = numba.njit(kernel)
+    compiled(1)
+    compiled(1.0)
+    assert capfd.readouterr().err.count("compiling numerical kernels") == 1
