@@ -230,17 +230,35 @@ def check_layers(widths: list[int]) -> list[int]:
     return widths
 
 
-class AnalyticConfig(Config):
-    """Hyperparameters of the analytic policy gradient (`agents.learners.analytic`)."""
+class PPOConfig(Config):
+    """Hyperparameters of proximal policy optimisation, named as in stable-baselines3."""
+
+    learning_rate: float = Field(default=1e-3, gt=0)
+    final_learning_rate: float = Field(default=1e-4, gt=0, description="reached linearly at the last step")
+    n_steps: int = Field(default=25, gt=0, description="of each environment between updates")
+    batch_size: int = Field(default=400, gt=1, description="at most all steps between updates")
+    n_epochs: int = Field(default=6, gt=0)
+    gamma: float = Field(default=0.9, gt=0, le=1)
+    gae_lambda: float = Field(default=0.9, gt=0, le=1)
+    clip_range: float = Field(default=0.2, gt=0)
+    ent_coef: float = Field(default=0.0, ge=0)
+    log_std_init: float = -0.5
+    net_arch: list[int] = [64, 64]
+
+    @field_validator("net_arch")
+    @classmethod
+    def _layers(cls, value: list[int]) -> list[int]:
+        return check_layers(value)
+
+
+class GradientConfig(Config):
+    """Hyperparameters of the learners that know the model."""
 
     learning_rate: float = Field(default=2e-3, gt=0)
     final_learning_rate: float = Field(default=4e-5, gt=0, description="reached linearly at the last step")
     net_arch: list[int] = [128, 128]
     members: int | None = Field(
         default=1, ge=1, description="of the surrogate's ensemble, in training; evaluations use all"
-    )
-    slack_pull: float = Field(
-        default=0.3, ge=0, description="how strongly commands of slack cables follow the displacement that is reached"
     )
 
     @field_validator("net_arch")
@@ -249,30 +267,60 @@ class AnalyticConfig(Config):
         return check_layers(value)
 
 
-class TrainConfig(Config):
+class AnalyticConfig(GradientConfig):
+    """Hyperparameters of the analytic policy gradient (`agents.learners.analytic`)."""
+
+    slack_pull: float = Field(
+        default=0.3, ge=0, description="how strongly commands of slack cables follow the displacement that is reached"
+    )
+
+
+class CloningConfig(GradientConfig):
+    """Hyperparameters of the imitation of the inverse QP (`agents.learners.cloning`)."""
+
+    batch_size: int = Field(default=256, gt=0)
+    gradient_steps: int = Field(default=8, gt=0, description="per step of all environments together")
+    lead: float = Field(
+        default=0.2, gt=0, le=1, description="share of the steps until the policy acts alone in all environments"
+    )
+
+
+class LearnerConfig(Config):
+    """A learning method and its hyperparameters.
+
+    Attributes:
+        learner: ``"sac"`` or ``"ppo"``, model-free, for every environment; or, model-based and on the surrogate only,
+            ``"analytic"``, which follows derivatives of the reward, or ``"cloning"``, which imitates the inverse QP.
+        sac: hyperparameters of SAC.
+        ppo: hyperparameters of PPO.
+        analytic: hyperparameters of the analytic policy gradient.
+        cloning: hyperparameters of the imitation.
+        num_envs: number of sub-environments.
+        seed: seed of everything random.
+    """
+
+    learner: Literal["sac", "ppo", "analytic", "cloning"] = "sac"
+    sac: SACConfig = Field(default_factory=SACConfig)
+    ppo: PPOConfig = Field(default_factory=PPOConfig)
+    analytic: AnalyticConfig = Field(default_factory=AnalyticConfig)
+    cloning: CloningConfig = Field(default_factory=CloningConfig)
+    num_envs: int = Field(default=16, gt=0)
+    seed: int = Field(default=0, ge=0)
+
+
+class TrainConfig(LearnerConfig):
     """One training run.
 
     Attributes:
         environment: what the policy is trained in.
-        learner: ``"sac"``, model-free, for every environment; or ``"analytic"``, which follows the derivatives of the
-            learned model and needs the surrogate.
-        sac: hyper-parameters of SAC.
-        analytic: hyper-parameters of the analytic policy gradient.
         steps: environment steps, over all sub-environments.
-        num_envs: number of sub-environments.
-        seed: seed of everything random.
         initial: initial policy: a file or the name of a shipped one.
         evaluation_episodes: number of episodes of each evaluation.
         report_every: environment steps between evaluations.
     """
 
     environment: EnvironmentConfig
-    learner: Literal["sac", "analytic"] = "sac"
-    sac: SACConfig = SACConfig()
-    analytic: AnalyticConfig = AnalyticConfig()
     steps: int = Field(default=40_000, gt=0)
-    num_envs: int = Field(default=16, gt=0)
-    seed: int = Field(default=0, ge=0)
     initial: Annotated[str | None, BesideConfig()] = None
     evaluation_episodes: int = Field(default=64, gt=0)
     report_every: int = Field(default=4_000, gt=0)

@@ -6,13 +6,11 @@ Silver et al., Residual policy learning, 2018.
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium
 import numpy as np
 
 from agents.baselines import InverseQPAgent, make_controller
-from softgym_envs.control.inverse_qp import InverseQP
+from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 
@@ -35,8 +33,35 @@ class ResidualQP(gymnasium.ActionWrapper):
         return np.clip(self._qp(None, self.unwrapped) + self.scale * np.asarray(action), -1.0, 1.0)
 
 
+class BatchQP:
+    """Inverse QP of every row of the batched surrogate environment, on one batch of condensed models.
+
+    Args:
+        env: the environment.
+    """
+
+    def __init__(self, env: SoftRobotVectorEnv) -> None:
+        self._env = env
+        self._controllers = [make_controller(env.robot, env.task) for _ in range(env.num_envs)]
+
+    def __call__(self) -> np.ndarray:
+        """Return actions for the present states, shape (num_envs, n_a); rows without a solution hold the command."""
+        env = self._env
+        models, goals, previous = env.condensed, env.goals, env.command
+        commands = previous.copy()
+        for i, controller in enumerate(self._controllers):
+            if not previous[i].any():  # an episode begins
+                controller = self._controllers[i] = make_controller(env.robot, env.task)
+            model = CondensedModel(models.compliance[i], models.free[i], models.effort[i], models.roles)
+            try:
+                commands[i] = controller.solve(model, goals[i], previous[i], env.slack[i])
+            except ConvergenceError:
+                pass
+        return env.spaces.action(commands, previous)
+
+
 class VectorResidualQP(gymnasium.vector.VectorActionWrapper):
-    """`ResidualQP` of the batched surrogate environment: one QP per row, on one batch of condensed models.
+    """`ResidualQP` of the batched surrogate environment.
 
     Args:
         env: a `SoftRobotVectorEnv`.
@@ -46,24 +71,8 @@ class VectorResidualQP(gymnasium.vector.VectorActionWrapper):
     def __init__(self, env: gymnasium.vector.VectorEnv, scale: float) -> None:
         super().__init__(env)
         self.scale = scale
-        batch: Any = env.unwrapped
-        self._batch = batch
-        self._controllers: list[InverseQP] = [make_controller(batch.robot, batch.task) for _ in range(env.num_envs)]
+        self._qp = BatchQP(env.unwrapped)  # type: ignore[arg-type]
 
     def actions(self, actions: np.ndarray) -> np.ndarray:
         """Return the actions for the wrapped environment, shape (num_envs, n_a)."""
-        return np.clip(self._qp_actions() + self.scale * np.asarray(actions), -1.0, 1.0)
-
-    def _qp_actions(self) -> np.ndarray:
-        env = self._batch
-        models, goals, previous = env.condensed, env.goals, env.command
-        commands = previous.copy()
-        for i, controller in enumerate(self._controllers):
-            if not previous[i].any():  # an episode begins
-                controller = self._controllers[i] = make_controller(env.robot, env.task)
-            model = CondensedModel(models.compliance[i], models.free[i], models.effort[i], models.roles)
-            try:
-                commands[i] = controller.solve(model, goals[i], previous[i], env.slack[i])
-            except ConvergenceError:  # hold the command
-                pass
-        return env.spaces.action(commands, previous)
+        return np.clip(self._qp() + self.scale * np.asarray(actions), -1.0, 1.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,8 +22,11 @@ if TYPE_CHECKING:
 RESULTS = Path(__file__).parent / "results"
 """Stored runs of the configurations in ``configs/agents``."""
 
-LEARNERS = {"sac": "SAC", "analytic": "analytic gradient"}
-"""Titles of the learners. The analytic gradient uses the learned model; SAC is model-free."""
+LEARNERS = {"sac": "SAC", "ppo": "PPO", "analytic": "analytic gradient", "cloning": "cloning"}
+"""Titles of the learners."""
+
+MODEL_BASED = ("analytic", "cloning")
+"""Learners that know the model of the robot, as the inverse QP does; the others are model-free."""
 
 AGENTS = LEARNERS | {
     "qp": "QP",
@@ -36,7 +39,12 @@ AGENTS = LEARNERS | {
 
 
 #: Colours of the curves of each learner: single seeds, and their mean.
-_COLOURS = {"sac": ("#99d0ca", "#0f766e"), "analytic": ("#f3c49a", "#c2570c")}
+_COLOURS = {
+    "sac": ("#99d0ca", "#0f766e"),
+    "ppo": ("#a9bff0", "#1d4ed8"),
+    "analytic": ("#f3c49a", "#c2570c"),
+    "cloning": ("#d3b5ea", "#7e22ce"),
+}
 
 
 class StoredEvaluation(TypedDict):
@@ -158,7 +166,9 @@ def table(runs: list[StoredRuns]) -> str:
     seeds = sorted({count for each in counts for count in each.values()})
     text = [
         f"Interquartile means over all seeds ({' or '.join(map(str, seeds))}) and goals, with 95 % bootstrap intervals "
-        "over both (with three seeds that differ much, they cover only about 80 %). Distances are in mm, errors of "
+        "over both (with three seeds that differ much, they cover only about 80 %). "
+        f"{_listed(agent for agent in LEARNERS if agent not in MODEL_BASED)} are model-free; "
+        f"{_listed(MODEL_BASED)} learn from the model of the robot that the QP uses. Distances are in mm, errors of "
         "forces in %: to the goal at the end of an episode, or the mean along a path (track tasks, marked *). Policies "
         "were chosen on other goals.\n"
     ]
@@ -222,12 +232,30 @@ def summary(runs: list[StoredRuns]) -> list[Summary]:
     return rows
 
 
-def _grid(runs: Iterable[StoredRuns], cell: Callable[[StoredRuns, str], str]) -> str:
-    lines = ["| configuration | " + " | ".join(AGENTS.values()) + " |", "|---" * (len(AGENTS) + 1) + "|"]
+def _listed(learners: Iterable[str]) -> str:
+    return " and ".join(LEARNERS[name] for name in learners)
+
+
+def _grid(runs: Sequence[StoredRuns], cell: Callable[[StoredRuns, str], str]) -> str:
+    agents = _evaluated(runs)
+    lines = _head("configuration", agents)
     for entry in runs:
         name = f"{entry.name}*" if entry.follows else entry.name
-        lines.append(f"| {name} | " + " | ".join(cell(entry, agent) for agent in AGENTS) + " |")
+        lines.append(f"| {name} | " + " | ".join(cell(entry, agent) for agent in agents) + " |")
     return "\n".join(lines)
+
+
+def _evaluated(runs: Sequence[StoredRuns]) -> list[str]:
+    """Return the agents of which there are evaluations."""
+    return [
+        agent
+        for agent in AGENTS
+        if any(entry.scores(agent, backend, "returns") is not None for entry in runs for backend in ("own", "fem"))
+    ]
+
+
+def _head(first: str, agents: Sequence[str]) -> list[str]:
+    return [f"| {first} | " + " | ".join(AGENTS[agent] for agent in agents) + " |", "|---" * (len(agents) + 1) + "|"]
 
 
 def _distance(entry: StoredRuns, agent: str, backend: str) -> str:
@@ -255,16 +283,16 @@ def _present(estimate: Estimate, digits: int = 3) -> str:
 
 def _together(runs: list[StoredRuns]) -> str:
     """Return the table of returns over all environments, with the plain configuration of each task."""
+    agents = _evaluated(runs)
     plain = [entry for entry in runs if not entry.environment.residual_scale and not entry.environment.sample_design]
     lines = [
         "Return as a share of the largest possible return; interquartile mean over seeds and the plain configurations "
         "(the intervals resample the seeds of each configuration).\n",
-        "| backend | " + " | ".join(AGENTS.values()) + " |",
-        "|---" * (len(AGENTS) + 1) + "|",
+        *_head("backend", agents),
     ]
     for backend, word in (("own", "of the training"), ("fem", "FEM")):
         cells = []
-        for agent in AGENTS:
+        for agent in agents:
             found = [(entry, entry.scores(agent, backend, "returns")) for entry in plain]
             means = [scores.mean(axis=1) / entry.horizon for entry, scores in found if scores is not None]
             count = max(map(len, means), default=0)
@@ -283,8 +311,8 @@ def _together(runs: list[StoredRuns]) -> str:
 def draw_curves(runs: list[StoredRuns], path: str | Path, columns: int = 4) -> Path:
     """Draw the learning curves of every seed and their mean, in a panel for each configuration.
 
-    The curves are mean returns of the evaluations during training, green for SAC and orange for the analytic gradient;
-    the dashed line is the inverse QP on the goals of the final evaluation.
+    The curves are mean returns of the evaluations during training, green for SAC, blue for PPO, orange for the analytic
+    gradient and violet for cloning; the dashed line is the inverse QP on the goals of the final evaluation.
 
     Args:
         runs: the runs.

@@ -189,8 +189,13 @@ def _attempt(function: Callable[..., Path], arguments: tuple[Any, ...]) -> tuple
 def _cost(config: TrainConfig) -> float:
     """Return the rough CPU time of a training [s]; the longest trainings run first."""
     step = 0.02 if config.environment.backend == "fem" else 1e-4
-    update = 0.005 * config.sac.gradient_steps if config.learner == "sac" else 0.001
-    return config.steps * (step + update / config.num_envs)
+    updates = {
+        "sac": 0.005 * config.sac.gradient_steps,
+        "ppo": 3e-5 * config.num_envs,
+        "analytic": 0.001,
+        "cloning": 1e-4 * config.num_envs + 0.0005 * config.cloning.gradient_steps,
+    }  # per step of all environments together
+    return config.steps * (step + updates[config.learner] / config.num_envs)
 
 
 def sweep(

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from agents.config import AnalyticConfig, SACConfig
+from agents.config import LearnerConfig
 from codesign.sampling import check_options
 from softgym_envs.config import Config
 
@@ -106,17 +106,15 @@ class GoalsConfig(Config):
         return self
 
 
-class TrainingConfig(Config):
-    """Training for one body, in a trial or as a finalist; see `agents.config.TrainConfig`."""
+class TrainingConfig(LearnerConfig):
+    """Training for one body, in a trial or as a finalist; see `agents.config.TrainConfig`.
+
+    All trials have the same seed and then differ by their bodies only.
+    """
 
     steps: int = Field(default=2_500, ge=1, description="environment steps of one trial")
     report_every: int = Field(default=500, ge=1, description="environment steps between two reports to the pruner")
     evaluation_episodes: int = Field(default=32, ge=1, description="episodes of each report")
-    num_envs: int = Field(default=16, ge=1)
-    seed: int = Field(default=0, ge=0, description="the same in all trials, which then differ by their bodies only")
-    learner: Literal["sac", "analytic"] = Field(default="sac", description="see `agents.config.TrainConfig`")
-    sac: SACConfig = Field(default_factory=SACConfig)
-    analytic: AnalyticConfig = Field(default_factory=AnalyticConfig)
 
 
 class JointConfig(TrainingConfig):

@@ -12,7 +12,9 @@ if TYPE_CHECKING:
 
 LEARNERS = {
     "sac": "agents.learners.sac:SACLearner",
+    "ppo": "agents.learners.ppo:PPOLearner",
     "analytic": "agents.learners.analytic:AnalyticLearner",
+    "cloning": "agents.learners.cloning:CloningLearner",
 }
 
 

@@ -62,14 +62,7 @@ def training_config(folder: StudyFolder, design: Mapping[str, float], options: M
         environment=environment.model_copy(
             update={"design": dict(design), "sample_design": False, "task_options": task_options}
         ),
-        learner=training.learner,
-        sac=training.sac,
-        analytic=training.analytic,
-        steps=training.steps,
-        num_envs=training.num_envs,
-        seed=training.seed,
-        evaluation_episodes=training.evaluation_episodes,
-        report_every=training.report_every,
+        **training.model_dump(),
     )
 
 

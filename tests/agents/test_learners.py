@@ -1,13 +1,19 @@
 """Learners other than SAC: what they learn, files, resumption, warm starts and what they refuse."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 import torch
 
 from agents.config import TrainConfig
 from agents.evaluation import evaluate, sample_goals
+from agents.learners import LEARNERS
 from agents.learners.analytic import AnalyticLearner
+from agents.learners.cloning import CloningLearner
+from agents.learners.ppo import PPOLearner
 from agents.policy import Policy, read_tensors
+from agents.residual import BatchQP
 from agents.training import train
 from softgym_envs.errors import DataError, WeightsError
 
@@ -53,11 +59,22 @@ def test_an_untrained_policy_keeps_still():
     learner.close()
 
 
-def test_same_seed_same_policy_and_interruptions_change_nothing(tmp_path, monkeypatch):
-    first = train(SHORT, tmp_path / "first", progress=False).read_bytes()
-    assert train(SHORT, tmp_path / "again", progress=False).read_bytes() == first
-    assert train(SHORT.model_copy(update={"seed": 1}), tmp_path / "other", progress=False).read_bytes() != first
-    original = AnalyticLearner.learn
+QUICK = {
+    "analytic": SHORT,
+    "cloning": SHORT.model_copy(update={"learner": "cloning"}),
+    "ppo": TrainConfig.model_validate({**SHORT.model_dump(), "learner": "ppo", "ppo": {"n_steps": 2, "n_epochs": 2}}),
+}
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_same_seed_same_policy_and_interruptions_change_nothing(name, tmp_path, monkeypatch):
+    config = QUICK[name]
+    first = train(config, tmp_path / "first", progress=False).read_bytes()
+    assert train(config, tmp_path / "again", progress=False).read_bytes() == first
+    assert train(config.model_copy(update={"seed": 1}), tmp_path / "other", progress=False).read_bytes() != first
+    module, _, name = LEARNERS[name].partition(":")
+    method = getattr(import_module(module), name)
+    original = method.learn
 
     def stop(learner, target, progress):
         if learner.step >= 512:
@@ -65,12 +82,50 @@ def test_same_seed_same_policy_and_interruptions_change_nothing(tmp_path, monkey
         original(learner, target, progress)
 
     with monkeypatch.context() as patch:
-        patch.setattr(AnalyticLearner, "learn", stop)
+        patch.setattr(method, "learn", stop)
         with pytest.raises(KeyboardInterrupt):
-            train(SHORT, tmp_path / "resumed", progress=False)
-    assert train(SHORT, tmp_path / "resumed", progress=False).read_bytes() == first
+            train(config, tmp_path / "resumed", progress=False)
+    torch.manual_seed(5)  # a new process would have other random states
+    assert train(config, tmp_path / "resumed", progress=False).read_bytes() == first
     with pytest.raises(DataError, match="learner"):
-        train(SHORT.model_copy(update={"learner": "sac"}), tmp_path / "resumed", progress=False)
+        train(config.model_copy(update={"learner": "sac"}), tmp_path / "resumed", progress=False)
+
+
+def test_policy_of_ppo_is_its_mean_action_and_weights_return(tmp_path):
+    config = QUICK["ppo"]
+    path = train(config, tmp_path / "ppo", progress=False)
+    learner = PPOLearner(config.model_copy(update={"seed": 7}))
+    learner.load_weights(read_tensors(path), path)
+    for name, values in learner.weights().items():
+        assert (values == read_tensors(path)[name]).all()
+    observation = np.random.default_rng(0).uniform(-1, 1, (6, 15)).astype(np.float32)
+    expected, _ = learner.model.predict(observation, deterministic=True)
+    assert np.abs(Policy(path)(observation) - expected).max() < 1e-5
+    assert np.abs(expected).max() > 1e-3
+    learner.close()
+
+
+def test_rates_fall_over_the_whole_training(tmp_path):
+    learner = PPOLearner(QUICK["ppo"])
+    learner.learn(512, lambda steps: None)
+    assert learner.model.lr_schedule(0.3) == pytest.approx(0.5 * (1e-3 + 1e-4))
+    learner.close()
+
+
+def test_a_clone_does_what_the_qp_does():
+    config = QUICK["cloning"].model_copy(update={"steps": 3200, "num_envs": 32})
+    learner = CloningLearner(config)
+    learner.learn(config.steps, lambda steps: None)
+    env = learner.env
+    observation, _ = env.reset(seed=9)
+    errors, sizes = [], []
+    for _ in range(10):
+        action, answer = learner.policy(observation).detach().numpy(), BatchQP(env)()
+        errors.append(np.abs(action - answer).mean())
+        sizes.append(np.abs(answer).mean())
+        observation, *_ = env.step(action)
+    assert np.mean(errors) < 0.2 * np.mean(sizes)
+    learner.close()
 
 
 def test_training_starts_from_a_policy_of_the_same_widths(trained, tmp_path):
@@ -82,12 +137,13 @@ def test_training_starts_from_a_policy_of_the_same_widths(trained, tmp_path):
         train(narrow, tmp_path / "narrow", initial=trained, progress=False)
 
 
+@pytest.mark.parametrize("learner", ["analytic", "cloning"])
 @pytest.mark.parametrize(
     "environment",
     [{"id": "SoftGym/FingerReach-v0", "backend": "fem"}, {"id": "SoftGym/FingerReach-v0", "residual_scale": 0.5}],
 )
-def test_environments_without_derivatives_are_refused(environment, tmp_path):
-    config = TrainConfig.model_validate({**SHORT.model_dump(), "environment": environment})
-    with pytest.raises(ValueError, match=r"learner 'analytic' needs environment\.backend = surrogate"):
+def test_environments_without_a_model_are_refused(environment, learner, tmp_path):
+    config = TrainConfig.model_validate({**SHORT.model_dump(), "environment": environment, "learner": learner})
+    with pytest.raises(ValueError, match=rf"learner '{learner}' needs environment\.backend = surrogate"):
         train(config, tmp_path / "new", progress=False)
     assert not (tmp_path / "new").exists()

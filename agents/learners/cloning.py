@@ -1,0 +1,54 @@
+"""Cloning of the inverse QP (model-based): the policy imitates the QP in the states that the policy itself visits.
+
+This is DAgger (Ross, Gordon and Bagnell, A reduction of imitation learning and structured prediction to no-regret
+online learning, 2011): at every step the QP tells what it would do, all its answers are kept, and the policy is fitted
+to samples of them. At first the QP acts in some of the environments, later only the policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from agents.config import TrainConfig
+from agents.learners.base import Tensors
+from agents.learners.gradient import GradientLearner
+from agents.residual import BatchQP
+
+
+class CloningLearner(GradientLearner):
+    """Imitation of the inverse QP on the batched environment."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        super().__init__(config, config.cloning)
+        self._expert = BatchQP(self.env)
+        size = config.steps + config.num_envs
+        self._observations = np.zeros((size, *self.env.single_observation_space.shape), dtype=np.float32)  # type: ignore[misc]
+        self._answers = np.zeros((size, *self.env.single_action_space.shape), dtype=np.float32)  # type: ignore[misc]
+
+    def advance(self, observation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        import torch
+
+        cloning, env = self.config.cloning, self.env
+        answer = self._expert()
+        rows = slice(self.step, self.step + env.num_envs)
+        self._observations[rows], self._answers[rows] = observation, answer
+        for _ in range(cloning.gradient_steps):
+            sample = rng.integers(0, rows.stop, cloning.batch_size)
+            error = self.policy(self._observations[sample]) - torch.from_numpy(self._answers[sample])
+            self.descend((error**2).mean())
+        with torch.no_grad():
+            action = self.policy(observation).numpy()
+        led = rng.random(env.num_envs) < 1.0 - self.step / (cloning.lead * self.config.steps)
+        return env.step(np.where(led[:, None], answer, action))[0]
+
+    def state(self) -> tuple[Tensors, dict[str, Any]]:
+        tensors, meta = super().state()
+        kept = {"observations": self._observations[: self.step], "answers": self._answers[: self.step]}
+        return tensors | kept, meta
+
+    def restore(self, tensors: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
+        super().restore(tensors, meta)
+        self._observations[: self.step], self._answers[: self.step] = tensors["observations"], tensors["answers"]
