@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from agents.results import LEARNERS, MODEL_BASED
+from benchmarks.learners import REPORTS, TASKS, spread
 from benchmarks.recorded import figure, number, records, results
 
 WEIGHTS = {
@@ -116,6 +118,21 @@ def _spread(value: object) -> str:
     middle, _, rest = text.partition(" (")
     low, _, high = rest.rstrip(")").partition(" to ")
     return middle if low == high == middle else text
+
+
+def learners() -> str:
+    """CPU seconds of the learners to 90 and 95 % of unseen goals, and their success on FEM."""
+    found = results("learners")
+    columns = ["CPU seconds to 90 %", "CPU seconds to 95 %", "CPU seconds of the training"]
+    columns += ["goals reached on the surrogate [%]", "goals reached on FEM [%]"]
+    rows = []
+    for task in TASKS:
+        for learner in REPORTS:
+            name, kind = f"{task}, {learner}", "model-based" if learner in MODEL_BASED else "model-free"
+            known = name not in found
+            cells = [spread(found[f"{name}: {column}"]) if known else "not run" for column in columns]
+            rows.append([task, f"{LEARNERS[learner]} ({kind})", *cells])
+    return markdown(["task", "learner", *columns], rows, "llrrrrr")
 
 
 def kills() -> str:
@@ -450,8 +467,8 @@ def provenance() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     function.__name__: function
     for function in (
-        headlines, codesign, codesign_goals, codesign_bodies, strategies, kills, profile, agents, carry, test_set,
-        buckling, predicted_tracking, trajectories, design_gradients, networks, design_optima,
+        headlines, codesign, codesign_goals, codesign_bodies, learners, strategies, kills, profile, agents, carry,
+        test_set, buckling, predicted_tracking, trajectories, design_gradients, networks, design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop,
         validation, contact, surrogate_speed, fem_speed, deployed, provenance,
     )
