@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -176,6 +176,18 @@ class DesignSpace:
         for name in design:
             self[name]  # raises for an unknown name
         return Design(self, {**start, **design})
+
+    def within(self, bounds: Mapping[str, tuple[float, float]]) -> DesignSpace:
+        """Return a space in which some variables have other bounds.
+
+        Args:
+            bounds: smallest and largest value of these variables [their units].
+
+        Raises:
+            DesignError: for an unknown name, or bounds that do not contain the baseline.
+        """
+        changed = {name: replace(self[name], low=low, high=high) for name, (low, high) in bounds.items()}
+        return DesignSpace(*(changed.get(variable.name, variable) for variable in self))
 
     def to_unit(self, design: Mapping[str, float]) -> np.ndarray:
         """Return the design as a vector in [-1, 1], shape (len(self),)."""

@@ -265,3 +265,15 @@ def test_unknown_variable_by_name():
         SPACE.sample(np.random.default_rng(0), ("width",))
     assert len(SPACE) == 3
     assert repr(SPACE) == "DesignSpace(length, young_modulus, offset)"
+
+
+def test_a_space_with_other_bounds():
+    space = make_robot("finger").design_space
+    wide = space.within({"length": (0.03, 0.05)})
+    assert (wide["length"].low, wide["length"].high) == (0.03, 0.05)
+    assert wide.names == space.names and wide["height"] == space["height"] and wide.baseline == dict(space.baseline)
+    assert space.within({}) == space != wide
+    with pytest.raises(DesignError, match="'length': baseline 0.04 is outside"):
+        space.within({"length": (0.05, 0.06)})
+    with pytest.raises(DesignError, match="'width'"):
+        space.within({"width": (0.0, 1.0)})

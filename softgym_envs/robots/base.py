@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from softgym_envs.designs import Design, DesignSpace
-from softgym_envs.errors import InfeasibleDesign, SoftGymError
+from softgym_envs.errors import InfeasibleDesign, SoftGymError, unknown_name
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.contact.obstacles import Obstacle, obstacle_from
@@ -30,6 +30,9 @@ Drawing = tuple[Callable[..., None], dict]
 
 LARGEST = 10.0
 """Largest allowed robot, stroke or dimension [m]; larger ones were probably given in millimetres."""
+
+PUBLISHED = "published"
+"""Name of the design box that every robot has: the bounds with which its class defines its design space."""
 
 WITHOUT_CONTACT: dict[str, object] = {
     "obstacles": (),
@@ -115,10 +118,13 @@ class Robot(ABC):
         self_friction: coefficient of friction between them.
         contact_distance: gap below which there are forces [m]. It must be smaller than the thinnest wall.
         contact_stiffness: of the barrier [Pa]; default a tenth of the largest Young's modulus of the body.
+        design_box: bounds of the design variables: ``"published"``, those of ``design_space`` as the class defines it,
+            or a name in ``design_boxes``.
 
     Attributes:
         name: registry name, also used to look up weights and meshes.
         design_space: variables of the body with bounds and baseline.
+        design_boxes: other boxes of designs by name, each with the bounds of the variables that it changes.
         actuators: in the order of the commands.
         effectors: names, in the order of the effector rows of the condensed model.
         size: a characteristic length [m], for scaling.
@@ -155,7 +161,8 @@ class Robot(ABC):
     convex: bool = True
     free_object: bool = False
     learned: str = "potential"
-    non_mechanical_options: tuple[str, ...] = ("unilateral",)
+    design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
+    non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")
     _options: dict[str, object]
 
     def __init_subclass__(cls, **options: object) -> None:
@@ -178,6 +185,7 @@ class Robot(ABC):
         self_friction: float = 0.0,
         contact_distance: float = 5e-4,
         contact_stiffness: float | None = None,
+        design_box: str = "published",
     ) -> None:
         if len(gravity) != 3 or not np.isfinite(gravity).all():
             raise ValueError(f"gravity must be three finite numbers [m/s2], got {gravity!r}")
@@ -189,6 +197,7 @@ class Robot(ABC):
         self.self_friction = self_friction
         self.contact_distance = contact_distance
         self.contact_stiffness = contact_stiffness
+        self.design_box = design_box
 
     # -- what a robot defines ---------------------------------------------------------------------------------------
 
@@ -343,9 +352,14 @@ class Robot(ABC):
 
         Raises:
             TypeError: naming the attributes that the class does not define.
-            ValueError: for arrays of a wrong shape, or lengths that are probably not in metres.
+            ValueError: for an unknown design box, arrays of a wrong shape, or lengths that are probably not in metres.
         """
         _check_defined(self, type(self))
+        boxes = {PUBLISHED: {}, **self.design_boxes}
+        if self.design_box not in boxes:
+            raise ValueError(f"robot '{self.name}': {unknown_name('design_box', self.design_box, boxes)}")
+        if bounds := boxes[self.design_box]:
+            self.design_space = self.design_space.within(bounds)
         if isinstance(self.effectors, str):
             raise TypeError(f"robot '{self.name}': effectors must be a tuple of names, got {self.effectors!r}")
         if not hasattr(self, "workspace_scale"):

@@ -52,8 +52,21 @@ FINGER_MESHES = {
 the fine meshes before the end of their range, and from 1 to 1.5 mm efforts hardly change."""
 
 
+WIDE_BOXES = {
+    1: {"length": (0.028, 0.052), "height": (0.0195, 0.027), "joint_height": (0.0042, 0.008)},
+    2: {"length": (0.037, 0.052), "height": (0.017, 0.022), "joint_height": (0.0042, 0.008)},
+}
+"""Wide design boxes by the number of cables [m]. Every body in them exists.
+
+They reach 30 % from the baseline, except where notches would meet (with two cables, in segments shorter than 35.6 mm or
+higher than 22 mm) or cables would leave the body.
+"""
+
+
 class SoftFinger(MeshedRobot):
     """Cable-driven soft finger.
+
+    The design box ``"wide"`` has other lengths, heights and hinges than the published one (`WIDE_BOXES`).
 
     Args:
         cables: 2 (thesis, sec. 4.3: x = -5 and 5 mm, y = 15.33 mm, notch slope 45 degrees, nu 0.3) or
@@ -128,6 +141,9 @@ class SoftFinger(MeshedRobot):
             DesignVariable("young_modulus", 1.0e6, 1.0e7, 3.0e6, "Pa", "stiffness of the silicone", log=True),
             DesignVariable("poisson_ratio", 0.30, 0.499, 0.30 if cables == 2 else 0.47, "1", "0.5 is incompressible"),
         )
+        self.design_boxes = {"wide": WIDE_BOXES[cables]}
+        # The mesh of a design does not depend on the design box.
+        self._middle = {v.name: 0.5 * (v.low + v.high) for v in self.design_space if v.unit == "m"}
         self.stiffness_variable = None if any(gravity) else "young_modulus"
         self.effector_rest = self.tip(self.design_space.baseline)
         self.effort_scale = np.full(cables, 20.0)
@@ -154,11 +170,8 @@ class SoftFinger(MeshedRobot):
 
     @property
     def reference_design(self) -> Design:
-        """The baseline; for graded meshes the middle of the dimensions, from where every design can be reached."""
-        if not is_half(self.tier):
-            return super().reference_design
-        middle = {v.name: 0.5 * (v.low + v.high) for v in self.design_space if v.unit == "m"}
-        return self.design_space.complete(middle)
+        """The baseline; for graded meshes the middle of the published box, from where its designs can be reached."""
+        return self.design_space.complete(self._middle) if is_half(self.tier) else super().reference_design
 
     def mesh(self, design: Mapping[str, float]) -> BodyMesh:
         """Mesh the body of a complete design, or the half that `unfold` completes."""

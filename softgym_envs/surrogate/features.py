@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -28,10 +29,16 @@ class Features:
     Args:
         robot: the robot.
         learned: design variables that are inputs, in order; default all but the stiffness variable.
+        bounds: smallest and largest values of design variables by which they are scaled, instead of the robot's.
     """
 
-    def __init__(self, robot: Robot, learned: tuple[str, ...] | None = None) -> None:
-        self.robot, self.space = robot, robot.design_space
+    def __init__(
+        self,
+        robot: Robot,
+        learned: tuple[str, ...] | None = None,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:
+        self.robot, self.space = robot, robot.design_space.within(bounds or {})
         self.learned = learned_variables(robot) if learned is None else learned
         self.design_size = len(self.learned) + ("poisson_ratio" in self.learned)
 

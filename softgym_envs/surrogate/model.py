@@ -118,7 +118,9 @@ class SurrogateModel(ABC):
         self.robot = robot
         self.tensors = tensors
         self.card = dict(card)
-        self.features = Features(robot)
+        # Weights of a wide design box also serve a robot with a narrow one.
+        learned_box = {name: (low, high) for name, (low, high, _) in self.card.get("design_variables", {}).items()}
+        self.features = Features(robot, bounds=learned_box)
         self.count = len(robot.actuators)
         self.effectors = 3 * len(robot.effectors)
         self.size = self.count + self.effectors

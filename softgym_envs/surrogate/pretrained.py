@@ -15,8 +15,9 @@ _ROOT = Path(__file__).parent / "weights"
 
 
 def pretrained_folder(robot: Robot) -> Path:
-    """Return the folder of the shipped weights of a robot."""
-    return _ROOT / robot.weights_name
+    """Return the folder of a robot's shipped weights; its name ends in that of the mesh unless it is the published."""
+    mesh = robot.mechanics_key.get("mesh")
+    return _ROOT / (robot.weights_name if mesh is None else f"{robot.weights_name}_{mesh}")
 
 
 def pretrained_model(robot: Robot, weights: str | Path | None = None, members: int | None = None) -> SurrogateModel:
@@ -38,7 +39,7 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
     folder = Path(weights) if weights is not None else pretrained_folder(robot)
     if weights is None and not folder.is_dir():
         shipped = sorted(p.name for p in _ROOT.iterdir()) if _ROOT.is_dir() else []
-        raise WeightsError(f"no weights ship for '{robot.weights_name}'; shipped: {', '.join(shipped) or 'none'}")
+        raise WeightsError(f"no weights ship for '{folder.name}'; shipped: {', '.join(shipped) or 'none'}")
     return load_model(folder, robot, members)
 
 

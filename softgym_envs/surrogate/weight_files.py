@@ -62,9 +62,11 @@ def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict
             + "; use backend='fem' or train weights with 'softgym fit'"
         )
     expected = card_of(robot, str(card.get("network")))
-    for name in ("design_variables", "actuators"):
-        if card.get(name) != expected[name]:
-            raise WeightsError(f"weights '{folder.name}' have {name} = {card.get(name)}, needed {expected[name]}")
+    if card.get("actuators") != expected["actuators"]:
+        raise WeightsError(
+            f"weights '{folder.name}' have actuators = {card.get('actuators')}, needed {expected['actuators']}"
+        )
+    _check_box(folder.name, card.get("design_variables"), expected["design_variables"])
     try:
         tensors = load_file(weights_path)
     except (SafetensorError, OSError, ValueError) as error:
@@ -72,6 +74,23 @@ def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict
     if wrong := sorted(name for name, tensor in tensors.items() if not np.isfinite(tensor).all()):
         raise WeightsError(f"weights '{weights_path}' have values that are not finite in {', '.join(wrong)}")
     return card, tensors
+
+
+def _check_box(weights: str, learned: Any, needed: dict[str, list]) -> None:
+    """Check that the box of a card's design variables contains that of a robot.
+
+    Raises:
+        WeightsError: naming the first variable whose box does not, or all variables if they are others.
+    """
+    if not isinstance(learned, dict) or learned.keys() != needed.keys():
+        raise WeightsError(f"weights '{weights}' have design_variables = {learned}, needed {needed}")
+    for name, (low, high, unit) in needed.items():
+        own = learned[name]
+        if not (isinstance(own, list) and len(own) == 3 and own[2] == unit and own[0] <= low and high <= own[1]):
+            raise WeightsError(
+                f"weights '{weights}' were trained for {name} = {own}, which does not contain {[low, high, unit]}; "
+                "use another design_box of the robot, or train weights with 'softgym fit'"
+            )
 
 
 def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> SurrogateModel:

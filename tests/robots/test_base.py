@@ -47,7 +47,7 @@ class Optioned(Spike):
     """A robot whose options come through two constructors."""
 
     name = "optioned"
-    non_mechanical_options = ("unilateral", "colour")
+    non_mechanical_options = (*Robot.non_mechanical_options, "colour")
 
     def __init__(self, layers=None, *, colour="red", file=Path("a/b.msh"), **options):
         super().__init__(**options)

@@ -14,7 +14,7 @@ from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import ROBOTS
 from softgym_envs.robots.geometry import meshing
-from softgym_envs.robots.geometry.finger_shape import draw_finger
+from softgym_envs.robots.geometry.finger_shape import check_finger, draw_finger
 from softgym_envs.robots.geometry.morphing import mean_ratio
 from softgym_envs.robots.soft_finger import BELLOWS
 
@@ -303,3 +303,31 @@ def test_a_geometry_that_cannot_exist_is_infeasible(monkeypatch):
     monkeypatch.setattr(robot, "mesh", impossible)
     with pytest.raises(InfeasibleDesign, match="notches meet"):
         robot.build()
+
+
+# -- design boxes -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cables", [1, 2])
+def test_every_body_of_the_wide_box_of_the_finger_can_exist(cables):
+    robot = make_robot("finger", cables=cables, design_box="wide")
+    for published in make_robot("finger", cables=cables).design_space:
+        own = robot.design_space[published.name]
+        assert own.low <= published.low < published.high <= own.high and own.baseline == published.baseline
+    for design in corners_of(robot.design_space):
+        check_finger(robot.lengths(design))
+        # Cables stay 1 mm inside the body, the radius of their guides.
+        assert robot.cable_height + 1e-3 <= design["height"]
+
+
+def test_a_design_box_does_not_change_the_mechanics():
+    narrow, wide = (make_robot("finger", mesh="accurate", design_box=box) for box in ("published", "wide"))
+    assert narrow.mechanics_key == wide.mechanics_key
+    assert narrow.reference_design == dict(wide.reference_design)
+
+
+def test_an_unknown_design_box_is_refused():
+    with pytest.raises(ValueError, match="robot 'finger': unknown design_box 'wider'; did you mean 'wide'"):
+        make_robot("finger", design_box="wider")
+    with pytest.raises(ValueError, match="robot 'diamond': unknown design_box 'wide'; allowed: published"):
+        make_robot("diamond", design_box="wide")

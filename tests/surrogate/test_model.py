@@ -425,6 +425,26 @@ def test_missing_and_foreign_weights(copied):
         load_model(folder, robot)
 
 
+def test_weights_serve_every_box_inside_theirs(copied):
+    robot, folder = copied
+    narrow = make_robot("finger")
+    narrow.design_space = narrow.design_space.within({"length": (0.039, 0.041)})
+    whole, part = load_model(folder, robot), load_model(folder, narrow)
+    design = robot.design_space.complete({"length": 0.0405}).array[None]
+    displacement = np.array([[0.006, 0.009]])
+    for a, b in zip(*(m.state(m.context(design), displacement) for m in (whole, part)), strict=True):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(WeightsError, match=r"length = \[0.038, 0.042, 'm'\], which does not contain \[0.037"):
+        load_model(folder, make_robot("finger", design_box="wide"))
+
+
+def test_shipped_weights_belong_to_a_mesh():
+    assert pretrained_folder(make_robot("finger")).name == "finger_2cables"
+    assert pretrained_folder(make_robot("finger", mesh="reference")).name == "finger_2cables_reference"
+    with pytest.raises(WeightsError, match="no weights ship for 'finger_2cables_reference'"):
+        pretrained_model(make_robot("finger", mesh="reference"))
+
+
 def splits(**changes):
     data = {name: {"groups": 2, "states": 4} for name in ("train", "validation", "test")}
     return {name: data[name] | changes.get(name, {}) for name in data}
