@@ -8,7 +8,7 @@
 #   make docs     site, in site/                   make docs-images   pictures of the site, in docs/images/
 #   make setup    set-up only                      make lock          renew requirements.lock
 #
-# PYTHON=python3.12      use another interpreter (3.11 to 3.13; requirements.lock is made for 3.11)
+# PYTHON=python3.12      use another interpreter (3.11 to 3.14; requirements.lock is made for 3.11)
 # PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"    install the small torch without CUDA
 # ARGS="-k cable -x"     pass more arguments to pytest (make check, make test), softgym bench (make bench),
 #                        docs/make_images.py (make docs-images) or pip (make lock)
@@ -17,8 +17,8 @@ VENV ?= .venv
 WORKERS ?= 2
 DEMO ?= results/demo
 BIN := $(VENV)/bin
-SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
-PYTHON ?= $(shell for python in python3.11 python3 python3.12 python3.13; do \
+SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 15))
+PYTHON ?= $(shell for python in python3.11 python3 python3.12 python3.13 python3.14; do \
 	$$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
 
 # System libraries, as Debian packages, that the wheels of gmsh (at import) and vtk (off-screen pictures) load.
@@ -40,7 +40,7 @@ CHROMIUM_CHECK := command -v chromium || command -v chromium-browser || command 
 setup: $(VENV)/.stamp-system
 
 $(VENV)/.stamp: requirements.lock pyproject.toml
-	@test -n "$(PYTHON)" || { echo "setup: no Python 3.11, 3.12 or 3.13 found; name one with PYTHON=..." >&2; exit 1; }
+	@test -n "$(PYTHON)" || { echo "setup: no Python 3.11 to 3.14 found; name one with PYTHON=..." >&2; exit 1; }
 	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install $(PIP_ARGS) -r requirements.lock
 	$(BIN)/python -m pip install --no-deps --no-build-isolation -e .

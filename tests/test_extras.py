@@ -1,13 +1,22 @@
 """Core without extras: one line says what to install; the first use says that it compiles."""
 
+import os
+import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import numba
 import pytest
+import yaml
 
 from softgym_envs.errors import MissingLibrary
-from softgym_envs.extras import EXTRAS, explain, require
+from softgym_envs.extras import EXTRAS, SYSTEM_PACKAGES, explain, require
 from softgym_envs.mechanics.compilation import ANNOUNCED
+from softgym_envs.version import __version__
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 @pytest.fixture
@@ -57,11 +66,29 @@ def test_a_missing_system_library_is_named_with_the_packages_to_install():
 
 
 def test_extras_are_those_of_the_package():
-    import tomllib
-    from pathlib import Path
+    extras = PROJECT["optional-dependencies"]
+    assert set(EXTRAS) <= set(extras)
+    page = (ROOT / "docs" / "install.md").read_text()
+    assert [extra for extra in set(extras) - {"test", "docs", "compare"} if f"`{extra}`" not in page] == []
 
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
-    assert set(EXTRAS) <= set(project["optional-dependencies"])
+
+def test_system_packages_are_the_same_everywhere():
+    for name in ("Makefile", "Dockerfile", "docs/install.md"):
+        words = (ROOT / name).read_text().replace("\\", " ").split()
+        assert set(SYSTEM_PACKAGES.split()) <= {word.strip("`,;") for word in words}, name
+
+
+def test_citation_and_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == __version__ and citation["license"] == PROJECT["license"]
+    assert citation["title"] in (ROOT / "README.md").read_text()
+
+
+def test_verbs_are_completed_in_the_shell():
+    variables = {"_SOFTGYM_COMPLETE": "bash_complete", "COMP_WORDS": "softgym rol", "COMP_CWORD": "1"}
+    command = [sys.executable, "-c", "from softgym_envs.cli import main; main()"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **variables}, cwd=ROOT)
+    assert done.stdout.strip() == "plain,rollout"
 
 
 def test_the_first_compilation_is_announced_once(monkeypatch, capfd):

@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from softgym_envs.cli import options
+from softgym_envs.extras import require
 
 
 @click.command()
@@ -49,6 +50,7 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
 
     The method is one at a time, Morris or Sobol. An interrupted run continues where it stopped.
     """
+    require("codesign")
     from codesign.tools.config import SensitivityConfig
     from codesign.tools.sensitivity import analyse_sensitivity
     from softgym_envs.config import load_config
@@ -74,6 +76,7 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
 
     The solver is an Optuna sampler, whose interrupted runs continue where they stopped, or gradient descent.
     """
+    require("codesign")
     from codesign.tools import gradient
     from codesign.tools.config import OptimiseConfig
     from codesign.tools.search import search
@@ -103,6 +106,7 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
 @options.overrides
 def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> None:
     """Fit design variables to measured states in a CSV or JSON file."""
+    require("codesign")
     from codesign.tools.calibration import calibrate as run
     from codesign.tools.config import CalibrationConfig
     from softgym_envs.config import load_config
