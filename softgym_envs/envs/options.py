@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.envs.spaces import AgentSpaces
@@ -149,6 +152,52 @@ def design_names(space: DesignSpace, choice: bool | Sequence[str]) -> tuple[str,
     if isinstance(choice, bool):
         return space.names if choice else ()
     return tuple(space[name].name for name in choice)
+
+
+def check_autoreset(mode: AutoresetMode | str) -> AutoresetMode:
+    """Return the mode of a name, such as ``"NextStep"``.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        allowed = ", ".join(repr(other.value) for other in AutoresetMode)
+        raise ValueError(f"autoreset_mode = {mode!r} is unknown; allowed: {allowed}") from None
+
+
+def take_reset_mask(options: Mapping[str, Any] | None, count: int) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return which of ``count`` sub-environments to reset (indices), and the options without ``reset_mask``.
+
+    Raises:
+        ValueError: for a mask of another kind, or one without True.
+    """
+    rest = dict(options or {})
+    mask = np.asarray(rest.pop("reset_mask", np.ones(count, dtype=bool)))
+    if mask.shape != (count,) or mask.dtype != bool or not mask.any():
+        raise ValueError(f"reset_mask must be {count} booleans, at least one of them True, got {mask.tolist()}")
+    return np.flatnonzero(mask), rest
+
+
+def joined_seed(seed: int | Sequence[int | None] | None, count: int, draw: Callable[[], int]) -> int | None:
+    """Return the one seed that stands for the seeds of ``count`` sub-environments.
+
+    Args:
+        seed: None, an integer, or ``count`` of either.
+        count: number of sub-environments.
+        draw: returns a random integer, which replaces None in a list with other seeds.
+
+    Raises:
+        ValueError: for another number of seeds.
+    """
+    if seed is None or isinstance(seed, (int, np.integer)):
+        return None if seed is None else int(seed)
+    if len(seed) != count:
+        raise ValueError(f"seed must be an integer, None or a list of {count}, got {len(seed)} seeds")
+    if all(one is None for one in seed):
+        return None
+    return int(np.random.SeedSequence([draw() if one is None else one for one in seed]).generate_state(1)[0])
 
 
 def check_reset_options(options: Mapping[str, Any] | None) -> tuple[Any, Any]:

@@ -13,18 +13,25 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import numpy as np
 import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from softgym_envs.backends.torch_batch import MAX_NEWTON_STEPS, Bodies, TorchBatch, put_rows, repeat_body, take_rows
 from softgym_envs.envs.arrays import with_tensors
 from softgym_envs.envs.options import (
     EnvironmentOptions,
+    check_autoreset,
     check_batchable,
     check_counts,
     check_reset_options,
+    joined_seed,
     set_up,
+    take_reset_mask,
 )
 from softgym_envs.envs.registration import ENVIRONMENTS, find_row
 from softgym_envs.surrogate.pretrained import pretrained_model
@@ -39,13 +46,12 @@ NEWTON_STEPS = 4
 Result = dict[str, Any]
 
 
-class TorchVectorEnv:
+class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
     """``num_envs`` copies of an environment on the surrogate, stepped together on one device.
 
-    Mirrors the API of `gymnasium.vector.VectorEnv` but returns tensors on ``device``, so it is not a subclass. Episodes
-    that end are reset in the same step: the observation is the first of the next episode, and ``info["final_obs"]`` and
-    ``info["final_info"]`` hold the end of the last one; ``info["_final_obs"]`` marks the rows that ended. Later steps
-    do not overwrite returned tensors.
+    As `SoftRobotVectorEnv`, with tensors on ``device`` in place of arrays; ``info["final_obs"]`` has a row for each
+    sub-environment, and ``info["_final_obs"]`` marks those that ended. Later steps do not overwrite returned tensors.
+    It is made for GPUs: on a CPU, `gymnasium.make_vec` is several times faster.
 
     Args:
         id: ID of an environment on the surrogate.
@@ -56,6 +62,7 @@ class TorchVectorEnv:
         compile: compile the step with ``torch.compile``; the first step then takes about a minute.
         cuda_graph: capture the step as a CUDA graph and replay it; for CUDA devices.
         max_episode_steps: time limit; default that of the ID.
+        autoreset_mode: ``"SameStep"``, ``"NextStep"`` or ``"Disabled"``.
         robot: replaces that of the ID; see `SoftRobotEnv`.
         task: replaces that of the ID; its methods must take tensors, see `Task`.
         **options: ``design``, ``action_mode`` and the other arguments that the page of each environment ID lists.
@@ -77,6 +84,7 @@ class TorchVectorEnv:
         compile: bool = False,
         cuda_graph: bool = False,
         max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         robot: RobotSource | None = None,
         task: TaskSource | None = None,
         **options: Any,
@@ -86,7 +94,9 @@ class TorchVectorEnv:
             raise ValueError(f"dtype = {dtype} is not supported; allowed: torch.float32, torch.float64")
         self.device = torch.device(device)
         if self.device.type == "cuda" and not torch.cuda.is_available():
-            raise ValueError(f"device = {str(device)!r} is not available here; allowed: 'cpu'")
+            raise ValueError(
+                f"device = {str(device)!r} is not available here; allowed: 'cpu', on which gymnasium.make_vec is faster"
+            )
         if cuda_graph and self.device.type != "cuda":
             raise ValueError(f"cuda_graph needs a CUDA device, got device = {str(device)!r}")
         row = find_row(id)
@@ -103,6 +113,11 @@ class TorchVectorEnv:
         self.max_episode_steps = row.max_episode_steps if max_episode_steps is None else max_episode_steps
         self.single_action_space = self.spaces.action_space
         self.single_observation_space = self.spaces.observation_space
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.autoreset_mode = check_autoreset(autoreset_mode)
+        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        self.render_mode, self.spec = None, gymnasium.spec(id)
         self._task, self._spaces = with_tensors(self.task, self._put), with_tensors(self.spaces, self._put)
         self._model = TorchBatch(pretrained_model(self.robot, **setup.backend_options), self.device, dtype)
 
@@ -129,6 +144,8 @@ class TorchVectorEnv:
         self._bodies = self._prepare(self._fixed[None])
         self._state = self._at_rest(self._bodies, num_envs)
         self._started = False
+        #: Rows whose episodes are over and not reset yet; None if there are none.
+        self._ended: Tensor | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         # The prepared step works on the tensors of this object; a copy prepares its own.
@@ -228,47 +245,56 @@ class TorchVectorEnv:
         return (command - self._model.middle) / self._model.half_range
 
     def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+        self, *, seed: int | list[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
         """Start an episode in every sub-environment.
 
         Args:
-            seed: seed of all random numbers from here on; by default the sequence continues, beginning with the seed
-                of the constructor.
+            seed: seed of all random numbers from here on, or a list of ``num_envs`` seeds to make it from; by default
+                the sequence continues, beginning with the seed of the constructor.
             options: ``"design"``: one body for all for one episode, a mapping, or values of all design variables in
                 their order for each, shape (num_envs, len(design_space)); ``"goal"``: a point (3,) or a path (p, 3)
-                [m] for all, or a path for each (num_envs, p, 3).
+                [m] for all, or a path for each (num_envs, p, 3); ``"reset_mask"``: which sub-environments to reset,
+                boolean (num_envs,); default all.
 
         Returns:
             Observation (num_envs, d) and info.
 
         Raises:
             DesignError: for a malformed design.
-            ValueError: for an unknown option or a malformed goal.
+            ValueError: for an unknown option, a malformed goal or mask, or another number of seeds.
         """
+        rows, options = take_reset_mask({name: _array(value) for name, value in (options or {}).items()}, self.num_envs)
         design, goal = check_reset_options(options)
+        index = torch.as_tensor(rows, device=self.device)
         paths = designs = None
         if goal is not None:
-            goal = _array(goal)
             paths = self._put(self.task.check_paths(goal, () if np.ndim(goal) < 3 else (self.num_envs,)))
-            paths = paths.expand(self.num_envs, *paths.shape[-2:])
+            paths = paths.expand(self.num_envs, *paths.shape[-2:])[index]
         if design is not None:
             designs = self._check_designs(design)
+            designs = designs if len(designs) == 1 else designs[index]
+        seed = joined_seed(seed, self.num_envs, self._random_seed)
         seed = self._first_seed if seed is None else seed
         self._first_seed = None
         if seed is not None:
             self._generator.manual_seed(seed)
-        self._begin_episodes(torch.arange(self.num_envs, device=self.device), designs, paths)
+        self._begin_episodes(index, designs, paths)
         self._started = True
+        if self._ended is not None:
+            self._ended[index] = False
         report = self._report(self._bodies, self._state)
         return report["observation"], report["info"]
+
+    def _random_seed(self) -> int:
+        return int(torch.randint(2**31, (1,), generator=self._generator, device=self.device))
 
     def _check_designs(self, design: Any) -> Tensor:
         if isinstance(design, Mapping):
             fixed = dict(zip(self.design_space.names, self._fixed.tolist(), strict=True))
             values = self.design_space.complete(design, fixed).array[None]
         else:
-            values = np.asarray(_array(design), dtype=float)
+            values = np.asarray(design, dtype=float)
             shape = (self.num_envs, len(self.design_space))
             if values.shape != shape:
                 raise ValueError(f"design must be a mapping or an array of shape {shape}, got {values.shape}")
@@ -285,11 +311,14 @@ class TorchVectorEnv:
             Observation (num_envs, d), reward, terminated and truncated (num_envs,), and info.
 
         Raises:
-            RuntimeError: before the first `reset`.
+            ResetNeeded: before the first `reset`, or without autoreset if an episode is over.
             ValueError: for actions with a wrong shape or values that are not finite.
         """
         if not self._started:
-            raise RuntimeError("step was called before reset")
+            raise ResetNeeded("step was called before reset")
+        if self.autoreset_mode == AutoresetMode.DISABLED and self._ended is not None and bool(self._ended.any()):
+            over = torch.nonzero(self._ended)[:, 0].tolist()
+            raise ResetNeeded(f"the episodes of sub-environments {over} are over; reset them with a reset_mask")
         actions = torch.as_tensor(actions, dtype=self.dtype, device=self.device)
         shape = (self.num_envs, self._model.count)
         if actions.shape != shape:
@@ -307,13 +336,23 @@ class TorchVectorEnv:
         for name, value in result["state"].items():
             self._state[name].copy_(value)
         observation, info, truncated = result["observation"], result["info"], result["truncated"]
-        if ended:
+        reward = result["reward"]
+        if self.autoreset_mode != AutoresetMode.SAME_STEP:
+            if self._ended is not None:  # these rows are reset in place of the step
+                rows = torch.nonzero(self._ended)[:, 0]
+                reward, truncated = torch.where(self._ended, 0.0, reward), truncated & ~self._ended
+                if len(rows):
+                    self._begin_episodes(rows)
+                    report = self._report(self._bodies, self._state)
+                    observation, info = report["observation"], report["info"]
+            self._ended = truncated.clone() if ended else None
+        elif ended:
             final, mask = {"final_obs": observation, "final_info": info}, truncated
             self._begin_episodes(torch.nonzero(mask)[:, 0])
             report = self._report(self._bodies, self._state)
             observation = report["observation"]
             info = {**report["info"], **final, **{f"_{name}": mask for name in final}}
-        return observation, result["reward"], torch.zeros_like(truncated), truncated, info
+        return observation, reward, torch.zeros_like(truncated), truncated, info
 
     def _prepare_step(self, actions: Tensor) -> Callable[[Tensor], Result]:
         """Return the step as it is, compiled, or captured as a CUDA graph."""

@@ -7,12 +7,22 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from softgym_envs.backends.surrogate import BatchState, displacement_gradient, rest_state, solve_displacements
 from softgym_envs.envs.gradients import RewardGradient, StepGradient
-from softgym_envs.envs.options import EnvironmentOptions, check_batchable, check_counts, check_reset_options, set_up
+from softgym_envs.envs.options import (
+    EnvironmentOptions,
+    check_autoreset,
+    check_batchable,
+    check_counts,
+    check_reset_options,
+    joined_seed,
+    set_up,
+    take_reset_mask,
+)
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.surrogate.model import Context
@@ -25,14 +35,17 @@ if TYPE_CHECKING:
 class SoftRobotVectorEnv(VectorEnv):
     """``num_envs`` copies of a `SoftRobotEnv` on the surrogate backend, stepped together.
 
-    Sub-environments that end are reset in the same step (``AutoresetMode.SAME_STEP``): the returned observation is
+    Sub-environments that end are reset as Gymnasium's `AutoresetMode` says. ``"SameStep"``: the returned observation is
     the first of the next episode, and ``info["final_obs"]``, ``info["final_info"]`` hold the end of the last one.
+    ``"NextStep"``: the next step resets them in place of a step, with a reward of 0. ``"Disabled"``: they must be reset
+    with ``options={"reset_mask": mask}``.
 
     Args:
         robot: as for `SoftRobotEnv`.
         task: as for `SoftRobotEnv`.
         num_envs: number of sub-environments.
         max_episode_steps: time limit; default none.
+        autoreset_mode: ``"SameStep"``, ``"NextStep"`` or ``"Disabled"``.
         backend: ``"surrogate"``; ``gymnasium.make_vec(..., vectorization_mode="sync")`` steps other backends.
         render_mode: must be None; batches are not rendered.
         **options: ``design``, ``action_mode`` and the other arguments that the page of each environment ID lists;
@@ -53,6 +66,7 @@ class SoftRobotVectorEnv(VectorEnv):
         num_envs: int = 1,
         *,
         max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         backend: str | None = None,
         render_mode: str | None = None,
         **options: Any,
@@ -62,6 +76,8 @@ class SoftRobotVectorEnv(VectorEnv):
                 f"render_mode = {render_mode!r} is not available in the batched environment; allowed: None"
             )
         check_counts(num_envs, max_episode_steps)
+        self.autoreset_mode = check_autoreset(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         setup = set_up(robot, task, backend, EnvironmentOptions.check(options))
         self.robot, self.task = setup.robot, setup.task
         if setup.backend != "surrogate":
@@ -95,6 +111,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self._paths = np.zeros((num_envs, 1, 3))
         self._counts = np.ones(num_envs, dtype=np.int64)  # goals in each path
         self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._ended = np.zeros(num_envs, dtype=bool)  # episodes that are over and not reset yet
         self._changed = np.zeros(num_envs, dtype=bool)  # bodies given in reset that differ from the fixed one
         rest = rest_state(self.model, self._context.rows(np.zeros(1, dtype=np.int64)), self._unilateral)
         self._rest, self._state = _repeat(rest, num_envs), _repeat(rest, num_envs)
@@ -129,9 +146,7 @@ class SoftRobotVectorEnv(VectorEnv):
     ) -> None:
         """Start episodes in the sub-environments ``index``."""
         if design is not None:
-            designs = [design] * len(index) if isinstance(design, Mapping) else list(design)
-            if len(designs) != len(index):
-                raise ValueError(f"design must be one body or a list of {len(index)}, got {len(designs)}")
+            designs = [design] * len(index) if isinstance(design, Mapping) else design
             self.designs[index] = [self.design_space.complete(d, self._fixed_design).array for d in designs]
             self._begin_bodies(index)
             self._changed[index] = True
@@ -150,6 +165,7 @@ class SoftRobotVectorEnv(VectorEnv):
         _put(self._state, index, _rows(self._rest, index))
         self._state.slack[index] = False
         self._steps[index] = 0
+        self._ended[index] = False
         if goal is not None:
             paths = goal
         else:
@@ -215,26 +231,33 @@ class SoftRobotVectorEnv(VectorEnv):
     # -- Gymnasium --------------------------------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: int | list[int] | None = None, options: Mapping[str, Any] | None = None
+        self, *, seed: int | list[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode in every sub-environment; ``options`` as for `SoftRobotEnv.reset`.
+        """Start an episode in every sub-environment.
 
-        ``"design"`` is the body of all of them, or a list of ``num_envs`` bodies; ``"goal"`` is a point (3,) or a path
-        (p, 3) for all of them, or a path for each (num_envs, p, 3).
+        Args:
+            seed: seed of the random numbers, which all sub-environments share, or a list of ``num_envs`` seeds to make
+                it from; None continues them, or stands for a random seed in a list.
+            options: ``"design"``: the body of all sub-environments, or a list of ``num_envs`` bodies; ``"goal"``: a
+                point (3,) or a path (p, 3) for all [m], or a path for each (num_envs, p, 3); ``"reset_mask"``: which
+                sub-environments to reset, boolean (num_envs,); default all.
 
         Raises:
             DesignError: for a malformed design.
-            ValueError: for an unknown option or a malformed goal.
+            ValueError: for an unknown option, a malformed goal or mask, or another number of seeds.
         """
-        if isinstance(seed, list):
-            seed = int(np.random.SeedSequence(seed).generate_state(1)[0])
-        super().reset(seed=seed)
+        super().reset(seed=joined_seed(seed, self.num_envs, lambda: int(self.np_random.integers(2**31))))
+        index, options = take_reset_mask(options, self.num_envs)
         design, goal = check_reset_options(options)
+        if design is not None and not isinstance(design, Mapping):
+            if len(design) != self.num_envs:
+                raise ValueError(f"design must be one body or a list of {self.num_envs}, got {len(design)}")
+            design = [design[i] for i in index]
         if goal is not None:
             shared = np.ndim(goal) < 3
             goal = self.task.check_paths(goal, () if shared else (self.num_envs,))
-            goal = np.broadcast_to(goal, (self.num_envs, *goal.shape[-2:]))
-        self._begin_episodes(np.arange(self.num_envs), design, goal)
+            goal = np.broadcast_to(goal, (self.num_envs, *goal.shape[-2:]))[index]
+        self._begin_episodes(index, design, goal)
         return self._observe(), self._info()[0]
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -242,6 +265,7 @@ class SoftRobotVectorEnv(VectorEnv):
 
         Raises:
             ValueError: for actions with a wrong shape or values that are not finite.
+            ResetNeeded: without autoreset, if an episode is over.
         """
         self._advance(self._checked(actions))
         return self._finish_step()
@@ -251,10 +275,11 @@ class SoftRobotVectorEnv(VectorEnv):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any], StepGradient]:
         """As `step`; also returns the derivatives of the rewards in the actions.
 
-        Rows that found no equilibrium have a reward and derivatives of zero.
+        Rows that found no equilibrium or are reset have a reward and derivatives of zero.
 
         Raises:
             ValueError: for actions with a wrong shape or values that are not finite.
+            ResetNeeded: without autoreset, if an episode is over.
             ImportError: without torch, which differentiates the task.
         """
         actions = self._checked(actions)
@@ -267,6 +292,9 @@ class SoftRobotVectorEnv(VectorEnv):
         actions = self.spaces.check_action(actions)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
+        if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
+            ended = np.flatnonzero(self._ended).tolist()
+            raise ResetNeeded(f"the episodes of sub-environments {ended} are over; reset them with a reset_mask")
         return actions
 
     def _advance(self, actions: np.ndarray) -> None:
@@ -292,20 +320,25 @@ class SoftRobotVectorEnv(VectorEnv):
         effector[:, :3], by_effort = self._reward_gradient(state.effector[:, :3], effort, goals)
         held, command = displacement_gradient(self.model, self._context, state, effector, by_effort)
         _, _, reward = self.task.rate(state.effector[:, :3], goals, self.spaces.effort_share(effort))
-        found, gap = state.converged[:, None], state.displacement - self._command
+        rated = state.converged & ~self._ended
+        found, gap = rated[:, None], state.displacement - self._command
         held, command = np.where(found, held, 0.0), np.where(found, command, 0.0)
-        reward = np.where(state.converged, reward, 0.0)
+        reward = np.where(rated, reward, 0.0)
         return StepGradient(reward, command, held, state.slack.copy(), gap, slope, limited)
 
     def _finish_step(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Rate the present states, and start new episodes where the last ones have ended."""
-        found = self._state.converged
+        rated = self._state.converged & ~self._ended
+        if self._ended.any():  # only where the next step resets them
+            self._begin_episodes(np.flatnonzero(self._ended))
         info, reward = self._info()
         observation = self._observe()
-        reward = np.where(found, reward, 0.0)
-        truncated = (self._steps >= self.max_episode_steps) | ~found
+        reward = np.where(rated, reward, 0.0)
+        truncated = (self._steps >= self.max_episode_steps) | ~self._state.converged
         ended = np.flatnonzero(truncated)
-        if len(ended):
+        if self.autoreset_mode != AutoresetMode.SAME_STEP:
+            self._ended = truncated.copy()
+        elif len(ended):
             final_info = info
             final_obs = np.full(self.num_envs, None, dtype=object)
             for i in ended:

@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.error import ResetNeeded
 
 import softgym_envs
 from softgym_envs.backends import torch_batch
@@ -284,7 +285,7 @@ def test_bad_input():
         with pytest.raises((ValueError, WeightsError), match=message):
             TorchVectorEnv(**{"id": FINGER, "num_envs": 2, "device": "cpu", **options})
     env = TorchVectorEnv(FINGER, 2, device="cpu")
-    with pytest.raises(RuntimeError, match="reset"):
+    with pytest.raises(ResetNeeded, match="reset"):
         env.step(torch.zeros(2, 2))
     env.reset(seed=0)
     before = {name: value.clone() for name, value in env._state.items()}
@@ -326,3 +327,62 @@ def test_device_agrees_with_host(sampled, cuda_graph):
         observation, rewards, _, _, _ = device.step(action)
         torch.testing.assert_close(observation.cpu(), expected, atol=1e-4, rtol=0.0)
         torch.testing.assert_close(rewards.cpu(), reward, atol=1e-4, rtol=0.0)
+
+
+def test_it_is_a_vector_environment():
+    env = TorchVectorEnv("SoftGym/FingerReach-v0", 3, device="cpu")
+    twin = gymnasium.make_vec("SoftGym/FingerReach-v0", 3)
+    assert isinstance(env, gymnasium.vector.VectorEnv)
+    for name in ("num_envs", "render_mode", "action_space", "observation_space", "single_action_space", "metadata"):
+        assert getattr(env, name) == getattr(twin, name), name
+    assert env.spec.id == "SoftGym/FingerReach-v0" and env.unwrapped is env and not env.closed
+    env.close()
+    assert env.closed
+
+
+def test_a_missing_gpu_points_to_the_faster_environment():
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(ValueError, match="'cuda' is not available here; allowed: 'cpu', on which gymnasium.make_vec"):
+        TorchVectorEnv("SoftGym/FingerReach-v0", 3)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
+def test_other_autoreset_modes_are_those_of_the_batch_in_numpy(mode):
+    options = {"max_episode_steps": 4, "autoreset_mode": mode}
+    env = TorchVectorEnv("SoftGym/FingerReach-v0", 3, device="cpu", dtype=torch.float64, **options)
+    twin = gymnasium.make_vec("SoftGym/FingerReach-v0", 3, **options)
+    start = {"goal": np.array([0.0, 0.05, -0.1])}
+    for each in (env, twin):
+        each.reset(seed=0, options=start)
+        masked = start | {"reset_mask": np.array([False, True, False])}
+        each.step(np.full((3, 2), 0.5))
+        each.reset(options=masked | {"design": {"length": 0.039}})
+    assert env.designs[:, 0].tolist() == [0.04, 0.039, 0.04]
+    for step in range(9):
+        action = np.full((3, 2), 0.1 * step)
+        (_, *row, info), (_, *expected, expected_info) = env.step(action), twin.step(action)
+        for a, b in zip(row, expected, strict=True):
+            np.testing.assert_allclose(a.numpy(), b, atol=1e-5)
+        np.testing.assert_allclose(info["displacement"].numpy(), expected_info["displacement"], atol=1e-6)
+        truncated = row[-1]
+        assert "final_obs" not in info
+        if mode == "Disabled" and truncated.any():
+            with pytest.raises(ResetNeeded, match=r"are over; reset them"):
+                env.step(action)
+            for each in (env, twin):
+                each.reset(options=start | {"reset_mask": truncated.numpy()})
+        elif truncated.any():
+            # The next step resets these rows, to goals that differ; another row may end in it.
+            env.step(action)
+            over = truncated.numpy() | twin.step(action)[3]
+            for each in (env, twin):
+                each.reset(options=start | {"reset_mask": over})
+
+
+def test_lists_of_seeds():
+    env = TorchVectorEnv("SoftGym/FingerReach-v0", 2, device="cpu")
+    first, second, other = (env.reset(seed=seed)[1]["goal"] for seed in ([1, 2], [1, 2], [1, None]))
+    assert (first == second).all() and (first != other).any(axis=1).all()
+    with pytest.raises(ValueError, match="list of 2, got 1 seeds"):
+        env.reset(seed=[1])

@@ -139,3 +139,101 @@ def test_options_of_stable_baselines_hold_one_episode():
         env.set_options(wrong)
         with pytest.raises(ValueError, match="2 mappings with the same names"):
             env.reset()
+
+
+def batch(mode, num_envs=3, **options):
+    return gymnasium.make_vec(
+        "SoftGym/FingerReach-v0", num_envs, autoreset_mode=mode, max_episode_steps=4, sample_design=True, **options
+    )
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_autoreset_is_that_of_gymnasium(mode):
+    """The same rewards and ends at the same steps as Gymnasium's own vector environment."""
+    design = {"length": 0.041}
+    env = gymnasium.make_vec("SoftGym/FingerReach-v0", 2, autoreset_mode=mode, max_episode_steps=4, design=design)
+    sync = gymnasium.make_vec(
+        "SoftGym/FingerReach-v0",
+        2,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": env.metadata["autoreset_mode"]},
+        max_episode_steps=4,
+        design=design,
+    )
+    options = {"goal": np.array([0.0, 0.05, -0.1])}
+    for each in (env, sync):
+        each.reset(seed=0, options=options)
+    action = np.full((2, 2), 0.5, dtype=np.float32)
+    for step in range(12):
+        (a, reward_a, *ends_a, info), (b, reward_b, *ends_b, _) = (each.step(action) for each in (env, sync))
+        assert [end.tolist() for end in ends_a] == [end.tolist() for end in ends_b]
+        parts = env.unwrapped.spaces.slices
+        own = slice(0, parts["effort"].stop)  # later goals are random
+        np.testing.assert_allclose(a[:, own], b[:, own], atol=1e-4)
+        if step < 4:
+            np.testing.assert_allclose(reward_a, reward_b, atol=1e-4)
+        assert ((reward_a == 0.0) == (reward_b == 0.0)).all()
+        assert info["displacement"].any() == (b[0, parts["displacement"]] > -1.0).any()
+    assert ends_a[1].all() == (mode == "SameStep")
+
+
+def test_next_step_resets_each_row_in_place_of_its_own_step():
+    env = batch("NextStep")
+    env.reset(seed=0)
+    unwrapped = env.unwrapped
+    unwrapped.steps = np.array([0, 1, 2])
+    designs, action = unwrapped.designs.copy(), np.full((3, 2), 0.5, dtype=np.float32)
+    for step in range(1, 7):
+        _, reward, _, truncated, info, gradient = unwrapped.step_with_gradient(action)
+        due = np.array([step == 5, step == 4, step == 3])
+        assert (truncated == np.array([step == 4, step == 3, step == 2])).all()
+        assert ((reward == 0.0) == due).all() and (~info["displacement"].any(axis=1) == due).all()
+        assert (~gradient.held.any(axis=1) == due).all() and (gradient.reward == reward).all()
+        assert ((unwrapped.designs != designs).any(axis=1) == (step >= np.array([5, 4, 3]))).all()
+        assert "final_obs" not in info
+
+
+def test_without_autoreset_ended_rows_must_be_reset():
+    from gymnasium.error import ResetNeeded
+
+    env = batch("Disabled")
+    env.reset(seed=0)
+    env.unwrapped.steps = np.array([2, 0, 2])
+    action = np.ones((3, 2), dtype=np.float32)
+    env.step(action)
+    truncated = env.step(action)[3]
+    assert truncated.tolist() == [True, False, True]
+    with pytest.raises(ResetNeeded, match=r"sub-environments \[0, 2\]"):
+        env.step(action)
+    command, goals = env.unwrapped.command.copy(), env.unwrapped.goals.copy()
+    options = {"reset_mask": truncated, "design": [{"length": 0.039}, {"length": 0.0395}, {"length": 0.041}]}
+    observation, _ = env.reset(options=options)
+    assert "reset_mask" in options  # unchanged
+    assert env.unwrapped.steps.tolist() == [0, 2, 0] and env.unwrapped.designs[[0, 2], 0].tolist() == [0.039, 0.041]
+    assert (env.unwrapped.command[1] == command[1]).all() and (env.unwrapped.goals[1] == goals[1]).all()
+    assert (env.unwrapped.goals[[0, 2]] != goals[[0, 2]]).any(axis=1).all()
+    assert (observation[1, :2] > observation[0, :2]).all()
+    env.step(action)
+    for mask in (np.zeros(3, bool), np.ones(2, bool), np.ones(3), [True, False]):
+        with pytest.raises(ValueError, match="reset_mask must be 3 booleans"):
+            env.reset(options={"reset_mask": mask})
+
+
+def test_lists_of_seeds_may_hold_none():
+    env = batch("SameStep")
+
+    def goals(seed):
+        env.reset(seed=seed)
+        return env.unwrapped.goals.copy()
+
+    assert (goals([1, 2, 3]) == goals([1, 2, 3])).all() and (goals([1, 2, 3]) != goals([1, 2, 4])).all()
+    first, second = [(goals(5), goals([1, None, 3]))[1] for _ in range(2)]
+    assert (first == second).all() and (goals([1, None, 3]) != first).all()
+    assert (goals([None] * 3) != goals([None] * 3)).all()
+    with pytest.raises(ValueError, match="list of 3, got 2 seeds"):
+        env.reset(seed=[1, 2])
+
+
+def test_an_unknown_autoreset_mode_names_the_known_ones():
+    with pytest.raises(ValueError, match="autoreset_mode = 'later' is unknown; allowed: 'NextStep', 'SameStep'"):
+        batch("later")
