@@ -22,10 +22,10 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
+from softgym_envs.surrogate.correction import order_of
 from softgym_envs.testing import box_mesh
 
 MM = 1e-3
-LOWEST_ORDER, HIGHEST_ORDER = 0.5, 4.0
 
 
 @dataclass(frozen=True)
@@ -121,21 +121,8 @@ def order_and_limit(values: Sequence[Any], sizes: Sequence[float]) -> tuple[floa
     """
     coarse, middle, fine = (np.asarray(value, dtype=float) for value in values)
     first, second = (float(np.linalg.norm(difference)) for difference in (coarse - middle, middle - fine))
-    h, m, k = sizes
-
-    def ratio(order: float) -> float:
-        return (h**order - m**order) / (m**order - k**order)
-
-    low, high = LOWEST_ORDER, HIGHEST_ORDER
-    if first >= ratio(high) * second:
-        order = high
-    elif first <= ratio(low) * second:
-        order = low
-    else:
-        for _ in range(60):
-            order = 0.5 * (low + high)
-            low, high = (order, high) if ratio(order) * second < first else (low, order)
-    limit = fine + (fine - middle) / ((m / k) ** order - 1.0)
+    order = order_of(first / second if second else math.inf, sizes)
+    limit = fine + (fine - middle) / ((sizes[1] / sizes[2]) ** order - 1.0)
     return order, limit if limit.ndim else float(limit)
 
 

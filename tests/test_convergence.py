@@ -11,6 +11,7 @@ import pytest
 from benchmarks import convergence, convergence_tables
 from benchmarks.run import matching
 from softgym_envs.errors import ConfigError
+from softgym_envs.surrogate.correction import HIGHEST_ORDER, LOWEST_ORDER
 
 
 @pytest.mark.parametrize("order", [0.8, 1.0, 2.0, 3.5])
@@ -25,9 +26,9 @@ def test_extrapolation_is_exact_for_one_power_of_the_size(order):
 
 def test_the_order_stays_within_its_bounds():
     sizes = (1.0, 0.5, 0.25)
-    assert convergence.order_and_limit([3.0, 2.0, 2.0], sizes) == (convergence.HIGHEST_ORDER, 2.0)
+    assert convergence.order_and_limit([3.0, 2.0, 2.0], sizes) == (HIGHEST_ORDER, 2.0)
     order, limit = convergence.order_and_limit([2.2, 2.1, 2.0], sizes)  # differences that do not shrink
-    assert order == convergence.LOWEST_ORDER
+    assert order == LOWEST_ORDER
     assert limit == pytest.approx(2.0 - 0.1 / (2.0**0.5 - 1.0))
 
 

@@ -58,7 +58,8 @@ class TorchBatch:
         self.unilateral = tuple(model.robot.unilateral.tolist())
         self._pulls = torch.tensor(self.unilateral, device=device)
         self._ensemble = PotentialEnsemble.of_model(model, device, dtype)
-        self._features, self._loaded = model.features, bool(model.card.get("loaded", False))
+        self._features, self._correction = model.features, model.correction
+        self._loaded = bool(model.card.get("loaded", False))
         self._calibrated = model.members >= model.trained
         self._effort_scale = put(model.energy_scale / model.half_range)
         self._effector_scale, self._effector_mean = model.effector_scale, put(model.effector_mean)
@@ -79,8 +80,10 @@ class TorchBatch:
             Arrays of the bodies, among them ``rest`` (S, n_a), ``rest_effort`` (S, n_a), ``rest_effector`` [m] (S, 3),
             ``rest_uncertainty`` [m] (S,) and ``rest_trusted`` (S,).
         """
-        bodies = self._ensemble.coefficients(self._features.design(designs).to(self.dtype))
-        bodies["effort"] = self._features.stiffness(designs).to(self.dtype) * self._effort_scale
+        features = self._features.design(designs)
+        bodies = self._ensemble.coefficients(features.to(self.dtype))
+        stiffness = self._features.stiffness(designs) * self._correction.factor(features)
+        bodies["effort"] = stiffness.to(self.dtype) * self._effort_scale
         bodies["known"] = ((designs >= self._design_low) & (designs <= self._design_high)).all(dim=1)
         zero = (-self.middle / self.half_range).expand(len(designs), -1)
         if self._growth is not None:

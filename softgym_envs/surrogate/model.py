@@ -18,6 +18,7 @@ import numpy as np
 from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row, effort_unit, point_rows
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
 from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.correction import EffortCorrection
 from softgym_envs.surrogate.domain import Domain
 from softgym_envs.surrogate.features import Features
 
@@ -45,7 +46,7 @@ class Context:
     """Bodies, prepared for a model: everything that does not depend on the actuation.
 
     Attributes:
-        stiffness: stiffness relative to the baseline, which scales all efforts, shape (S, 1).
+        stiffness: what scales all efforts: stiffness relative to the baseline, and the correction, shape (S, 1).
         arrays: arrays of the model with leading dimension S, the number of different bodies.
         slot: index of the body of each of B rows, shape (B,).
     """
@@ -97,6 +98,7 @@ class SurrogateModel(ABC):
 
     Attributes:
         features: scaling of inputs.
+        correction: of the efforts, for the error of the mesh that was learned.
         count: number of actuators n_a.
         effectors: number of effector coordinates n_e.
         size: order of W, n_a + n_e.
@@ -121,6 +123,7 @@ class SurrogateModel(ABC):
         # Weights of a wide design box also serve a robot with a narrow one.
         learned_box = {name: (low, high) for name, (low, high, _) in self.card.get("design_variables", {}).items()}
         self.features = Features(robot, bounds=learned_box)
+        self.correction = EffortCorrection.of_card(self.card, self.features.design_size)
         self.count = len(robot.actuators)
         self.effectors = 3 * len(robot.effectors)
         self.size = self.count + self.effectors
@@ -132,10 +135,12 @@ class SurrogateModel(ABC):
 
     def context(self, designs: np.ndarray) -> Context:
         """Prepare bodies, given as designs (B, len(space)) in the order of the design space."""
-        arrays = self._prepare(self.features.design(designs))
+        features = self.features.design(designs)
+        arrays = self._prepare(features)
         low, high = self.domain.design_low, self.domain.design_high
         arrays["known"] = np.all((designs >= low) & (designs <= high), axis=1)
-        context = Context(self.features.stiffness(designs), arrays, np.arange(len(designs)))
+        stiffness = self.features.stiffness(designs) * self.correction.factor(features)
+        context = Context(stiffness, arrays, np.arange(len(designs)))
         if self.domain.limits_growth:
             arrays["unmoved"] = self._curvature(context, np.zeros((len(designs), self.count)))
             arrays["known"] &= definite(arrays["unmoved"])

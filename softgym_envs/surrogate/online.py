@@ -251,7 +251,8 @@ def fine_tune(
     designs, displacement = rehearsal_states(model, rehearsal, seed)
     tuned = []
     for member in range(M):
-        own = Model(robot, _member(model.tensors, member), {})
+        # Its predictions are rehearsed as it learned them: without the correction of efforts.
+        own = Model(robot, _member(model.tensors, member), {**model.card, "correction": None})
         seen = np.flatnonzero(~withheld & ((turn % M != member) | (len(new) < 2 * M)))
         old = _predicted(own, designs, displacement)
         targets = make_targets(robot, _joined(new.rows(seen), old), scales)

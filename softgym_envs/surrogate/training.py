@@ -8,6 +8,7 @@ import json
 import operator
 import shutil
 import time
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -18,6 +19,7 @@ from softgym_envs.config import BesideConfig, Config, save_resolved
 from softgym_envs.extras import require
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write
+from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.data.dataset import generate_dataset
 from softgym_envs.surrogate.data.sampling import SamplingPlan
 from softgym_envs.surrogate.data.states import full_compliance, stable_rows, training_states
@@ -46,7 +48,8 @@ class SplitConfig(Config):
 class DataConfig(Config):
     """Three separate datasets. The validation set chooses the best step of a training; the test set is used once.
 
-    Seeds default to 0, 1 and 2.
+    Seeds default to 0, 1 and 2. An interrupted run keeps finished shards of ``groups_per_shard`` bodies; choose small
+    ones where a body takes long.
     """
 
     train: SplitConfig
@@ -58,6 +61,7 @@ class DataConfig(Config):
     bounds: dict[str, tuple[float, float]] = {}
     alike: tuple[str, ...] = ()
     boundary: float = Field(default=0.0, ge=0.0, le=1.0)
+    groups_per_shard: int = Field(default=10, gt=0)
 
     @model_validator(mode="before")
     @classmethod
@@ -80,7 +84,50 @@ class DataConfig(Config):
 
     def plan(self, split: str) -> SamplingPlan:
         """Return the plan of the dataset ``split``: "train", "validation" or "test"."""
-        return SamplingPlan(**getattr(self, split).model_dump(), **self.model_dump(exclude=set(SPLITS)))
+        return self.plan_of(getattr(self, split))
+
+    def plan_of(self, split: SplitConfig) -> SamplingPlan:
+        """Return the plan of another split, with the margin and the design variables of this one."""
+        return SamplingPlan(**split.model_dump(), **self.model_dump(exclude={*SPLITS, "groups_per_shard"}))
+
+
+class PretrainingConfig(Config):
+    """Cheap states that the network learns first, for example those of a coarse mesh.
+
+    Attributes:
+        robot_options: options that replace those of the robot.
+        train: states to learn.
+        validation: states that choose the best step.
+        steps: optimisation steps.
+    """
+
+    robot_options: dict[str, Any]
+    train: SplitConfig
+    validation: SplitConfig
+    steps: int = Field(gt=0)
+
+
+class CorrectionConfig(Config):
+    """Few states on a coarser and a finer mesh, for a factor to the converged efforts.
+
+    Attributes:
+        coarser: options of the coarser mesh, which replace those of the robot.
+        finer: options of the finer mesh.
+        sizes: of the elements from coarse to fine, in any unit.
+        states: the same states on the coarser mesh, that of the robot, and the finer one.
+    """
+
+    coarser: dict[str, Any]
+    finer: dict[str, Any]
+    sizes: tuple[float, float, float]
+    states: SplitConfig
+
+    @model_validator(mode="after")
+    def _decreasing(self) -> CorrectionConfig:
+        coarse, middle, fine = self.sizes
+        if not coarse > middle > fine > 0.0:
+            raise ValueError(f"sizes = {list(self.sizes)} must decrease and be positive")
+        return self
 
 
 if TYPE_CHECKING:
@@ -100,6 +147,8 @@ class FitConfig(Config):
         robot: registered name, or path ``module:class``.
         robot_options: options of the robot.
         data: the states that are solved on FEM, for training, validation and test.
+        pretraining: cheaper states that are learned before those of ``data``; only for potential networks.
+        correction: states on other meshes, by which the efforts are corrected.
         network: kind of the network and its hyper-parameters.
         workers: number of processes that solve FEM states.
         executor: ``"loky"`` for processes of this machine, or ``"ray"`` for tasks of a cluster.
@@ -109,10 +158,18 @@ class FitConfig(Config):
     robot: str
     robot_options: Annotated[dict[str, Any], BesideConfig()] = {}
     data: DataConfig
+    pretraining: PretrainingConfig | None = None
+    correction: CorrectionConfig | None = None
     network: NetworkOptions = Field(default_factory=network_module("potential").Options)
     workers: int = Field(default=2, gt=0)
     executor: Literal["loky", "ray"] = "loky"
     seed: int = 0
+
+    @model_validator(mode="after")
+    def _pretrained_kind(self) -> FitConfig:
+        if self.pretraining is not None and self.network.kind != "potential":
+            raise ValueError(f"only networks of kind 'potential' can be pretrained, not '{self.network.kind}'")
+        return self
 
 
 def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[str, float]:
@@ -184,24 +241,39 @@ def domain_of(
 def generate_datasets(
     config: FitConfig, data_folder: str | Path, *, progress: bool = True
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Return the datasets ``train``, ``validation`` and ``test`` of a surrogate; whatever is missing is generated."""
+    """Return the datasets of a surrogate; whatever is missing is generated.
+
+    Returns:
+        ``train``, ``validation`` and ``test``; with pretraining also ``pretraining/train`` and
+        ``pretraining/validation``; with a correction also ``correction/coarser``, ``correction/own`` and
+        ``correction/finer``.
+    """
     if not (Path(data_folder) / "config.yaml").exists():  # an existing file is kept until the data are accepted
         save_resolved(data_folder, config)
-    data = {
-        split: generate_dataset(
-            Path(data_folder) / split,
+    options, data = config.robot_options, config.data
+    plans = {split: (options, data.plan(split)) for split in SPLITS}
+    if coarse := config.pretraining:
+        for split in ("train", "validation"):
+            plans[f"pretraining/{split}"] = options | coarse.robot_options, data.plan_of(getattr(coarse, split))
+    if fine := config.correction:
+        plan = replace(data.plan_of(fine.states), margin=0.0)  # efforts are compared at equal commands
+        for level, changed in (("coarser", fine.coarser), ("own", {}), ("finer", fine.finer)):
+            plans[f"correction/{level}"] = options | changed, plan
+    found = {
+        name: generate_dataset(
+            Path(data_folder) / name,
             config.robot,
-            config.data.plan(split),
-            robot_options=config.robot_options,
-            groups_per_shard=10,
+            plan,
+            robot_options=robot_options,
+            groups_per_shard=data.groups_per_shard,
             workers=config.workers,
             executor=config.executor,
             progress=progress,
         )
-        for split in SPLITS
+        for name, (robot_options, plan) in plans.items()
     }
     save_resolved(data_folder, config)
-    return data
+    return found
 
 
 def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progress: bool = True) -> dict[str, float]:
@@ -211,7 +283,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         config: robot, data and network.
         folder: folder for ``model.safetensors``, ``model.json`` and ``history.npz``. Weights of the same configuration
             and data are not trained again.
-        data_folder: folder of the datasets ``train``, ``validation`` and ``test``.
+        data_folder: folder of the datasets, see `generate_datasets`.
         progress: show progress bars.
 
     Returns:
@@ -239,15 +311,24 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
             return model.card["test"]
     torch.set_num_threads(1)
     features = Features(robot)
-    states = {split: training_states(robot, data[split], features) for split in SPLITS}
+    states = {name: training_states(robot, columns, features) for name, columns in data.items()}
     key = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:12]
     trainer = Trainer(config.network, config.seed, folder / "parts", key, progress, config.workers)
     start = time.perf_counter()
     module = network_module(config.network.kind)
-    tensors, histories = module.train(robot, states["train"], states["validation"], trainer)
+    first: dict[str, Any] = {}
+    if config.pretraining is not None:
+        options = config.network.model_copy(update={"steps": config.pretraining.steps})
+        trained = Trainer(options, config.seed, folder / "parts" / "pretraining", key, progress, config.workers)
+        first["start"], _ = module.train(robot, states["pretraining/train"], states["pretraining/validation"], trained)
+    tensors, histories = module.train(robot, states["train"], states["validation"], trainer, **first)
     seconds = time.perf_counter() - start
     model = module.Model(robot, tensors, {})
     errors = measure_errors(model, data["test"])
+    correction = None
+    if config.correction is not None:
+        levels = [data[f"correction/{level}"] for level in ("coarser", "own", "finer")]
+        correction = asdict(fit_correction(levels, config.correction.sizes, features.design(levels[1]["design"])))
     card = {
         **card_of(robot, config.network.kind),
         "config": config.model_dump(mode="json", exclude={"executor"}),
@@ -259,6 +340,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         "training_seconds": round(seconds, 1),
         "best_validation": {part: min(row["validation"] for row in rows) for part, rows in histories.items()},
         "test": errors,
+        "correction": correction,
     }
     save_model(module.Model(robot, tensors, card), folder)
     history = {f"{p}_{k}": np.array([row[k] for row in rows]) for p, rows in histories.items() for k in rows[0]}

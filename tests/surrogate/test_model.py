@@ -17,6 +17,8 @@ from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.mechanics.solvers import complementarity
 from softgym_envs.surrogate import online
 from softgym_envs.surrogate.baselines import residual
+from softgym_envs.surrogate.correction import fit_correction
+from softgym_envs.surrogate.data.dataset import load_dataset
 from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.networks import NETWORKS
 from softgym_envs.surrogate.potential import kernels
@@ -515,3 +517,57 @@ def test_fit_end_to_end(kind, tmp_path, tmp_path_factory):
         assert errors["positive_definite"] == 1.0 and errors["asymmetry_worst"] == 0.0
     history = np.load(tmp_path / "model" / "history.npz")
     assert all(np.isfinite(history[name]).all() for name in history.files)
+
+
+def test_fit_of_three_fidelities(tmp_path):
+    """Cheap states first, then those of the robot's mesh; efforts corrected by states on two other meshes."""
+    fidelities = {
+        "robot": "trunk",
+        "robot_options": {"mesh": "accurate"},
+        "data": splits(train={"groups": 6}, validation={"groups": 2}, test={"groups": 1}) | {"groups_per_shard": 2},
+        "pretraining": {
+            "robot_options": {"mesh": "published"},
+            "train": {"groups": 20, "states": 8, "sequence": "halton"},
+            "validation": {"groups": 3, "states": 4, "seed": 5},
+            "steps": 200,
+        },
+        "correction": {
+            "coarser": {"mesh": "published"},
+            "finer": {"mesh": "reference"},
+            "sizes": [4.0, 2.0, 1.0],
+            "states": {"groups": 3, "states": 1, "seed": 7},
+        },
+        "network": {"kind": "potential", "width": 16, "body_width": 16, "members": 1, "steps": 50, "batch_size": 32},
+        "workers": 1,
+    }
+    config = FitConfig.model_validate(fidelities)
+    fit(config, tmp_path / "model", tmp_path / "data", progress=False)
+    assert len(list((tmp_path / "data" / "train").glob("shard_*.npz"))) == 3
+    levels = [load_dataset(tmp_path / "data" / "correction" / name) for name in ("coarser", "own", "finer")]
+    for level in levels:  # equal bodies, equal commands
+        np.testing.assert_array_equal(level["design"], levels[1]["design"])
+    robot = make_robot("trunk", mesh="accurate")
+    model = load_model(tmp_path / "model", robot)
+    assert model.card["states"]["pretraining/train"] > 150 and model.card["correction"]["states"] == 3
+    features = model.features.design(levels[1]["design"])
+    assert model.correction == fit_correction(levels, (4.0, 2.0, 1.0), features)
+    # Converged beams are a little softer or stiffer, by what the order of their elements leaves.
+    factor = model.correction.factor(features)
+    assert (factor != 1.0).all() and np.abs(factor - 1.0).max() < 1e-3
+    # The few states of the own mesh, learned in as few steps from random weights, teach less.
+    alone = FitConfig.model_validate({k: v for k, v in fidelities.items() if k not in ("pretraining", "correction")})
+    fit(alone, tmp_path / "alone", tmp_path / "data", progress=False)
+    random = load_model(tmp_path / "alone", robot)
+    assert model.card["best_validation"]["member 0"] < 0.5 * random.card["best_validation"]["member 0"]
+
+
+def test_fidelities_that_do_not_fit_are_refused():
+    split = {"groups": 2, "states": 2}
+    first = {"robot_options": {}, "train": split, "validation": split, "steps": 10}
+    with pytest.raises(ValueError, match="only networks of kind 'potential' can be pretrained, not 'rbf'"):
+        FitConfig.model_validate(
+            {"robot": "finger", "data": splits(), "pretraining": first, "network": {"kind": "rbf"}}
+        )
+    levels = {"coarser": {}, "finer": {}, "sizes": [1.0, 2.0, 0.5], "states": split}
+    with pytest.raises(ValueError, match=r"sizes = \[1.0, 2.0, 0.5\] must decrease"):
+        FitConfig.model_validate({"robot": "finger", "data": splits(), "correction": levels})

@@ -292,7 +292,8 @@ class TorchModel(nn.Module):
         """
         model, half = self.model, self._half
         u = (displacement - self._middle) / half
-        body = self._ensemble.coefficients(self.features.design(design))
+        features = self.features.design(design)
+        body = self._ensemble.coefficients(features)
         gradient, hessian = self._ensemble.derivatives(body, u)
         x, J, L = self._ensemble.shape(body, u)
         effector = x.mean(dim=0) * model.effector_scale + self._effector_mean
@@ -304,7 +305,7 @@ class TorchModel(nn.Module):
         W_ea = moved * half
         W_ee = _symmetric(moved @ J.transpose(-1, -2)) + held
         W = torch.cat([torch.cat([W_aa, W_ea.transpose(-1, -2)], dim=2), torch.cat([W_ea, W_ee], dim=2)], dim=1)
-        stiffness = self.features.stiffness(design)
+        stiffness = self.features.stiffness(design) * model.correction.factor(features)
         return gradient * (model.energy_scale / half) * stiffness, effector, W / stiffness[:, :, None]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -29,29 +29,50 @@ class Options(TrainingOptions):
 
 
 def train(
-    robot: Robot, training: States, validation: States, trainer: Trainer
+    robot: Robot,
+    training: States,
+    validation: States,
+    trainer: Trainer,
+    start: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[dict[str, np.ndarray], dict[str, History]]:
     """Train the members, ``trainer.workers`` at a time: on the same data, each with its own seed and order of batches.
 
     A process that trains a member uses one thread, so the weights do not depend on the number of workers.
+
+    Args:
+        robot: the robot of the states.
+        training: states to learn.
+        validation: states that choose the best step.
+        trainer: hyper-parameters, seed and folder.
+        start: weights of `Model` to start from, learned on other states of the same inputs; default random ones.
 
     Returns:
         The weights of `Model`, and the history of each member.
     """
     options: Options = trainer.options
     scales = _scales(robot, training)
+    states: list[Any] = [None] * options.members
+    if start is not None:
+        # Energies and held compliances keep their order of magnitude when the stiffness changes, effectors their value.
+        states, old = unstack_members(start)
+        scales |= {name: old[name] for name in ("effector_mean", "effector")}
     data = make_targets(robot, training, scales), make_targets(robot, validation, scales)
     rest = None
     if training.unloaded:
         middle = 0.5 * (robot.upper + robot.lower)
         rest = (0.0 - middle) / (robot.upper - middle)
-    arguments = [(trainer, member, data, rest, robot.convex) for member in range(options.members)]
+    arguments = [(trainer, member, data, rest, robot.convex, states[member]) for member in range(options.members)]
     found = sorted(parallel_map(_train_member, arguments, trainer.workers), key=lambda result: result[0])
     return stack_members([state for _, state, _ in found], scales), {f"member {k}": rows for k, _, rows in found}
 
 
 def _train_member(
-    trainer: Trainer, member: int, data: tuple[Targets, Targets], rest: np.ndarray | None, convex: bool
+    trainer: Trainer,
+    member: int,
+    data: tuple[Targets, Targets],
+    rest: np.ndarray | None,
+    convex: bool,
+    start: dict[str, np.ndarray] | None,
 ) -> tuple[int, dict[str, np.ndarray], History]:
     """Train one member; return its number, weights and history."""
     import torch
@@ -65,6 +86,8 @@ def _train_member(
     training, validation = data
     sizes = (training.effort.shape[1], training.effector.shape[1], training.design.shape[1])
     net = PotentialNet(*sizes, options.width, options.body_width, rest, convex=convex)
+    if start is not None:
+        net.load_state_dict({k: torch.tensor(v) for k, v in start.items()})
     effort_spread = training.effort_spread
 
     def loss(rows: Tensor | None) -> Tensor:
