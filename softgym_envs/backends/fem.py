@@ -16,6 +16,9 @@ from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 
+SATURATED = 1.0 - 1e-9
+"""Part of its largest effort from which an actuator counts as saturated: round-off."""
+
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
     """Find an equilibrium that Newton's method misses, by a slow, heavily damped motion towards it."""
@@ -183,9 +186,17 @@ class FEMBackend(Backend):
         start = self.state.effort
         if mode == "displacement":
             start = self.state.command if self._mode == mode else self.state.displacement
-        for k in range(self._substeps):
-            part = command if k == self._substeps - 1 else start + (k + 1) / self._substeps * (command - start)
+        parts = start + np.arange(1, self._substeps + 1)[:, None] / self._substeps * (command - start)
+        parts[-1] = command  # without round-off
+        done, motion = 0, None
+        if not (np.abs(self._dynamics.effort[: len(command)]) >= self._max_effort * SATURATED).any():
+            aims = np.clip(parts, -self._max_effort, self._max_effort) if mode == "effort" else parts
+            done, motion = self._dynamics.advance_compiled(
+                aims, mode, largest_effort=self._max_effort, effector_force=load
+            )
+        for part in parts[done:]:
             motion = self._drive(self._dynamics, part, mode, load)
+        assert motion is not None
         return self._state(motion.equilibrium, command, motion)
 
     def _drive(self, solver: Any, command: np.ndarray, mode: str, load: np.ndarray | None) -> Any:
@@ -196,7 +207,7 @@ class FEMBackend(Backend):
                 command = np.clip(command, -self._max_effort, self._max_effort)
             return go(command, mode, effector_force=load)
         present = solver.effort[: len(command)]
-        saturated, sign = np.abs(present) >= self._max_effort * (1.0 - 1e-9), np.sign(present)
+        saturated, sign = np.abs(present) >= self._max_effort * SATURATED, np.sign(present)
         count = len(command)
         for attempt in range(2 * count + 2):
             # A saturated actuator is released when its command asks for less than it has reached.

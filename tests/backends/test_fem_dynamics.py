@@ -67,10 +67,10 @@ def test_a_displacement_after_an_effort_begins_where_the_actuators_are():
     backend = FEMBackend(make_robot("tetrapod"), dynamics=True)
     reached = backend.step(np.full(4, 0.02), "effort").displacement
     seen = []
-    advance = backend._dynamics.advance
-    backend._dynamics.advance = lambda command, *rest, **named: (
-        seen.append(np.array(command)),
-        advance(command, *rest, **named),
+    advance = backend._dynamics.advance_compiled
+    backend._dynamics.advance_compiled = lambda commands, *rest, **named: (
+        seen.extend(commands),
+        advance(commands, *rest, **named),
     )[1]
     backend.step(np.zeros(4))
     count = len(seen)

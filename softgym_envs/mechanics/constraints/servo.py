@@ -20,6 +20,9 @@ class Servo(Constraint):
         row: first row of the frame.
         axis: direction of the axis, shape (3,).
         nodes: rest rows [m], shape (n, 3).
+
+    Attributes:
+        directions: directions in which the angle is zero and pi/2, shape (2, 3).
     """
 
     size = 1
@@ -36,10 +39,10 @@ class Servo(Constraint):
         across = directors - np.outer(directors @ self.axis, self.axis)
         chosen = int(np.argmax(np.linalg.norm(across, axis=1)))
         self.row = row + 1 + chosen
-        self._first = across[chosen] / np.linalg.norm(across[chosen])
-        self._second = np.cross(self.axis, self._first)
+        first = across[chosen] / np.linalg.norm(across[chosen])
+        self.directions = np.array([first, np.cross(self.axis, first)])
         self.dofs = 3 * self.row + np.arange(3)
-        a, b = self._first, self._second
+        a, b = self.directions
         self._mixed = np.outer(a, b) + np.outer(b, a)
         self._same = np.outer(a, a) - np.outer(b, b)
 
@@ -50,11 +53,12 @@ class Servo(Constraint):
         return self.linearise(x)[1]
 
     def linearise(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        p, q = float(x[self.row] @ self._first), float(x[self.row] @ self._second)
+        p, q = (float(value) for value in self.directions @ x[self.row])
+        first, second = self.directions
         square = p * p + q * q
-        return np.array([math.atan2(q, p)]), ((p / square) * self._second - (q / square) * self._first)[None, :]
+        return np.array([math.atan2(q, p)]), ((p / square) * second - (q / square) * first)[None, :]
 
     def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray:
-        p, q = float(x[self.row] @ self._first), float(x[self.row] @ self._second)
+        p, q = (float(value) for value in self.directions @ x[self.row])
         scale = float(effort[0]) / (p * p + q * q) ** 2
         return (2.0 * p * q * scale) * self._same + ((q * q - p * p) * scale) * self._mixed

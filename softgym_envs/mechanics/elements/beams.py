@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.elements.beam_kernels import interpolate, pull_back, strains
 from softgym_envs.mechanics.elements.block import ElementBlock, lower_pairs
 from softgym_envs.mechanics.elements.tetrahedra import check_density, element_masses
 
@@ -91,63 +92,37 @@ class Section:
 # Quantities of a cross-section that are linear in the rows: r', d1..d3, d1'..d3'; which row of a frame each belongs to.
 _ROW = np.array([0, 1, 2, 3, 1, 2, 3])
 _SLOPE = np.array([True, False, False, False, True, True, True])
-# Strains as sums of products of two of them: strain, first, second, factor.
-_PRODUCTS = np.array(
-    [(0, 1, 0), (1, 2, 0), (2, 3, 0), (3, 3, 5), (3, 2, 6), (4, 1, 6), (4, 3, 4), (5, 2, 4), (5, 1, 5)]
-)
-_FACTORS = np.array([1.0, 1.0, 1.0, 0.5, -0.5, 0.5, -0.5, 0.5, -0.5])
 
 
 @njit(cache=True, error_model="numpy")
-def _strains(z, products, factors, out):
-    out[:] = 0.0
-    for p in range(products.shape[0]):
-        s, a, b = products[p]
-        out[s] += factors[p] * (z[a, 0] * z[b, 0] + z[a, 1] * z[b, 1] + z[a, 2] * z[b, 2])
-
-
-@njit(cache=True, error_model="numpy")
-def _evaluate(
-    x, rows, shape, slope, weights, rest, stiffness, products, factors, row_of, is_slope, stressed, forces, matrix
-):
+def _evaluate(x, rows, shape, slope, weights, rest, stiffness, row_of, is_slope, stressed, forces, matrix):
     """Energy; forces (m, k, 4, 3) and, unless ``matrix`` is empty, element matrices (m, 12 k, 12 k).
 
     Without ``stressed``, the matrices omit the terms of the stress.
     """
     m, k = rows.shape
-    quadrature = weights.shape[1]
-    z = np.empty((7, 3))
-    strain = np.empty(6)
+    z, unit, column, gradient = np.empty((7, 3)), np.zeros((7, 3)), np.empty((7, 3)), np.empty((7, 3))
+    stress, alone = np.empty(6), np.zeros(6)
     first = np.empty((6, 7, 3))
-    gradient = np.empty((7, 3))
     hessian = np.empty((21, 21))
     coefficient = np.empty((k, 7))
     energy = 0.0
     forces[:] = 0.0
     matrix[:] = 0.0
     for e in range(m):
-        for q in range(quadrature):
+        for q in range(weights.shape[1]):
             for a in range(k):
                 for v in range(7):
                     coefficient[a, v] = slope[e, q, a] if is_slope[v] else shape[q, a]
-            z[:] = 0.0
-            for a in range(k):
-                for v in range(7):
-                    for d in range(3):
-                        z[v, d] += coefficient[a, v] * x[rows[e, a] + row_of[v], d]
-            _strains(z, products, factors, strain)
-            first[:] = 0.0
-            for p in range(products.shape[0]):
-                s, a, b = products[p]
-                for d in range(3):
-                    first[s, a, d] += factors[p] * z[b, d]
-                    first[s, b, d] += factors[p] * z[a, d]
+            interpolate(x, rows[e], shape[q], slope[e, q], z)
+            strains(z, stress)
             w = weights[e, q]
-            gradient[:] = 0.0
             for s in range(6):
-                strain[s] -= rest[e, q, s]
-                energy += 0.5 * w * stiffness[e, s] * strain[s] ** 2
-                gradient += (w * stiffness[e, s] * strain[s]) * first[s]
+                strain = stress[s] - rest[e, q, s]
+                stress[s] = w * stiffness[e, s] * strain
+                energy += 0.5 * stress[s] * strain
+            gradient[:] = 0.0
+            pull_back(z, stress, gradient)
             for a in range(k):
                 for v in range(7):
                     for d in range(3):
@@ -155,7 +130,11 @@ def _evaluate(
             if matrix.shape[0] == 0:
                 continue
             hessian[:] = 0.0
+            first[:] = 0.0
             for s in range(6):
+                alone[s] = 1.0
+                pull_back(z, alone, first[s])
+                alone[s] = 0.0
                 c = w * stiffness[e, s]
                 g = first[s].ravel()
                 for i in range(21):
@@ -163,12 +142,15 @@ def _evaluate(
                         ci = c * g[i]
                         for j in range(21):
                             hessian[i, j] += ci * g[j]
-            for p in range(products.shape[0] if stressed else 0):
-                s, a, b = products[p]
-                c = w * stiffness[e, s] * strain[s] * factors[p]
-                for d in range(3):
-                    hessian[3 * a + d, 3 * b + d] += c
-                    hessian[3 * b + d, 3 * a + d] += c
+            for v in range(7 if stressed else 0):
+                # Strains are products of rows, so their second derivative is the gradient of a unit state.
+                unit[v, 0] = 1.0
+                column[:] = 0.0
+                pull_back(unit, stress, column)
+                unit[v, 0] = 0.0
+                for u in range(7):
+                    for d in range(3):
+                        hessian[3 * u + d, 3 * v + d] += column[u, 0]
             for a in range(k):
                 for v in range(7):
                     i = 12 * a + 3 * row_of[v]
@@ -182,6 +164,16 @@ def _evaluate(
                                 for f in range(3):
                                     matrix[e, i + d, j + f] += c * hessian[3 * v + d, 3 * u + f]
     return energy
+
+
+@njit(cache=True)
+def _strains_at(x, rows, shape, slope, out):
+    """Fill ``out`` (m, q, 6) with the strains at the Gauss points, those at rest included."""
+    z = np.empty((7, 3))
+    for e in range(out.shape[0]):
+        for q in range(out.shape[1]):
+            interpolate(x, rows[e], shape[q], slope[e, q], z)
+            strains(z, out[e, q])
 
 
 @njit(cache=True)
@@ -261,6 +253,14 @@ class Beam(ElementBlock):
         stress_free: rows of the chain's frames in the stress-free shape [m], shape (c, 4, 3); default: as in ``nodes``,
             which may be curved.
 
+    Attributes:
+        rows: first rows of the frames of each element, shape (m, order + 1).
+        shape: shape functions at the Gauss points, shape (q, order + 1).
+        slope: their slopes along the axis [1/m], shape (m, q, order + 1).
+        weights: of the Gauss points [m], shape (m, q).
+        rest: strains at rest, shape (m, q, 6).
+        element_stiffness: of the cross-sections, shape (m, 6), see `Section.stiffness`.
+
     Raises:
         ValueError: if the chain has the wrong length or two frames coincide.
     """
@@ -287,20 +287,20 @@ class Beam(ElementBlock):
         self.order = order
         self.rows = chain[order * np.arange(m)[:, None] + np.arange(order + 1)]
         points, gauss = np.polynomial.legendre.leggauss(order)
-        self._shape, local = _lagrange(order, points)
+        self.shape, local = _lagrange(order, points)
         sections = [section] * m if isinstance(section, Section) else list(section)
         if len(sections) != m:
             raise ValueError(f"the beam has {m} elements, got {len(sections)} sections")
-        shape = nodes[chain[:, None] + np.arange(4)] if stress_free is None else np.asarray(stress_free, dtype=float)
-        if shape.shape != (len(chain), 4, 3):
-            raise ValueError(f"stress_free must have shape ({len(chain)}, 4, 3), got {shape.shape}")
+        natural = nodes[chain[:, None] + np.arange(4)] if stress_free is None else np.asarray(stress_free, dtype=float)
+        if natural.shape != (len(chain), 4, 3):
+            raise ValueError(f"stress_free must have shape ({len(chain)}, 4, 3), got {natural.shape}")
         rest = np.zeros_like(nodes)
-        rest[chain[:, None] + np.arange(4)] = shape
+        rest[chain[:, None] + np.arange(4)] = natural
         tangents = np.einsum("qa,mad->mqd", local, rest[self.rows])
         speed = np.linalg.norm(tangents, axis=2)
         if not (speed > 1e-12).all():
             raise ValueError("two frames of a beam coincide")
-        self._slope = local / speed[:, :, None]
+        self.slope = local / speed[:, :, None]
         self.weights = gauss * speed
         young = np.broadcast_to(np.asarray(young_modulus, dtype=float), (m,))
         poisson = np.broadcast_to(np.asarray(poisson_ratio, dtype=float), (m,))
@@ -323,9 +323,9 @@ class Beam(ElementBlock):
         self._forces = np.empty((m, order + 1, 4, 3))
         self._matrix = np.empty((m, 12 * (order + 1), 12 * (order + 1)))
         self._none = np.empty((0, 12 * (order + 1), 12 * (order + 1)))
-        self._rest = np.zeros((m, order, 6))
-        self._rest = self.strains(rest)
-        if not (self._rest[..., 0] > 0.5).all():
+        self.rest = np.zeros((m, order, 6))
+        self.rest = self.strains(rest)
+        if not (self.rest[..., 0] > 0.5).all():
             raise ValueError("the directors d_1 of a beam's frames must point along its axis")
 
     @property
@@ -334,12 +334,9 @@ class Beam(ElementBlock):
 
     def strains(self, x: np.ndarray) -> np.ndarray:
         """Strains (Gamma, K) beyond those at rest at the Gauss points, shape (m, q, 6) [1, 1/m]."""
-        kinds = np.where(_SLOPE[:, None], self._slope[:, :, None, :], self._shape[:, None, :])  # (m, q, 7, k)
-        z = np.einsum("mqvk,mkvd->mqvd", kinds, x[self.rows[:, :, None] + _ROW])
-        out = np.zeros((*z.shape[:2], 6))
-        for (s, a, b), factor in zip(_PRODUCTS, _FACTORS, strict=True):
-            out[..., s] += factor * np.einsum("mqd,mqd->mq", z[..., a, :], z[..., b, :])
-        return out - self._rest
+        out = np.empty((*self.weights.shape, 6))
+        _strains_at(x, self.rows, self.shape, self.slope, out)
+        return out - self.rest
 
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
         rows = self.rows[:, :, None] + np.arange(4)
@@ -365,13 +362,11 @@ class Beam(ElementBlock):
         return _evaluate(
             x,
             self.rows,
-            self._shape,
-            self._slope,
+            self.shape,
+            self.slope,
             self.weights,
-            self._rest,
+            self.rest,
             self.element_stiffness,
-            _PRODUCTS,
-            _FACTORS,
             _ROW,
             _SLOPE,
             stressed,
@@ -380,11 +375,11 @@ class Beam(ElementBlock):
         )
 
     def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
-        _add_warped(x, step, self.rows, self._shape, self._slope, self.weights, out)
+        _add_warped(x, step, self.rows, self.shape, self.slope, self.weights, out)
 
     def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         k = self.order + 1
-        values = np.einsum("mq,mqa,mqb->mab", self.weights, self._slope, self._slope)
+        values = np.einsum("mq,mqa,mqb->mab", self.weights, self.slope, self.slope)
         return np.repeat(self.rows, k, axis=1).ravel(), np.tile(self.rows, (1, k)).ravel(), values.ravel()
 
     def nodal_masses(self, count: int) -> np.ndarray:
@@ -424,7 +419,7 @@ class Beam(ElementBlock):
             for q in range(self.order):
                 factors = np.array([1.0, 0.0, offset[0], offset[1]])
                 ids.append((self.rows[e][:, None] + np.arange(4)).ravel())
-                weights.append((self.weights[e, q] * self._slope[e, q][:, None] * factors).ravel())
+                weights.append((self.weights[e, q] * self.slope[e, q][:, None] * factors).ravel())
         return EmbeddedPoints.from_weights(np.array(ids), np.array(weights), nodes)
 
 

@@ -24,8 +24,10 @@ import numpy as np
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
+from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.equilibrium import AppliedLoads, Equilibrium
 from softgym_envs.mechanics.solvers.schemes import SCHEMES, GeneralisedAlpha, ImplicitEuler, StartingAcceleration
 from softgym_envs.mechanics.solvers.statics import NewtonFailure, Statics
@@ -75,6 +77,8 @@ class Dynamics(Statics):
         tolerance: largest remaining correction of any node at convergence [m].
         max_iterations: limit of Newton iterations per load increment.
         max_cuts: how often a step that cannot be solved is halved.
+        compiled: take implicit Euler steps of bodies of beams in compiled code (`BeamMotion`), which is many times
+            faster and gives the same motion to the tolerance.
 
     Attributes:
         velocity: current velocity of the rows [m/s], shape (n, 3).
@@ -97,6 +101,7 @@ class Dynamics(Statics):
         tolerance: float = 1e-11,
         max_iterations: int = 30,
         max_cuts: int = 6,
+        compiled: bool = True,
     ) -> None:
         if scheme not in SCHEMES:
             raise ValueError(f"scheme = {scheme!r} is unknown; allowed: {', '.join(SCHEMES)}")
@@ -120,6 +125,8 @@ class Dynamics(Statics):
         self.max_cuts = max_cuts
         super().__init__(model, tolerance=tolerance, max_iterations=max_iterations, max_halvings=2)
         self._mass = self._assembly.mass_matrix(lumped)
+        self._beams: BeamMotion | None = None
+        self._compiled = compiled and scheme == "euler"
 
     def reset(self) -> None:
         super().reset()
@@ -201,6 +208,9 @@ class Dynamics(Statics):
             ValueError: as `Statics.solve`.
         """
         target = np.asarray(target, dtype=float)
+        _, motion = self.advance_compiled(target[None], mode, **applied)
+        if motion is not None:
+            return motion
         start = self.snapshot
         first = self._current_command(mode)
         for cut in range(self.max_cuts + 1):
@@ -226,6 +236,90 @@ class Dynamics(Statics):
         return Motion(
             found, self.velocity.copy(), self.time, kinetic, potential, self._work, self._dissipated, substeps=count
         )
+
+    def advance_compiled(
+        self,
+        targets: np.ndarray,
+        mode: str | Sequence[str] = "displacement",
+        *,
+        largest_effort: np.ndarray | None = None,
+        **applied: Unpack[AppliedLoads],
+    ) -> tuple[int, Motion | None]:
+        """Advance by time steps in one compiled call, as far as that can solve them.
+
+        Args:
+            targets: arguments of `advance` for each time step, shape (k, n_a).
+            mode: as for `advance`.
+            largest_effort: of each actuator, shape (n_a,): a time step that exceeds one is not taken. Default none.
+            **applied: as for `advance`.
+
+        Returns:
+            How many of the time steps were taken, and the last one if all were.
+        """
+        beams, load = self._beam_motion(), applied.get("effector_force")
+        modes = [mode] * self._actuators if isinstance(mode, str) else list(mode)
+        known = len(modes) == self._actuators and all(m in ("displacement", "effort") for m in modes)
+        if beams is None or not known or applied.get("contact") is not None or targets.shape[1] != self._actuators:
+            return 0, None
+        goals = np.zeros((len(targets), len(self.effort)))
+        goals[:, : self._actuators] = targets
+        if load is not None:
+            if np.shape(load) != self._effectors.shape:
+                return 0, None
+            goals[:, self._effectors] = load
+        if not np.isfinite(goals).all():
+            return 0, None
+        is_driven = np.zeros(len(self.effort), dtype=bool)
+        is_driven[: self._actuators] = [m == "displacement" for m in modes]
+        loads = self.model.loads
+        found = beams.march(
+            self.x,
+            self.velocity,
+            self.effort,
+            goals,
+            is_driven,
+            limit=np.zeros(0) if largest_effort is None else largest_effort,
+            loads=loads,
+            step=self.step,
+            mass_damping=self.mass_damping,
+            stiffness_damping=self.stiffness_damping,
+            tolerance=self.tolerance,
+        )
+        if not found.taken:
+            return 0, None
+        self.x, self.velocity, self.effort = found.x, found.velocity, found.effort
+        self._current_loads = loads
+        self.linearisation.current = False
+        self.time += found.taken * self.step
+        self._work += found.work
+        self._dissipated += found.dissipated
+        if found.taken < len(targets):
+            return found.taken, None
+        W = found.compliance
+        equilibrium = Equilibrium(
+            x=found.x.copy(),
+            condensed=CondensedModel(W, found.delta - W @ found.effort, found.effort, self._roles, self._labels),
+            delta=found.delta,
+            effort=found.effort.copy(),
+            slack=np.zeros(self._actuators, dtype=bool),
+            stable=True,  # the factorisation fails otherwise
+            iterations=found.iterations,
+            increments=1,
+        )
+        potential = found.elastic - float(np.vdot(loads, found.x - self.model.nodes))
+        velocity = found.velocity.copy()
+        return found.taken, Motion(
+            equilibrium, velocity, self.time, found.kinetic, potential, self._work, self._dissipated, substeps=1
+        )
+
+    def _beam_motion(self) -> BeamMotion | None:
+        """Return the compiled steps of the body, or None if it needs the general solver."""
+        if not self._compiled or self.model.assembly is not self._assembly:
+            return None
+        if self._beams is None or self._beams.elasticity_version != self.model.elasticity_version:
+            self._beams = BeamMotion.of(self.model, self._mass)
+            self._compiled = self._beams is not None
+        return self._beams
 
     def _displacement_rows(self, mode: str | Sequence[str]) -> np.ndarray:
         """Actuator rows that are driven in displacement."""

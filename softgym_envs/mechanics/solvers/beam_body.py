@@ -1,0 +1,263 @@
+"""Bodies of beams and rigid parts as plain arrays, for the compiled equations of `beam_equations`."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from softgym_envs.mechanics.assembly import MassMatrix
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.constraints.servo import Servo
+from softgym_envs.mechanics.elements.beams import Beam
+from softgym_envs.mechanics.elements.rigid import RigidBody
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.block_cholesky import SIZE, BlockPattern, analyse
+
+FIXED, ORIGIN, DIRECTOR, MOUNTED = -1, 0, 1, 2
+"""Kinds of rows: those that do not move, origins and directors of frames, and origins of frames on another frame."""
+
+
+class Elements(NamedTuple):
+    """Elements of all beams of a body.
+
+    Attributes:
+        frames: first rows of the frames of each element, shape (m, 3).
+        shape: shape functions at the two Gauss points, shape (2, 3).
+        slope: their slopes, shape (m, 2, 3).
+        stiffness: weight times stiffness at the Gauss points, shape (m, 2, 6).
+        rest: strains at rest, shape (m, 2, 6).
+        mount: row of the origin of the frame on which each frame is mounted, or -1, shape (m, 3).
+        place: block of the tangent for each pair of an element's frames, shape (m, 3, 3); -1 below the diagonal, and
+            where one of them is fixed.
+    """
+
+    frames: np.ndarray
+    shape: np.ndarray
+    slope: np.ndarray
+    stiffness: np.ndarray
+    rest: np.ndarray
+    mount: np.ndarray
+    place: np.ndarray
+
+
+class Rows(NamedTuple):
+    """How the rows move.
+
+    Attributes:
+        kind: `FIXED`, `ORIGIN`, `DIRECTOR` or `MOUNTED`, shape (n,).
+        block: block of the frame that moves each row, -1 if fixed, shape (n,).
+        origin: row of the origin of this frame, shape (n,).
+    """
+
+    kind: np.ndarray
+    block: np.ndarray
+    origin: np.ndarray
+
+
+class MovingFrames(NamedTuple):
+    """Frames that can move, and what is mounted on them.
+
+    Attributes:
+        rows: rows of their origins, shape (f,).
+        block: their blocks, shape (f,).
+        mounted: rows that follow them besides their own directors, shape (c,).
+        owner: row of the origin of the frame that these follow, shape (c,).
+        moves: 1 for origins, 0 for directors, shape (c,).
+        arm: coordinates in the directors of that frame [m], shape (c, 3).
+    """
+
+    rows: np.ndarray
+    block: np.ndarray
+    mounted: np.ndarray
+    owner: np.ndarray
+    moves: np.ndarray
+    arm: np.ndarray
+
+
+class Masses(NamedTuple):
+    """The mass matrix between rows, as a CSR matrix, and as a list of its entries in the tangent.
+
+    Attributes:
+        pointers: shape (n + 1,).
+        columns: of the matrix.
+        values: of the matrix [kg].
+        pairs: row, column and block of the tangent for one half of the entries between rows that move, shape (k, 3).
+        entries: their values [kg], shape (k,).
+    """
+
+    pointers: np.ndarray
+    columns: np.ndarray
+    values: np.ndarray
+    pairs: np.ndarray
+    entries: np.ndarray
+
+
+class Components(NamedTuple):
+    """The six components of the blocks.
+
+    Attributes:
+        free: 1 for those that are equations, 0 for those that are held, shape (b, 6).
+        whole: whether all of a block are free, shape (b,).
+        scale: length [m] that a unit of each moves, shape (b, 6).
+    """
+
+    free: np.ndarray
+    whole: np.ndarray
+    scale: np.ndarray
+
+
+class Servos(NamedTuple):
+    """Constraints of kind `Servo`.
+
+    Attributes:
+        number: constraint row, shape (s,).
+        row: row of the director, shape (s,).
+        directions: directions in which the angle is 0 and pi/2, shape (s, 2, 3).
+    """
+
+    number: np.ndarray
+    row: np.ndarray
+    directions: np.ndarray
+
+
+class Points(NamedTuple):
+    """Constraints of kind `Point` in frames.
+
+    Attributes:
+        number: first constraint row, shape (p,).
+        rows: shape (p, 4).
+        weights: shape (p, 4).
+    """
+
+    number: np.ndarray
+    rows: np.ndarray
+    weights: np.ndarray
+
+
+class BeamBody(NamedTuple):
+    """A body whose unknowns are the six motions of each frame: one block of equations for each frame that can move."""
+
+    elements: Elements
+    rows: Rows
+    frames: MovingFrames
+    masses: Masses
+    pattern: BlockPattern
+    components: Components
+    servos: Servos
+    points: Points
+
+
+def is_beam_body(model: MechanicalModel) -> bool:
+    """Whether a model consists of quadratic beams, rigid parts, servos and points only, and cannot touch anything."""
+    constraints = [c for c, _ in model.rows]
+    points = [c for c in constraints if isinstance(c, Point)]
+    used = np.unique(np.concatenate([block.nodes_used for block in model.blocks]))
+    in_frames = np.concatenate([model.frames.carried, model.frames.rows])
+    return (
+        model.contact is None
+        and any(isinstance(block, Beam) for block in model.blocks)
+        and all(isinstance(b, RigidBody) or (isinstance(b, Beam) and b.order == 2) for b in model.blocks)
+        and all(isinstance(c, Servo | Point) for c in constraints)
+        and not model.constraints["b"]
+        and all(p.embedding.node_ids.shape[1] == 4 for p in points)
+        and bool(np.isin(used, in_frames).all())
+    )
+
+
+def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
+    """Return the arrays of a model for which `is_beam_body` holds, with its mass matrix."""
+    kinematics, frames = model.kinematics, model.frames
+    n = len(model.nodes)
+    beams = [block for block in model.blocks if isinstance(block, Beam)]
+    numbers = np.hstack([kinematics.number[3 * frames.rows[:, None] + np.arange(3)], kinematics.spin_number])
+    movable = np.flatnonzero((numbers >= 0).any(axis=1))
+    block_of_frame = np.full(len(frames), -1)
+    block_of_frame[movable] = np.arange(len(movable))
+
+    owner = np.full(n, -1)  # frame that moves each row
+    owner[frames.rows] = np.arange(len(frames))
+    owner[frames.carried] = frames.owner
+    kind = np.full(n, FIXED)
+    kind[frames.rows] = ORIGIN
+    kind[frames.carried] = np.where(frames.moves == 1.0, MOUNTED, DIRECTOR)
+    kind[block_of_frame[owner] < 0] = FIXED
+
+    elements = np.concatenate([beam.rows for beam in beams])
+    masses = mass.rows.tocoo()
+    moved = (kind[masses.row] != FIXED) & (kind[masses.col] != FIXED)
+    first, second = block_of_frame[owner[masses.row]], block_of_frame[owner[masses.col]]
+    element_blocks = block_of_frame[owner[elements]]
+    pairs = {(int(i), int(j)) for i, j in zip(first[moved], second[moved], strict=True)}
+    pairs |= {(int(i), int(j)) for group in element_blocks for i in group for j in group if i >= 0 and j >= 0}
+    order, pattern = analyse(len(movable), pairs)
+    block_of_frame[movable] = order
+    block = np.where(kind == FIXED, -1, block_of_frame[owner])
+
+    own = (frames.rows[:, None] + np.arange(1, 4)).ravel()
+    follows = ~np.isin(frames.carried, own) & (kind[frames.carried] != FIXED)
+
+    i, j, value = masses.row[moved], masses.col[moved], masses.data[moved]
+    # Between different blocks the entry above the diagonal; within one block, one of each pair of rows.
+    half = np.where(block[i] == block[j], i <= j, block[i] < block[j])
+    i, j, value = i[half], j[half], value[half]
+    mass_place = np.array([pattern.place(a, b) for a, b in zip(block[i], block[j], strict=True)], dtype=np.int64)
+
+    free = np.zeros((len(movable), SIZE))
+    scale = np.zeros((len(movable), SIZE))
+    known = numbers[movable] >= 0
+    free[order] = known
+    scale[order] = np.where(known, kinematics.dof_scale[np.where(known, numbers[movable], 0)], 0.0)
+
+    servos = [(c, rows.start) for c, rows in model.rows if isinstance(c, Servo)]
+    points = [(c, rows.start) for c, rows in model.rows if isinstance(c, Point)]
+    return BeamBody(
+        elements=Elements(
+            frames=elements,
+            shape=np.ascontiguousarray(beams[0].shape),
+            slope=np.concatenate([beam.slope for beam in beams]),
+            stiffness=np.concatenate([beam.weights[:, :, None] * beam.element_stiffness[:, None] for beam in beams]),
+            rest=np.concatenate([beam.rest for beam in beams]),
+            mount=np.where(kind[elements] == MOUNTED, frames.rows[owner[elements]], -1),
+            place=_element_places(block[elements], pattern),
+        ),
+        rows=Rows(kind, block, np.where(kind == FIXED, -1, frames.rows[owner])),
+        frames=MovingFrames(
+            rows=frames.rows[movable],
+            block=block_of_frame[movable],
+            mounted=frames.carried[follows],
+            owner=frames.rows[frames.owner[follows]],
+            moves=frames.moves[follows],
+            arm=frames.arm[follows],
+        ),
+        masses=Masses(
+            pointers=mass.rows.indptr.astype(np.int64),
+            columns=mass.rows.indices.astype(np.int64),
+            values=mass.rows.data,
+            pairs=np.column_stack([i, j, mass_place]).astype(np.int64),
+            entries=value,
+        ),
+        pattern=pattern,
+        components=Components(free, free.min(axis=1) > 0.0, scale),
+        servos=Servos(
+            number=np.array([start for _, start in servos], dtype=np.int64),
+            row=np.array([servo.row for servo, _ in servos], dtype=np.int64),
+            directions=np.array([servo.directions for servo, _ in servos]).reshape(-1, 2, 3),
+        ),
+        points=Points(
+            number=np.array([start for _, start in points], dtype=np.int64),
+            rows=np.array([p.embedding.node_ids[0] for p, _ in points], dtype=np.int64).reshape(-1, 4),
+            weights=np.array([p.embedding.weights[0] for p, _ in points]).reshape(-1, 4),
+        ),
+    )
+
+
+def _element_places(blocks: np.ndarray, pattern: BlockPattern) -> np.ndarray:
+    """Place of the block of each pair of frames of an element (m, 3, 3); -1 where a frame is fixed, or below."""
+    places = np.full((*blocks.shape, 3), -1)
+    for e, group in enumerate(blocks):
+        for a, i in enumerate(group):
+            for b, j in enumerate(group):
+                if 0 <= i <= j:
+                    places[e, a, b] = pattern.place(i, j)
+    return places

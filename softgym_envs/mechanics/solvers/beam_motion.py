@@ -1,0 +1,366 @@
+"""Implicit Euler steps of bodies of beams in one compiled call.
+
+The solution of each step is that of `Dynamics`, to its tolerance; what is saved is everything around the arithmetic.
+Newton's method keeps its factor while it converges fast, and takes whole steps only. Anything unusual (no convergence,
+a tangent that is not positive definite, an effort beyond its limit) ends the compiled call before that time step, and
+the general solver takes over.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from softgym_envs.mechanics.assembly import MassMatrix
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.beam_body import beam_body, is_beam_body
+from softgym_envs.mechanics.solvers.beam_equations import (
+    Step,
+    add_constraints,
+    assemble,
+    drag_work,
+    make_equations,
+    motion_of,
+    move,
+    multiply_mass,
+    point_states,
+)
+from softgym_envs.mechanics.solvers.block_cholesky import SIZE, factorise, solve_lower, solve_upper
+
+MAX_ITERATIONS = 20
+"""Newton iterations of a time step after which the general solver takes over."""
+SLOW = 0.1
+"""A step longer than this part of the last one calls for a new factor."""
+REMAINING, SMALLEST = 0.01, 1e-13
+"""The next step must be shorter than this part of the tolerance, or than this length [m], which is near rounding.
+Errors of a time step act on the next one through the velocities."""
+
+
+class Factor(NamedTuple):
+    """A factorised tangent with what follows from it, and work arrays.
+
+    Attributes:
+        half: ``L^-1 H``, shape (size, b, 6).
+        compliance: ``W``, shape (size, size).
+        driven: inverse of its part of the driven rows, shape (d, d).
+        step: of the equations, shape (b, 6).
+        efforts: step of the efforts, shape (size,).
+        turned: work array of `move`, shape (3, 3).
+    """
+
+    half: np.ndarray
+    compliance: np.ndarray
+    driven: np.ndarray
+    step: np.ndarray
+    efforts: np.ndarray
+    turned: np.ndarray
+
+
+class MarchedSteps(NamedTuple):
+    """Time steps that were taken in one call.
+
+    Attributes:
+        taken: how many of the time steps were taken.
+        x: rows at the end [m], shape (n, 3).
+        velocity: of the rows [m/s], shape (n, 3).
+        effort: of all constraint rows, shape (size,).
+        delta: their values, shape (size,).
+        compliance: ``W`` at the end, shape (size, size).
+        kinetic: kinetic energy at the end [J].
+        elastic: elastic energy at the end [J].
+        work: done by efforts on these steps [J].
+        dissipated: by damping on these steps [J].
+        iterations: Newton iterations of the last time step.
+    """
+
+    taken: int
+    x: np.ndarray
+    velocity: np.ndarray
+    effort: np.ndarray
+    delta: np.ndarray
+    compliance: np.ndarray
+    kinetic: float
+    elastic: float
+    work: float
+    dissipated: float
+    iterations: int
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _dot(a, b):
+    """Return the scalar product of two vectors (b, 6)."""
+    value = 0.0
+    for k in range(a.shape[0]):
+        for i in range(SIZE):
+            value += a[k, i] * b[k, i]
+    return value
+
+
+@njit(cache=True, error_model="numpy")
+def _factorise(body, equations, factor, rows):
+    """Factorise the tangent and fill ``half`` and ``W`` of constraint rows; False if it is not positive definite."""
+    if not factorise(equations.tangent, body.pattern.pointers, body.pattern.targets):
+        return False
+    for i in range(rows.shape[0]):
+        half = factor.half[rows[i]]
+        half[:] = equations.H[rows[i]]
+        solve_lower(equations.tangent, body.pattern.pointers, body.pattern.columns, half)
+        for j in range(i + 1):
+            value = _dot(half, factor.half[rows[j]])
+            factor.compliance[rows[i], rows[j]] = value
+            factor.compliance[rows[j], rows[i]] = value
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _correct(body, equations, factor, effort, target, driven, forced):
+    """Solve the linearised equations for the steps of the motions and of the efforts, as `Statics` does.
+
+    Returns the largest displacement of the step.
+    """
+    step, change, W = factor.step, factor.efforts, factor.compliance
+    step[:] = equations.residual
+    solve_lower(equations.tangent, body.pattern.pointers, body.pattern.columns, step)
+    for i in range(forced.shape[0]):
+        change[forced[i]] = target[forced[i]] - effort[forced[i]]
+    count = driven.shape[0]
+    gap = np.empty(count)
+    for i in range(count):
+        row = driven[i]
+        gap[i] = equations.delta[row] - target[row] - _dot(factor.half[row], step)
+        for j in range(forced.shape[0]):
+            gap[i] += W[row, forced[j]] * change[forced[j]]
+    for i in range(count):
+        value = 0.0
+        for j in range(count):
+            value -= factor.driven[i, j] * gap[j]
+        change[driven[i]] = value
+    for k in range(step.shape[0]):
+        for i in range(SIZE):
+            step[k, i] = -step[k, i]
+    for c in range(change.shape[0]):
+        if change[c] != 0.0:
+            half = factor.half[c]
+            for k in range(step.shape[0]):
+                for i in range(SIZE):
+                    step[k, i] += change[c] * half[k, i]
+    solve_upper(equations.tangent, body.pattern.pointers, body.pattern.columns, step)
+    largest, scale = 0.0, body.components.scale
+    for k in range(step.shape[0]):
+        for i in range(SIZE):
+            largest = max(largest, abs(step[k, i]) * scale[k, i])
+    return largest
+
+
+@njit(cache=True, error_model="numpy")
+def _time_step(body, x, effort, target, driven, forced, step, equations, factor, tolerance, fresh):
+    """Solve one time step in place, starting at the predicted rows ``x``; the iterations, or -1 on failure.
+
+    It starts with the factor of the last step unless ``fresh``.
+    """
+    rows = np.concatenate((driven, forced))
+    before = np.inf
+    enough = min(tolerance, max(REMAINING * tolerance, SMALLEST))
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        assemble(body, x, effort, step, equations, fresh)
+        if fresh:
+            if not _factorise(body, equations, factor, rows):
+                return -1
+            count = driven.shape[0]
+            among = np.empty((count, count))
+            for i in range(count):
+                for j in range(count):
+                    among[i, j] = factor.compliance[driven[i], driven[j]]
+            if count:
+                factor.driven[:count, :count] = np.linalg.inv(among)
+        length = _correct(body, equations, factor, effort, target, driven, forced)
+        if not length < 1e3:  # also true for NaN
+            return -1
+        ratio = length / before
+        if ratio > 1.0:
+            if fresh:
+                return -1
+            fresh = True  # this step is not taken
+            continue
+        move(body.frames, x, factor.step, factor.turned)
+        for c in range(effort.shape[0]):
+            effort[c] += factor.efforts[c]
+        # Lengths fall by this ratio with every iteration, so this is the length of the next step.
+        if length <= enough or (iteration > 1 and length * ratio <= enough):
+            return iteration
+        fresh = ratio > SLOW and iteration > 1
+        before = length
+    return -1
+
+
+@njit(cache=True, error_model="numpy")
+def _march(
+    body,
+    equations,
+    factor,
+    states,
+    x,
+    velocity,
+    effort,
+    delta,
+    targets,
+    driven,
+    forced,
+    limit,
+    loads,
+    h,
+    alpha,
+    beta,
+    tolerance,
+    totals,
+):
+    """Take time steps in place until one fails or exceeds a limit, which is undone; the number of steps taken.
+
+    ``totals`` (5,) receives kinetic and elastic energy, work, dissipation and the iterations of the last step.
+    """
+    size = effort.shape[0]
+    everything = np.arange(size)
+    kept, kept_velocity, kept_effort = x.copy(), velocity.copy(), effort.copy()
+    add_constraints(body.servos, body.points, body.rows, x, effort, equations, False)
+    delta[:] = equations.delta
+    taken = 0
+    for k in range(targets.shape[0]):
+        kept[:] = x
+        kept_effort[:] = effort
+        kept_velocity[:] = velocity
+        point_states(body.elements, x, states)
+        step = Step(kept, kept_velocity, states, loads, h, alpha, beta)
+        motion_of(body.frames, body.components.free, x, velocity, h, factor.step)
+        move(body.frames, x, factor.step, factor.turned)
+        iterations = _time_step(body, x, effort, targets[k], driven, forced, step, equations, factor, tolerance, k == 0)
+        good = iterations > 0
+        for i in range(limit.shape[0]):
+            good = good and abs(effort[i]) <= limit[i]
+        if good:
+            # At the end of the step: all compliances where they are asked for, else values and energies alone.
+            last = k == targets.shape[0] - 1
+            if last:
+                assemble(body, x, effort, step, equations, True)
+                good = _factorise(body, equations, factor, everything)
+            else:
+                add_constraints(body.servos, body.points, body.rows, x, effort, equations, False)
+        if not good:
+            x[:] = kept
+            effort[:] = kept_effort
+            velocity[:] = kept_velocity
+            return taken
+        taken += 1
+        for i in range(x.shape[0]):
+            for d in range(3):
+                velocity[i, d] = (x[i, d] - kept[i, d]) / h
+        for c in range(size):
+            totals[2] += 0.5 * (kept_effort[c] + effort[c]) * (equations.delta[c] - delta[c])
+            delta[c] = equations.delta[c]
+        momentum = equations.momentum
+        momentum[:] = 0.0
+        multiply_mass(body.masses, velocity, momentum)
+        kinetic = 0.0
+        for i in range(x.shape[0]):
+            for d in range(3):
+                kinetic += 0.5 * velocity[i, d] * momentum[i, d]
+        totals[0], totals[1], totals[4] = kinetic, equations.energy[0], iterations
+        totals[3] += drag_work(body.elements, x, step) + 2.0 * alpha * h * kinetic
+    return taken
+
+
+class BeamMotion:
+    """Time steps of a body of beams.
+
+    Args:
+        model: a model for which `is_beam_body` holds.
+        mass: its mass matrix.
+    """
+
+    def __init__(self, model: MechanicalModel, mass: MassMatrix) -> None:
+        self.body = beam_body(model, mass)
+        self.elasticity_version = model.elasticity_version
+        size, count = model.assembly.size, len(self.body.components.free)
+        self.equations = make_equations(self.body, size)
+        self._factor = Factor(
+            half=np.zeros((size, count, SIZE)),
+            compliance=np.zeros((size, size)),
+            driven=np.zeros((size, size)),
+            step=np.zeros((count, SIZE)),
+            efforts=np.zeros(size),
+            turned=np.zeros((3, 3)),
+        )
+        self._states = np.zeros((len(self.body.elements.frames), 2, 7, 3))
+
+    @classmethod
+    def of(cls, model: MechanicalModel, mass: MassMatrix) -> BeamMotion | None:
+        """Return the compiled time steps of a model, or None for a model that needs the general solver."""
+        return cls(model, mass) if is_beam_body(model) else None
+
+    def march(
+        self,
+        x: np.ndarray,
+        velocity: np.ndarray,
+        effort: np.ndarray,
+        targets: np.ndarray,
+        is_driven: np.ndarray,
+        *,
+        limit: np.ndarray,
+        loads: np.ndarray,
+        step: float,
+        mass_damping: float,
+        stiffness_damping: float,
+        tolerance: float,
+    ) -> MarchedSteps:
+        """Take time steps until one cannot be solved or exceeds a limit of effort.
+
+        Args:
+            x: rows at the start [m], shape (n, 3).
+            velocity: of the rows [m/s], shape (n, 3).
+            effort: of all constraint rows, shape (size,).
+            targets: values of driven rows and efforts of all others at the end of each step, shape (k, size).
+            is_driven: rows whose values are commanded, mask of shape (size,).
+            limit: largest efforts of the first rows, shape (l,).
+            loads: dead loads [N], shape (n, 3).
+            step: duration of one time step [s].
+            mass_damping: Rayleigh's alpha [1/s].
+            stiffness_damping: Rayleigh's beta [s].
+            tolerance: largest remaining correction of any row [m].
+        """
+        x, velocity, effort, delta = x.copy(), velocity.copy(), effort.copy(), np.empty(len(effort))
+        totals = np.zeros(5)
+        count = _march(
+            self.body,
+            self.equations,
+            self._factor,
+            self._states,
+            x,
+            velocity,
+            effort,
+            delta,
+            targets,
+            np.flatnonzero(is_driven),
+            np.flatnonzero(~is_driven),
+            limit,
+            loads,
+            step,
+            mass_damping,
+            stiffness_damping,
+            tolerance,
+            totals,
+        )
+        kinetic, elastic, work, dissipated, iterations = totals.tolist()
+        return MarchedSteps(
+            count,
+            x,
+            velocity,
+            effort,
+            delta,
+            self._factor.compliance.copy(),
+            kinetic,
+            elastic,
+            work,
+            dissipated,
+            int(iterations),
+        )

@@ -1,0 +1,181 @@
+"""Cholesky factors of sparse symmetric matrices made of small dense blocks: the six motions of each frame of a beam.
+
+The upper triangle is kept, ``A = U^T U``, so that the innermost loops run along rows. The order of elimination and the
+blocks that fill in are found once; factorisation and solution are compiled and allocate nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+SIZE = 6
+"""Rows of a block."""
+
+
+class BlockPattern(NamedTuple):
+    """Places of the blocks of a matrix. Blocks are numbered in the order of elimination.
+
+    Values have shape (blocks, 6, 6): the diagonal blocks, then those above the diagonal, row by row.
+
+    Attributes:
+        pointers: where each row's blocks above the diagonal start, shape (b + 1,).
+        columns: their columns, ascending in each row.
+        targets: for each row, the blocks that its elimination changes: one for each pair of the row's blocks.
+    """
+
+    pointers: np.ndarray
+    columns: np.ndarray
+    targets: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """Number of rows of blocks, b."""
+        return len(self.pointers) - 1
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks that are stored."""
+        return self.size + len(self.columns)
+
+    def place(self, row: int, column: int) -> int:
+        """Index of a block; the column must not be smaller than the row."""
+        if row == column:
+            return row
+        start, end = self.pointers[row], self.pointers[row + 1]
+        return self.size + int(start + np.searchsorted(self.columns[start:end], column))
+
+
+def analyse(count: int, pairs: Iterable[tuple[int, int]]) -> tuple[np.ndarray, BlockPattern]:
+    """Order the elimination of blocks by minimum degree.
+
+    Args:
+        count: number of rows of blocks.
+        pairs: blocks that are not zero, (row, column) in any order; diagonal ones need not be listed.
+
+    Returns:
+        The place of each block row in the order of elimination, shape (count,), and the pattern in this order.
+    """
+    neighbours: list[set[int]] = [set() for _ in range(count)]
+    for i, j in pairs:
+        if i != j:
+            neighbours[i].add(j)
+            neighbours[j].add(i)
+    place = np.full(count, -1)
+    later: list[list[int]] = []
+    for step in range(count):
+        chosen = min(np.flatnonzero(place < 0), key=lambda k: len(neighbours[k]))
+        place[chosen] = step
+        later.append(list(neighbours[chosen]))
+        for i in neighbours[chosen]:
+            neighbours[i] |= neighbours[chosen]
+            neighbours[i] -= {i, int(chosen)}
+    rows = [np.sort(place[row]).astype(np.int64) for row in later]
+    pointers = np.concatenate([[0], np.cumsum([len(row) for row in rows])]).astype(np.int64)
+    pattern = BlockPattern(pointers, np.concatenate([np.empty(0, dtype=np.int64), *rows]), np.empty(0, dtype=np.int64))
+    targets = [pattern.place(row[q], row[p]) for row in rows for p in range(len(row)) for q in range(p + 1)]
+    return place, pattern._replace(targets=np.array(targets, dtype=np.int64))
+
+
+@njit(cache=True, error_model="numpy")
+def _invert_factor(D):
+    """Replace a block by the inverse of its Cholesky factor (lower triangle); False if it is not positive definite."""
+    for j in range(SIZE):
+        pivot = D[j, j]
+        for m in range(j):
+            pivot -= D[j, m] * D[j, m]
+        if not pivot > 0.0:
+            return False
+        root = 1.0 / np.sqrt(pivot)
+        D[j, j] = root
+        for i in range(j + 1, SIZE):
+            value = D[i, j]
+            for m in range(j):
+                value -= D[i, m] * D[j, m]
+            D[i, j] = value * root
+    # The diagonal holds the inverses of the pivots.
+    for j in range(SIZE):
+        for i in range(j + 1, SIZE):
+            value = 0.0
+            for m in range(j, i):
+                value -= D[i, m] * D[m, j]
+            D[i, j] = value * D[i, i]
+            D[j, i] = 0.0
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def factorise(A, pointers, targets):
+    """Factorise a matrix in place; False if it is not positive definite. Diagonal blocks become inverses of factors."""
+    count, t = pointers.shape[0] - 1, 0
+    product = np.empty((SIZE, SIZE))
+    for k in range(count):
+        D = A[k]
+        if not _invert_factor(D):
+            return False
+        for p in range(pointers[k], pointers[k + 1]):
+            B = A[count + p]
+            for i in range(SIZE):
+                for j in range(SIZE):
+                    product[i, j] = D[i, 0] * B[0, j]
+                for m in range(1, SIZE):
+                    for j in range(SIZE):
+                        product[i, j] += D[i, m] * B[m, j]
+            for i in range(SIZE):
+                for j in range(SIZE):
+                    B[i, j] = product[i, j]
+            for q in range(pointers[k], p + 1):
+                C, L = A[targets[t]], A[count + q]
+                for i in range(SIZE):
+                    for m in range(SIZE):
+                        factor = L[m, i]
+                        for j in range(SIZE):
+                            C[i, j] -= factor * B[m, j]
+                t += 1
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def solve_lower(A, pointers, columns, y):
+    """Solve with the lower factor ``U^T`` in place, for one vector ``y`` (b, 6). Leading zeros are passed over."""
+    count = pointers.shape[0] - 1
+    v = np.empty(SIZE)
+    for k in range(count):
+        if not (y[k, 0] or y[k, 1] or y[k, 2] or y[k, 3] or y[k, 4] or y[k, 5]):
+            continue
+        D = A[k]
+        for i in range(SIZE):
+            v[i] = 0.0
+            for j in range(i + 1):
+                v[i] += D[i, j] * y[k, j]
+        for i in range(SIZE):
+            y[k, i] = v[i]
+        for p in range(pointers[k], pointers[k + 1]):
+            B, row = A[count + p], columns[p]
+            for m in range(SIZE):
+                for j in range(SIZE):
+                    y[row, j] -= B[m, j] * v[m]
+
+
+@njit(cache=True, error_model="numpy")
+def solve_upper(A, pointers, columns, y):
+    """Solve with the upper factor ``U`` in place, for one vector ``y`` (b, 6)."""
+    count = pointers.shape[0] - 1
+    v = np.empty(SIZE)
+    for k in range(count - 1, -1, -1):
+        for i in range(SIZE):
+            v[i] = y[k, i]
+        for p in range(pointers[k], pointers[k + 1]):
+            B, row = A[count + p], columns[p]
+            for i in range(SIZE):
+                for j in range(SIZE):
+                    v[i] -= B[i, j] * y[row, j]
+        D = A[k]
+        for j in range(SIZE):
+            y[k, j] = 0.0
+        for i in range(SIZE):
+            for j in range(i + 1):
+                y[k, j] += D[i, j] * v[i]

@@ -1,0 +1,278 @@
+"""Compiled steps of bodies of beams: factorisation, equations, motions and fallbacks against the general solver."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.mechanics.builder import ModelBuilder
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.elements.beams import Section
+from softgym_envs.mechanics.solvers import block_cholesky
+from softgym_envs.mechanics.solvers.beam_body import is_beam_body
+from softgym_envs.mechanics.solvers.beam_equations import Step, assemble, motion_of, move, point_states
+from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
+from softgym_envs.mechanics.solvers.dynamics import Dynamics
+from softgym_envs.mechanics.solvers.schemes import ImplicitEuler
+from softgym_envs.robots.stiff_flop import StiffFlop
+from softgym_envs.robots.tetrapod import Tetrapod
+from softgym_envs.testing import dense_tangent
+
+H = 0.01
+ORIGINS = slice(0, None, 4)  # rows of the origins of frames
+
+
+def moving_tetrapod(seed=0, **options):
+    """A Tetrapod with two elements in each leg, in the middle of a random motion, with random efforts."""
+    rng = np.random.default_rng(seed)
+    robot = Tetrapod(elements=2, payload=0.1)
+    design = robot.design_space.sample(rng)
+    solver = Dynamics(robot.build(design), step=H, tolerance=1e-12, compiled=False, **options)
+    solver.advance(rng.uniform(-0.3, 0.3, 4))
+    solver.effort += rng.uniform(-0.05, 0.05, 7)
+    return solver
+
+
+def equations_at(solver, x, *, full=True):
+    """The compiled equations of one step of a solver that ends at rows ``x``."""
+    beams = BeamMotion(solver.model, solver._mass)
+    body = beams.body
+    states = np.zeros((len(body.elements.frames), 2, 7, 3))
+    point_states(body.elements, solver.x, states)
+    step = Step(
+        solver.x,
+        solver.velocity,
+        states,
+        solver.model.loads,
+        solver.step,
+        solver.mass_damping,
+        solver.stiffness_damping,
+    )
+    assemble(body, x, solver.effort, step, beams.equations, full)
+    return body, beams.equations
+
+
+def numbers_of(model, body):
+    """Equation of each component of the blocks, -1 where it is held, shape (b, 6)."""
+    kinematics = model.kinematics
+    frames = np.searchsorted(model.frames.rows, body.frames.rows)
+    numbers = np.full((len(body.frames.rows), 6), -1)
+    numbers[body.frames.block, :3] = kinematics.number[3 * body.frames.rows[:, None] + np.arange(3)]
+    numbers[body.frames.block, 3:] = kinematics.spin_number[frames]
+    return numbers
+
+
+def test_block_factors_solve_like_dense_ones(rng):
+    count = 9
+    pairs = [(i, j) for i in range(count) for j in range(i) if rng.random() < 0.3]
+    dense = np.zeros((count, 6, count, 6))
+    for i, j in pairs:
+        dense[i, :, j] = rng.normal(size=(6, 6))
+    dense = dense.reshape(54, 54)
+    dense += dense.T + 40.0 * np.eye(54)
+    place, pattern = block_cholesky.analyse(count, pairs)
+    values = np.zeros((pattern.blocks, 6, 6))
+    order = np.argsort(place)
+    for i in range(count):
+        for j in range(i, count):
+            block = dense[6 * order[i] : 6 * order[i] + 6, 6 * order[j] : 6 * order[j] + 6]
+            if block.any():
+                values[pattern.place(i, j)] = block
+    right = rng.normal(size=(count, 6))
+    solution = right[order].copy()
+    assert block_cholesky.factorise(values, pattern.pointers, pattern.targets)
+    block_cholesky.solve_lower(values, pattern.pointers, pattern.columns, solution)
+    block_cholesky.solve_upper(values, pattern.pointers, pattern.columns, solution)
+    assert solution[place].ravel() == pytest.approx(np.linalg.solve(dense, right.ravel()), rel=1e-10, abs=1e-12)
+    values[pattern.place(4, 4)] = -np.eye(6)
+    assert not block_cholesky.factorise(values, pattern.pointers, pattern.targets)
+
+
+@pytest.mark.parametrize("damping", [{}, {"mass_damping": 0.7, "stiffness_damping": 0.02}])
+def test_equations_are_those_of_the_general_assembly(damping):
+    """Residual, tangent and constraint gradients in mid-motion, for a random design and random efforts."""
+    solver = moving_tetrapod(**damping)
+    model, start = solver.model, solver.x
+    x = start + model.kinematics.displacement(start, 1e-2 * np.random.default_rng(1).normal(size=model.equations))
+    inertia = ImplicitEuler(start, solver.velocity, H, solver._mass_and_damping())
+    found = model.assembly.evaluate(x, solver.effort, model.loads, inertia)
+    body, equations = equations_at(solver, x)
+    numbers = numbers_of(model, body)
+    held = numbers < 0
+
+    def in_equations(values):
+        out = np.zeros(model.equations)
+        out[numbers[~held]] = values[~held]
+        return out
+
+    size = np.abs(found.residual).max()
+    assert in_equations(equations.residual) == pytest.approx(found.residual, abs=1e-11 * size)
+    assert equations.delta == pytest.approx(found.delta, abs=1e-14)
+    for row in range(7):
+        assert in_equations(equations.H[row]) == pytest.approx(found.gradients[:, row], abs=1e-13)
+    assert equations.energy[0] == pytest.approx(found.energy, rel=1e-12)
+    # The tangent, through its action on random motions.
+    tangent = dense_tangent(model, found.tangent)
+    block = np.zeros((len(numbers), 6, len(numbers), 6))
+    pattern = body.pattern
+    for i in range(pattern.size):
+        block[i, :, i] = equations.tangent[i]
+        for p in range(pattern.pointers[i], pattern.pointers[i + 1]):
+            block[i, :, pattern.columns[p]] = equations.tangent[pattern.size + p]
+            block[pattern.columns[p], :, i] = equations.tangent[pattern.size + p].T
+    block = block.reshape(numbers.size, numbers.size)
+    free = numbers.ravel() >= 0
+    mine = np.zeros_like(tangent)
+    chosen = numbers.ravel()[free]
+    mine[np.ix_(chosen, chosen)] = block[np.ix_(free, free)]
+    assert np.abs(mine - tangent).max() < 1e-11 * np.abs(tangent).max()
+    assert (block[~free] == np.eye(len(free))[~free]).all()
+
+
+def test_tangent_is_the_derivative_of_the_residual():
+    solver = moving_tetrapod(stiffness_damping=0.02)
+    body, equations = equations_at(solver, solver.x.copy())
+    rng = np.random.default_rng(3)
+    motion = rng.normal(size=body.components.free.shape) * body.components.free
+    pattern, tangent = body.pattern, equations.tangent
+    expected = 0.0
+    for i in range(pattern.size):
+        expected += motion[i] @ tangent[i] @ motion[i]
+        for p in range(pattern.pointers[i], pattern.pointers[i + 1]):
+            expected += 2.0 * motion[i] @ tangent[pattern.size + p] @ motion[pattern.columns[p]]
+    along = []
+    for size in (1e-6, -1e-6):
+        x = solver.x.copy()
+        move(body.frames, x, size * motion, np.zeros((3, 3)))
+        _, moved = equations_at(solver, x, full=False)
+        along.append(float((moved.residual * motion).sum()))
+    assert (along[0] - along[1]) / 2e-6 == pytest.approx(expected, rel=1e-6)
+
+
+def test_motions_are_those_of_the_kinematics(rng):
+    solver = moving_tetrapod()
+    body = BeamMotion(solver.model, solver._mass).body
+    kinematics, numbers = solver.model.kinematics, numbers_of(solver.model, body)
+    step = rng.normal(size=solver.model.equations)
+    for size in (1e-3, 1.0):
+        motion = np.where(numbers >= 0, size * step[numbers], 0.0)
+        x = solver.x.copy()
+        move(body.frames, x, motion, np.zeros((3, 3)))
+        assert x == pytest.approx(solver.x + kinematics.displacement(solver.x, size * step), abs=1e-10)
+    velocity = kinematics.row_velocity(solver.x, step)
+    found = np.zeros_like(motion)
+    motion_of(body.frames, body.components.free, solver.x, velocity, 0.5, found)
+    assert found == pytest.approx(0.5 * np.where(numbers >= 0, step[numbers], 0.0), abs=1e-12)
+
+
+def both(robot, design=None, **options):
+    """Two backends in motion: with compiled steps, and with the general solver alone."""
+    pair = [FEMBackend(robot, design, dynamics=True, **options) for _ in range(2)]
+    pair[1]._dynamics._compiled = False
+    for backend in pair:  # to compare what remains beyond the tolerance of Newton's method
+        backend._dynamics.tolerance = 1e-12
+    return pair
+
+
+def compare(fast, general):
+    """Assert that two states in motion are equal, with their efforts, energies and ``W``."""
+    assert np.abs(fast.nodes - general.nodes)[ORIGINS].max() < 1e-9
+    assert fast.velocity == pytest.approx(general.velocity, abs=1e-7)
+    assert fast.effort == pytest.approx(general.effort, abs=1e-8)
+    assert fast.displacement == pytest.approx(general.displacement, abs=1e-9)
+    scale = np.abs(general.condensed.compliance).max()
+    assert np.abs(fast.condensed.compliance - general.condensed.compliance).max() < 1e-7 * scale
+    for name in ("time", "kinetic", "potential", "work", "dissipated"):
+        assert getattr(fast.motion, name) == pytest.approx(getattr(general.motion, name), rel=1e-7, abs=1e-10), name
+    assert fast.stable == general.stable
+
+
+def compiled_steps(backend, command):
+    """How many of the five time steps to a command are taken in compiled code, without taking them."""
+    solver = copy.copy(backend._dynamics)
+    parts = backend.state.command + np.arange(1, 6)[:, None] / 5 * (command - backend.state.command)
+    return solver.advance_compiled(parts)[0]
+
+
+@pytest.mark.parametrize("payload", [0.0, 1.0])
+def test_same_motion_for_random_designs_commands_and_forces(rng, payload):
+    robot = Tetrapod(elements=3, payload=payload)
+    compiled = []
+    for _ in range(2):
+        fast, general = both(robot, robot.design_space.sample(rng), mass_damping=0.3)
+        command = np.zeros(4)
+        for k in range(6):
+            command = np.clip(command + rng.uniform(-1, 1, 4) * robot.rates, robot.lower, robot.upper)
+            force = rng.uniform(-0.2, 0.2, 3) if k % 2 else None
+            compiled.append(compiled_steps(fast, command))
+            states = [backend.step(command, force=force) for backend in (fast, general)]
+            compare(*states)
+        assert general._dynamics._beams is None
+    assert np.mean(compiled) > 2.5  # of 5: the general solver takes those that need a line search
+
+
+def test_same_motion_under_commanded_efforts_and_with_saturated_servos(rng):
+    """Limits that the motion exceeds: the compiled steps end before them, and then drive the efforts."""
+    robot = Tetrapod(elements=2)
+    fast, general = both(robot)
+    for _ in range(3):
+        efforts = rng.uniform(-0.03, 0.03, 4)
+        compare(*(backend.step(efforts, "effort") for backend in (fast, general)))
+    fast, general = both(robot)
+    command, saturated = np.zeros(4), 0
+    for backend in (fast, general):
+        backend._max_effort = np.full(4, 0.05)
+        backend._limited = True
+    for _ in range(8):
+        command = np.clip(command + rng.uniform(-1, 1, 4) * robot.rates, robot.lower, robot.upper)
+        states = [backend.step(command) for backend in (fast, general)]
+        compare(*states)
+        saturated += int((np.abs(states[0].effort) >= 0.05 * (1.0 - 1e-9)).any())
+    assert 0 < saturated
+
+
+def test_a_free_beam_keeps_the_energy_that_the_general_solver_keeps():
+    """A beam without supports spins and bends; implicit Euler dissipates, and both by the same amount."""
+    body = ModelBuilder(floating=True)
+    frames = [body.add_frame([0.05 * k, 0.0, 0.0]) for k in range(5)]
+    body.add_beam(frames, section=Section.circle(5e-3), young_modulus=1e7)
+    model = body.build()
+    model.add("e", Point("tip", EmbeddedPoints.in_frame(frames[-1], np.array([0.0, 0.01, 0.0]), model.nodes)))
+    solvers = [Dynamics(model, step=1e-3, tolerance=1e-12, compiled=compiled) for compiled in (True, False)]
+    motions = []
+    for solver in solvers:
+        velocity = np.zeros(model.equations)
+        velocity[1:15:3] = [0.3, 0.0, -0.2, 0.0, 0.3]
+        velocity[15:] = np.tile([4.0, 0.5, 2.0], 5)
+        solver.launch(velocity)
+        motions.append([solver.advance([], effector_force=[0.0, 0.0, 0.01 * (k < 5)]) for k in range(20)])
+    assert solvers[0]._beams is not None
+    for fast, general in zip(*motions, strict=True):
+        assert fast.energy == pytest.approx(general.energy, rel=1e-9)
+        assert np.abs(fast.equilibrium.x - general.equilibrium.x)[ORIGINS].max() < 1e-10
+
+
+def test_what_the_compiled_steps_cannot_do_goes_to_the_general_solver():
+    robot = Tetrapod(elements=2)
+    model = robot.build()
+    solver = Dynamics(model, step=H)
+    with pytest.raises(ValueError, match="mode must be"):
+        solver.advance(np.zeros(4), "torque")
+    with pytest.raises(ValueError, match="finite"):
+        solver.advance(np.full(4, np.nan))
+    with pytest.raises(ValueError, match="effector_force"):
+        solver.advance(np.zeros(4), effector_force=np.zeros(2))
+    # A step far beyond what Newton's method does in one go is divided, as ever.
+    far = Dynamics(model, step=H)
+    assert far.advance_compiled(np.full((1, 4), 1.5))[0] == 0
+    assert far.time == 0.0 and not far.velocity.any() and (far.x == model.nodes).all()
+    assert far.advance(np.full(4, 1.5)).equilibrium.delta[:4] == pytest.approx(np.full(4, 1.5), abs=1e-9)
+    # Chambers and other schemes are not compiled.
+    trunk = StiffFlop().build()
+    assert not is_beam_body(trunk) and Dynamics(trunk, step=H).advance_compiled(np.zeros((1, 6))) == (0, None)
+    other = Dynamics(model, step=H, scheme="generalised_alpha")
+    assert other.advance_compiled(np.zeros((1, 4))) == (0, None)
