@@ -129,6 +129,10 @@ class CableTrunk(Robot):
     name = "cable_trunk"
     effectors = ("tip",)
     size = 0.195
+    design_boxes = {
+        # 30 % about the baseline.
+        "wide": {"length": (0.1365, 0.2535), "base_half_width": (0.0091, 0.0169), "tip_half_width": (0.0035, 0.007)}
+    }
 
     def __init__(
         self,

@@ -94,6 +94,15 @@ class Diamond(MeshedRobot):
         "accurate": MeshTier(17.0e-3, "quadratic", guide_radius=2.0e-3),
         "reference": MeshTier(8.0e-3, "quadratic", guide_radius=2.0e-3),
     }
+    design_boxes = {
+        # 30 % about the baseline; with legs 1.3 times as wide, the bevels between two legs nearly vanish.
+        "wide": {
+            "leg_width": (0.7, 1.3),
+            "top_height": (0.0885, 0.164),
+            "elbow_height": (0.0315, 0.0585),
+            "elbow_radius": (0.068, 0.126),
+        }
+    }
 
     def __init__(
         self,

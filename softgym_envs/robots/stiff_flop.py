@@ -67,6 +67,15 @@ class StiffFlop(Robot):
     effectors = ("tip",)
     size = 0.11
     non_mechanical_options = (*Robot.non_mechanical_options, "largest_volume")
+    design_boxes = {
+        # 30 % about the baseline, except where chambers would leave the body.
+        "wide": {
+            "module_length": (0.0385, 0.0715),
+            "outer_radius": (0.0052, 0.0075),
+            "chamber_offset": (0.0024, 0.0042),
+            "chamber_radius": (0.0005, 0.00094),
+        }
+    }
 
     def __init__(
         self,

@@ -320,6 +320,28 @@ def test_every_body_of_the_wide_box_of_the_finger_can_exist(cables):
         assert robot.cable_height + 1e-3 <= design["height"]
 
 
+@pytest.mark.parametrize("name", ["diamond", "cable_trunk", "trunk"])
+def test_bodies_at_corners_of_a_wide_box_move(name):
+    robot = make_robot(name, design_box="wide")
+    lengths = [v for v in robot.design_space if v.unit == "m"]
+    narrow = make_robot(name).design_space
+    assert all(v.low <= narrow[v.name].low and narrow[v.name].high <= v.high for v in robot.design_space)
+    assert sum(v.high >= 1.295 * v.baseline for v in lengths) >= len(lengths) - 1
+    command = np.maximum(robot.lower + (robot.upper - robot.lower) * np.resize([0.5, 0.0, 0.25], len(robot.lower)), 0.0)
+    # Every fifth corner: each variable has both ends.
+    for design in list(corners_of(robot.design_space))[::5]:
+        design = {**design, "poisson_ratio": 0.45}
+        statics = Statics(robot.build(design))
+        rest = statics.solve(np.zeros(len(command)))
+        state = statics.solve(command)
+        assert np.linalg.norm(state.delta[len(command) :][:3] - rest.delta[len(command) :][:3]) > 5e-3, design
+
+
+def test_chambers_lie_inside_every_body_of_the_wide_box():
+    space = make_robot("trunk", design_box="wide").design_space
+    assert space["chamber_offset"].high + space["chamber_radius"].high < space["outer_radius"].low
+
+
 def test_a_design_box_does_not_change_the_mechanics():
     narrow, wide = (make_robot("finger", mesh="accurate", design_box=box) for box in ("published", "wide"))
     assert narrow.mechanics_key == wide.mechanics_key
@@ -329,5 +351,5 @@ def test_a_design_box_does_not_change_the_mechanics():
 def test_an_unknown_design_box_is_refused():
     with pytest.raises(ValueError, match="robot 'finger': unknown design_box 'wider'; did you mean 'wide'"):
         make_robot("finger", design_box="wider")
-    with pytest.raises(ValueError, match="robot 'diamond': unknown design_box 'wide'; allowed: published"):
-        make_robot("diamond", design_box="wide")
+    with pytest.raises(ValueError, match="robot 'tetrapod': unknown design_box 'wide'; allowed: published"):
+        make_robot("tetrapod", design_box="wide")
