@@ -10,7 +10,7 @@ import numpy as np
 from agents.config import EnvironmentConfig
 from softgym_envs.config import check_config
 from softgym_envs.envs.options import design_names
-from softgym_envs.errors import ConfigError, DataError, WeightsError
+from softgym_envs.errors import ConfigError, DataError, WeightsError, unknown_name
 from softgym_envs.registry import class_path
 from softgym_envs.storage import atomic_write, read_json, write_json
 
@@ -29,11 +29,14 @@ def policy_path(policy: str | Path) -> Path:
         if not path.is_file():
             raise WeightsError(f"policy '{path}' does not exist; train one with 'softgym train'")
         return path
-    shipped = _SHIPPED / str(policy) / "policy.safetensors"
-    if not shipped.is_file():
-        names = sorted(p.parent.name for p in _SHIPPED.glob("*/policy.safetensors"))
-        raise WeightsError(f"unknown policy '{policy}'; allowed: a .safetensors file or one of {', '.join(names)}")
-    return shipped
+    if str(policy) not in shipped_policies():
+        raise WeightsError(f"{unknown_name('policy', str(policy), shipped_policies())}, or a .safetensors file")
+    return _SHIPPED / str(policy) / "policy.safetensors"
+
+
+def shipped_policies() -> list[str]:
+    """Return the names of the policies that ship with the package."""
+    return sorted(path.parent.name for path in _SHIPPED.glob("*/policy.safetensors"))
 
 
 def save_policy(path: Path, tensors: dict[str, np.ndarray], card: dict[str, Any]) -> None:

@@ -1,6 +1,8 @@
 """The command line: every command, and one clear line with status 2 for bad input."""
 
+import errno
 import json
+import os
 import re
 import subprocess
 import sys
@@ -8,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from codesign.scheduling import worker
 from softgym_envs.cli import app
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -132,15 +135,91 @@ STRENGTH = "configs/design/finger_strength.yaml"
         (["frobnicate"], ["frobnicate", "rollout"]),
         (["rolout"], ["unknown verb 'rolout'; did you mean 'rollout'?"]),
         (["bench", "nothing"], ["nothing"]),
+        (["show", "finegr"], ["unknown robot 'finegr'; did you mean 'finger'? allowed: finger, diamond"]),
+        (["show", "finger", "--option", "cabels=1"], ["unknown option 'cabels'; did you mean 'cables'? allowed: "]),
+        (["show", "finger", "--option", "cables=two"], ["cables = 'two' must be an integer"]),
+        (["show", "finger", "--desing", "length=0.04"], ["No such option '--desing'. Did you mean '--design'?"]),
+        (["show", "finger", "--design", "lenght=0.04"], ["unknown design variable 'lenght'; did you mean 'length'?"]),
+        (["list", "--jsn"], ["No such option '--jsn'. Did you mean '--json'?"]),
+        (["rollout"], ["Missing argument 'ENVIRONMENT'"]),
+        (["rollout", "FingerReach"], ["unknown environment 'FingerReach'; did you mean 'SoftGym/FingerReach-v0'?"]),
+        (["rollout", "SoftGym/FingerReach-v0", "--agent", "qpp"], ["unknown agent 'qpp'; did you mean 'qp'?"]),
+        (["rollout", "SoftGym/FingerReach-v0", "--seed", "x"], ["--seed", "'x' is not a valid integer"]),
+        (["train", "--config", CONFIG], ["Missing option '--folder'"]),
+        (["train", "--config", "finger_reech", "--folder", "x"], ["'finger_reech'; did you mean 'finger_reach'?"]),
+        (
+            ["train", "--config", "finger_reach", "--folder", "x", "environment.backend_options={memebrs: 1}"],
+            ["backend 'surrogate': unknown option 'memebrs'; did you mean 'members'? allowed: weights, members"],
+        ),
+        (
+            ["train", "--config", "finger_reach", "--folder", "x", "environment.robot_options={cabels: 1}"],
+            ["robot 'finger': unknown option 'cabels'; did you mean 'cables'? allowed: "],
+        ),
+        (["evaluate", "--config", "finger_reach", "--agent", "finger_reech"], ["did you mean 'finger_reach'?"]),
+        (["evaluate", "--config", "nowhere.yaml"], ["config 'nowhere.yaml' cannot be read: No such file"]),
+        (["results", "--folder", "nowhere"], ["'nowhere' contains no results"]),
+        (
+            ["codesign", "--config", "finger_reach", "variables=[heigth]"],
+            ["'heigth'; did you mean 'height'? allowed: "],
+        ),
+        (["codesign", "--config", "finger_reach", "strategy=polcy"], ["strategy: must be 'policy'", "got 'polcy'"]),
+        (["codesign", "--config", "finger_reach", "--workers", "0"], ["workers = 0 is out of bounds; allowed: 1"]),
+        (["codesign", "--config", "finger_reach", "--storage", "mysql://x"], ["allowed: journal, postgresql://user@"]),
+        (["codesign", "--config", "finger_reach", "--folder", "/proc/x"], ["'/proc/x': No such file or directory"]),
+        (["calibrate", "--config", "finger_calibration", "data=nowhere.csv"], ["'nowhere.csv' cannot be read"]),
+        (["sensitivity", "--config", "finger_sensitivity", "method=sobl"], ["method: must be 'oat'", "'sobl'"]),
+        (["export", "finger", "x.obj"], ["'x.obj' must end with .step or .stl"]),
+        (["export", "finger"], ["nothing to write"]),
+        (["deploy", "finger", "x.bin"], ["'x.bin' must end with .h or .onnx"]),
+        (["deploy", "finger", "x.h", "--members", "99"], ["members = 99", "1 to 5"]),
+        (["deploy-policy", "finger_reech", "x.h"], ["unknown policy 'finger_reech'; did you mean 'finger_reach'?"]),
+        (["configs", "--copy", "."], ["'.' exists; choose a new folder"]),
+        (["--verison"], ["No such option '--verison'. Did you mean '--version'?"]),
     ],
 )
 def test_bad_input_is_one_line_and_status_two(refused, arguments, words):
     line = refused(*(str(ROOT / argument) if argument == CONFIG else argument for argument in arguments))
     for word in words:
         assert word in line
+    assert line.count("did you mean") <= 1
 
 
-@pytest.mark.parametrize("text", ["steps: [1, 2", "- a\n- b\n", "steps: {a: 1}", "\x00\x01"])
+@pytest.mark.parametrize(
+    "arguments",
+    [["deploy", "finger", "x.h"], ["show", "finger", "--picture", "x.png"], ["configs", "--copy", "copies"]],
+)
+def test_a_full_disk_is_one_line_that_names_the_file(arguments, softgym, monkeypatch, tmp_path):
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "fsync", full)
+    status, _, err = softgym(*arguments)
+    assert status == 2 and re.fullmatch(r"softgym: error: '(x|copies).*': No space left on device\n", err)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_a_worker_reports_a_full_disk_in_one_line(monkeypatch, capsys, tmp_path):
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "trials/0000/result.json")
+
+    monkeypatch.setattr(worker, "_end_with_parent", lambda: None)
+    monkeypatch.setattr(worker.signal, "signal", lambda *_: None)
+    monkeypatch.setitem(worker.PHASES, "trials", full)
+    assert worker.main([str(tmp_path), "trials"]) == 2
+    assert capsys.readouterr().err == "DataError: 'trials/0000/result.json': No space left on device\n"
+
+
+def test_viewing_without_a_display(softgym, monkeypatch, tmp_path):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    recording = tmp_path / "x.rrd"
+    recording.touch()
+    status, _, err = softgym("view", recording)
+    assert status == 2 and "there is no display" in err and len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("text", ["", "steps: [1, 2", "- a\n- b\n", "steps: {a: 1}", "\x00\x01"])
 def test_malformed_files(softgym, tmp_path, text):
     path = tmp_path / "config.yaml"
     path.write_text(text)

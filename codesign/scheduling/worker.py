@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -48,6 +49,9 @@ def _test_finalists(folder: StudyFolder) -> None:
     run_pending(folder, finalist_jobs(snapshot))
 
 
+STORAGE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
+"""Errors of the file system that the user can solve: no space, quota exceeded, read-only, not permitted."""
+
 PHASES: dict[str, Callable[[StudyFolder], None]] = {
     "shared_policy": lambda folder: run_pending(folder, shared_policy_jobs(folder)),
     "screen": lambda folder: run_pending(folder, screen_jobs(folder)),
@@ -77,6 +81,11 @@ def main(arguments: list[str]) -> int:
         PHASES[phase](StudyFolder(Path(path)))
     except SoftGymError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        if error.errno not in STORAGE_ERRORS:
+            raise
+        print(f"DataError: '{error.filename or path}': {error.strerror}", file=sys.stderr)
         return 2
     return 0
 

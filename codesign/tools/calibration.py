@@ -40,6 +40,8 @@ def calibrate(
         DataError: for a malformed file of measurements.
         ConvergenceError: if a body has no equilibrium under a measured command.
     """
+    if data is None:  # before anything is written
+        data = read_measurements(config.data, config.make_robot())
     if folder is None:
         return _calibrate(config, data)
     with run_folder(folder, config, "a calibration") as place:
@@ -51,10 +53,8 @@ def calibrate(
     return result
 
 
-def _calibrate(config: CalibrationConfig, data: Measurements | None) -> CalibrationResult:
+def _calibrate(config: CalibrationConfig, data: Measurements) -> CalibrationResult:
     began = time.perf_counter()
-    if data is None:
-        data = read_measurements(config.data, config.make_robot())
     misfit = make_misfit(config, data, config.backend)
     parameters = misfit.parameters
     if config.method == "tpe":

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from softgym_envs.registry import Registry
+from softgym_envs.registry import Registry, check_options
 
 if TYPE_CHECKING:
     from softgym_envs.backends.backend import Backend
@@ -33,10 +34,23 @@ CHAINS = Registry(
 """Backends of robots that are learned as chains, by the same names."""
 
 
+def _table(robot: Robot) -> Registry:
+    return CHAINS if robot.learned == "chain" else BACKENDS
+
+
+def check_backend(name: str, robot: Robot, options: Mapping[str, object]) -> None:
+    """Check the options of a backend, besides robot and design, before it is made.
+
+    Raises:
+        ValueError: for an unknown name or option, or a value of the wrong type.
+    """
+    check_options(f"backend '{name}'", _table(robot).resolve(name), 2, options)
+
+
 def make_backend(name: str, robot: Robot, **options: object) -> Backend:
     """Return the backend with a name, for a robot.
 
     Raises:
         ValueError: for an unknown name or option.
     """
-    return (CHAINS if robot.learned == "chain" else BACKENDS).make(name, robot, **options)
+    return _table(robot).make(name, robot, **options)

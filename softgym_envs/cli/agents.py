@@ -73,6 +73,7 @@ def evaluate(
     if goals < 1:
         raise ConfigError(f"--goals {goals} must be at least 1")
     for agent in agents:  # reject an invalid policy before any evaluation
+        options.check_agent(agent)
         if agent not in BASELINES:
             Policy(agent).check_environment(environment)
     points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)

@@ -91,7 +91,14 @@ def main() -> None:
     except (SoftGymError, ValueError, OSError, gymnasium.error.Error) as error:
         if hasattr(error, "__notes__"):  # an error in a robot's code, annotated by `Robot.build`
             raise
-        _fail(str(error))
+        _fail(_described(error))
+
+
+def _described(error: Exception) -> str:
+    """Return the message of an error; of one of the file system, the file and the reason."""
+    if not isinstance(error, OSError) or error.strerror is None:
+        return str(error)
+    return f"'{error.filename}': {error.strerror}" if error.filename is not None else error.strerror
 
 
 def _fail(message: str) -> NoReturn:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import click
 
 from softgym_envs.cli import options
 from softgym_envs.errors import ConfigError
+from softgym_envs.storage import atomic_write
 
 VERBS = {
     "agents": "train, evaluate",
@@ -34,5 +34,7 @@ def configs(copy: Path | None) -> None:
         return
     if copy.exists():
         raise ConfigError(f"'{copy}' exists; choose a new folder for the configurations")
-    shutil.copytree(options.CONFIGS, copy)
+    for path in sorted(options.CONFIGS.glob("*/*")):
+        with atomic_write(copy / path.relative_to(options.CONFIGS)) as stream:
+            stream.write(path.read_bytes())
     click.echo(f"wrote {copy}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import click
 
 from softgym_envs.cli import options
 from softgym_envs.errors import ConfigError
+from softgym_envs.extras import require
 
 AGENT_HELP = "qp, qp_static, qp_model, qp_pi, random, or a policy (a file or the name of a shipped policy)."
 
@@ -55,6 +57,7 @@ def rollout(
     from softgym_envs.config import check_config
 
     chosen = options.design_of(design)
+    options.check_agent(agent)
     # A policy needs the same observations and actions as in training.
     policy = None if agent in BASELINES else Policy(agent)
     trained = {} if policy is None else policy.environment.model_dump()
@@ -93,4 +96,7 @@ def view(recording: Path) -> None:
 
     if not recording.is_file():
         raise ConfigError(f"recording '{recording}' does not exist; make one with 'softgym rollout ... --record'")
+    require("viewer")
+    if not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
+        raise ConfigError(f"there is no display to open '{recording}' on; copy the file to a machine that has one")
     sys.exit(subprocess.call([sys.executable, "-m", "rerun", str(recording)]))

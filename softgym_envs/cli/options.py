@@ -91,6 +91,20 @@ def resumable() -> Iterator[None]:
         raise Resumable from None
 
 
+def check_agent(name: str) -> None:
+    """Check that an agent is a baseline, a shipped policy or a file.
+
+    Raises:
+        ConfigError: with the nearest name, and the allowed ones.
+    """
+    from agents.baselines import BASELINES
+    from agents.policy import shipped_policies
+
+    names = [*BASELINES, *shipped_policies()]
+    if name not in names and not name.endswith(".safetensors"):
+        raise ConfigError(f"{unknown_name('agent', name, names)}, or a .safetensors file")
+
+
 def design_of(pairs: tuple[str, ...]) -> dict[str, float]:
     """Return the design variables of ``--design name=value``.
 

@@ -11,6 +11,7 @@ import click
 
 from softgym_envs.cli import options
 from softgym_envs.errors import ConfigError
+from softgym_envs.storage import atomic_write
 
 
 @click.command()
@@ -67,7 +68,8 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
 
         from softgym_envs.viewer.image import render_body
 
-        Image.fromarray(render_body(body, chosen, size=(960, 960))).save(picture)
+        with atomic_write(picture) as stream:
+            Image.fromarray(render_body(body, chosen, size=(960, 960))).save(stream, "PNG")
         click.echo(f"wrote {picture}", err=as_json)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from softgym_envs.backends.registry import check_backend
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.base import Task
@@ -122,6 +123,7 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
         backend = default_backend(made, backend_options)
     if backend == defaults.get("backend"):
         backend_options = {**defaults.get("backend_options", {}), **backend_options}
+    check_backend(backend, made, backend_options)
     space = made.design_space
     return Setup(
         robot=made,

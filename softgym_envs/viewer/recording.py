@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -105,6 +107,8 @@ class RolloutRecorder:
         try:
             self._stream.disconnect()
             if kind is None:
+                if shutil.disk_usage(self.path.parent).free == 0:  # rerun drops what it cannot write
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
                 os.chmod(self._temporary, 0o644)
                 os.replace(self._temporary, self.path)
         finally:
