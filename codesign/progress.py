@@ -1,13 +1,47 @@
-"""What a running study prints: a line per finished trial and test, and who won."""
+"""What a running study prints: its phases with the time left, a line per finished trial and test, and who won."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from codesign.folder import StudyFolder
 from codesign.records import FinalistTest, TestGroup, TrialResult
 from codesign.report.results import Comparison, StudyResults
 from codesign.report.units import present
+
+SCREEN_INTERVAL = 10.0
+"""Least time between two lines about the screen, whose bodies take a moment each [s]."""
+
+
+class Countdown:
+    """Counts what is finished of a phase, and estimates the time left from the mean time so far.
+
+    Args:
+        total: number of parts of the phase.
+        done: how many were finished before.
+        clock: returns the time [s].
+    """
+
+    def __init__(self, total: int, done: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
+        self.total, self._clock = total, clock
+        self._first, self._began = done, clock()
+
+    def text(self, done: int) -> str:
+        """Return ``"[ 7/24, 3 min left]"`` for a number of finished parts."""
+        left = ""
+        if self._first < done < self.total:
+            seconds = (self._clock() - self._began) / (done - self._first) * (self.total - done)
+            left = f", {duration(seconds)} left"
+        return f"[{done:>{len(str(self.total))}}/{self.total}{left}]"
+
+
+def duration(seconds: float) -> str:
+    """Return a rough duration: ``"50 s"``, ``"12 min"`` or ``"3.4 h"``."""
+    if seconds < 90.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 5400.0 else f"{seconds / 3600.0:.1f} h"
 
 
 class Progress:
@@ -19,8 +53,30 @@ class Progress:
         self.objective = self.config.primary
         self.enabled = enabled
         self._seen: set[Path] = set()
-        self._finished = 0
         self._best: TrialResult | None = None
+        config = study.config
+        phases = {
+            "screen": config.screen.enabled,
+            "shared policy": bool(config.plan.proposer),
+            "trials": True,
+            "test": config.finalists.count > 0,
+        }
+        self._phases = [name for name, runs in phases.items() if runs]
+        self._countdown = Countdown(config.trials)
+        self._said = 0.0
+        self._done = 0
+
+    def begin(self, phase: str, text: str, total: int, done: int = 0) -> None:
+        """Print the head of a phase.
+
+        Args:
+            phase: ``"screen"``, ``"shared policy"``, ``"trials"`` or ``"test"``.
+            text: what it does.
+            total: number of its parts.
+            done: how many of them were finished before.
+        """
+        self._countdown, self._done = Countdown(total, done), done
+        self.say(f"phase {self._phases.index(phase) + 1} of {len(self._phases)}, {phase}: {text}")
 
     def say(self, line: str) -> None:
         """Print a line."""
@@ -33,11 +89,17 @@ class Progress:
         self._seen.update(fresh)
         return sorted(fresh, key=lambda path: path.stat().st_mtime)
 
+    def screened(self, done: int) -> None:
+        """Print how many bodies of the screen are scored, now and then."""
+        if done and time.monotonic() - self._said > SCREEN_INTERVAL:
+            self._said = time.monotonic()
+            self.say(f"{self._countdown.text(done)} bodies scored")
+
     def trials(self, *, quiet: bool = False) -> None:
         """Print the trials that finished since the last call; with ``quiet`` only count them."""
         for path in self._fresh("trials/[0-9]*/result.json"):
             trial = TrialResult.read(path)
-            self._finished += 1
+            self._done += not quiet
             best = self._best
             if trial.feasible and (best is None or (trial.score or 0.0) > (best.score or 0.0)):
                 self._best = trial
@@ -57,9 +119,8 @@ class Progress:
             best = f"best {text(self._best.values[self.objective.name])} (trial {self._best.number})"
         else:
             best = "no body satisfies the constraints yet" if self.config.constraints else "no complete trial yet"
-        total = self.config.trials
         return (
-            f"[{self._finished:>{len(str(total))}}/{total}] trial {trial.number} ({trial.origin}): {found}; {best}; "
+            f"{self._countdown.text(self._done)} trial {trial.number} ({trial.origin}): {found}; {best}; "
             f"{trial.seconds:.1f} s"
         )
 
@@ -69,9 +130,10 @@ class Progress:
             test = FinalistTest.read(path)
             if quiet:
                 continue
+            self._done += 1
             seed = f" (seed {test.seed})" if test.seed else ""
             which = f"{test.agent}{seed} on {test.backend}, {test.goals} goals"
-            self.say(f"test: trial {test.trial}, {which}: {self._test_text(test)}")
+            self.say(f"{self._countdown.text(self._done)} test of trial {test.trial}, {which}: {self._test_text(test)}")
 
     def _test_text(self, test: FinalistTest) -> str:
         if test.evaluation is None:

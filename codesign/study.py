@@ -170,8 +170,8 @@ def _run_jobs(
 def _run_screen(study: StudyFolder, workers: int, output: Progress) -> None:
     jobs = screen_jobs(study)
     if missing := missing_jobs(study, jobs):
-        output.say(f"screen: scoring {len(missing)} bodies by the inverse QP")
-        _run_jobs(study, "screen", missing, workers)
+        output.begin("screen", f"{len(missing)} bodies scored by the inverse QP", len(missing))
+        _run_jobs(study, "screen", missing, workers, lambda: output.screened(sum(job.path.exists() for job in missing)))
     output.say(f"screen: kept {len(kept_bodies(study))} of {len(jobs)} bodies")
 
 
@@ -179,7 +179,7 @@ def _make_shared_policy(study: StudyFolder, output: Progress) -> None:
     if missing := missing_jobs(study, shared_policy_jobs(study)):
         if study.config.plan.proposer:
             steps = study.config.joint.steps
-            output.say(f"shared policy: training bodies and policy together, {steps:,} steps")
+            output.begin("shared policy", f"bodies and policy are trained together, {steps:,} steps", 1)
         _run_jobs(study, "shared_policy", missing, 1)
 
 
@@ -200,7 +200,8 @@ def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
 
         if queue.left():
             finished = len(study.result_files())
-            output.say(f"study '{config.name}': {config.trials} trials, {finished} of them finished before")
+            text = f"{config.trials} bodies of study '{config.name}', {finished} of them finished before"
+            output.begin("trials", text, config.trials, finished)
         while queue.left():
             if queue.claimable():
                 stopped = run_workers(study, "trials", min(workers, queue.left()), tick)
@@ -214,10 +215,12 @@ def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
 
 def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
     snapshot = load_study(study)
-    if missing := missing_jobs(study, finalist_jobs(snapshot)):
+    jobs = finalist_jobs(snapshot)
+    if missing := missing_jobs(study, jobs):
         backends = " and ".join(study.config.test_backends)
-        output.say(f"test: {len(snapshot.finalists)} bodies on {len(study.goals['unseen'])} test goals, {backends}")
+        count, goals, done = len(snapshot.finalists), len(study.goals["unseen"]), len(jobs) - len(missing)
         output.tests(quiet=True)
+        output.begin("test", f"{count} bodies on {goals} unseen goals, {backends}", len(jobs), done)
         _run_jobs(study, "finalists", missing, workers, output.tests)
 
 

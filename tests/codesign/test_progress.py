@@ -1,0 +1,46 @@
+"""What a running study prints: its phases, what is finished of them, the time left and the winner's dimensions."""
+
+import re
+
+import pytest
+
+from codesign.config import StudyConfig
+from codesign.progress import Countdown, duration
+from codesign.study import run_study
+
+
+def test_the_time_left_follows_from_the_mean_time_of_this_run():
+    now = [100.0]
+    countdown = Countdown(24, 4, clock=lambda: now[0])
+    assert countdown.text(4) == "[ 4/24]"  # nothing is known yet
+    now[0] += 60.0
+    assert countdown.text(6) == "[ 6/24, 9 min left]"  # 30 s each, 18 to go
+    assert countdown.text(24) == "[24/24]"
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(4.4, "4 s"), (89.0, "89 s"), (90.0, "2 min"), (5400.0, "1.5 h")])
+def test_durations(seconds, text):
+    assert duration(seconds) == text
+
+
+def test_phases_counters_and_the_dimensions_of_the_winner(tmp_path, capsys):
+    config = StudyConfig.model_validate(
+        {
+            "name": "tiny",
+            "environment": {"id": "SoftGym/FingerReach-v0"},
+            "variables": ["length"],
+            "strategy": "qp",
+            "trials": 2,
+            "sampler": {"name": "random"},
+            "goals": {"count": 2, "unseen_count": 2, "training_count": 2},
+            "finalists": {"count": 1, "seeds": 0},
+        }
+    )
+    run_study(config, tmp_path / "study")
+    out = capsys.readouterr().out
+    assert re.findall(r"^phase (\d) of 2, (\w+): ", out, re.M) == [("1", "trials"), ("2", "test")]
+    assert re.findall(r"^\[(\d)/2.*?\] trial ", out, re.M) == ["1", "2"]
+    tests = re.findall(r"^\[(\d)/(\d).*?\] test of trial ", out, re.M)
+    assert [done for done, _ in tests] == [str(k + 1) for k in range(len(tests))] and tests[-1][0] == tests[-1][1]
+    assert re.search(r"^winner: trial \d", out, re.M)
+    assert re.search(r"^  length .* mm \(baseline .* mm\)", out, re.M)
