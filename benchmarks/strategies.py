@@ -1,6 +1,7 @@
 """Co-design strategies compared on one question: regret by environment steps and CPU time, three repeats each.
 
     python -m benchmarks.strategies results/strategies 2
+    python -m benchmarks.strategies results/strategies 2 "inverse QP" critic    # only these
 
 First the ground truth: 64 bodies of the Soft Finger (4 x 4 x 4 over length, height, joint height), each with a policy
 trained until it stops improving, in the work zone of ``configs/codesign/finger_reach.yaml``. Then every strategy,
@@ -16,8 +17,9 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,17 @@ GOALS = 40
 REPEATS = 3
 PRETRAINING = 80_000 + 10 * 200 * 50
 """Environment steps behind the policy ``finger_reach_designs``: training, and the points of its learning curve."""
+
+SAC = {
+    "learner": "sac",
+    "steps": 2_560,
+    "report_every": 640,
+    "evaluation_episodes": 32,
+    "num_envs": 16,
+    "sac": {"learning_starts": 0},
+}
+"""Training in a trial unless a strategy says otherwise, and of the ground truth."""
+ANALYTIC = {"learner": "analytic", "num_envs": 128, "steps": 51_200, "report_every": 25_600}
 
 PLAIN = {
     "policy": None,
@@ -64,6 +77,21 @@ STRATEGIES: dict[str, dict[str, Any]] = {
         "training": {"steps": 12_000, "report_every": 12_000, "num_envs": 16},
         "sampler": {"name": "gp"},
     },
+    "plain nesting, analytic gradient, Gaussian process, 12 goals": {
+        "strategy": "scratch",
+        "trials": 24,
+        "training": ANALYTIC,
+        "sampler": {"name": "gp"},
+        "goals": {"count": 12},
+    },
+    "warm start, analytic gradient, Gaussian process, 12 goals (default)": {
+        "strategy": "warm_start",
+        "policy": "finger_reach_designs",
+        "trials": 24,
+        "training": {**ANALYTIC, "steps": 25_600, "report_every": 12_800, "analytic": {"learning_rate": 1e-3}},
+        "sampler": {"name": "gp"},
+        "goals": {"count": 12},
+    },
     "warm start": {"strategy": "warm_start", "policy": "finger_reach_designs", "trials": 12},
     "warm start, screen": {
         "strategy": "warm_start",
@@ -88,7 +116,7 @@ STRATEGIES: dict[str, dict[str, Any]] = {
         "trials": 30,
         "sampler": {"name": "gp"},
     },
-    "shared policy, Gaussian process, 12 goals (default)": {
+    "shared policy, Gaussian process, 12 goals": {
         "strategy": "policy",
         "policy": "finger_reach_designs",
         "trials": 30,
@@ -111,7 +139,7 @@ def _question(**changes: Any) -> Any:
     from codesign.config import StudyConfig
 
     base = load_config(QUESTION, StudyConfig).model_dump(mode="json")
-    base["goals"]["count"] = GOALS
+    base["goals"]["count"], base["training"] = GOALS, SAC
     return StudyConfig.model_validate({**base, **changes})
 
 
@@ -173,16 +201,17 @@ def _run_study(path: Path, name: str, repeat: int) -> Path:
     rows = []
     for trial in sorted(folder.results(), key=lambda trial: trial.finished_at):
         scored = trial.evaluation.steps if trial.evaluation is not None else 0
-        qp_seconds = trial.qp.cpu_seconds if trial.qp is not None and trial.controller != "qp" else 0.0
+        others = [trial.qp, trial.judge] if trial.controller != "qp" else []
+        unneeded = sum(evaluation.cpu_seconds for evaluation in others if evaluation is not None)
         reports = len(trial.curve) * folder.config.training.evaluation_episodes * 50
         rows.append(
             {
                 "design": trial.design,
                 "score": trial.score,
-                # Every trial is also scored by the inverse QP; strategies do not need that score, so its steps do not
-                # count.
+                # Trials are also scored by the inverse QP and by the policy that trainings start from; strategies do
+                # not need these scores, so their steps do not count.
                 "steps": trial.training_steps + reports + scored,
-                "cpu_seconds": trial.cpu_seconds - qp_seconds,
+                "cpu_seconds": trial.cpu_seconds - unneeded,
             }
         )
     pretraining = PRETRAINING if folder.config.policy else 0
@@ -195,18 +224,24 @@ def _call(function: Callable[..., Path], arguments: tuple) -> Path:
     return function(*arguments)
 
 
-def main(folder: Path, workers: int = 1) -> None:
-    """Compute what is missing, and write everything to ``benchmarks/data/strategies.json``, even if interrupted."""
+def main(folder: Path, workers: int = 1, names: Sequence[str] = ()) -> None:
+    """Compute what is missing, and merge everything into ``benchmarks/data/strategies.json``, even if interrupted.
+
+    Args:
+        folder: folder of the studies.
+        workers: number of processes.
+        names: of strategies; default all of them and the ground truth.
+    """
     from softgym_envs.executors import parallel_map
 
     folder = folder.resolve()
     jobs: list[tuple[Any, tuple]] = []
-    for values in itertools.product(LEVELS, repeat=len(VARIABLES)):
+    for values in itertools.product(LEVELS, repeat=len(VARIABLES)) if not names else ():
         name = "_".join(f"{value:+.1f}" for value in values)
         jobs.append((_truth, (folder / "truth" / f"{name}.json", values, folder)))
     for repeat in range(REPEATS):
-        for name in STRATEGIES:
-            place = folder / name.replace(" ", "_").replace(",", "") / str(repeat)
+        for name in names or STRATEGIES:
+            place = folder / re.sub(r"\W+", "_", name) / str(repeat)
             jobs.append((_run_study, (place / "regret.json", name, repeat)))
     missing = [job for job in jobs if not job[1][0].exists()]
     try:
@@ -217,13 +252,20 @@ def main(folder: Path, workers: int = 1) -> None:
 
 
 def collect(folder: Path) -> None:
-    """Write the finished runs to ``benchmarks/data/strategies.json``."""
-    truth = [json.loads(path.read_text()) for path in sorted((folder / "truth").glob("*.json"))]
-    runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*/*/regret.json"))]
-    kept = {**provenance(), "truth": [_short(point) for point in truth], "runs": runs}
+    """Merge the finished runs into ``benchmarks/data/strategies.json``."""
+    kept = _kept()
+    points = [_short(json.loads(path.read_text())) for path in sorted((folder / "truth").glob("*.json"))]
+    truth = {tuple(point["unit"]): point for point in (*kept["truth"], *_rounded(points))}
+    found = [json.loads(path.read_text()) for path in sorted(folder.glob("*/*/regret.json"))]
+    runs = {(run["name"], run["repeat"]): run for run in (*kept["runs"], *found)}
+    merged = {**provenance(), "truth": list(truth.values()), "runs": [runs[key] for key in sorted(runs)]}
     if len(truth) == len(LEVELS) ** len(VARIABLES):
-        kept |= _judge(truth, runs)
-    write_json(KEPT, _rounded(kept))
+        merged |= _judge(merged["truth"], merged["runs"], kept)
+    write_json(KEPT, _rounded(merged))
+
+
+def _kept() -> dict[str, Any]:
+    return json.loads(KEPT.read_text()) if KEPT.exists() else {"truth": [], "runs": []}
 
 
 def _rounded(value: Any) -> Any:
@@ -244,7 +286,7 @@ def _short(point: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str, Any]:
+def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]], kept: dict[str, Any]) -> dict[str, Any]:
     """Add the true score and the regret to every trial of every run."""
     from scipy.interpolate import RBFInterpolator
     from scipy.optimize import minimize
@@ -258,7 +300,7 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
 
     goals = np.array(draw_goals(config)["selection"])
     x = np.array([point["unit"] for point in truth])
-    lack = np.array([point["sac"]["mean_distance"] - point["qp"]["mean_distance"] for point in truth])
+    lack = np.array([point["sac"] - point["qp"] for point in truth])
     residual = RBFInterpolator(x, lack)
     left_out = [
         lack[i] - RBFInterpolator(np.delete(x, i, 0), np.delete(lack, i))(x[i : i + 1])[0] for i in range(len(x))
@@ -275,22 +317,29 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
     def unit_of(design: dict[str, float]) -> np.ndarray:
         return np.array([float(space[name].to_unit(design[name])) for name in VARIABLES])
 
-    start = x[int(np.argmin([point["sac"]["mean_distance"] for point in truth]))]
-    found = minimize(
-        lambda unit: score(np.clip(unit, -1.0, 1.0)),
-        start,
-        method="Nelder-Mead",
-        options={"maxfev": 120, "initial_simplex": start + 0.2 * np.vstack([np.zeros(3), -np.sign(start) * np.eye(3)])},
-    )
+    same = kept["truth"] == truth
+    if same and "best" in kept:
+        best_body, candidates = kept["best_body"], [kept["best"]]
+    else:
+        start = x[int(np.argmin([point["sac"] for point in truth]))]
+        simplex = start + 0.2 * np.vstack([np.zeros(3), -np.sign(start) * np.eye(3)])
+        found = minimize(
+            lambda unit: score(np.clip(unit, -1.0, 1.0)),
+            start,
+            method="Nelder-Mead",
+            options={"maxfev": 120, "initial_simplex": simplex},
+        )
+        best_body, candidates = found.x.tolist(), [float(found.fun)]
 
     def key_of(design: dict[str, float]) -> tuple[float, ...]:
         return tuple(np.round(unit_of(design), 5).tolist())
 
-    # The ground truth has not changed, so kept scores are still valid.
-    kept = json.loads(KEPT.read_text()) if KEPT.exists() else {"truth": [], "runs": []}
-    same = kept["truth"] == _rounded([_short(point) for point in truth])
-    known = {key_of(t["design"]): t["true_score"] for run in kept["runs"] for t in run["trials"]} if same else {}
-    candidates = [float(found.fun)]
+    # While the ground truth does not change, kept scores are valid.
+    known = (
+        {key_of(t["design"]): t["true_score"] for run in kept["runs"] for t in run["trials"] if "true_score" in t}
+        if same
+        else {}
+    )
     for run in runs:
         for trial in run["trials"]:
             key = key_of(trial["design"])
@@ -313,7 +362,7 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]]) -> dict[str,
     return {
         "best": best,
         "baseline": baseline,
-        "best_body": found.x.tolist(),
+        "best_body": best_body,
         "interpolation_error": float(np.median(np.abs(left_out))),
         "converged_within": float(
             np.median([abs(p["curve"][-1][1] - min(v for _, v in p["curve"][:-1])) for p in truth])
@@ -333,7 +382,7 @@ def _steps_to(curve: list[list[float]], limit: float) -> float:
 
 def strategies() -> dict[str, object]:
     """Regret of the co-design strategies by environment steps: median of the repeats (smallest to largest)."""
-    kept = json.loads(KEPT.read_text())
+    kept = _kept()
     if unknown := sorted({run["name"] for run in kept["runs"]} - STRATEGIES.keys()):
         raise DataError(f"'{KEPT.name}' has runs of unknown strategies: {', '.join(unknown)}")
     result: dict[str, object] = {
@@ -366,4 +415,5 @@ def strategies() -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "results/strategies"), *map(int, sys.argv[2:3]))
+    given = sys.argv[1:]
+    main(Path(given[0] if given else "results/strategies"), int(given[1]) if given[1:] else 1, given[2:])

@@ -69,7 +69,7 @@ class Record:
 class TrialResult(Record):
     """Result of one trial."""
 
-    EVALUATIONS = ("evaluation", "qp")
+    EVALUATIONS = ("evaluation", "qp", "judge")
 
     number: int
     origin: str  # of its body: "baseline", "screen 3", "joint 0" or "sampler 7"
@@ -86,6 +86,8 @@ class TrialResult(Record):
     evaluation: Evaluation | None = None  # of the controller on the selection goals
     qp: Evaluation | None = None  # of the inverse QP on the same goals
     qp_value: float | None = None  # of the objective with the inverse QP [SI]
+    judge: Evaluation | None = None  # of the policy that the training starts from on the same goals
+    judge_value: float | None = None  # of the objective with that policy [SI]
     curve: list[list[float]] = field(default_factory=list)  # environment steps and score of each report in training
     training_steps: int = 0
     seconds: float = 0.0  # wall-clock time [s]
@@ -105,7 +107,7 @@ class TrialResult(Record):
     @property
     def steps_of_scores(self) -> int:
         """Environment steps of the evaluations."""
-        evaluations = [self.evaluation] if self.controller == "qp" else [self.qp, self.evaluation]
+        evaluations = [self.evaluation] if self.controller == "qp" else [self.qp, self.judge, self.evaluation]
         return sum(evaluation.steps for evaluation in evaluations if evaluation is not None)
 
 

@@ -130,6 +130,9 @@ class _Runner:
         else:
             self._keep_qp(self._assess("qp", self.goals))
             if config.plan.trains:
+                if config.policy:  # how well one policy for all bodies would have judged this one
+                    judged = self._assess(config.policy, self.goals)
+                    result.judge, result.judge_value = judged.evaluation, judged.values[config.objective]
                 policy = self._train()
                 if policy is None:
                     return

@@ -15,7 +15,7 @@ from codesign.report.collect import FEW_GOALS
 from codesign.report.exports import write_exports
 from codesign.report.files import write_results
 from codesign.report.results import Comparison, StudyResults
-from codesign.report.statistics import MIN_GOALS, rank_correlation
+from codesign.report.statistics import MIN_GOALS, kendall_tau, rank_correlation
 from codesign.report.tables import AGENTS, BACKENDS, SHOWN_ALWAYS, millimetres, percent
 from codesign.report.units import present
 from codesign.snapshot import StudySnapshot, load_study
@@ -321,14 +321,17 @@ def _search(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, s
 
 def _search_notes(snapshot: StudySnapshot, results: StudyResults) -> list[str]:
     notes = []
-    both = [t for t in snapshot.trials if t.state == "complete" and t.controller != "qp"]
-    name = snapshot.objective.name
-    correlation = rank_correlation([t.qp_value or 0.0 for t in both], [t.values[name] for t in both])
-    if correlation is not None:
-        notes.append(
-            f"Rank correlation (Spearman) between the inverse QP and the trained controllers over {len(both)} bodies: "
-            f"{correlation:.2f}."
-        )
+    own = [t for t in snapshot.trials if t.state == "complete" and t.controller != "qp"]
+    name, joint = snapshot.objective.name, "the policy that all trainings start from"
+    for judge, field in (("the inverse QP", "qp_value"), (joint, "judge_value")):
+        both = [t for t in own if getattr(t, field) is not None]
+        scores = [getattr(t, field) for t in both], [t.values[name] for t in both]
+        spearman, kendall = rank_correlation(*scores), kendall_tau(*scores)
+        if spearman is not None and kendall is not None:
+            notes.append(
+                f"Rank correlation between {judge} and the controllers of the trials over {len(both)} bodies: "
+                f"{spearman:.2f} (Spearman), {kendall:.2f} (Kendall's tau)."
+            )
     if results.importance:
         notes.append(
             "Importance by PED-ANOVA: how differently the best quarter of the bodies and all bodies are distributed "

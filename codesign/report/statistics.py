@@ -70,6 +70,18 @@ def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float |
     """Return Spearman's rank correlation; None with fewer than three pairs or without any variation."""
     from scipy.stats import spearmanr
 
-    if len(first) < 3 or np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
-        return None
-    return float(spearmanr(first, second).statistic)
+    return None if _alike(first, second) else float(spearmanr(first, second).statistic)
+
+
+def kendall_tau(first: Sequence[float], second: Sequence[float]) -> float | None:
+    """Return Kendall's tau-b: the share of pairs in the same order minus that in opposite order, corrected for ties.
+
+    None with fewer than three pairs or without any variation.
+    """
+    from scipy.stats import kendalltau
+
+    return None if _alike(first, second) else float(kendalltau(first, second).statistic)
+
+
+def _alike(first: Sequence[float], second: Sequence[float]) -> bool:
+    return len(first) < 3 or np.ptp(first) == 0.0 or np.ptp(second) == 0.0

@@ -17,6 +17,7 @@ from codesign.folder import SHARED_POLICY, StudyFolder
 from codesign.phases.shared_policy import joint_config
 from codesign.records import FinalistTest
 from codesign.report.page import write_report
+from codesign.report.statistics import kendall_tau
 from codesign.scheduling.optuna_study import open_study
 from codesign.snapshot import load_study
 from codesign.study import run_study
@@ -60,6 +61,25 @@ def test_shared_policy_with_pruning_by_goals(run):
     for trial in open_study(folder).get_trials():
         record = folder.result(trial.number).evaluation.distances
         np.testing.assert_allclose([-trial.intermediate_values[k] for k in range(len(record))], record)
+
+
+def test_each_body_gets_a_policy_of_its_own_from_the_model(run):
+    training = {"learner": "analytic", "steps": 256, "report_every": 128, "num_envs": 32, "evaluation_episodes": 2}
+    folder, results = run(
+        strategy="warm_start", policy="finger_reach_designs", environment=SHOWN, trials=3, training=training
+    )
+    complete = [trial for trial in folder.results() if trial.state == "complete"]
+    assert len(complete) == 3 and results.cost.training_steps == 256 * len(complete)
+    for trial in complete:
+        assert trial.controller == f"trials/{trial.number:04d}/policy.safetensors"
+        # The policy of the trial is that of the study, trained on: near it, but not the same.
+        assert trial.judge_value != trial.values["mean_distance"]
+        assert trial.judge_value == pytest.approx(trial.judge.mean_distance)
+    own = [trial.values["mean_distance"] for trial in complete]
+    tau = kendall_tau([trial.judge_value for trial in complete], own)
+    text = write_report(folder.path).read_text()
+    assert "the policy that all trainings start from and the controllers of the trials" in text
+    assert f"{tau:.2f} (Kendall" in text
 
 
 @pytest.mark.parametrize("strategy", ["critic", "distribution"])

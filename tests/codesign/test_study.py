@@ -18,7 +18,7 @@ from codesign.config import StudyConfig
 from codesign.folder import SHARED_POLICY, SHARED_POLICY_RECORD, StudyFolder
 from codesign.records import FinalistTest, SharedPolicy, TrialResult
 from codesign.report.page import write_report
-from codesign.report.statistics import mean_interval, rank_correlation, rate_interval
+from codesign.report.statistics import kendall_tau, mean_interval, rank_correlation, rate_interval
 from codesign.scheduling.optuna_study import open_study
 from codesign.snapshot import load_study
 from codesign.study import run_study
@@ -242,6 +242,8 @@ def test_statistics(rng):
     assert 0.0 <= low < 9.0 / 10.0 < high <= 1.0
     assert rank_correlation([1, 2, 3], [10, 20, 15]) == pytest.approx(0.5)
     assert rank_correlation([1, 1, 1], [1, 2, 3]) is None
+    assert kendall_tau([1, 2, 3, 4], [10, 20, 15, 30]) == pytest.approx((5 - 1) / 6)  # five pairs of six agree
+    assert kendall_tau([1, 2], [1, 2]) is None and kendall_tau([1, 2, 3], [5, 5, 5]) is None
 
 
 @pytest.mark.parametrize("seeds", [1, 2, 3])

@@ -73,6 +73,9 @@ def test_complete(study, pretend):
     assert found.controller == "trials/0000/policy.safetensors"
     assert found.curve == [[100, 0.2], [200, 0.4], [300, 0.6]]
     assert (found.qp.mean_distance, found.qp_value, found.training_steps) == (1e-3, 1e-3, 300)
+    assert [call[0] for call in pretend.evaluate][1] == "start.safetensors"
+    assert (found.judge.mean_distance, found.judge_value) == (pytest.approx(3e-3), pytest.approx(3e-3))
+    assert found.steps_of_scores == found.qp.steps + found.judge.steps + found.evaluation.steps
     assert found.values == {"mean_distance": pytest.approx(3e-3)}
 
 
