@@ -7,6 +7,9 @@ import numpy as np
 from benchmarks.convergence import STUDIES
 from benchmarks.recorded import records, results
 from benchmarks.tables import markdown
+from softgym_envs.robots.registry import make_robot
+from softgym_envs.surrogate.correction import fit_correction
+from softgym_envs.surrogate.features import Features
 
 TITLES = {
     "finger": "Soft Finger, 2 cables",
@@ -70,6 +73,44 @@ def convergence_limits() -> str:
     return markdown(head, rows, "llrrrr")
 
 
+def convergence_corrections() -> str:
+    """Tension of the finger on the mesh `accurate`, before and after a correction by the other bodies."""
+    found = results("convergence_finger")
+    robot = make_robot("finger", mesh="accurate")
+    bodies = list(found["errors"])
+    designs = np.array([robot.design_space.complete(found["designs"][body]).array for body in bodies])
+    features = Features(robot).design(designs)
+    efforts = {(row["mesh"], row["body"]): row["effort"] for row in found["rows"]}
+
+    def level(mesh: str, chosen: np.ndarray) -> dict[str, np.ndarray]:
+        return {
+            "design": designs[chosen],
+            "displacement": np.full((len(chosen), 1), found["command"][0]),
+            "effort": np.array([[efforts[mesh, bodies[k]]] for k in chosen]),
+            "rest": np.zeros(len(chosen), dtype=bool),
+        }
+
+    rows = []
+    for k, body in enumerate(bodies):
+        others = np.delete(np.arange(len(bodies)), k)
+        levels = [level(mesh, others) for mesh in ("coarser", "accurate", "finer")]
+        correction = fit_correction(levels, found["sizes"], features[others])
+        before = found["errors"][body]["meshes"]["accurate"]["effort"]
+        after = (1.0 + before) * float(correction.factor(features[k : k + 1])[0, 0]) - 1.0
+        design = found["designs"][body]
+        rows.append(
+            [
+                body,
+                f"{1e3 * design['joint_height']:.1f} mm",
+                f"{design['poisson_ratio']:.2f}",
+                percent(before),
+                percent(after),
+            ]
+        )
+    head = ["body", "hinge", "Poisson's ratio", "accurate", "accurate, corrected"]
+    return markdown(head, rows, "lrrrr")
+
+
 def convergence_guides() -> str:
     """Compliance of a cable against the mesh, for single points and averaged guides."""
     found = results("convergence_guides")
@@ -118,6 +159,7 @@ def convergence_scatter() -> str:
 CONVERGENCE_TABLES = {
     "convergence": convergence,
     "convergence_limits": convergence_limits,
+    "convergence_corrections": convergence_corrections,
     "convergence_guides": convergence_guides,
     "convergence_fillets": convergence_fillets,
     "convergence_scatter": convergence_scatter,

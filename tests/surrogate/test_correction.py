@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from softgym_envs import make_robot
+from softgym_envs.config import load_config
 from softgym_envs.errors import DataError
 from softgym_envs.surrogate.correction import HIGHEST_ORDER, LOWEST_ORDER, EffortCorrection, fit_correction, order_of
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import TorchModel
+from softgym_envs.surrogate.pretrained import pretrained_folder
+from softgym_envs.surrogate.training import FitConfig
 from softgym_envs.testing import random_states, untrained_potential
 
+ROOT = Path(__file__).resolve().parents[2]
 SIZES = (5.0, 3.0, 2.0)
 
 
@@ -145,3 +150,25 @@ def test_a_damaged_correction_is_refused(correction, message):
     plain, _ = untrained_potential(robot)
     with pytest.raises(ValueError, match=message):
         Model(robot, plain.tensors, {"correction": correction})
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs" / "surrogate").glob("*_accurate.yaml")), ids=lambda p: p.stem)
+def test_configurations_of_accurate_meshes_fit_their_robots(path):
+    config = load_config(path, FitConfig)
+    robot = make_robot(config.robot, **config.robot_options)
+    assert path.stem == pretrained_folder(robot).name  # where the weights ship
+    assert config.pretraining is not None and config.correction is not None
+    first, coarser, finer = (
+        make_robot(config.robot, **config.robot_options | options)
+        for options in (
+            config.pretraining.robot_options,
+            config.correction.coarser,
+            config.correction.finer,
+        )
+    )
+    assert first.design_space == robot.design_space and first.mechanics_key != robot.mechanics_key
+    assert config.correction.sizes == (coarser.mesh_size, robot.mesh_size, finer.mesh_size)
+    plans = [config.data.plan(name) for name in ("train", "validation", "test")]
+    assert all(plan.boundary > 0.0 for plan in plans)
+    states = (plans[0].states + 1) * plans[0].groups + (few := config.correction.states).groups * (few.states + 1)
+    assert states <= 400 and few.groups * (few.states + 1) <= 60  # on the robot's mesh, and on the finer one
