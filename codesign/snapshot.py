@@ -8,6 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from codesign.config import StudyConfig
 from codesign.folder import SHARED_POLICY_RECORD, StudyFolder
 from codesign.objectives import Objective
@@ -25,6 +27,9 @@ from codesign.records import (
 
 if TYPE_CHECKING:
     import optuna
+
+POOL = 3
+"""Finalists are chosen among this many times as many of the best bodies."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +121,11 @@ class StudySnapshot:
 
     @cached_property
     def finalists(self) -> list[Finalist]:
-        """The baseline and the best other bodies, best first; without the baseline if it is infeasible.
+        """The baseline and good other bodies that differ, best first; without the baseline if it is infeasible.
 
-        A body that samplers proposed several times counts once, as its first trial.
+        The best body is always one of them. Each further one is, among the best `POOL` times as many bodies, the one
+        farthest from those chosen before, so that the check compares different bodies and not copies of the winner. A
+        body that samplers proposed several times counts once, as its first trial.
         """
         bodies: dict[tuple[float, ...], TrialResult] = {}
         for trial in self.ranked:
@@ -126,8 +133,28 @@ class StudySnapshot:
             if key not in bodies or trial.origin == "baseline":
                 bodies[key] = trial
         baseline = [trial for trial in bodies.values() if trial.origin == "baseline"]
-        others = [trial for trial in bodies.values() if trial.origin != "baseline"][: self.config.finalists.count]
-        return [_finalist(trial) for trial in (baseline + others if self.config.finalists.count else [])]
+        others = [trial for trial in bodies.values() if trial.origin != "baseline"]
+        chosen = self._different(others, self.config.finalists.count)
+        return [_finalist(trial) for trial in (baseline + chosen if self.config.finalists.count else [])]
+
+    def _different(self, ranked: Sequence[TrialResult], count: int) -> list[TrialResult]:
+        """Return ``count`` of the best trials by greedy maximin choice, best first.
+
+        Bodies that satisfy the constraints come before all others. Distances are those in the unit cube of the
+        optimised variables.
+        """
+        feasible = [trial for trial in ranked if trial.feasible]
+        pool = (feasible if len(feasible) >= count else ranked)[: POOL * count]
+        variables = [self.config.optimised[name] for name in self.config.variables]
+        places = np.array(
+            [[v.to_unit({**trial.design, **trial.options}[v.name]) for v in variables] for trial in pool]
+        ).reshape(len(pool), len(variables))
+        chosen = [0] if pool and count else []
+        while chosen and len(chosen) < min(count, len(pool)):
+            distances = np.linalg.norm(places[:, None] - places[None, chosen], axis=-1).min(axis=1)
+            distances[chosen] = -1.0
+            chosen.append(int(distances.argmax()))
+        return [pool[index] for index in sorted(chosen)]
 
     @property
     def baseline(self) -> Finalist | None:

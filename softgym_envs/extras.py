@@ -10,7 +10,8 @@ EXTRAS = {
     "train": ("torch", "stable_baselines3", "pytorch_optimizer", "matplotlib"),
     "geometry": ("gmsh",),
     "viewer": ("pyvista", "vtkmodules", "rerun", "PIL"),
-    "codesign": ("optuna", "cmaes", "jinja2"),
+    "video": ("imageio_ffmpeg",),
+    "codesign": ("optuna", "cmaes", "jinja2", "plotly"),
     "onnx": ("onnx",),
     "design": ("SALib",),
 }

@@ -36,6 +36,25 @@ def fetch_policies(snapshot: StudySnapshot) -> None:
             snapshot.folder.policy(finalist.policy)
 
 
+def policy_file(snapshot: StudySnapshot, finalist: Finalist) -> Path | None:
+    """Return the policy of a finalist, copied from another machine if need be; None for the inverse QP.
+
+    It is the first policy that was trained anew for the body, if that lies in this folder, else the one of its trial.
+
+    Raises:
+        DataError: if the policy is nowhere.
+    """
+    if finalist.policy is None:
+        return None
+    trained = snapshot.folder.path / "finalists" / training_name(finalist.trial, 1) / "policy.safetensors"
+    return trained if snapshot.config.finalists.seeds and trained.exists() else snapshot.folder.policy(finalist.policy)
+
+
+def training_name(trial: int, seed: int) -> str:
+    """Return the name of the training of a finalist with a seed."""
+    return f"trial{trial:04d}-seed{seed}"
+
+
 def check_tests(config: StudyConfig) -> None:
     """Build the baseline on FEM as for the tests of the finalists, if these have options of their own (seconds).
 
@@ -46,14 +65,14 @@ def check_tests(config: StudyConfig) -> None:
     if not (options and config.finalists.count):
         return
     try:
-        _environment(config, "fem", {}).make(sample_design=False).close()
+        finalist_environment(config, "fem", {}).make(sample_design=False).close()
     except ValueError as error:
         raise ConfigError(f"finalists cannot be tested with finalists.fem_options = {options}: {error}") from None
     except (InfeasibleDesign, ConvergenceError):  # of the baseline: a result of the test
         pass
 
 
-def _environment(config: StudyConfig, backend: str, options: Mapping[str, float]) -> EnvironmentConfig:
+def finalist_environment(config: StudyConfig, backend: str, options: Mapping[str, float]) -> EnvironmentConfig:
     """Return the environment in which finalists are tested on a backend."""
     own = config.environment_of(options)
     backend_options: dict[str, Any] = own.backend_options if backend == own.backend else {}
@@ -68,7 +87,7 @@ def _test(folder: StudyFolder, plan: PlannedTest) -> FinalistTest:
     if plan.agent == "policy" and finalist.policy:
         controller = _trained_policy(folder, finalist, plan.seed) if plan.seed else folder.path / finalist.policy
     test = FinalistTest(finalist.trial, plan.agent, plan.backend, plan.goals, plan.seed)
-    environment = _environment(config, plan.backend, finalist.options)
+    environment = finalist_environment(config, plan.backend, finalist.options)
     try:
         found = assess(controller, config, environment, folder.goals[plan.goals], finalist.design)
     except (InfeasibleDesign, ConvergenceError) as error:
@@ -91,7 +110,7 @@ def _trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
         own = getattr(training, training.learner)
         update[training.learner] = own.model_copy(update={"net_arch": widths})
     training = training.model_copy(update={**update, "report_every": min(training.report_every, steps)})
-    name = f"trial{finalist.trial:04d}-seed{seed}"
+    name = training_name(finalist.trial, seed)
     place = folder.path / "finalists" / name
     with folder.lock(f"training-{name}"):
         policy = train(training, place, initial=initial, progress=False)

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from markupsafe import Markup
 
 from codesign.objectives import OBJECTIVES
-from codesign.report import plots, tables
+from codesign.report import interactive, plots, tables
 from codesign.report.collect import FEW_GOALS
-from codesign.report.exports import write_exports
+from codesign.report.episodes import Episode, run_episodes
+from codesign.report.exports import Download, write_exports
 from codesign.report.files import write_results
+from codesign.report.findings import findings
 from codesign.report.results import Comparison, StudyResults
 from codesign.report.statistics import MIN_GOALS, kendall_tau, rank_correlation
-from codesign.report.tables import AGENTS, BACKENDS, SHOWN_ALWAYS, millimetres, percent
+from codesign.report.tables import BACKENDS, SHOWN_ALWAYS, millimetres, percent
 from codesign.report.units import present
 from codesign.snapshot import StudySnapshot, load_study
+from softgym_envs.errors import SoftGymError
 from softgym_envs.storage import atomic_write
 
 CONTROLLERS = {
@@ -42,17 +46,22 @@ def write_report(folder: str | Path) -> Path:
 
     snapshot = load_study(folder)
     results = write_results(snapshot)
-    files, no_files = [], ""
+    episodes, failed = [], ""
     try:
-        files = write_exports(snapshot)
-    except Exception as error:  # the report is useful without them
-        no_files = f"Not written: {type(error).__name__}: {error}"
+        episodes = run_episodes(snapshot, results)
+    except SoftGymError as error:  # the report is useful without them
+        failed = f"The episodes of baseline and winner cannot be shown: {error}"
+    downloads, missing = write_exports(snapshot, results, episodes)
+    film = next((file for file in downloads if file.name.endswith(".gif")), None)
     templates = FileSystemLoader(Path(__file__).parent / "templates")
     environment = Environment(
         loader=templates, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     text = environment.get_template("report.html.j2").render(
-        {**_context(snapshot, results), "files": files, "no_files": no_files}
+        **_context(snapshot, results, episodes),
+        downloads=downloads,
+        not_written=[*missing, failed] if failed else missing,
+        film=_source(film),
     )
     path = snapshot.folder.path / "report.html"
     with atomic_write(path, "w") as stream:
@@ -60,13 +69,24 @@ def write_report(folder: str | Path) -> Path:
     return path
 
 
-def _context(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
+def _context(snapshot: StudySnapshot, results: StudyResults, episodes: Sequence[Episode]) -> dict[str, Any]:
     config, objective = snapshot.config, snapshot.objective
+    outcomes = interactive.goal_outcomes(snapshot, results)
     complete = any(trial.state == "complete" for trial in snapshot.trials)
     measures = {**OBJECTIVES, **config.objectives}
     return {
         "r": results,
         "headline": _headline(snapshot, results),
+        "findings": findings(snapshot, results),
+        "plotly": Markup(interactive.plotly_code()),
+        "comparison_goals": results.comparison[0].goals if results.comparison else 0,
+        "radius": f"{1e3 * results.success_distance:g} mm",
+        "goal_legend": outcomes.legend if outcomes else [],
+        "goal_views": []
+        if outcomes is None
+        else [Markup(interactive.html(figure, f"goals-{plane}")) for plane, figure in interactive.goal_views(outcomes)],
+        "motion": Markup(interactive.html(interactive.motion(episodes, outcomes), "motion")) if episodes else "",
+        "episode": _episode_text(episodes),
         "tiles": _tiles(snapshot, results),
         "question": _question(snapshot, results),
         **_pictures(snapshot, results),
@@ -79,9 +99,9 @@ def _context(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
         "interval_note": _interval_note(snapshot, results),
         "figures": {
             "reached": plots.reached(results),
-            "goals": plots.goal_map(snapshot, results),
             "transfer": plots.transfer(snapshot, results),
         },
+        "interactive": _interactive(snapshot, results) if complete else [],
         "search": _search(snapshot, results) if complete else [],
         "search_notes": _search_notes(snapshot, results),
         "transfer": [tables.transfer_row(row, measures[row.objective]) for row in results.transfer],
@@ -113,7 +133,7 @@ def _headline(snapshot: StudySnapshot, results: StudyResults) -> str:
     reached = f"reaches {percent(row.winner.success_rate)} of them within {1e3 * results.success_distance:g} mm"
     sentences = [
         _finding(snapshot, row),
-        f"On {BACKENDS[row.backend]}, with its own {AGENTS[row.agent]}, it ends "
+        f"On {BACKENDS[row.backend]}, with {'its own policy' if row.agent == 'policy' else 'the inverse QP'}, it ends "
         f"{millimetres(row.winner.mean_distance)} from {row.goals} test goals on average instead of "
         f"{millimetres(row.baseline.mean_distance)} (difference {millimetres(row.distance_change, '+')}"
         f"{_interval(row.distance_change_interval, 1e3)}), and {reached} instead of "
@@ -307,8 +327,6 @@ def _interval_note(snapshot: StudySnapshot, results: StudyResults) -> str:
 
 def _search(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, str]]:
     figures = (
-        ("Every trial, and the best so far", plots.history),
-        ("Several objectives", plots.pareto),
         ("Learning in the trials", plots.curves),
         ("Learning of the finalists, each with several seeds", plots.finalist_curves),
         ("Bodies and their objective", plots.parallel),
@@ -317,6 +335,33 @@ def _search(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, s
     )
     drawn = ((title, draw(snapshot, results)) for title, draw in figures)
     return [(title, image) for title, image in drawn if image is not None]
+
+
+def _interactive(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, Markup]]:
+    figures = (
+        ("Every trial, and the best so far", "history", interactive.history),
+        ("The objective along each variable", "slices", interactive.slices),
+        ("Several objectives", "pareto", interactive.pareto),
+    )
+    drawn = ((title, name, draw(snapshot, results)) for title, name, draw in figures)
+    return [(title, Markup(interactive.html(figure, name))) for title, name, figure in drawn if figure is not None]
+
+
+def _source(film: Download | None) -> str:
+    """Return the source of an image element."""
+    return "" if film is None else film.href.replace("data:application/octet-stream", "data:image/gif")
+
+
+def _episode_text(episodes: Sequence[Episode]) -> str:
+    """Return what the animation shows."""
+    if not episodes:
+        return ""
+    goal = ", ".join(f"{1e3 * value:.1f}" for value in episodes[-1].path[-1])
+    ends = " and ".join(f"the {episode.role} {millimetres(episode.distances[-1])}" for episode in episodes)
+    return (
+        f"Computed with finite elements at a typical goal, where the winner gains the median of all goals: ({goal}) "
+        f"mm. At the end, {ends} away."
+    )
 
 
 def _search_notes(snapshot: StudySnapshot, results: StudyResults) -> list[str]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 BASELINE, WINNER, OTHER, MUTED, VIOLATES = "#64748b", "#0f766e", "#cbd5e1", "#94a3b8", "#dc2626"
 COLOURS = {"baseline": BASELINE, "winner": WINNER}
 AGENTS = {"policy": ("policy", "o"), "qp": ("inverse QP", "s")}
-SILHOUETTE_HEIGHT = 700  # pixels
+SILHOUETTE_HEIGHT = 350  # pixels
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 9.5,
@@ -64,77 +64,12 @@ def _uri(data: bytes, kind: str) -> str:
 
 
 def picture(image: np.ndarray) -> str:
-    """Return an image (h, w, 3) uint8 as PNG data for HTML."""
+    """Return an image (h, w, 3) uint8 as WebP data for HTML."""
     from PIL import Image
 
     stream = io.BytesIO()
-    Image.fromarray(image).save(stream, format="png", optimize=True)
-    return _uri(stream.getvalue(), "png")
-
-
-def history(snapshot: StudySnapshot, results: StudyResults) -> str:
-    """Objective of each trial, and the best so far."""
-    objective, roles = snapshot.objective, results.roles
-    done = [trial for trial in snapshot.trials if trial.state == "complete"]
-    feasible = [trial for trial in done if trial.feasible]
-    with _figure(6.2, 3.2) as (_, (ax,), out):
-        kinds = (
-            ("sampler", MUTED, "o", "from the sampler"),
-            ("screen", "#d97706", "D", "from the screen"),
-            ("joint", "#7c3aed", "^", "from the joint training"),
-        )
-        for kind, colour, marker, label in kinds:
-            part = [t for t in feasible if t.origin.startswith(kind) and roles.get(t.number) != "winner"]
-            if part:
-                values = [objective.shown(t.score) for t in part]
-                ax.scatter([t.number for t in part], values, 26, colour, marker=marker, label=label, zorder=3)
-        broken = [t for t in done if not t.feasible]
-        if broken:
-            values = [objective.shown(t.score) for t in broken]
-            label = "violates a constraint"
-            ax.scatter([t.number for t in broken], values, 26, VIOLATES, marker="x", label=label, zorder=3)
-        for trial in done:
-            if (role := roles.get(trial.number)) is not None:
-                colour, marker = (WINNER, "*") if role == "winner" else (BASELINE, "P")
-                ax.scatter(trial.number, objective.shown(trial.score), 95, colour, marker=marker, label=role, zorder=5)
-        if feasible:
-            best = objective.shown(np.maximum.accumulate([t.score or 0.0 for t in feasible]))
-            ax.step([t.number for t in feasible], best, where="post", color=WINNER, label="best so far")
-        for state, marker in (("pruned", "|"), ("infeasible", "x")):
-            part = [t for t in snapshot.trials if t.state == state]
-            if part:
-                heights = [0.02] * len(part)
-                numbers = [t.number for t in part]
-                ax.plot(numbers, heights, marker, color=MUTED, transform=ax.get_xaxis_transform(), label=state)
-        ax.set(xlabel="trial", ylabel=objective.axis)
-        ax.legend(fontsize=8, ncols=2)
-    return out[0]
-
-
-def pareto(snapshot: StudySnapshot, results: StudyResults) -> str | None:
-    """Complete trials in the first two objectives, with the Pareto front; None with one objective."""
-    if len(results.objectives) < 2:
-        return None
-    first, second = (snapshot.config.objectives[name] for name in results.objectives[:2])
-    complete = [trial for trial in snapshot.trials if trial.scores is not None]
-    points = {t.number: (first.shown(t.scores[0]), second.shown(t.scores[1])) for t in complete if t.scores}
-    with _figure(6.4, 3.6) as (_, (ax,), out):
-        for feasible, style, colour, label in (
-            (True, "o", OTHER, "bodies"),
-            (False, "x", VIOLATES, "violate a constraint"),
-        ):
-            part = [points[trial.number] for trial in complete if trial.feasible == feasible]
-            if part:
-                ax.plot(*zip(*part, strict=True), style, color=colour, ms=5, label=label)
-        front = sorted(points[number] for number in results.pareto)
-        if front:
-            ax.plot(*zip(*front, strict=True), "o-", color=WINNER, ms=5, lw=1, label="Pareto front")
-        for number, name in results.roles.items():
-            if number in points:
-                ax.annotate(name, points[number], textcoords="offset points", xytext=(6, 6), color=MUTED)
-        ax.set(xlabel=first.axis, ylabel=second.axis)
-        ax.legend()
-    return out[0]
+    Image.fromarray(image).save(stream, format="webp", quality=85)
+    return _uri(stream.getvalue(), "webp")
 
 
 def curves(snapshot: StudySnapshot, results: StudyResults) -> str | None:
@@ -345,26 +280,4 @@ def reached(results: StudyResults) -> str | None:
             ax.set_title(AGENTS[agent][0], fontsize=10, color="#334155")
             ax.set_xlim(left=0)
             ax.legend(fontsize=8, loc="lower right")
-    return out[0]
-
-
-def goal_map(snapshot: StudySnapshot, results: StudyResults) -> str | None:
-    """Test goals in side view: reached on FEM by baseline and winner or not; None without FEM."""
-    rows = [row for row in results.comparison if row.backend == "fem"]
-    if not rows:
-        return None
-    points = 1e3 * snapshot.folder.goals["unseen"][:, -1]
-    tests = {(*group.key, group.goals): group for group in results.tests}
-    with _figure(9.4, 3.6, len(results.roles)) as (_, axes, out):
-        for ax, (number, role) in zip(axes, sorted(results.roles.items(), key=lambda item: item[1]), strict=True):
-            reached = tests[number, rows[0].agent, "fem", "unseen"].mean.successes >= 0.5
-            kinds = ((reached, "o", COLOURS[role], "reached"), (~reached, "x", VIOLATES, "not reached"))
-            for chosen, marker, colour, label in kinds:
-                ax.scatter(
-                    points[chosen, 1], points[chosen, 2], 28, colour, marker=marker, label=f"{label}: {chosen.sum()}"
-                )
-            ax.set(xlabel="y [mm]", ylabel="z [mm]")
-            ax.set_aspect("equal", adjustable="datalim")
-            ax.set_title(f"{role}, {AGENTS[rows[0].agent][0]}", fontsize=10, color="#334155")
-            ax.legend(fontsize=8)
     return out[0]

@@ -11,6 +11,10 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.scene import STUB, Scene
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
+MAX_DEFLECTION = 0.725
+"""Largest sideways motion of the tip of a beam that bends uniformly by an angle t, relative to its length: the maximum
+of (1 - cos t) / t."""
+
 
 class ImageRenderer:
     """Renders states of a robot off screen with a fixed camera.
@@ -20,8 +24,8 @@ class ImageRenderer:
     a scale grid. Cables, effectors and goal remain faintly visible where the body hides them.
 
     Args:
-        robot: the family of bodies. The camera view contains the baseline body at rest and with its actuators at their
-            limits.
+        robot: the family of bodies. The camera view contains the baseline body at rest and where its actuators may move
+            its effectors.
         size: width and height [pixels].
 
     Raises:
@@ -104,19 +108,38 @@ class ImageRenderer:
 
     def _open(self) -> Scene:
         if self._scene is None:
-            baseline, lower, upper = self.robot.design_space.baseline, self.robot.lower, self.robot.upper
+            baseline = self.robot.design_space.baseline
             model = self._shapes.load(baseline)
-            # At rest, with each actuator alone at its limit, and with all of them, which deforms a body differently.
-            seen = []
-            commands = (
-                [] if self.robot.free_object else [*np.where(np.eye(len(upper), dtype=bool), upper, lower), upper]
-            )
-            for command in (None, *commands):
-                x = self._shapes.at(baseline, command)
-                lines = cable_lines(model, x, self._shapes.state, stub=STUB * self.robot.size)
-                seen += [BodySurface(model).points(x), *lines.values()]
+            x = self._shapes.at(baseline)
+            lines = cable_lines(model, x, self._shapes.state, stub=STUB * self.robot.size)
+            pulled = [_pulled(line, self.robot.upper[row]) for row, line in lines.items()]
+            seen = [BodySurface(model).points(x), *pulled, _reached(self.robot, self._shapes.state)]
             self._scene = Scene(self.robot, self.size, np.concatenate(seen))
         return self._scene
+
+
+def _pulled(line: np.ndarray, length: float) -> np.ndarray:
+    """Return both ends of the visible line (p, 3) of a cable after it was pulled by a length, shape (2, 3) [m]."""
+    outwards = (line[0] - line[1]) / np.linalg.norm(line[0] - line[1])
+    return np.stack([line[0] + length * outwards, line[-1]])
+
+
+def _reached(robot: Robot, rest: State) -> np.ndarray:
+    """Return where the effectors come with each actuator alone, and with all, at the limits, shape (m, 3) [m].
+
+    It is estimated from the condensed model at rest, without another equilibrium, which takes up to a minute on large
+    meshes. The linear prediction is cut at `MAX_DEFLECTION`, because bodies that bend far move along an arc.
+    """
+    if robot.free_object:
+        return rest.effector
+    compliance = rest.condensed.W
+    ends = np.stack([robot.lower, robot.upper]) - rest.displacement  # (2, n_a)
+    alone = compliance.ea / np.diag(compliance.aa)  # effector displacements per displacement of one actuator
+    moves = [end * alone for end in ends] + [(compliance.ea @ np.linalg.solve(compliance.aa, ends.T))]
+    steps = np.concatenate(moves, axis=1).T.reshape(-1, *rest.effector.shape)
+    lengths = np.linalg.norm(steps, axis=-1, keepdims=True)
+    limit = MAX_DEFLECTION * robot.size
+    return (rest.effector + steps * np.minimum(1.0, limit / np.maximum(lengths, 1e-12))).reshape(-1, 3)
 
 
 def render_body(

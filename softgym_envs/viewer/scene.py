@@ -215,7 +215,7 @@ class Scene:
         return caption
 
     def _place_camera(self, size: tuple[int, int], cloud: np.ndarray) -> None:
-        margin = 0.07 * self._length * np.vstack([np.eye(3), -np.eye(3)])
+        margin = 0.1 * self._length * np.vstack([np.eye(3), -np.eye(3)])
         cloud = (cloud[:, None] + margin).reshape(-1, 3)
         position, focal = _fit(cloud, _unit(_CAMERA), _VIEW_ANGLE, size[0] / size[1])
         camera = self.plotter.camera

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -190,8 +191,10 @@ def test_report_opens_in_a_browser(run, tmp_path, require_program):
         [CHROMIUM, *options, "--dump-dom", page.as_uri()], check=True, capture_output=True, text=True
     ).stdout
     assert f"winner-trial{results.winner.trial:04d}.stl" in dumped
-    assert dumped.count("data:image/png") >= 4 and dumped.count("data:image/svg") >= 4
-    assert 'src="http' not in dumped and 'href="http' not in dumped  # self-contained
+    assert dumped.count("data:image/webp") >= 4 and dumped.count("data:image/svg") >= 2
+    assert dumped.count('class="main-svg"') >= 3  # plotly has drawn
+    text = re.sub(r"<script.*?</script>", "", dumped, flags=re.DOTALL)
+    assert 'src="http' not in text and 'href="http' not in text  # self-contained
 
 
 def test_every_strategy_is_described():

@@ -118,17 +118,25 @@ class Balance(HTMLParser):
         self.open = []
         self.text = []
         self.sources = []
+        self.downloads = set()
+        self.without_text = []
 
     def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
         if tag not in self.VOID:
             self.open.append(tag)
+        if tag == "img" and not given.get("alt") or tag == "figure" and not given.get("aria-label"):
+            self.without_text.append((tag, given))
+        if "download" in given:
+            self.downloads.add(given["download"])
         self.sources += [value for key, value in attrs if key in ("src", "href")]
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.text.append(data)
+        if self.open and self.open[-1] not in ("script", "style"):
+            self.text.append(data)
 
 
 def test_report(finished):
@@ -138,9 +146,12 @@ def test_report(finished):
     assert page.open == []
     assert len(page.sources) > 8
     beside = {path.name for path in finished.folder.path.glob("winner-trial*")}
-    assert len(beside) == 2
-    tables = {"results.json", "trials.csv", "finalists.csv"}
-    assert all(source.startswith("data:image/") or source in beside | tables for source in page.sources)
+    assert {name.partition(".")[2] for name in beside} == {"stl", "step", "gif", "rrd"}
+    sections = {source for source in page.sources if source.startswith("#")}
+    assert all(source.startswith("data:") or source in beside | sections for source in page.sources)
+    assert all(f'id="{section[1:]}"' in path.read_text() for section in sections)
+    assert page.downloads >= beside | {"results.json", "trials.csv", "finalists.csv"}
+    assert page.without_text == []
     text = " ".join(page.text)
     row = finished.results.comparison[0]
     for role in ("baseline", "winner"):

@@ -1,0 +1,105 @@
+"""What baseline and winner do at one test goal, computed with finite elements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from agents.evaluation import make_agent
+from codesign.phases.finalists import finalist_environment, policy_file
+from codesign.records import Finalist
+from codesign.report.results import StudyResults
+from codesign.snapshot import StudySnapshot
+from softgym_envs.backends.backend import State
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.base import Robot
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of one body.
+
+    Attributes:
+        role: ``"baseline"`` or ``"winner"``.
+        robot: its family of bodies.
+        design: the body [SI].
+        model: its mechanical model.
+        path: the goals [m], shape (p, 3).
+        states: mechanical states, that of the reset first.
+        goals: goal of each state [m].
+        distances: distance to the goal in each state [m].
+        rewards: reward of each step to a state; None after the reset.
+    """
+
+    role: str
+    robot: Robot
+    design: dict[str, float]
+    model: MechanicalModel
+    path: np.ndarray
+    states: list[State]
+    goals: list[np.ndarray]
+    distances: list[float]
+    rewards: list[float | None]
+
+    def pick(self, count: int) -> list[int]:
+        """Return indices of at most ``count`` states, evenly over the episode, its first and last included."""
+        return list(dict.fromkeys(np.linspace(0, len(self.states) - 1, count).round().astype(int).tolist()))
+
+
+def typical_goal(snapshot: StudySnapshot, results: StudyResults) -> int:
+    """Return the index of the unseen goal at which the winner gains as much as at half of all goals (the median)."""
+    tests = {group.key: group.mean.distances for group in snapshot.unseen_tests}
+    if not results.comparison or results.baseline is None or results.winner is None:
+        return 0
+    row = results.comparison[0]
+    gains = np.subtract(
+        *(tests[body.trial, row.agent, row.backend] for body in (results.baseline, results.winner)),
+    )
+    return int(np.argsort(gains, kind="stable")[len(gains) // 2])
+
+
+def run_episodes(snapshot: StudySnapshot, results: StudyResults) -> list[Episode]:
+    """Return the episodes of baseline and winner at `typical_goal`; none without a winner."""
+    if results.winner is None:
+        return []
+    path = snapshot.folder.goals["unseen"][typical_goal(snapshot, results)]
+    bodies = {
+        body.trial: (role, body) for role, body in (("baseline", results.baseline), ("winner", results.winner)) if body
+    }
+    return [_run(snapshot, role, body, path) for role, body in bodies.values()]
+
+
+def _run(snapshot: StudySnapshot, role: str, body: Finalist, path: np.ndarray) -> Episode:
+    environment = finalist_environment(snapshot.config, "fem", body.options)
+    policy = policy_file(snapshot, body)
+    if policy is None:  # the QP alone, not on top of another one
+        environment = environment.model_copy(update={"residual_scale": 0.0})
+    agent = make_agent("qp" if policy is None else policy)
+    env = environment.make(sample_design=False)
+    inner: Any = env.unwrapped
+    try:
+        observation, info = env.reset(seed=0, options={"design": body.design, "goal": path})
+        episode = Episode(
+            role,
+            inner.robot,
+            dict(inner.design),
+            inner.backend.model,
+            inner.path,
+            [inner.state],
+            [inner.goal],
+            [float(info["distance"])],
+            [None],
+        )
+        ended = False
+        while not ended:
+            observation, reward, terminated, truncated, info = env.step(agent(observation, inner))
+            episode.states.append(inner.state)
+            episode.goals.append(inner.goal)
+            episode.distances.append(float(info["distance"]))
+            episode.rewards.append(float(reward))
+            ended = terminated or truncated
+        return episode
+    finally:
+        env.close()

@@ -1,0 +1,131 @@
+"""What the results of a study mean for the designer: what limits the winner, and what to try next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from codesign.report.results import StudyResults
+from codesign.report.statistics import mean_interval
+from codesign.report.units import present
+from codesign.snapshot import StudySnapshot
+
+NEGLIGIBLE = 0.1
+"""A difference of mean distances below this share of the success distance does not matter."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding.
+
+    Attributes:
+        title: the finding in a few words.
+        text: its numbers, and what to do.
+        warns: whether it limits the result.
+    """
+
+    title: str
+    text: str
+    warns: bool = True
+
+
+def findings(snapshot: StudySnapshot, results: StudyResults) -> list[Finding]:
+    """Return the findings of a study, the most important ones first; none without a winner."""
+    if results.winner is None:
+        return []
+    found = [_goals(snapshot, results), _limit(snapshot, results), _bounds(results), _alternatives(snapshot, results)]
+    if results.few_goals:
+        found.append(Finding("Few test goals", f"{results.few_goals} Raise goals.unseen_count."))
+    return [finding for finding in found if finding is not None]
+
+
+def _about_places(snapshot: StudySnapshot) -> bool:
+    """Return whether goals are positions, so that distances are lengths."""
+    return snapshot.config.environment.task_class.goal_unit == "m"
+
+
+def _goals(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
+    row = next((row for row in results.comparison if row.backend == "fem"), None)
+    if row is None or not _about_places(snapshot):
+        return None
+    radius = f"{1e3 * results.success_distance:g} mm"
+    missed = round(row.goals * (1.0 - row.winner.success_rate))
+    if not missed:
+        return Finding("Every test goal is reached", f"All {row.goals} goals, within {radius}, on FEM.", warns=False)
+    worst = f"The farthest is missed by {1e3 * row.winner.worst_distance:.2f} mm."
+    title = f"{missed} of {row.goals} test goals are not reached"
+    return Finding(title, f"On FEM the winner ends more than {radius} from them. {worst}")
+
+
+def _limit(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
+    """Return whether the body or its policy limits the winner, by comparison with the inverse QP on the same body."""
+    assert results.winner is not None
+    tests = {group.key: group for group in snapshot.unseen_tests}
+    policy, qp = (tests.get((results.winner.trial, agent, "fem")) for agent in ("policy", "qp"))
+    if policy is None or qp is None or policy.mean.success_rate == 1.0 or not _about_places(snapshot):
+        return None
+    gain = policy.mean.mean_distance - qp.mean.mean_distance
+    interval = mean_interval(policy.table("distances"), qp.table("distances"))
+    trained, solved = (f"{1e3 * group.mean.mean_distance:.2f} mm" for group in (policy, qp))
+    means = f"{trained} from the goals with its policy and {solved} with the inverse QP"
+    if gain > NEGLIGIBLE * results.success_distance and (interval is None or interval[0] > 0.0):
+        return Finding(
+            "The policy limits, not the body",
+            f"The same body ends on average {means}. Train longer (finalists.steps), or let the policy correct the "
+            "inverse QP (environment.residual_scale).",
+        )
+    return Finding(
+        "The body limits, not the policy",
+        f"On average it ends {means}, which knows the mechanical model and needs no training. More training will "
+        "hardly help; other variables, wider ranges or nearer goals may.",
+    )
+
+
+def _bounds(results: StudyResults) -> Finding | None:
+    ended = [variable for variable in results.variables if variable.at_limit]
+    if not ended:
+        return None
+    parts = [
+        f"{variable.name.replace('_', ' ')} at its {variable.at_limit} limit of "
+        f"{present(variable.low if variable.at_limit == 'lower' else variable.high, variable.unit)}"
+        for variable in ended
+    ]
+    count = sum(variable.optimised for variable in results.variables)
+    return Finding(
+        f"{len(ended)} of {count} variables at a limit",
+        f"The winner has its {' and its '.join(parts)}. A better body may lie beyond. If it can be made, widen the "
+        "range: for a dimension in the robot's design space, whose surrogate is then fitted anew; for an option under "
+        "ranges.",
+    )
+
+
+def _alternatives(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
+    """Return the finalists whose mean distance on FEM is about that of the winner, and how their bodies differ."""
+    assert results.winner is not None
+    agent = results.winner.agents[0]
+    tests = {group.key: group.mean.mean_distance for group in snapshot.unseen_tests}
+    own = tests.get((results.winner.trial, agent, "fem"))
+    if own is None or not _about_places(snapshot):
+        return None
+    variables = [variable for variable in results.variables if variable.optimised]
+    winner = {**results.winner.design, **results.winner.options}
+    parts = []
+    for body in results.finalists:
+        distance = tests.get((body.trial, agent, "fem"))
+        if body.trial == results.winner.trial or distance is None:
+            continue
+        if distance - own > NEGLIGIBLE * results.success_distance:
+            continue
+        values = {**body.design, **body.options}
+        steps = [abs(v.place(values[v.name]) - v.place(winner[v.name])) for v in variables]
+        far = variables[int(np.argmax(steps))]
+        differs = f"{far.name.replace('_', ' ')} {present(values[far.name], far.unit)}"
+        parts.append(
+            f"trial {body.trial} ({1e3 * distance:.2f} mm, {differs} instead of {present(winner[far.name], far.unit)})"
+        )
+    if not parts:
+        return None
+    return Finding(
+        "Other bodies do as well", f"{'; '.join(parts)}. Choose the one that is easiest to make.", warns=False
+    )

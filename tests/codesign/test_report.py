@@ -1,0 +1,160 @@
+"""What a report concludes from results, and what it draws; the studies are written by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from agents.evaluation import Evaluation
+from codesign.records import FinalistTest, TrialResult
+from codesign.report.collect import collect
+from codesign.report.episodes import typical_goal
+from codesign.report.findings import findings
+from codesign.report.interactive import goal_outcomes, goal_views, history, slices
+from codesign.snapshot import load_study
+from softgym_envs.viewer.video import write_video
+
+BOX = {"height": (0.020, 0.022), "joint_height": (0.005, 0.008)}
+
+
+def evaluation(distances):
+    distances = np.asarray(distances, dtype=float)
+    ones = np.ones(len(distances))
+    return Evaluation(distances, distances, ones, distances < 2e-3, ones, steps=1)
+
+
+def write_trial(folder, number, score, place, controller="qp"):
+    """Write the result of a trial whose variables lie at a place in [0, 1]^2 of their ranges."""
+    design = {name: low + p * (high - low) for (name, (low, high)), p in zip(BOX.items(), place, strict=True)}
+    TrialResult(
+        number=number,
+        origin="baseline" if number == 0 else f"sampler {number}",
+        process="",
+        design={**folder.config.baseline, **design},
+        values={"mean_distance": score},
+        scores=[-score],
+        controller=controller,
+        evaluation=evaluation([score]),
+    ).write(folder.trial(number) / "result.json")
+
+
+def write_test(folder, number, agent, distances):
+    values = {"mean_distance": float(np.mean(distances))}
+    test = FinalistTest(number, agent, "fem", "unseen", 0, evaluation(distances), values, list(distances))
+    test.write(folder.path / "finalists" / f"trial{number:04d}-{agent}-fem-unseen.json")
+
+
+@pytest.fixture
+def tested(study):
+    """Function ``tested(policy, qp, place) -> snapshot``: baseline and winner on six goals, distances in metres."""
+
+    def make(policy, qp, place=(0.5, 0.5)):
+        folder = study(finalists={"count": 1}, goals={"count": 3, "unseen_count": 6, "training_count": 1})
+        (folder.path / "trials").mkdir(exist_ok=True)
+        write_trial(folder, 0, 5e-3, (0.0, 0.3), controller="a policy")
+        write_trial(folder, 1, 1e-3, place, controller="a policy")
+        for agent in ("policy", "qp"):
+            write_test(folder, 0, agent, [5e-3, 1e-3, 5e-3, 5e-3, 5e-3, 5e-3])
+        write_test(folder, 1, "policy", policy)
+        write_test(folder, 1, "qp", qp)
+        return load_study(folder)
+
+    return make
+
+
+def titles(snapshot):
+    return [finding.title for finding in findings(snapshot, collect(snapshot))]
+
+
+FAR, NEAR = np.full(6, 4e-3), np.full(6, 1e-3)
+WIGGLE = 1e-5 * np.arange(6)
+
+
+def test_the_body_limits_if_the_inverse_qp_does_no_better(tested):
+    found = titles(tested(FAR, FAR - 1e-4 + WIGGLE))
+    assert "6 of 6 test goals are not reached" in found
+    assert "The body limits, not the policy" in found
+
+
+def test_the_policy_limits_if_the_inverse_qp_does_better(tested):
+    assert "The policy limits, not the body" in titles(tested(FAR, NEAR + WIGGLE))
+
+
+def test_nothing_limits_if_every_goal_is_reached(tested):
+    found = titles(tested(NEAR, NEAR))
+    assert "Every test goal is reached" in found
+    assert not any("limits" in title for title in found)
+
+
+@pytest.mark.parametrize("place, count", [((0.5, 0.5), 0), ((0.0, 0.5), 1), ((1.0, 0.0), 2)])
+def test_variables_at_a_limit_are_named(tested, place, count):
+    snapshot = tested(FAR, FAR, place)
+    found = [finding for finding in findings(snapshot, collect(snapshot)) if "at a limit" in finding.title]
+    assert [finding.title for finding in found] == ([f"{count} of 2 variables at a limit"] if count else [])
+    assert not count or ("lower limit of 20.00 mm" in found[0].text) == (place[0] == 0.0)
+
+
+def test_a_typical_goal_has_the_median_gain(tested):
+    # The gains are -3, 0, 1, 2, 3 and 4 mm: the upper median belongs to the goal with 2 mm.
+    snapshot = tested([8e-3, 1e-3, 4e-3, 3e-3, 2e-3, 1e-3], FAR)
+    assert typical_goal(snapshot, collect(snapshot)) == 3
+
+
+def test_outcomes_of_goals(tested):
+    snapshot = tested([1e-3, 1e-3, 4e-3, 4e-3, 4e-3, 1e-3], FAR)  # the baseline reaches the second goal only
+    outcomes = goal_outcomes(snapshot, collect(snapshot))
+    assert outcomes.kinds.tolist() == [1, 0, 3, 3, 3, 1]
+    assert [(text, count) for _, _, text, count in outcomes.legend] == [
+        ("reached by both", 1),
+        ("reached by the winner only", 2),
+        ("reached by neither", 3),
+    ]
+    views = goal_views(outcomes)
+    assert 1 <= len(views) <= 3
+    for _, figure in views:
+        assert sum(len(trace.x) for trace in figure.data) == 6
+
+
+def test_plots_show_every_complete_trial(tested):
+    snapshot = tested(FAR, FAR)
+    results = collect(snapshot)
+    shown = [trace for trace in history(snapshot, results).data if trace.mode == "markers"]
+    assert {trace.name: list(trace.y) for trace in shown} == {"baseline": [5.0], "winner": [1.0]}
+    assert len([trace for trace in slices(snapshot, results).data if trace.name == "winner"]) == 2
+
+
+def test_finalists_differ(study):
+    folder = study(finalists={"count": 2}, trials=9)
+    # The best three bodies are nearly the same; the fifth is far away and among the best six, the seventh is not.
+    places = [(0.5, 0.5), (0.51, 0.5), (0.5, 0.51), (0.52, 0.5), (0.9, 0.9), (0.6, 0.6), (0.0, 0.0)]
+    write_trial(folder, 0, 9e-3, (0.3, 0.3))
+    for number, place in enumerate(places, start=1):
+        write_trial(folder, number, 1e-3 * number, place)
+    assert [body.trial for body in load_study(folder).finalists] == [0, 1, 5]
+
+
+@pytest.mark.parametrize("ending", ["gif", "webp"])
+def test_animations(tmp_path, ending):
+    frames = [np.full((33, 48, 3), 40 * k, dtype=np.uint8) for k in range(5)]
+    path = write_video(tmp_path / f"film.{ending}", frames, fps=10.0)
+    with Image.open(path) as film:
+        seen = np.stack([np.asarray(image.convert("RGB")) for image in ImageSequence.Iterator(film)])
+        assert film.info["loop"] == 0
+    assert seen.shape == (5, 33, 48, 3)
+    np.testing.assert_allclose(seen.mean(axis=(1, 2, 3)), 40 * np.arange(5), atol=8)
+
+
+def test_a_film_of_odd_size_as_mp4(tmp_path):
+    from imageio_ffmpeg import count_frames_and_secs
+
+    frames = [np.full((33, 47, 3), 40 * k, dtype=np.uint8) for k in range(5)]
+    path = write_video(tmp_path / "film.mp4", frames, fps=10.0)
+    assert count_frames_and_secs(str(path)) == (5, 0.5)
+
+
+def test_wrong_films(tmp_path):
+    with pytest.raises(ValueError, match=r"must end with \.gif, \.webp or \.mp4"):
+        write_video(tmp_path / "film.avi", [np.zeros((4, 4, 3), np.uint8)])
+    with pytest.raises(ValueError, match="has no frames"):
+        write_video(tmp_path / "film.gif", [])
