@@ -1,8 +1,8 @@
 """Draw the pictures of the documentation: ``make docs-images``, or ``python docs/make_images.py [NAME ...]``.
 
-Names are those of robots, of environment pages (``finger_reach``) and of other pictures; default: all. Pictures go to
-``docs/images/NAME.png``, the animation to ``docs/images/episodes.gif``. The picture ``report`` needs a finished study
-(``make demo``) and Chromium, so it is drawn only when it is named.
+Names are those of robots, of environment pages (``finger_reach``), of their films (``finger_reach.webp``) and of other
+pictures; default: all. Pictures go to ``docs/images/NAME.png``, the animation to ``docs/images/episodes.gif``. The
+picture ``report`` needs a finished study (``make demo``) and Chromium, so it is drawn only when it is named.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
 from softgym_envs.robots import ROBOTS
 from softgym_envs.viewer.image import ImageRenderer, render_bodies
+from softgym_envs.viewer.video import write_video
 
 # Share of the range of each actuator, for the actuated half of a robot's picture.
 COMMANDS: dict[str, tuple[float, ...]] = {
@@ -46,6 +47,11 @@ COMMANDS: dict[str, tuple[float, ...]] = {
 WIDTH, HEIGHT = 800, 520
 FILMED = ("SoftGym/FingerTrack-v0", "SoftGym/DiamondTrack-v0", "SoftGym/TrunkTrack-v0")
 FRAMES = 45
+FILM_SIZE, FILM_FRAMES = (360, 300), 30
+FILM_AGENTS = {"finger_grasp": "force", "gripper_lift": "close", "tetrapod_carry": "tetrapod_carry"}
+"""Agents of the films of environments, where it is not the inverse QP."""
+FILM_STEPS = {"gripper_lift": 50, "tetrapod_carry": 60}
+FILM_SEEDS: dict[str, int] = {}
 
 
 def draw_robot(name: str) -> np.ndarray:
@@ -71,6 +77,25 @@ def draw_environment(name: str) -> np.ndarray:
     image = np.asarray(env.render())
     env.close()
     return image
+
+
+def draw_film(name: str, path: Path) -> None:
+    """Write a small film of one episode of an environment."""
+    identifier = environment_pages()[name]
+    env = gymnasium.make(identifier, render_mode="rgb_array", render_size=FILM_SIZE)
+    observation, _ = env.reset(seed=FILM_SEEDS.get(name, 1))
+    unwrapped: Any = env.unwrapped
+    act = make_agent(FILM_AGENTS.get(name, "qp"))
+    steps = FILM_STEPS.get(name, unwrapped.task.horizon if unwrapped.task.horizon > 1 else 30)
+    shown = set(np.linspace(0, steps, min(steps + 1, FILM_FRAMES)).astype(int).tolist())
+    frames, step, ended = [np.asarray(env.render())], 0, False
+    while step < steps and not ended:
+        observation, _, terminated, truncated, _ = env.step(act(observation, unwrapped))
+        step, ended = step + 1, terminated or truncated
+        if step in shown or ended:
+            frames.append(np.asarray(env.render()))
+    env.close()
+    write_video(path, frames + [frames[-1]] * 6, fps=10.0)
 
 
 def film(identifier: str, size: int) -> Iterator[np.ndarray]:
@@ -147,11 +172,15 @@ def main(names: list[str]) -> None:
     table["convergence"] = convergence_tables.draw
     table |= {name: partial(draw_robot, name) for name in ROBOTS}
     table |= {name: partial(draw_environment, name) for name in environment_pages()}
-    for name in names or [*table, "episodes"]:
-        path = DOCS / "images" / f"{name}.png"
+    films = [f"{name}.webp" for name in environment_pages()]
+    for name in names or [*table, *films, "episodes"]:
+        path = DOCS / "images" / f"{name.removesuffix('.webp')}.png"
         if name == "episodes":
             path = path.with_suffix(".gif")
             draw_episodes(path)
+        elif name.endswith(".webp"):
+            path = path.with_suffix(".webp")
+            draw_film(name.removesuffix(".webp"), path)
         else:
             draw = draw_report if name == "report" else table[name]
             Image.fromarray(draw()).save(path, optimize=True)

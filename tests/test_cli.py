@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from codesign.scheduling import worker
 from softgym_envs.cli import app
@@ -23,6 +24,17 @@ def test_list_and_show(softgym, tmp_path):
     status, out, _ = softgym("show", "finger", "--design", "length=0.041", "--picture", picture)
     assert status == 0 and "joint_height" in out and "nodes" in out
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_film_of_an_episode(softgym, tmp_path):
+    film = tmp_path / "film.gif"
+    status, out, _ = softgym("rollout", "SoftGym/FingerReach-v0", "--video", film)
+    assert status == 0 and f"wrote {film}" in out
+    with Image.open(film) as frames:
+        assert frames.size == (480, 480) and frames.n_frames > 5
+    for name, rest in ((film.with_suffix(".avi"), []), (film, ["--record", tmp_path / "a.rrd"])):
+        status, _, error = softgym("rollout", "SoftGym/FingerReach-v0", "--video", name, *rest)
+        assert status == 2 and ("must end with .gif" in error or "exclude each other" in error)
 
 
 def test_rollout_evaluate_and_record(softgym, tmp_path):

@@ -6,7 +6,6 @@ import base64
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +14,6 @@ from codesign.report.episodes import Episode
 from codesign.report.results import StudyResults
 from codesign.snapshot import StudySnapshot
 from softgym_envs.robots.base import Robot
-
-if TYPE_CHECKING:
-    from softgym_envs.viewer.image import ImageRenderer
 
 EMBEDDED = 1_000_000
 """Largest file that the report contains itself [bytes]; larger ones are links to the folder of the study."""
@@ -130,17 +126,23 @@ def write_film(path: Path, episodes: Sequence[Episode]) -> None:
     for episode in episodes:
         renderer = ImageRenderer(episode.robot, FILM_SIZE)
         try:
-            films.append([_frame(renderer, episode, index) for index in episode.pick(FILM_FRAMES)])
+            films.append(
+                [
+                    renderer.render(
+                        episode.design,
+                        episode.states[index],
+                        episode.path,
+                        episode.goals[index],
+                        text=f"{episode.role}: {1e3 * episode.distances[index]:.1f} mm",
+                    )
+                    for index in episode.pick(FILM_FRAMES)
+                ]
+            )
         finally:
             renderer.close()
     length = max(map(len, films))
     rows = [np.concatenate([film[min(k, len(film) - 1)] for film in films], axis=1) for k in range(length)]
     write_video(path, rows + [rows[-1]] * 10, fps=10.0)  # a second to look at the end
-
-
-def _frame(renderer: ImageRenderer, episode: Episode, index: int) -> np.ndarray:
-    text = f"{episode.role}: {1e3 * episode.distances[index]:.1f} mm"
-    return renderer.render(episode.design, episode.states[index], episode.path, episode.goals[index], text=text)
 
 
 def _record(path: Path, episodes: Sequence[Episode]) -> None:

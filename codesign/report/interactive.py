@@ -13,7 +13,6 @@ from codesign.report.plots import BASELINE, MUTED, VIOLATES, WINNER
 from codesign.report.results import StudyResults
 from codesign.report.units import present, shown_unit
 from codesign.snapshot import StudySnapshot
-from softgym_envs.viewer.surface import BodySurface
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -262,6 +261,8 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
     """Baseline and winner over each other at one goal, step by step, with all goals; it can be rotated and played."""
     from plotly.graph_objects import Frame
 
+    from softgym_envs.viewer.surface import BodySurface
+
     surfaces = [BodySurface(episode.model) for episode in episodes]
     points = max(len(surface.shape(e.model.nodes)) for surface, e in zip(surfaces, episodes, strict=True))
     count = max(2, min(MAX_FRAMES, max(len(e.states) for e in episodes), MAX_POINTS // points))
@@ -272,7 +273,9 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
         drawn: list[dict[str, Any]] = []
         for episode, surface, pick in zip(episodes, surfaces, picks, strict=True):
             index = pick[min(frame, len(pick) - 1)]
-            drawn.append(_body_trace(episode, surface, index, whole))
+            nodes = episode.states[index].nodes
+            assert nodes is not None, "finite elements compute nodes"
+            drawn.append(_body_trace(episode.role, surface.shape(nodes), surface.faces if whole else None))
             drawn.append(_tip_trace(episode, index, whole))
         return drawn
 
@@ -317,16 +320,15 @@ def _scene() -> dict[str, Any]:
     }
 
 
-def _body_trace(episode: Episode, surface: BodySurface, index: int, whole: bool) -> dict[str, Any]:
-    nodes = episode.states[index].nodes
-    assert nodes is not None, "finite elements compute nodes"
-    x, y, z = (1e3 * surface.shape(nodes)).T.astype(np.float32)
+def _body_trace(role: str, points: np.ndarray, faces: np.ndarray | None) -> dict[str, Any]:
+    """Return a surface from points [m] (p, 3) and triangles (t, 3), which frames that only move it leave out."""
+    x, y, z = (1e3 * points).T.astype(np.float32)
     trace: dict[str, Any] = {"type": "mesh3d", "x": x, "y": y, "z": z}
-    if whole:
-        i, j, k = surface.faces.T.astype(np.int32)
-        winner = episode.role == "winner"
+    if faces is not None:
+        i, j, k = faces.T.astype(np.int32)
+        winner = role == "winner"
         trace |= {
-            **{"i": i, "j": j, "k": k, "name": episode.role, "showlegend": True, "hoverinfo": "name"},
+            **{"i": i, "j": j, "k": k, "name": role, "showlegend": True, "hoverinfo": "name"},
             "color": WINNER if winner else BASELINE,
             "opacity": 1.0 if winner else 0.3,
             "flatshading": True,

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -45,8 +46,15 @@ def list_(as_json: bool) -> None:
 @options.design
 @click.option("--seed", default=0, show_default=True, help="Seed of the episode.")
 @click.option("--record", type=options.PATH, help="Write a rerun recording (.rrd) to this file.")
+@click.option("--video", type=options.PATH, help="Write a film (.mp4, .gif or .webp) to this file.")
 def rollout(
-    environment: str, agent: str, backend: str | None, design: tuple[str, ...], seed: int, record: Path | None
+    environment: str,
+    agent: str,
+    backend: str | None,
+    design: tuple[str, ...],
+    seed: int,
+    record: Path | None,
+    video: Path | None,
 ) -> None:
     """Run one episode and print its result."""
     import softgym_envs  # noqa: F401 - registers the IDs
@@ -56,6 +64,12 @@ def rollout(
     from agents.policy import Policy
     from softgym_envs.config import check_config
 
+    if record is not None and video is not None:
+        raise ConfigError("--record and --video exclude each other; run the episode twice")
+    if video is not None:
+        from softgym_envs.viewer.video import check_video, write_video
+
+        check_video(video)  # before the work begins
     chosen = options.design_of(design)
     options.check_agent(agent)
     # A policy needs the same observations and actions as in training.
@@ -67,7 +81,8 @@ def rollout(
     if backend is not None:
         config = config.on(backend)
     act = make_agent(agent, seed)
-    env = config.make(**({"design": chosen} if chosen else {}))
+    drawn = {"render_mode": "rgb_array"} if video is not None else {}
+    env = config.make(**({"design": chosen} if chosen else {}), **drawn)
     if record is not None:
         from softgym_envs.viewer.recording import record_rollout
 
@@ -77,11 +92,17 @@ def rollout(
         return
     observation, info = env.reset(seed=seed)
     total, step, ended = 0.0, 0, False
+    frames: list[Any] = [env.render()] if video is not None else []
     while not ended:
         observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
         total, step, ended = total + float(reward), step + 1, terminated or truncated
+        if video is not None:
+            frames.append(env.render())
     click.echo(f"{environment} on {config.backend}, agent {agent}: {step} steps, return {total:.2f}")
     click.echo(f"final distance {1e3 * info['distance']:.3f} mm, success {info['is_success']}")
+    if video is not None:
+        write_video(video, frames, fps=env.metadata["render_fps"])
+        click.echo(f"wrote {video}")
     env.close()
 
 

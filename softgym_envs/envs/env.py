@@ -60,7 +60,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         task: registered name, path ``"module:class"``, class, or object made for the same robot object.
         backend: ``"surrogate"``, ``"fem"``, or ``"hybrid"`` of both; default the surrogate where weights ship for the
             robot, else FEM.
-        render_mode: None or ``"rgb_array"``.
+        render_mode: None, ``"rgb_array"`` for images, or ``"human"`` for a window that every step draws.
         render_size: width and height of an image [pixels].
         **options: ``design``, ``action_mode`` and the other arguments that the page of each environment ID lists.
 
@@ -71,7 +71,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         WeightsError: if the surrogate has no weights for the robot, or they are damaged.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 20}
 
     def __init__(
         self,
@@ -87,7 +87,11 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             self, robot, task, backend=backend, render_mode=render_mode, render_size=render_size, **options
         )
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode = {render_mode!r} is unknown; allowed: None, 'rgb_array'")
+            raise ValueError(f"render_mode = {render_mode!r} is unknown; allowed: None, 'human', 'rgb_array'")
+        if render_mode == "human":
+            from softgym_envs.viewer.scene import check_display
+
+            check_display()
         self.render_mode = render_mode
         self.render_size = render_size
         setup = set_up(robot, task, backend, EnvironmentOptions.check(options))
@@ -158,6 +162,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             self._path = self.task.check_paths(goal)
         self.task.begin(self.np_random)
         self._step = 0
+        if self.render_mode == "human":
+            self.render()
         observation, _, info = self._observe()
         return observation, info
 
@@ -246,6 +252,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         except ConvergenceError:
             converged = False
         self._step += 1
+        if self.render_mode == "human":
+            self.render()
         observation, reward, info = self._observe(converged)
         return observation, reward, bool(info["lost"]), not converged, info
 
@@ -292,21 +300,25 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             return np.full((1, 3), np.nan)
 
     def render(self) -> np.ndarray | None:
-        """Return an image (height, width, 3) of the body, its cables, effector and goal; None without a render mode."""
+        """Return an image (height, width, 3) of the body, its cables, effector and goal.
+
+        With ``render_mode="human"`` the image is shown in the window and None is returned, as without a render mode.
+        """
         if self.render_mode is None:
-            gymnasium.logger.warn("render() needs render_mode='rgb_array' in gymnasium.make")
+            gymnasium.logger.warn("render() needs render_mode='rgb_array' or 'human' in gymnasium.make")
             return None
         if self._renderer is None:
             from softgym_envs.viewer.image import ImageRenderer
 
-            self._renderer = ImageRenderer(self.robot, self.render_size)
+            self._renderer = ImageRenderer(self.robot, self.render_size, window=self.render_mode == "human")
         state, goal, path = self.backend.state, self.goal, self._path
         distance = float(self.task.distance(self.task.measure(state), goal))
         text = f"distance {1e3 * distance:.1f} mm"
         if self.task.goal_unit != "m":  # goals that are not places
             goal, path = state.effector[0], state.effector[:1]
             text = f"error {1e2 * distance:.1f} %"
-        return self._renderer.render(self.backend.design, state, path, goal, text=text)
+        image = self._renderer.render(self.backend.design, state, path, goal, text=text)
+        return None if self.render_mode == "human" else image
 
     def close(self) -> None:
         """Free the renderer."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import State
 from softgym_envs.robots.base import Robot
-from softgym_envs.viewer.scene import STUB, Scene
+from softgym_envs.viewer.scene import STUB, Scene, check_display
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
 MAX_DEFLECTION = 0.725
@@ -27,17 +27,21 @@ class ImageRenderer:
         robot: the family of bodies. The camera view contains the baseline body at rest and where its actuators may move
             its effectors.
         size: width and height [pixels].
+        window: show the images in a window too.
 
     Raises:
-        ValueError: for a size that is not two positive integers.
+        ValueError: for a size that is not two positive integers, or a window without a display.
     """
 
-    def __init__(self, robot: Robot, size: tuple[int, int] = (480, 480)) -> None:
+    def __init__(self, robot: Robot, size: tuple[int, int] = (480, 480), *, window: bool = False) -> None:
+        if window:
+            check_display()
         width, height = (int(n) for n in size)
         if width < 1 or height < 1:
             raise ValueError(f"size = {size!r} must be two positive integers: width and height in pixels")
         self.robot = robot
         self.size = (width, height)
+        self._window = window
         self._shapes = ShapeFinder(robot)
         self._scene: Scene | None = None
 
@@ -69,6 +73,8 @@ class ImageRenderer:
         scene.set_state(x, state)
         scene.set_goal(np.asarray(goal), np.asarray(path))
         scene.set_text(text or f"distance {1e3 * float(np.linalg.norm(state.effector[0] - goal)):.1f} mm")
+        if self._window:
+            scene.update()
         return scene.image()
 
     def render_body(
@@ -114,7 +120,7 @@ class ImageRenderer:
             lines = cable_lines(model, x, self._shapes.state, stub=STUB * self.robot.size)
             pulled = [_pulled(line, self.robot.upper[row]) for row, line in lines.items()]
             seen = [BodySurface(model).points(x), *pulled, _reached(self.robot, self._shapes.state)]
-            self._scene = Scene(self.robot, self.size, np.concatenate(seen))
+            self._scene = Scene(self.robot, self.size, np.concatenate(seen), window=self._window)
         return self._scene
 
 

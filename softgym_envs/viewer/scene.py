@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -44,6 +46,19 @@ _VIEW_ANGLE = np.radians(18.0)
 
 STUB = 0.06
 """Visible length of an unpulled cable outside the body, relative to the size of the robot."""
+
+
+def check_display() -> None:
+    """Check that a window can be opened.
+
+    Raises:
+        ValueError: on Linux without a display.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ValueError(
+            "render_mode = 'human' needs a display, but neither DISPLAY nor WAYLAND_DISPLAY is set; use 'rgb_array', "
+            "or softgym rollout --video FILE"
+        )
 
 
 def tension_color(share: float) -> Color:
@@ -140,16 +155,22 @@ class Scene:
         robot: the robot.
         size: width and height [pixels].
         cloud: points that the camera must see [m], shape (n, 3).
+        window: show the scene in a window, in place of off-screen images.
+
+    Raises:
+        ValueError: for a window without a display, or on one without OpenGL.
     """
 
-    def __init__(self, robot: Robot, size: tuple[int, int], cloud: np.ndarray) -> None:
+    def __init__(self, robot: Robot, size: tuple[int, int], cloud: np.ndarray, *, window: bool = False) -> None:
+        if window:
+            check_display()
         require("viewer")
         import pyvista
 
         self.robot = robot
         self._length = robot.size
         self._line = max(1.0, size[1] / 480.0)
-        self._open_window(size)
+        self._open_window(size, window)
         self._place_camera(size, cloud)
         self._draw_wall(size[0] / size[1], cloud)
 
@@ -171,7 +192,7 @@ class Scene:
 
     # -- set-up -----------------------------------------------------------------------------------------------------
 
-    def _open_window(self, size: tuple[int, int]) -> None:
+    def _open_window(self, size: tuple[int, int], window: bool) -> None:
         import pyvista
         from vtkmodules.vtkCommonCore import vtkLogger
         from vtkmodules.vtkRenderingCore import vtkRenderer
@@ -181,7 +202,7 @@ class Scene:
         vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
         try:
             self.plotter = pyvista.Plotter(
-                off_screen=True, window_size=list(size), lighting="none", theme=pyvista.themes.DocumentTheme()
+                off_screen=not window, window_size=list(size), lighting="none", theme=pyvista.themes.DocumentTheme()
             )
             self.plotter.background_color = pyvista.Color(COLORS["background"])
             self.plotter.enable_anti_aliasing("msaa", multi_samples=4)
@@ -196,6 +217,13 @@ class Scene:
                 renderer.AutomaticLightCreationOff()
                 renderer.SetActiveCamera(self.plotter.camera)
                 self.window.AddRenderer(renderer)
+            if window:
+                if "X" not in self.window.GetClassName() and sys.platform == "linux":  # it fell back to memory
+                    raise ValueError(
+                        f"render_mode = 'human': display {os.environ.get('DISPLAY')!r} does not answer, or has no "
+                        "OpenGL; use 'rgb_array', or softgym rollout --video FILE"
+                    )
+                self.plotter.show(interactive_update=True, auto_close=False, title=self.robot.name)
             self.window.Render()
         finally:
             vtkLogger.SetStderrVerbosity(verbosity)
@@ -321,6 +349,11 @@ class Scene:
         """Return an image of the scene, shape (height, width, 3) uint8."""
         self.window.Render()
         return np.array(self.plotter.screenshot(return_img=True), dtype=np.uint8)
+
+    def update(self) -> None:
+        """Draw the scene in its window, and let the user move the camera."""
+        self.window.Render()
+        self.plotter.update()
 
     def close(self) -> None:
         """Close the window."""

@@ -356,3 +356,10 @@ def test_render(backend):
         env.step(np.array([1.0, 1.0], dtype=np.float32))
     assert (env.render() != first).any()
     env.close()
+
+
+def test_a_window_without_a_display_is_refused(monkeypatch):
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(variable, raising=False)
+    with pytest.raises(ValueError, match=r"needs a display, .* softgym rollout --video"):
+        gymnasium.make("SoftGym/FingerReach-v0", render_mode="human")
