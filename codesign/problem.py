@@ -98,6 +98,12 @@ class StudyProblem(Config):
         return ["maximize" for _ in (self.objective, *self.secondary_objectives)]
 
     @property
+    def score_names(self) -> list[str]:
+        """Names of the scores in Optuna's studies; what is minimised has a score with the opposite sign."""
+        names = (self.objective, *self.secondary_objectives)
+        return [name if self.objectives[name].maximize else f"-{name}" for name in names]
+
+    @property
     def controller_constraints(self) -> dict[str, float]:
         """Constraints that depend on the controller, and therefore on the backend [SI]."""
         return {name: limit for name, limit in self.constraints.items() if not self.objectives[name].of_body}

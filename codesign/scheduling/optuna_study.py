@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 from codesign.config import StudyConfig
@@ -49,14 +50,28 @@ def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number:
     storage = folder.open_storage() if storage is None else storage
     sampler, pruner = make_sampler(folder.config.sampler, number), make_pruner(folder.config)
     try:
-        return optuna.load_study(study_name=storage.study, storage=storage.optuna, sampler=sampler, pruner=pruner)
+        study = optuna.load_study(study_name=storage.study, storage=storage.optuna, sampler=sampler, pruner=pruner)
     except KeyError:
         if storage.shared:
             raise DataError(f"storage '{folder.config.storage}' has no study '{storage.study}'") from None
-    return optuna.create_study(
-        study_name=storage.study,
-        storage=storage.optuna,
-        directions=folder.config.directions,
-        sampler=sampler,
-        pruner=pruner,
-    )
+        study = optuna.create_study(
+            study_name=storage.study,
+            storage=storage.optuna,
+            directions=folder.config.directions,
+            sampler=sampler,
+            pruner=pruner,
+        )
+    if study.metric_names is None:
+        _describe(study, folder.config)
+    return study
+
+
+def _describe(study: optuna.Study, config: StudyConfig) -> None:
+    """Tell Optuna's own tools what a study is about, and what its scores are called."""
+    import optuna
+
+    study.set_user_attr("environment", config.environment.id)
+    study.set_user_attr("strategy", config.strategy)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        study.set_metric_names(config.score_names)

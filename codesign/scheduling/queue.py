@@ -210,6 +210,7 @@ class TrialQueue:
         attributes: dict[str, Any] = {}
         if result.evaluation is not None:
             attributes = {name: getattr(result.evaluation, name) for name in REPORTED_METRICS}
+        attributes |= {"design": result.design, "values": result.values, "controller": result.controller}
         if result.reason:
             attributes["reason"] = result.reason
         if self.storage.shared:
