@@ -154,7 +154,7 @@ class EnvironmentConfig(Config):
         """Return the batched environment if there is one, else one process per environment."""
         import gymnasium
 
-        if self.batched:
+        if self.batched or not self.residual_scale:
             envs = gymnasium.make_vec(self._spec(), num_envs=num_envs, **self._options(overrides))
             if not self.residual_scale:
                 return envs
@@ -165,12 +165,13 @@ class EnvironmentConfig(Config):
             self._spec(),
             num_envs=num_envs,
             vectorization_mode="async" if num_envs > 1 else "sync",
+            # The QP of each environment runs in its process too.
             vector_kwargs={
                 "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP,
                 # Set explicitly: the start method of joblib's workers cannot pickle these environments.
                 **({"context": "fork"} if num_envs > 1 else {}),
             },
-            wrappers=[self._wrapped] if self.residual_scale else [],
+            wrappers=[self._wrapped],
             **self._options(overrides),
         )
 

@@ -178,7 +178,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         else:
             parts.append(
                 "No surrogate ships for this robot: the default backend is FEM. "
-                f'`gymnasium.make_vec("{identifier}", ...)` steps single environments one after the other.'
+                f'`gymnasium.make_vec("{identifier}", ...)` steps each environment in a process of its own.'
             )
         return "\n\n".join(parts)
 

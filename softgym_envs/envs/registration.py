@@ -64,10 +64,7 @@ class EnvironmentRow:
         return EnvSpec(
             id=id,
             entry_point="softgym_envs.envs.env:SoftRobotEnv",
-            # Only the surrogate is batched; without this entry point, make_vec steps single environments in turn.
-            vector_entry_point=(
-                "softgym_envs.envs.vector_env:SoftRobotVectorEnv" if self.backend in ("surrogate", None) else None
-            ),
+            vector_entry_point="softgym_envs.envs.parallel:make_batch",
             max_episode_steps=self.max_episode_steps,
             kwargs={"robot": self.robot, "task": self.task, "backend": self.backend, **self.defaults},
         )

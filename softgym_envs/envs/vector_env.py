@@ -46,7 +46,7 @@ class SoftRobotVectorEnv(VectorEnv):
         num_envs: number of sub-environments.
         max_episode_steps: time limit; default none.
         autoreset_mode: ``"SameStep"``, ``"NextStep"`` or ``"Disabled"``.
-        backend: ``"surrogate"``; ``gymnasium.make_vec(..., vectorization_mode="sync")`` steps other backends.
+        backend: ``"surrogate"``; ``gymnasium.make_vec`` steps other backends in processes (`ParallelVectorEnv`).
         render_mode: must be None; batches are not rendered.
         **options: ``design``, ``action_mode`` and the other arguments that the page of each environment ID lists;
             every sub-environment samples its own design.
@@ -83,7 +83,7 @@ class SoftRobotVectorEnv(VectorEnv):
         if setup.backend != "surrogate":
             raise ValueError(
                 f"backend = {setup.backend!r} of robot '{self.robot.name}' has no batched environment; "
-                "allowed: 'surrogate', or gymnasium.make_vec(..., vectorization_mode='sync')"
+                "allowed: 'surrogate', or gymnasium.make_vec, which steps it in processes"
             )
         check_batchable(self.task)
         self.num_envs = num_envs

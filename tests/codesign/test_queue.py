@@ -46,7 +46,7 @@ def test_optunas_own_tools_find_names_and_results(study):
         found = result(queue.claim(), None, scores=[0.5, -3.0], values={"success": 0.5}, design={"height": 0.02})
         queue.finish(found)
         optunas = queue.study
-    assert optunas.metric_names == folder.config.score_names == [folder.config.objective, "-mean_effort"]
+    assert optunas.metric_names == folder.config.score_names == ["-mean_distance", "-mean_effort"]
     assert optunas.user_attrs == {"environment": folder.config.environment.id, "strategy": folder.config.strategy}
     kept = optunas.trials[0].user_attrs
     assert (kept["values"], kept["design"], kept["controller"]) == ({"success": 0.5}, {"height": 0.02}, "qp")

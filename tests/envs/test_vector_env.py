@@ -6,6 +6,7 @@ import pytest
 
 import softgym_envs
 from agents.vec_env import SB3VecEnv
+from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import DesignError
 
 
@@ -83,7 +84,7 @@ def test_given_designs_do_not_stay_where_others_are_sampled():
 
 def test_bad_input():
     with pytest.raises(ValueError, match="fem.*surrogate"):
-        gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2, backend="fem")
+        SoftRobotVectorEnv("finger", num_envs=2, backend="fem")
     env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2)
     env.reset(seed=0)
     for actions in (np.zeros((3, 2)), np.zeros(2), np.full((2, 2), np.nan)):
