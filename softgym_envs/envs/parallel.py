@@ -101,10 +101,9 @@ class ParallelVectorEnv(AsyncVectorEnv):
             ValueError: for an unknown option or a malformed goal.
         """
         given = dict(options or {})
-        design, goal = given.get("design"), given.get("goal")
-        for name, rows in (("design", design), ("goal", goal if np.ndim(goal) == 3 else None)):
-            if rows is not None and not isinstance(rows, Mapping) and len(rows) != self.num_envs:
-                raise ValueError(f"{name} must be one for all or {self.num_envs}, got {len(rows)}")
+        for name in _options_by_row(given):
+            if len(given[name]) != self.num_envs:
+                raise ValueError(f"{name} must be one for all or {self.num_envs}, got {len(given[name])}")
         return super().reset(seed=seed, options=given)
 
     def _raise_if_errors(self, successes: Iterable[bool]) -> None:
@@ -118,6 +117,16 @@ class ParallelVectorEnv(AsyncVectorEnv):
             raise error
 
 
+def _options_by_row(options: Mapping[str, Any]) -> list[str]:
+    """Return the names of options of `reset` that hold a value for each sub-environment."""
+    design, goal = options.get("design"), options.get("goal")
+    lists = {
+        "design": design is not None and not isinstance(design, Mapping),
+        "goal": goal is not None and np.ndim(goal) == 3,
+    }
+    return [name for name, given in lists.items() if given]
+
+
 class _OwnOptions(gymnasium.Wrapper):
     """Takes the body and the goals of one sub-environment from the options of all."""
 
@@ -127,10 +136,8 @@ class _OwnOptions(gymnasium.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         own = dict(options or {})
-        if own.get("design") is not None and not isinstance(own["design"], Mapping):
-            own["design"] = own["design"][self._index]
-        if np.ndim(own.get("goal")) == 3:
-            own["goal"] = own["goal"][self._index]
+        for name in _options_by_row(own):
+            own[name] = own[name][self._index]
         return self.env.reset(seed=seed, options=own)
 
 
