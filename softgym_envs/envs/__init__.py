@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from softgym_envs.envs.env import SoftRobotEnv as SoftRobotEnv
     from softgym_envs.envs.goals import GoalObservation as GoalObservation
     from softgym_envs.envs.tasks.base import Task as Task
-    from softgym_envs.envs.tasks.reach import Reach as Reach
     from softgym_envs.envs.torch_env import TorchVectorEnv as TorchVectorEnv
 
 __getattr__, __dir__, __all__ = lazy_exports(
@@ -17,7 +16,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "env": ["SoftRobotEnv"],
         "goals": ["GoalObservation"],
         "tasks.base": ["Task"],
-        "tasks.reach": ["Reach"],
         "torch_env": ["TorchVectorEnv"],
     },
 )
