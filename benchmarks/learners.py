@@ -143,8 +143,6 @@ def spread(values: list[float | None], form: str = ".3g") -> str:
         return "never" if np.isinf(value) else f"{value:{form}}"
 
     middle = text(known[(len(known) - 1) // 2] if np.isinf(known).any() else float(np.median(known)))
-    if len(known) == 1:
-        return f"{middle} (one seed)"
     return middle if known[0] == known[-1] else f"{middle} ({text(known[0])} to {text(known[-1])})"
 
 

@@ -129,10 +129,10 @@ def learners() -> str:
     for task in TASKS:
         for learner in REPORTS:
             name, kind = f"{task}, {learner}", "model-based" if learner in MODEL_BASED else "model-free"
-            known = name not in found
-            cells = [spread(found[f"{name}: {column}"]) if known else "not run" for column in columns]
-            rows.append([task, f"{LEARNERS[learner]} ({kind})", *cells])
-    return markdown(["task", "learner", *columns], rows, "llrrrrr")
+            known = [found.get(f"{name}: {column}", []) for column in columns]
+            cells = [spread(values) if values else "not run" for values in known]
+            rows.append([task, f"{LEARNERS[learner]} ({kind})", str(len(known[0])), *cells])
+    return markdown(["task", "learner", "seeds", *columns], rows, "llrrrrrr")
 
 
 def kills() -> str:
