@@ -17,8 +17,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from site_api import PACKAGES, api_index, api_page
 from site_environments import environment_sections, environment_top
+from site_notebooks import PAGES, notebooks
 from site_robots import model_facts, robot_of, robot_sections
-from site_writing import DOCS, HERE, code, compose, describes, environment_pages, first_sentence, picture, summary
+from site_writing import (
+    DOCS,
+    HERE,
+    code,
+    compose,
+    describes,
+    environment_pages,
+    first_sentence,
+    picture,
+    picture_file,
+    summary,
+)
 
 from softgym_envs import ENVIRONMENTS
 from softgym_envs.robots import ROBOTS
@@ -39,11 +51,12 @@ def title_of(page: str) -> str:
 
 
 def cards(entries: Iterable[tuple[str, Sequence[str], str]]) -> str:
-    """Return a grid of cards, each from a page, names of pictures and a text."""
+    """Return a grid of cards, each from a page, names of pictures or films and a text."""
     items = []
     for page, images, text in entries:
-        shown = next((n for n in images if (DOCS / "images" / f"{n}.png").is_file()), None)
-        image = f"[![](../images/{shown}.png)]({Path(page).name})\n\n    " if shown else ""
+        shown = picture_file(*images)
+        alt = f"{title_of(page)}, in motion" if shown.endswith(".webp") else title_of(page)
+        image = f"[![{alt}](../images/{shown})]({Path(page).name})\n\n    " if shown else ""
         items.append(f"-   {image}**[{title_of(page)}]({Path(page).name})**\n\n    {text}")
     return '<div class="grid cards" markdown>\n\n' + "\n\n".join(items) + "\n\n</div>"
 
@@ -55,6 +68,13 @@ def environment_list() -> str:
         for name, identifier in environment_pages().items()
         if (DOCS / f"environments/{name}.md").is_file()
     )
+
+
+def gallery() -> str:
+    """Return the cards of the films of all environments, for a page in the folder of the documentation."""
+    entries = ((f"environments/{page}.md", (page,), f"`{name}`") for page, name in environment_pages().items())
+    text = cards(entry for entry in entries if picture_file(*entry[1]).endswith(".webp"))
+    return re.sub(r"\]\((\w+\.md)\)", r"](environments/\1)", text).replace("(../images/", "(images/")
 
 
 def robot_list() -> str:
@@ -82,11 +102,17 @@ def on_config(config: Any) -> Any:
         "Robots": [f"robots/{name}.md" for name in ROBOTS],
         "API reference": [f"reference/{package}.md" for package in PACKAGES],
     }
-    for entry in config.nav:
-        for title, pages in entry.items():
-            if title in generated:
-                pages += generated[title]
+    _complete(config.nav, generated)
     return config
+
+
+def _complete(entries: list[Any], generated: dict[str, list[str]]) -> None:
+    """Add generated pages to the sections of their titles, at any depth."""
+    for entry in entries:
+        for title, pages in entry.items() if isinstance(entry, dict) else ():
+            if isinstance(pages, list):
+                _complete(pages, generated)
+                pages += generated.get(title, [])
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -96,6 +122,8 @@ def on_files(files: Any, config: Any) -> Any:
     files.append(File.generated(config, "reference/index.md", content=api_index()))
     for package in PACKAGES:
         files.append(File.generated(config, f"reference/{package}.md", content=api_page(package)))
+    for path, content in notebooks().items():
+        files.append(File.generated(config, path, content=content))
     known = {f"environments/{name}.md" for name in (*environment_pages(), "index")}
     for file in list(files):
         if file.src_uri.startswith("environments/") and file.src_uri.endswith(".md") and file.src_uri not in known:
@@ -109,6 +137,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     if name == "index":
         lists = {"environments": environment_list, "robots": robot_list}
         return markdown.replace(HERE, lists[folder]()) if folder in lists else markdown
+    if page.file.src_uri.removesuffix(".md") in PAGES:
+        return f"{markdown}\n\n[This page as a notebook]({name}.ipynb){{ download }}\n"
+    if page.file.src_uri == "gallery.md":
+        return markdown.replace(HERE, gallery())
     if folder == "environments":
         identifier = environment_pages()[name]
         return compose(markdown, environment_top(identifier), environment_sections(identifier))

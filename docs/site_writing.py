@@ -133,12 +133,16 @@ def compose(page: str, top: str, template: Mapping[str, Callable[[], str]]) -> s
     return "\n\n".join(part for part in parts if part.strip()) + "\n"
 
 
+def picture_file(*names: str) -> str:
+    """Return the first file of ``docs/images`` that exists, films before pictures, or an empty text."""
+    files = (f"{name}{ending}" for name in names for ending in (".webp", ".png"))
+    return next((file for file in files if (DOCS / "images" / file).is_file()), "")
+
+
 def picture(*names: str, alt: str) -> str:
-    """Show the first picture of ``docs/images`` that exists, or nothing."""
-    for name in names:
-        if (DOCS / "images" / f"{name}.png").is_file():
-            return f"![{alt}](../images/{name}.png){{ .robot }}"
-    return ""
+    """Show the first film or picture of ``docs/images`` that exists, or nothing."""
+    file = picture_file(*names)
+    return f"![{alt}](../images/{file}){{ .robot }}" if file else ""
 
 
 # -- docstrings -----------------------------------------------------------------------------------------------------

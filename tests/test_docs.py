@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import json
 import re
 import subprocess
 import sys
@@ -137,6 +138,15 @@ def test_the_code_of_a_page_runs(page, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert ".save(" not in page.read_text() or list(tmp_path.glob("*.png"))
+
+
+def test_notebooks_hold_the_code_of_their_pages():
+    for path, text in importlib.import_module("site_notebooks").notebooks().items():
+        cells = json.loads(text)["cells"]
+        blocks = code_blocks((DOCS / path).with_suffix(".md"))
+        expected = [(f"%%writefile {title}\n" if title else "") + block.strip("\n") for title, block, _ in blocks]
+        assert [cell["source"] for cell in cells if cell["cell_type"] == "code"] == expected
+        assert any(cell["cell_type"] == "markdown" for cell in cells)
 
 
 @pytest.mark.parametrize(("page", "config"), [("tutorials/codesign", StudyConfig), ("surrogates", FitConfig)])
