@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from softgym_envs import make_robot
+from softgym_envs.backends.torch_batch import TorchBatch
 from softgym_envs.config import load_config
 from softgym_envs.errors import DataError
 from softgym_envs.surrogate.correction import HIGHEST_ORDER, LOWEST_ORDER, EffortCorrection, fit_correction, order_of
@@ -118,6 +119,9 @@ def test_a_corrected_model_is_a_condensed_model():
     np.testing.assert_allclose(
         W * factor[:, :, None], plain.compliance(plain.context(designs), displacement), rtol=1e-6
     )
+    bodies = TorchBatch(model, torch.device("cpu"), torch.float64).prepare(torch.as_tensor(designs))
+    stiffness = model.context(designs).stiffness
+    np.testing.assert_allclose(bodies["effort"], stiffness * model.energy_scale / model.half_range, rtol=1e-6)
     in_torch = TorchModel(model)(torch.as_tensor(designs), torch.as_tensor(displacement))
     for value, expected in zip(in_torch, (effort, effector, W), strict=True):
         np.testing.assert_allclose(value.detach(), expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
