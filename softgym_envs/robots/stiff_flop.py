@@ -59,7 +59,8 @@ class StiffFlop(Robot):
         unilateral: whether pressures must not be negative (default): a chamber that the others stretch beyond its
             commanded volume is open, without pressure.
         largest_volume: largest growth of a pair of chambers [m3]. The default is that of the authors' public code, and
-            the range of the shipped surrogate. Target A of the thesis (fig. 4.11) needs 35 mm3: pass 60e-9.
+            the range of the shipped surrogate. Target A of the thesis (fig. 4.11) needs 35 mm3: pass 40e-9.
+            The larger the volumes, the more bodies buckle.
         **options: options of `Robot`.
     """
 

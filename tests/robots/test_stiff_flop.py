@@ -187,7 +187,7 @@ def test_follows_the_published_circle():
     assert max(errors[20:]) < 0.2e-3
 
 
-@pytest.mark.parametrize(("volume", "misses"), [(30.0, (3.881, 0.0, 0.0)), (60.0, (0.0, 0.0, 0.0))])
+@pytest.mark.parametrize(("volume", "misses"), [(30.0, (3.881, 0.0, 0.0)), (40.0, (0.0, 0.0, 0.0))])
 def test_targets_of_the_thesis(volume, misses):
     """Figure 4.11 [mm]: one pair of the first target grows to 35 mm3, more than the default allows."""
     robot = StiffFlop(largest_volume=volume * UL)
@@ -202,7 +202,7 @@ def test_targets_of_the_thesis(volume, misses):
 
 
 def test_the_shipped_surrogate_stands_for_the_published_range_only():
-    wide = StiffFlop(largest_volume=60.0 * UL)
+    wide = StiffFlop(largest_volume=40.0 * UL)
     assert wide.mechanics_key == StiffFlop().mechanics_key
     with pytest.raises(WeightsError, match="'trunk' have actuators"):
         SurrogateBackend(wide)
