@@ -84,11 +84,21 @@ def test_citation_and_version():
     assert citation["title"] in (ROOT / "README.md").read_text()
 
 
-def test_verbs_are_completed_in_the_shell():
-    variables = {"_SOFTGYM_COMPLETE": "bash_complete", "COMP_WORDS": "softgym rol", "COMP_CWORD": "1"}
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        ("softgym rol", ["rollout"]),
+        ("softgym rollout SoftGym/FingerT", ["SoftGym/FingerTrack-v0"]),
+        ("softgym show diam", ["diamond"]),
+        ("softgym codesign --config finger_reach_scr", ["finger_reach_scratch"]),
+    ],
+)
+def test_words_are_completed_in_the_shell(words, completed):
+    count = str(len(words.split()) - 1)
+    variables = {"_SOFTGYM_COMPLETE": "bash_complete", "COMP_WORDS": words, "COMP_CWORD": count}
     command = [sys.executable, "-c", "from softgym_envs.cli import main; main()"]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **variables}, cwd=ROOT)
-    assert done.stdout.strip() == "plain,rollout"
+    assert done.stdout.split() == [f"plain,{word}" for word in completed]
 
 
 def test_the_first_compilation_is_announced_once(monkeypatch, capfd):

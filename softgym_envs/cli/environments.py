@@ -40,7 +40,7 @@ def list_(as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("environment")
+@click.argument("environment", shell_complete=options.complete_environment)
 @click.option("--agent", default="qp", show_default=True, help=AGENT_HELP)
 @click.option("--backend", help="surrogate or fem (default: the environment's).")
 @options.design

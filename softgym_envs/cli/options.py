@@ -105,6 +105,20 @@ def check_agent(name: str) -> None:
         raise ConfigError(f"{unknown_name('agent', name, names)}, or a .safetensors file")
 
 
+def complete_environment(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    """Return the IDs of environments that begin with ``incomplete``, for completion in the shell."""
+    from softgym_envs.envs.registration import ENVIRONMENTS
+
+    return [name for name in ENVIRONMENTS if name.startswith(incomplete)]
+
+
+def complete_robot(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    """Return the names of robots that begin with ``incomplete``, for completion in the shell."""
+    from softgym_envs.robots.registry import ROBOTS
+
+    return [name for name in ROBOTS if name.startswith(incomplete)]
+
+
 def design_of(pairs: tuple[str, ...]) -> dict[str, float]:
     """Return the design variables of ``--design name=value``.
 

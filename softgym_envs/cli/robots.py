@@ -15,7 +15,7 @@ from softgym_envs.storage import atomic_write
 
 
 @click.command()
-@click.argument("robot")
+@click.argument("robot", shell_complete=options.complete_robot)
 @options.robot_option
 @options.design
 @click.option("--picture", type=options.PATH, help="Write a PNG image of the body to this file.")
@@ -74,7 +74,7 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
 
 
 @click.command()
-@click.argument("robot")
+@click.argument("robot", shell_complete=options.complete_robot)
 @click.argument("files", nargs=-1, type=options.PATH)
 @options.robot_option
 @options.design

@@ -47,7 +47,7 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
 
 
 @click.command()
-@click.argument("robot")
+@click.argument("robot", shell_complete=options.complete_robot)
 @click.argument("files", nargs=-1, required=True, type=options.PATH)
 @options.robot_option
 @options.design
