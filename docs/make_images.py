@@ -1,7 +1,7 @@
 """Draw the pictures of the documentation: ``make docs-images``, or ``python docs/make_images.py [NAME ...]``.
 
 Names are those of robots, of environment pages (``finger_reach``), of their films (``finger_reach.webp``) and of other
-pictures; default: all. Pictures go to ``docs/images/NAME.png``, the animation to ``docs/images/episodes.gif``. The
+pictures; default: all. Pictures go to ``docs/images/NAME.png``, the animation to ``docs/images/episodes.webp``. The
 picture ``report`` needs a finished study (``make demo``) and Chromium, so it is drawn only when it is named.
 """
 
@@ -12,14 +12,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageSequence
 from site_writing import DOCS, environment_pages
 
 from agents.evaluation import make_agent
@@ -45,8 +45,8 @@ COMMANDS: dict[str, tuple[float, ...]] = {
     "three_finger_friction_gripper": (0.5, 0.5, 0.3, 0.3, 0.3, 0.3),
 }
 WIDTH, HEIGHT = 800, 520
-FILMED = ("SoftGym/FingerTrack-v0", "SoftGym/DiamondTrack-v0", "SoftGym/TrunkTrack-v0")
-FRAMES = 45
+SHOWN = ("finger_reach", "trunk_track", "gripper_lift")
+"""Environments of the animation of the home page."""
 FILM_SIZE, FILM_FRAMES = (360, 300), 30
 FILM_AGENTS = {"finger_grasp": "force", "gripper_lift": "close", "tetrapod_carry": "tetrapod_carry"}
 """Agents of the films of environments, where it is not the inverse QP."""
@@ -99,28 +99,15 @@ def draw_film(name: str, path: Path) -> None:
     write_video(path, frames + [frames[-1]] * 6, fps=10.0)
 
 
-def film(identifier: str, size: int) -> Iterator[np.ndarray]:
-    """Yield `FRAMES` pictures of one episode under the inverse QP."""
-    env = gymnasium.make(identifier, render_mode="rgb_array", render_size=(size, size))
-    act = make_agent("qp")
-    observation, _ = env.reset(seed=1)
-    unwrapped: Any = env.unwrapped
-    steps = unwrapped.task.horizon
-    shown = np.linspace(0, steps - 1, FRAMES).astype(int)
-    for step in range(steps):
-        observation, *_ = env.step(act(observation, unwrapped))
-        for _ in range(int((shown == step).sum())):
-            yield np.asarray(env.render())
-    env.close()
-
-
 def draw_episodes(path: Path) -> None:
-    """Write an animation of three robots that follow their paths."""
-    films = [list(film(identifier, 280)) for identifier in FILMED]
-    rows = [np.concatenate(frames, axis=1) for frames in zip(*films, strict=True)]
-    palette = Image.fromarray(rows[len(rows) // 2]).quantize(96)
-    frames = [Image.fromarray(row).quantize(palette=palette, dither=Image.Dither.NONE) for row in rows]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=80, loop=0, optimize=True)
+    """Write the films of `SHOWN` side by side, the shorter ones with their last image held."""
+    films = []
+    for name in SHOWN:
+        with Image.open(DOCS / "images" / f"{name}.webp") as film:
+            images = [np.asarray(image.convert("RGB").resize((288, 240))) for image in ImageSequence.Iterator(film)]
+            films.append(images)
+    length = max(map(len, films))
+    write_video(path, [np.concatenate([f[min(k, len(f) - 1)] for f in films], axis=1) for k in range(length)], fps=8.0)
 
 
 def draw_codesign() -> np.ndarray:
@@ -177,7 +164,7 @@ def main(names: list[str]) -> None:
     for name in names or [*table, *films, "episodes"]:
         path = DOCS / "images" / f"{name.removesuffix('.webp')}.png"
         if name == "episodes":
-            path = path.with_suffix(".gif")
+            path = path.with_suffix(".webp")
             draw_episodes(path)
         elif name.endswith(".webp"):
             path = path.with_suffix(".webp")
