@@ -370,13 +370,16 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]], kept: dict[s
     }
 
 
-def _steps_to(curve: list[list[float]], limit: float) -> float:
-    """Return the environment steps after which the regret stays below a limit; a noisy score may raise it again."""
+def _cost_to(curve: list[list[float]], limit: float, column: int = 0) -> float:
+    """Return the environment steps (column 0) or CPU seconds (1) after which the regret stays below a limit.
+
+    A noisy score may raise the regret again.
+    """
     reached = float("inf")
-    for steps, _, regret in reversed(curve):
-        if regret > limit:
+    for point in reversed(curve):
+        if point[2] > limit:
             break
-        reached = steps
+        reached = point[column]
     return reached
 
 
@@ -409,8 +412,9 @@ def strategies() -> dict[str, object]:
         result[f"{name}: CPU minutes"] = spread([row[1] / 60 for row in last], ".1f")
         for limit in (0.1, 0.01):
             result[f"{name}: environment steps to {limit:.0%} regret"] = spread(
-                [_steps_to(run["regret"], limit) for run in runs], ",.0f"
+                [_cost_to(run["regret"], limit) for run in runs], ",.0f"
             )
+        result[f"{name}: CPU seconds to 1% regret"] = spread([_cost_to(run["regret"], 0.01, 1) for run in runs], ".0f")
     return result
 
 
