@@ -14,6 +14,7 @@ import click
 
 from benchmarks import (
     accuracy,
+    beams,
     carry,
     codesign_scale,
     contact,
@@ -49,6 +50,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "fem_step": speed.fem_step,
     "fem_profile": speed.fem_profile,
     "fem_speed": speed.fem_speed,
+    "beams": beams.beams,
     "notched_beam": speed.notched_beam,
     "surrogate_step": speed.surrogate_step,
     "gpu_step": gpu.gpu_step,

@@ -66,6 +66,11 @@ class Chamber(Constraint):
         tangents: for each centre line, its weighted tangents as linear combinations of rows (`Beam.line`):
             ``node_ids`` (q, k) and ``weights`` (q, k), whose norms add up to the length.
         area: cross-section of one line [m2].
+
+    Attributes:
+        ids: rows of all tangents, shape (q, k).
+        weights: their weights, shape (q, k).
+        rest_length: length of all lines at rest [m].
     """
 
     size = 1
@@ -76,15 +81,15 @@ class Chamber(Constraint):
             raise ValueError(f"chamber '{name}': area = {area} m2 must be positive and finite")
         self.name = name
         self.area = area
-        self._ids = np.concatenate([line.node_ids for line in tangents])
-        self._weights = np.concatenate([line.weights for line in tangents])
-        nodes, slot = np.unique(self._ids, return_inverse=True)
-        self._slot = slot.reshape(self._ids.shape)
+        self.ids = np.concatenate([line.node_ids for line in tangents])
+        self.weights = np.concatenate([line.weights for line in tangents])
+        nodes, slot = np.unique(self.ids, return_inverse=True)
+        self._slot = slot.reshape(self.ids.shape)
         self.dofs = (3 * nodes[:, None] + np.arange(3)).ravel()
         self._gradient = np.empty(len(self.dofs))
-        self._rows, group = np.unique(self._ids, axis=0, return_inverse=True)
+        self._rows, group = np.unique(self.ids, axis=0, return_inverse=True)
         self._group = group.ravel()
-        k = 3 * self._ids.shape[1]
+        k = 3 * self.ids.shape[1]
         self._blocks = np.empty((len(self._rows), k, k))
         self.rest_length = float(sum(np.linalg.norm(line.points, axis=1).sum() for line in tangents))
 
@@ -95,7 +100,7 @@ class Chamber(Constraint):
         return self.linearise(x)[1]
 
     def linearise(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        length = _line_length(x, self._ids, self._weights, self._slot, self._gradient)
+        length = _line_length(x, self.ids, self.weights, self._slot, self._gradient)
         return np.array([self.area * (length - self.rest_length)]), self.area * self._gradient[None, :]
 
     def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
@@ -105,5 +110,5 @@ class Chamber(Constraint):
         return np.repeat(dofs, k, axis=1).ravel(), np.tile(dofs, (1, k)).ravel()
 
     def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray:
-        _line_hessian(x, self._ids, self._weights, self._group, effort[0] * self.area, self._blocks)
+        _line_hessian(x, self.ids, self.weights, self._group, effort[0] * self.area, self._blocks)
         return self._blocks

@@ -7,12 +7,16 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.mechanics.assembly import MassMatrix
+from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.elements.rigid import RigidBody
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, BlockPattern, analyse
+
+MAX_ACTUATORS = 16
+"""Complementarity problems have no more."""
 
 FIXED, ORIGIN, DIRECTOR, MOUNTED = -1, 0, 1, 2
 """Kinds of rows: those that do not move, origins and directors of frames, and origins of frames on another frame."""
@@ -135,6 +139,28 @@ class Points(NamedTuple):
     weights: np.ndarray
 
 
+class Chambers(NamedTuple):
+    """Constraints of kind `Chamber` along elements, tangent by tangent.
+
+    Attributes:
+        number: constraint row of each chamber, shape (c,).
+        rest: volume of each chamber at rest [m3], shape (c,).
+        chamber: constraint row of each tangent, shape (t,).
+        area: cross-section of its line [m2], shape (t,).
+        frames: first rows of the frames of its element, shape (t, 3).
+        weights: of the rows of these frames, shape (t, 3, 4).
+        place: blocks of the tangent stiffness, as in `Elements`, shape (t, 3, 3).
+    """
+
+    number: np.ndarray
+    rest: np.ndarray
+    chamber: np.ndarray
+    area: np.ndarray
+    frames: np.ndarray
+    weights: np.ndarray
+    place: np.ndarray
+
+
 class BeamBody(NamedTuple):
     """A body whose unknowns are the six motions of each frame: one block of equations for each frame that can move."""
 
@@ -146,10 +172,11 @@ class BeamBody(NamedTuple):
     components: Components
     servos: Servos
     points: Points
+    chambers: Chambers
 
 
 def is_beam_body(model: MechanicalModel) -> bool:
-    """Whether a model consists of quadratic beams, rigid parts, servos and points only, and cannot touch anything."""
+    """Whether a model consists of quadratic beams, rigid parts, servos, chambers and points, and touches nothing."""
     constraints = [c for c, _ in model.rows]
     points = [c for c in constraints if isinstance(c, Point)]
     used = np.unique(np.concatenate([block.nodes_used for block in model.blocks]))
@@ -158,11 +185,22 @@ def is_beam_body(model: MechanicalModel) -> bool:
         model.contact is None
         and any(isinstance(block, Beam) for block in model.blocks)
         and all(isinstance(b, RigidBody) or (isinstance(b, Beam) and b.order == 2) for b in model.blocks)
-        and all(isinstance(c, Servo | Point) for c in constraints)
+        and all(isinstance(c, Servo | Point | Chamber) for c in constraints)
+        and all(_runs_along_elements(c, model) for c in constraints if isinstance(c, Chamber))
+        and sum(c.size for c in model.constraints["a"]) <= MAX_ACTUATORS
         and not model.constraints["b"]
         and all(p.embedding.node_ids.shape[1] == 4 for p in points)
         and bool(np.isin(used, in_frames).all())
     )
+
+
+def _runs_along_elements(chamber: Chamber, model: MechanicalModel) -> bool:
+    """Whether each tangent of a chamber depends on the four rows of three frames that are not mounted on others."""
+    if chamber.ids.shape[1] != 12:
+        return False
+    rows = chamber.ids.reshape(-1, 3, 4)
+    own = np.isin(rows[:, :, 0], model.frames.rows)
+    return bool(own.all() and (rows == rows[:, :, :1] + np.arange(4)).all())
 
 
 def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
@@ -189,7 +227,10 @@ def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
     first, second = block_of_frame[owner[masses.row]], block_of_frame[owner[masses.col]]
     element_blocks = block_of_frame[owner[elements]]
     pairs = {(int(i), int(j)) for i, j in zip(first[moved], second[moved], strict=True)}
-    pairs |= {(int(i), int(j)) for group in element_blocks for i in group for j in group if i >= 0 and j >= 0}
+    chambers = [(c, rows.start) for c, rows in model.rows if isinstance(c, Chamber)]
+    lines = np.concatenate([np.empty((0, 12), dtype=np.int64), *(c.ids for c, _ in chambers)]).reshape(-1, 3, 4)[..., 0]
+    groups = np.concatenate([element_blocks, block_of_frame[owner[lines]]])
+    pairs |= {(int(i), int(j)) for group in groups for i in group for j in group if i >= 0 and j >= 0}
     order, pattern = analyse(len(movable), pairs)
     block_of_frame[movable] = order
     block = np.where(kind == FIXED, -1, block_of_frame[owner])
@@ -248,6 +289,15 @@ def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
             number=np.array([start for _, start in points], dtype=np.int64),
             rows=np.array([p.embedding.node_ids[0] for p, _ in points], dtype=np.int64).reshape(-1, 4),
             weights=np.array([p.embedding.weights[0] for p, _ in points]).reshape(-1, 4),
+        ),
+        chambers=Chambers(
+            number=np.array([start for _, start in chambers], dtype=np.int64),
+            rest=np.array([c.area * c.rest_length for c, _ in chambers], dtype=float),
+            chamber=np.repeat([start for _, start in chambers], [len(c.ids) for c, _ in chambers]).astype(np.int64),
+            area=np.repeat([c.area for c, _ in chambers], [len(c.ids) for c, _ in chambers]).astype(float),
+            frames=lines,
+            weights=np.concatenate([np.empty((0, 12)), *(c.weights for c, _ in chambers)]).reshape(-1, 3, 4),
+            place=_element_places(block[lines], pattern),
         ),
     )
 

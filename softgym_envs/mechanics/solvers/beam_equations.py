@@ -1,4 +1,4 @@
-"""The equations of one implicit Euler step of a body of beams, compiled: residual, tangent and constraints.
+"""The compiled equations of a body of beams, for an equilibrium or an implicit Euler step, and their derivative.
 
 Arrays are those of `BeamBody`. The sums are those of the general assembly (`Assembly`); the equations are those of
 frames, six for each, of which some may be held. Tests compare both.
@@ -33,7 +33,7 @@ class Step(NamedTuple):
         velocity: of the rows [m/s], shape (n, 3).
         states: of the Gauss points at the start, shape (m, 2, 7, 3).
         loads: dead loads [N], shape (n, 3).
-        h: duration [s].
+        h: duration [s]; infinite for an equilibrium.
         mass_damping: Rayleigh's alpha [1/s].
         stiffness_damping: Rayleigh's beta [s].
     """
@@ -239,7 +239,7 @@ def _add_inertia(masses, rows, x, step, equations, full):
             # M ((v' - v) / h + alpha v') with v' = (x - x_n) / h
             momentum[row, d] = factor * (x[row, d] - start[row, d]) - velocity[row, d] / step.h
     multiply_mass(masses, momentum, equations.gradient)
-    if not full:
+    if not full or factor == 0.0:
         return
     r, s = np.empty(3), np.empty(3)
     tangent, pairs, entries = equations.tangent, masses.pairs, masses.entries
@@ -306,12 +306,14 @@ def _add_curvature(rows, x, gradient, tangent):
 
 
 @njit(cache=True, error_model="numpy")
-def add_constraints(servos, points, rows, x, effort, equations, full):
+def add_constraints(body, x, effort, equations, full):
     """Fill the values of the constraints, and subtract the forces of their efforts; if ``full``, fill ``H``, too."""
+    servos, points, rows = body.servos, body.points, body.rows
     gradient, H, delta, tangent = equations.gradient, equations.H, equations.delta, equations.tangent
     slope, curved = np.empty(3), np.empty(3)
     if full:
         H[:] = 0.0
+    _add_chambers(body.chambers, rows, x, effort, equations, full)
     for s in range(servos.row.shape[0]):
         row, c = servos.row[s], servos.number[s]
         a, b = servos.directions[s, 0], servos.directions[s, 1]
@@ -365,6 +367,67 @@ def add_constraints(servos, points, rows, x, effort, equations, full):
 
 
 @njit(cache=True, error_model="numpy")
+def _add_chambers(chambers, rows, x, effort, equations, full):
+    """Do for chambers what `add_constraints` does for the others."""
+    gradient, H, delta, tangent = equations.gradient, equations.H, equations.delta, equations.tangent
+    t, motion = np.empty(3), np.empty((3, 18))
+    for c in range(chambers.number.shape[0]):
+        delta[chambers.number[c]] = -chambers.rest[c]
+    for q in range(chambers.chamber.shape[0]):
+        c, area, frames, weights = chambers.chamber[q], chambers.area[q], chambers.frames[q], chambers.weights[q]
+        t[:] = 0.0
+        for a in range(3):
+            for k in range(4):
+                for d in range(3):
+                    t[d] += weights[a, k] * x[frames[a] + k, d]
+        norm = np.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
+        delta[c] += area * norm
+        for d in range(3):
+            t[d] /= norm
+        pull = effort[c] * area
+        for a in range(3):
+            for k in range(4):
+                for d in range(3):
+                    gradient[frames[a] + k, d] -= pull * weights[a, k] * t[d]
+        if not full:
+            continue
+        # The motion of the tangent: frame a moves it by weights[a, 0] u + w x p.
+        for a in range(3):
+            for d in range(3):
+                e, f = (d + 1) % 3, (d + 2) % 3
+                p = 0.0
+                for k in range(1, 4):
+                    p += weights[a, k] * x[frames[a] + k, d]
+                for g in range(3):
+                    motion[g, 6 * a + d] = weights[a, 0] if g == d else 0.0
+                # w x p has the components w_f p_d along e and -w_e p_d along f.
+                motion[d, 6 * a + 3 + d] = 0.0
+                motion[e, 6 * a + 3 + f] = p
+                motion[f, 6 * a + 3 + e] = -p
+        for a in range(3):
+            block = rows.block[frames[a]]
+            if block >= 0:
+                for i in range(6):
+                    for d in range(3):
+                        H[c, block, i] += area * motion[d, 6 * a + i] * t[d]
+        # Second derivative of the norm: (1 - t t^T) / norm on the motion of the tangent.
+        for i in range(18):
+            along = motion[0, i] * t[0] + motion[1, i] * t[1] + motion[2, i] * t[2]
+            for d in range(3):
+                motion[d, i] -= along * t[d]
+        for a in range(3):
+            for b in range(3):
+                place = chambers.place[q, a, b]
+                if place >= 0:
+                    block, scale = tangent[place], -pull / norm
+                    for i in range(6):
+                        for d in range(3):
+                            value = scale * motion[d, 6 * a + i]
+                            for j in range(6):
+                                block[i, j] += value * motion[d, 6 * b + j]
+
+
+@njit(cache=True, error_model="numpy")
 def _hold(pattern, components, equations):
     """Replace the equations of components that are held by uncoupled ones."""
     tangent, H, free = equations.tangent, equations.H, components.free
@@ -398,7 +461,7 @@ def assemble(body, x, effort, step, equations, full):
         equations.tangent[:] = 0.0
     _add_elements(body.elements, x, step, equations, full)
     _add_inertia(body.masses, body.rows, x, step, equations, full)
-    add_constraints(body.servos, body.points, body.rows, x, effort, equations, full)
+    add_constraints(body, x, effort, equations, full)
     _reduce(body.rows, x, gradient, equations.residual)
     free, residual = body.components.free, equations.residual
     for k in range(free.shape[0]):

@@ -1,9 +1,9 @@
-"""Implicit Euler steps of bodies of beams in one compiled call.
+"""Equilibria and implicit Euler steps of bodies of beams in one compiled call.
 
-The solution of each step is that of `Dynamics`, to its tolerance; what is saved is everything around the arithmetic.
+The solutions are those of `Statics` and `Dynamics`, to their tolerance; only what surrounds the arithmetic is saved.
 Newton's method keeps its factor while it converges fast, and takes whole steps only. Anything unusual (no convergence,
-a tangent that is not positive definite, an effort beyond its limit) ends the compiled call before that time step, and
-the general solver takes over.
+a tangent that is not positive definite, an effort beyond its limit) ends the compiled call before that step, and the
+general solver takes over.
 """
 
 from __future__ import annotations
@@ -28,11 +28,16 @@ from softgym_envs.mechanics.solvers.beam_equations import (
     point_states,
 )
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, factorise, solve_lower, solve_upper
+from softgym_envs.mechanics.solvers.complementarity import solve_row
 
 MAX_ITERATIONS = 20
 """Newton iterations of a time step after which the general solver takes over."""
 SLOW = 0.1
 """A step longer than this part of the last one calls for a new factor."""
+LONG, TOO_LONG = 0.01, 1.0
+"""Steps that turn a frame by more [rad], or move it as far, call for a new factor in statics; or the general solver."""
+INCREMENTS = 4
+"""In statics, a step that is too long for Newton's method is divided once into this number of increments."""
 REMAINING, SMALLEST = 0.01, 1e-13
 """The next step must be shorter than this part of the tolerance, or than this length [m], which is near rounding.
 Errors of a time step act on the next one through the velocities."""
@@ -59,10 +64,11 @@ class Factor(NamedTuple):
 
 
 class MarchedSteps(NamedTuple):
-    """Time steps that were taken in one call.
+    """Time steps, or increments towards an equilibrium, that were taken in one call.
 
     Attributes:
-        taken: how many of the time steps were taken.
+        taken: how many of them were taken.
+        solved: whether all were.
         x: rows at the end [m], shape (n, 3).
         velocity: of the rows [m/s], shape (n, 3).
         effort: of all constraint rows, shape (size,).
@@ -76,6 +82,7 @@ class MarchedSteps(NamedTuple):
     """
 
     taken: int
+    solved: bool
     x: np.ndarray
     velocity: np.ndarray
     effort: np.ndarray
@@ -115,10 +122,10 @@ def _factorise(body, equations, factor, rows):
 
 
 @njit(cache=True, error_model="numpy")
-def _correct(body, equations, factor, effort, target, driven, forced):
+def _correct(body, equations, factor, effort, target, driven, forced, one_way):
     """Solve the linearised equations for the steps of the motions and of the efforts, as `Statics` does.
 
-    Returns the largest displacement of the step.
+    Returns the largest displacement of the step; NaN if no set of taut actuators is consistent.
     """
     step, change, W = factor.step, factor.efforts, factor.compliance
     step[:] = equations.residual
@@ -132,11 +139,23 @@ def _correct(body, equations, factor, effort, target, driven, forced):
         gap[i] = equations.delta[row] - target[row] - _dot(factor.half[row], step)
         for j in range(forced.shape[0]):
             gap[i] += W[row, forced[j]] * change[forced[j]]
-    for i in range(count):
-        value = 0.0
-        for j in range(count):
-            value -= factor.driven[i, j] * gap[j]
-        change[driven[i]] = value
+    if one_way.any():
+        among = np.empty((count, count))
+        for i in range(count):
+            for j in range(count):
+                among[i, j] = W[driven[i], driven[j]]
+                gap[i] -= among[i, j] * effort[driven[j]]
+        total = np.empty(count)
+        if not solve_row(among, gap, one_way, total, np.empty((count, count + 1)), np.empty(count, dtype=np.int64)):
+            return np.nan
+        for i in range(count):
+            change[driven[i]] = total[i] - effort[driven[i]]
+    else:
+        for i in range(count):
+            value = 0.0
+            for j in range(count):
+                value -= factor.driven[i, j] * gap[j]
+            change[driven[i]] = value
     for k in range(step.shape[0]):
         for i in range(SIZE):
             step[k, i] = -step[k, i]
@@ -155,13 +174,17 @@ def _correct(body, equations, factor, effort, target, driven, forced):
 
 
 @njit(cache=True, error_model="numpy")
-def _time_step(body, x, effort, target, driven, forced, step, equations, factor, tolerance, fresh):
-    """Solve one time step in place, starting at the predicted rows ``x``; the iterations, or -1 on failure.
+def _solve(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance, fresh):
+    """Solve the equations in place, starting at the predicted rows ``x``; the iterations, or -1 on failure.
 
-    It starts with the factor of the last step unless ``fresh``.
+    It starts with the factor of the last solution unless ``fresh``, and fails where a step with a new factor is longer
+    than the last of them. ``one_way`` (d,) are driven rows that cannot push.
     """
     rows = np.concatenate((driven, forced))
-    before = np.inf
+    before = last = np.inf
+    kept = not fresh
+    radian = body.components.scale[:, 3:].max()
+    long = LONG * radian if step.h == np.inf else np.inf
     enough = min(tolerance, max(REMAINING * tolerance, SMALLEST))
     for iteration in range(1, MAX_ITERATIONS + 1):
         assemble(body, x, effort, step, equations, fresh)
@@ -173,24 +196,28 @@ def _time_step(body, x, effort, target, driven, forced, step, equations, factor,
             for i in range(count):
                 for j in range(count):
                     among[i, j] = factor.compliance[driven[i], driven[j]]
-            if count:
+            if not one_way.any():
                 factor.driven[:count, :count] = np.linalg.inv(among)
-        length = _correct(body, equations, factor, effort, target, driven, forced)
-        if not length < 1e3:  # also true for NaN
+        length = _correct(body, equations, factor, effort, target, driven, forced, one_way)
+        if not length <= TOO_LONG * radian:  # also true for NaN
             return -1
         ratio = length / before
-        if ratio > 1.0:
-            if fresh:
+        if fresh:
+            if length > last:
                 return -1
+            last = length
+        elif ratio > 1.0:
             fresh = True  # this step is not taken
             continue
         move(body.frames, x, factor.step, factor.turned)
         for c in range(effort.shape[0]):
             effort[c] += factor.efforts[c]
-        # Lengths fall by this ratio with every iteration, so this is the length of the next step.
-        if length <= enough or (iteration > 1 and length * ratio <= enough):
+        # Two steps in a row with one factor, or the last new factor, tell how much shorter the next step will be.
+        known = iteration > 1 and (fresh or kept)
+        if length <= enough or (known and length * ratio <= enough):
             return iteration
-        fresh = ratio > SLOW and iteration > 1
+        kept = not fresh
+        fresh = length > long or (iteration > 1 and ratio > SLOW)
         before = length
     return -1
 
@@ -208,6 +235,7 @@ def _march(
     targets,
     driven,
     forced,
+    one_way,
     limit,
     loads,
     h,
@@ -223,7 +251,7 @@ def _march(
     size = effort.shape[0]
     everything = np.arange(size)
     kept, kept_velocity, kept_effort = x.copy(), velocity.copy(), effort.copy()
-    add_constraints(body.servos, body.points, body.rows, x, effort, equations, False)
+    add_constraints(body, x, effort, equations, False)
     delta[:] = equations.delta
     taken = 0
     for k in range(targets.shape[0]):
@@ -232,9 +260,12 @@ def _march(
         kept_velocity[:] = velocity
         point_states(body.elements, x, states)
         step = Step(kept, kept_velocity, states, loads, h, alpha, beta)
-        motion_of(body.frames, body.components.free, x, velocity, h, factor.step)
-        move(body.frames, x, factor.step, factor.turned)
-        iterations = _time_step(body, x, effort, targets[k], driven, forced, step, equations, factor, tolerance, k == 0)
+        if h < np.inf:  # start from where the current velocity leads
+            motion_of(body.frames, body.components.free, x, velocity, h, factor.step)
+            move(body.frames, x, factor.step, factor.turned)
+        iterations = _solve(
+            body, x, effort, targets[k], driven, forced, one_way, step, equations, factor, tolerance, k == 0
+        )
         good = iterations > 0
         for i in range(limit.shape[0]):
             good = good and abs(effort[i]) <= limit[i]
@@ -245,19 +276,22 @@ def _march(
                 assemble(body, x, effort, step, equations, True)
                 good = _factorise(body, equations, factor, everything)
             else:
-                add_constraints(body.servos, body.points, body.rows, x, effort, equations, False)
+                add_constraints(body, x, effort, equations, False)
         if not good:
             x[:] = kept
             effort[:] = kept_effort
             velocity[:] = kept_velocity
             return taken
         taken += 1
+        totals[1], totals[4] = equations.energy[0], iterations
+        if h == np.inf:
+            continue
         for i in range(x.shape[0]):
             for d in range(3):
                 velocity[i, d] = (x[i, d] - kept[i, d]) / h
         for c in range(size):
             totals[2] += 0.5 * (kept_effort[c] + effort[c]) * (equations.delta[c] - delta[c])
-            delta[c] = equations.delta[c]
+        delta[:] = equations.delta
         momentum = equations.momentum
         momentum[:] = 0.0
         multiply_mass(body.masses, velocity, momentum)
@@ -265,13 +299,13 @@ def _march(
         for i in range(x.shape[0]):
             for d in range(3):
                 kinetic += 0.5 * velocity[i, d] * momentum[i, d]
-        totals[0], totals[1], totals[4] = kinetic, equations.energy[0], iterations
+        totals[0] = kinetic
         totals[3] += drag_work(body.elements, x, step) + 2.0 * alpha * h * kinetic
     return taken
 
 
 class BeamMotion:
-    """Time steps of a body of beams.
+    """Time steps and equilibria of a body of beams.
 
     Args:
         model: a model for which `is_beam_body` holds.
@@ -305,6 +339,7 @@ class BeamMotion:
         effort: np.ndarray,
         targets: np.ndarray,
         is_driven: np.ndarray,
+        unilateral: np.ndarray,
         *,
         limit: np.ndarray,
         loads: np.ndarray,
@@ -321,6 +356,7 @@ class BeamMotion:
             effort: of all constraint rows, shape (size,).
             targets: values of driven rows and efforts of all others at the end of each step, shape (k, size).
             is_driven: rows whose values are commanded, mask of shape (size,).
+            unilateral: first rows, of the actuators, that cannot push, mask of shape (n_a,).
             limit: largest efforts of the first rows, shape (l,).
             loads: dead loads [N], shape (n, 3).
             step: duration of one time step [s].
@@ -330,6 +366,7 @@ class BeamMotion:
         """
         x, velocity, effort, delta = x.copy(), velocity.copy(), effort.copy(), np.empty(len(effort))
         totals = np.zeros(5)
+        driven = np.flatnonzero(is_driven)
         count = _march(
             self.body,
             self.equations,
@@ -340,8 +377,9 @@ class BeamMotion:
             effort,
             delta,
             targets,
-            np.flatnonzero(is_driven),
+            driven,
             np.flatnonzero(~is_driven),
+            unilateral[driven],
             limit,
             loads,
             step,
@@ -351,8 +389,10 @@ class BeamMotion:
             totals,
         )
         kinetic, elastic, work, dissipated, iterations = totals.tolist()
+        delta = self.equations.delta.copy() if count else delta
         return MarchedSteps(
             count,
+            count == len(targets),
             x,
             velocity,
             effort,
@@ -364,3 +404,52 @@ class BeamMotion:
             dissipated,
             int(iterations),
         )
+
+    def balance(
+        self,
+        x: np.ndarray,
+        effort: np.ndarray,
+        target: np.ndarray,
+        driven: np.ndarray,
+        unilateral: np.ndarray,
+        *,
+        loads: np.ndarray,
+        tolerance: float,
+    ) -> MarchedSteps:
+        """Find the equilibrium near a state; no step is taken if Newton's method fails, or if it is not stable.
+
+        Args:
+            x: rows at the start [m], shape (n, 3).
+            effort: of all constraint rows, shape (size,).
+            target: values of driven rows and efforts of all others, shape (size,).
+            driven: rows whose values are commanded, shape (d,).
+            unilateral: first rows, of the actuators, that cannot push, mask of shape (n_a,).
+            loads: dead loads [N], shape (n, 3).
+            tolerance: largest remaining correction of any row [m].
+        """
+        is_driven = np.zeros(len(effort), dtype=bool)
+        is_driven[driven] = True
+        still = np.zeros_like(x)
+        targets = target[None]
+        for _ in range(2):
+            found = self.march(
+                x,
+                still,
+                effort,
+                targets,
+                is_driven,
+                unilateral,
+                limit=np.zeros(0),
+                loads=loads,
+                step=np.inf,  # without inertia and damping
+                mass_damping=0.0,
+                stiffness_damping=0.0,
+                tolerance=tolerance,
+            )
+            if found.solved:
+                break
+            add_constraints(self.body, x, effort, self.equations, False)
+            start = np.where(is_driven, self.equations.delta, effort)
+            targets = start + np.arange(1, INCREMENTS + 1)[:, None] / INCREMENTS * (target - start)
+            targets[-1] = target
+        return found

@@ -24,11 +24,9 @@ import numpy as np
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
-from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
-from softgym_envs.mechanics.solvers.equilibrium import AppliedLoads, Equilibrium
+from softgym_envs.mechanics.solvers.equilibrium import AppliedLoads, Equilibrium, slack_rows
 from softgym_envs.mechanics.solvers.schemes import SCHEMES, GeneralisedAlpha, ImplicitEuler, StartingAcceleration
 from softgym_envs.mechanics.solvers.statics import NewtonFailure, Statics
 
@@ -123,10 +121,15 @@ class Dynamics(Statics):
         self.mass_damping = float(mass_damping)
         self.stiffness_damping = float(stiffness_damping)
         self.max_cuts = max_cuts
-        super().__init__(model, tolerance=tolerance, max_iterations=max_iterations, max_halvings=2)
+        super().__init__(
+            model,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            max_halvings=2,
+            compiled=compiled and scheme == "euler",
+        )
         self._mass = self._assembly.mass_matrix(lumped)
-        self._beams: BeamMotion | None = None
-        self._compiled = compiled and scheme == "euler"
+        self._lumped = lumped
 
     def reset(self) -> None:
         super().reset()
@@ -256,10 +259,15 @@ class Dynamics(Statics):
         Returns:
             How many of the time steps were taken, and the last one if all were.
         """
-        beams, load = self._beam_motion(), applied.get("effector_force")
+        beams, load = self._beam_solver(), applied.get("effector_force")
         modes = [mode] * self._actuators if isinstance(mode, str) else list(mode)
         known = len(modes) == self._actuators and all(m in ("displacement", "effort") for m in modes)
         if beams is None or not known or applied.get("contact") is not None or targets.shape[1] != self._actuators:
+            return 0, None
+        is_driven = np.zeros(len(self.effort), dtype=bool)
+        is_driven[: self._actuators] = [m == "displacement" for m in modes]
+        pushed = self.unilateral & ~is_driven[: self._actuators]
+        if (targets[:, pushed] < 0.0).any():
             return 0, None
         goals = np.zeros((len(targets), len(self.effort)))
         goals[:, : self._actuators] = targets
@@ -269,8 +277,6 @@ class Dynamics(Statics):
             goals[:, self._effectors] = load
         if not np.isfinite(goals).all():
             return 0, None
-        is_driven = np.zeros(len(self.effort), dtype=bool)
-        is_driven[: self._actuators] = [m == "displacement" for m in modes]
         loads = self.model.loads
         found = beams.march(
             self.x,
@@ -278,6 +284,7 @@ class Dynamics(Statics):
             self.effort,
             goals,
             is_driven,
+            self.unilateral,
             limit=np.zeros(0) if largest_effort is None else largest_effort,
             loads=loads,
             step=self.step,
@@ -293,33 +300,22 @@ class Dynamics(Statics):
         self.time += found.taken * self.step
         self._work += found.work
         self._dissipated += found.dissipated
-        if found.taken < len(targets):
+        if not found.solved:
             return found.taken, None
-        W = found.compliance
-        equilibrium = Equilibrium(
-            x=found.x.copy(),
-            condensed=CondensedModel(W, found.delta - W @ found.effort, found.effort, self._roles, self._labels),
-            delta=found.delta,
-            effort=found.effort.copy(),
-            slack=np.zeros(self._actuators, dtype=bool),
+        equilibrium = self._layout.equilibrium(
+            found.x.copy(),
+            found.effort.copy(),
+            found.delta,
+            found.compliance,
+            slack_rows(found.effort, found.delta, targets[-1], np.flatnonzero(is_driven), self.unilateral),
             stable=True,  # the factorisation fails otherwise
             iterations=found.iterations,
-            increments=1,
         )
         potential = found.elastic - float(np.vdot(loads, found.x - self.model.nodes))
         velocity = found.velocity.copy()
         return found.taken, Motion(
             equilibrium, velocity, self.time, found.kinetic, potential, self._work, self._dissipated, substeps=1
         )
-
-    def _beam_motion(self) -> BeamMotion | None:
-        """Return the compiled steps of the body, or None if it needs the general solver."""
-        if not self._compiled or self.model.assembly is not self._assembly:
-            return None
-        if self._beams is None or self._beams.elasticity_version != self.model.elasticity_version:
-            self._beams = BeamMotion.of(self.model, self._mass)
-            self._compiled = self._beams is not None
-        return self._beams
 
     def _displacement_rows(self, mode: str | Sequence[str]) -> np.ndarray:
         """Actuator rows that are driven in displacement."""

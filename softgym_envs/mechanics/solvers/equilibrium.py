@@ -8,8 +8,9 @@ from typing import TypedDict
 
 import numpy as np
 
-from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row
 from softgym_envs.mechanics.contact.contact import ContactMemory, Contacts
+from softgym_envs.mechanics.model import MechanicalModel
 
 
 @dataclass(frozen=True)
@@ -48,3 +49,121 @@ class AppliedLoads(TypedDict, total=False):
     effector_force: Sequence[float] | np.ndarray | None
     contact: Sequence[float] | np.ndarray | None
     contact_mode: str
+
+
+@dataclass(frozen=True)
+class RowLayout:
+    """What the constraint rows of a model are: actuators first, bonds last.
+
+    Attributes:
+        roles: role letters and sizes without bonds.
+        labels: names and units of these rows.
+        bonds: number of bond rows.
+    """
+
+    roles: Roles
+    labels: tuple[Row, ...]
+    bonds: int
+
+    @classmethod
+    def of(cls, model: MechanicalModel) -> RowLayout:
+        """Return the layout of a model's rows."""
+        groups = [group for letter, group in model.constraints.items() if letter != "b"]
+        return cls(
+            roles=tuple(role for role in model.roles if role[0] != "b"),
+            labels=tuple(row for group in groups for c in group for row in c.rows()),
+            bonds=dict(model.roles).get("b", 0),
+        )
+
+    def equilibrium(
+        self,
+        x: np.ndarray,
+        effort: np.ndarray,
+        delta: np.ndarray,
+        W: np.ndarray,
+        slack: np.ndarray,
+        *,
+        stable: bool,
+        iterations: int,
+        increments: int = 1,
+        symmetric: bool = True,
+        contacts: Contacts | None = None,
+        memory: ContactMemory | None = None,
+    ) -> Equilibrium:
+        """Return an equilibrium with its condensed model, from which bonds are eliminated.
+
+        Args:
+            x: node positions [m], shape (n, 3).
+            effort: of all rows, shape (size,).
+            delta: values of all rows, shape (size,).
+            W: compliance of all rows, shape (size, size).
+            slack: actuators that hang slack, shape (n_a,).
+            stable: as in `Equilibrium`.
+            iterations: as there.
+            increments: as there.
+            symmetric: whether ``W`` is symmetric: no point slides.
+            contacts: as there.
+            memory: as there.
+        """
+        count = len(effort) - self.bonds
+        if self.bonds:
+            W = W[:count, :count] - W[:count, count:] @ np.linalg.solve(W[count:, count:], W[count:, :count])
+            if symmetric:
+                W = 0.5 * (W + W.T)
+        condensed = CondensedModel(W, delta[:count] - W @ effort[:count], effort[:count], self.roles, self.labels)
+        return Equilibrium(x, condensed, delta, effort, slack, stable, iterations, increments, contacts, memory)
+
+
+def slack_rows(
+    effort: np.ndarray, delta: np.ndarray, target: np.ndarray, driven: np.ndarray, unilateral: np.ndarray
+) -> np.ndarray:
+    """Return which actuators hang slack, shape (n_a,): unilateral ones that are driven beyond where they are.
+
+    Args:
+        effort: of all rows, shape (size,).
+        delta: values of all rows, shape (size,).
+        target: values that driven rows are commanded to, shape (size,) or (n_a,).
+        driven: driven rows, shape (d,).
+        unilateral: actuators that cannot push, shape (n_a,).
+    """
+    slack = np.zeros(len(unilateral), dtype=bool)
+    rows = driven[driven < len(unilateral)]
+    rows = rows[unilateral[rows]] if len(rows) else rows
+    # The sign of the effort alone does not suffice: at rest it is round-off.
+    slack[rows] = (effort[rows] <= 0.0) & (delta[rows] > target[rows] + 1e-9)
+    return slack
+
+
+def checked(name: str, values: Sequence[float] | np.ndarray, count: int) -> np.ndarray:
+    """Return values as an array (count,).
+
+    Raises:
+        ValueError: for a wrong shape or a value that is not finite.
+    """
+    array = np.asarray(values, dtype=float)
+    if array.shape != (count,):
+        raise ValueError(f"{name} must have shape ({count},), got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {array.tolist()}")
+    return array
+
+
+def checked_modes(mode: str | Sequence[str], target: np.ndarray, unilateral: np.ndarray) -> list[str]:
+    """Return how each actuator is driven, shape (n_a,).
+
+    Args:
+        mode: ``"displacement"`` or ``"effort"`` for all actuators, or one of them for each.
+        target: their commands, shape (n_a,).
+        unilateral: actuators that cannot push, shape (n_a,).
+
+    Raises:
+        ValueError: for an unknown mode, or a negative effort on an actuator that cannot push.
+    """
+    count = len(target)
+    modes = [mode] * count if isinstance(mode, str) else list(mode)
+    if len(modes) != count or any(m not in ("displacement", "effort") for m in modes):
+        raise ValueError(f"mode must be 'displacement' or 'effort' (one, or {count} of them), got {mode!r}")
+    for row, (kind, value) in enumerate(zip(modes, target, strict=True)):
+        if kind == "effort" and unilateral[row] and value < 0.0:
+            raise ValueError(f"effort {value:g} on actuator row {row} must not be negative: this actuator cannot push")
+    return modes

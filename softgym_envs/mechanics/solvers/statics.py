@@ -24,8 +24,9 @@ from softgym_envs.mechanics.assembly import Assembled
 from softgym_envs.mechanics.condensation import CondensedModel, Row
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.complementarity import complementary_step
-from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.mechanics.solvers.equilibrium import Equilibrium, RowLayout, checked, checked_modes, slack_rows
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.mechanics.solvers.prediction import LARGEST_BEND, Bend
 
@@ -47,6 +48,8 @@ class Statics:
         max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the whole step.
         exact_compliance: compute ``W`` at each equilibrium. Otherwise, with contact, ``W`` may be that of the last
             iterate, which saves one factorisation per increment.
+        compiled: solve bodies of beams in compiled code (`BeamMotion`) where that converges fast; it gives the same
+            equilibria to the tolerance.
 
     Attributes:
         x: current node positions [m], shape (n, 3).
@@ -63,6 +66,7 @@ class Statics:
         max_iterations: int = 30,
         max_halvings: int = 8,
         exact_compliance: bool = True,
+        compiled: bool = True,
     ) -> None:
         self.model = model
         self.exact_compliance = exact_compliance
@@ -72,16 +76,15 @@ class Statics:
         self.linearisation = Linearisation(model)
         self._assembly = model.assembly
         sizes = dict(model.roles)
-        self._roles = tuple(role for role in model.roles if role[0] != "b")
-        self._labels = tuple(
-            row for letter in sizes if letter != "b" for c in model.constraints[letter] for row in c.rows()
-        )
         self._actuators = sizes.get("a", 0)
         self._effectors = self._actuators + np.arange(sizes.get("e", 0))
         self._contacts = self._actuators + sizes.get("e", 0) + np.arange(sizes.get("c", 0))
         self._bonds = self._assembly.size - sizes.get("b", 0) + np.arange(sizes.get("b", 0))
         self.unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
         self._elasticity_version = model.elasticity_version
+        self._layout = RowLayout.of(model)
+        self._compiled, self._lumped = compiled, False
+        self._beams: BeamMotion | None = None
         used = np.unique(np.concatenate([block.nodes_used for block in model.blocks]))  # not the directors of frames
         extent = float(np.linalg.norm(np.ptp(model.nodes[used], axis=0)))
         self._longest_step = 0.2 * extent  # with contact
@@ -415,10 +418,8 @@ class Statics:
                 cannot push.
         """
         count = self._actuators
-        target = _checked("target", target, count)
-        modes = [mode] * count if isinstance(mode, str) else list(mode)
-        if len(modes) != count or any(m not in ("displacement", "effort") for m in modes):
-            raise ValueError(f"mode must be 'displacement' or 'effort' (one, or {count} of them), got {mode!r}")
+        target = checked("target", target, count)
+        modes = checked_modes(mode, target, self.unilateral)
         if contact_mode not in ("displacement", "effort"):
             raise ValueError(f"contact_mode must be 'displacement' or 'effort', got {contact_mode!r}")
         if contact_mode == "displacement" and contact is None:
@@ -427,22 +428,19 @@ class Statics:
         if contact_mode == "displacement":
             held.append(self._contacts)
         driven = np.concatenate([*held, self._bonds])
-        forced = np.array([i for i, m in enumerate(modes) if m == "effort"], dtype=int)
-        for row in forced[self.unilateral[forced]] if len(forced) else forced:
-            if target[row] < 0.0:
-                raise ValueError(
-                    f"effort {target[row]:g} on actuator row {row} must not be negative: this actuator cannot push"
-                )
         goal = np.zeros(self._assembly.size)
         goal[:count] = target
         if effector_force is not None:
-            goal[self._effectors] = _checked("effector_force", effector_force, len(self._effectors))
+            goal[self._effectors] = checked("effector_force", effector_force, len(self._effectors))
         if contact is not None:
-            goal[self._contacts] = _checked("contact", contact, len(self._contacts))
+            goal[self._contacts] = checked("contact", contact, len(self._contacts))
         if self.model.assembly is not self._assembly:
             raise ValueError(
                 f"the model's constraints changed after this {type(self).__name__} was made; make a new one"
             )
+        balanced = self._balance(goal, driven)
+        if balanced is not None:
+            return balanced
         linear = self.linearisation
         if self._elasticity_version != self.model.elasticity_version:
             self._elasticity_version = self.model.elasticity_version
@@ -526,9 +524,9 @@ class Statics:
         sensors = dict(self.model.roles).get("s", 0)
         first = size - len(bonds) - sensors
         order = np.concatenate([keep[:first], keep[first + sensors :], keep[first : first + sensors]])
-        labels = list(self._labels)
+        labels = list(self._layout.labels)
         labels[first:first] = [Row(row.name, "m", "N") for row in rows]
-        sizes = dict(self._roles)
+        sizes = dict(self._layout.roles)
         sizes["c"] = sizes.get("c", 0) + len(rows)
         W = W[np.ix_(order, order)]
         return CondensedModel(
@@ -558,43 +556,43 @@ class Statics:
         return contact.memory
 
     def _state(self, target: np.ndarray, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
-        effort, delta, W = self.effort.copy(), self.linearisation.delta, self.linearisation.W.copy()
-        slack = np.zeros(self._actuators, dtype=bool)
-        rows = driven[driven < self._actuators]
-        rows = rows[self.unilateral[rows]] if len(rows) else rows
-        # The sign of the effort alone does not suffice: at rest it is round-off.
-        slack[rows] = (effort[rows] <= 0.0) & (delta[rows] > target[rows] + 1e-9)
-        count = len(effort) - len(self._bonds)
-        if len(self._bonds):
-            W = W[:count, :count] - W[:count, count:] @ np.linalg.solve(W[count:, count:], W[count:, :count])
-            if not self.linearisation.sliding:
-                W = 0.5 * (W + W.T)
-        contact = self.linearisation.contact
-        condensed = CondensedModel(
-            compliance=W,
-            free=delta[:count] - W @ effort[:count],
-            effort=effort[:count],
-            roles=self._roles,
-            rows=self._labels,
-        )
-        return Equilibrium(
-            x=self.x.copy(),
-            condensed=condensed,
-            delta=delta.copy(),
-            effort=effort,
-            slack=slack,
-            stable=self.linearisation.positive_definite,
+        linear, effort = self.linearisation, self.effort.copy()
+        return self._layout.equilibrium(
+            self.x.copy(),
+            effort,
+            linear.delta.copy(),
+            linear.W.copy(),
+            slack_rows(effort, linear.delta, target, driven, self.unilateral),
+            stable=linear.positive_definite,
             iterations=iterations,
             increments=increments,
-            contacts=None if contact is None else contact.contacts(self.x),
+            symmetric=not linear.sliding,
+            contacts=None if linear.contact is None else linear.contact.contacts(self.x),
             memory=self.memory,
         )
 
+    # -- bodies of beams --------------------------------------------------------------------------------------------
 
-def _checked(name: str, values: Sequence[float] | np.ndarray, count: int) -> np.ndarray:
-    array = np.asarray(values, dtype=float)
-    if array.shape != (count,):
-        raise ValueError(f"{name} must have shape ({count},), got {array.shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite, got {array.tolist()}")
-    return array
+    def _beam_solver(self) -> BeamMotion | None:
+        """Return the compiled solver of the body, or None if it needs the general one."""
+        if not self._compiled or self.model.assembly is not self._assembly:
+            return None
+        if self._beams is None or self._beams.elasticity_version != self.model.elasticity_version:
+            self._beams = BeamMotion.of(self.model, self._assembly.mass_matrix(self._lumped))
+            self._compiled = self._beams is not None
+        return self._beams
+
+    def _balance(self, goal: np.ndarray, driven: np.ndarray) -> Equilibrium | None:
+        """Find the equilibrium for commanded rows (size,) in compiled code; None where the general solver is needed."""
+        beams, loads = self._beam_solver(), self.model.loads
+        ramped = bool((loads != self._current_loads).any())
+        if beams is None or ramped or self.linearisation.inertia is not None or (driven >= self._actuators).any():
+            return None
+        found = beams.balance(self.x, self.effort, goal, driven, self.unilateral, loads=loads, tolerance=self.tolerance)
+        if not found.solved:
+            return None
+        self.x, self.effort = found.x, found.effort.copy()
+        self.linearisation.current = False
+        slack = slack_rows(found.effort, found.delta, goal, driven, self.unilateral)
+        solved = found.x.copy(), found.effort, found.delta, found.compliance, slack
+        return self._layout.equilibrium(*solved, stable=True, iterations=found.iterations)
