@@ -19,7 +19,7 @@ from softgym_envs.surrogate import online
 from softgym_envs.surrogate.baselines import residual
 from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.data.dataset import load_dataset
-from softgym_envs.surrogate.model import Context, SurrogateModel
+from softgym_envs.surrogate.model import Context, SurrogateModel, definite
 from softgym_envs.surrogate.networks import NETWORKS
 from softgym_envs.surrogate.potential import kernels
 from softgym_envs.surrogate.potential.model import Model
@@ -172,6 +172,17 @@ def test_the_search_is_recompiled_when_the_code_it_inlines_changes():
     codegen = numba.core.registry.cpu_target.target_context.codegen()
     keys = {f._cache._index_key((), codegen) for f in map(kernels._compile_search, (checksum, checksum, checksum + 1))}
     assert len(keys) == 2 and kernels.search._cache._index_key((), codegen) in keys
+
+
+def test_definite_matrices_are_recognised_in_any_units():
+    """As of volumes in m3 and effectors in m: eigenvalues of such a W are round-off."""
+    rng = np.random.default_rng(0)
+    roots = rng.standard_normal((20, 9, 9))
+    units = np.repeat([1e-7, 6.0], [6, 3])
+    sound = roots @ roots.swapaxes(1, 2) + 0.01 * np.eye(9)
+    broken = sound - 2.0 * np.linalg.eigvalsh(sound)[:, 0, None, None] * np.eye(9)
+    for matrices, expected in ((sound, True), (broken, False)):
+        assert (definite(matrices * units[:, None] * units) == expected).all()
 
 
 def test_a_row_without_a_definite_compliance_does_not_affect_others(monkeypatch):
