@@ -34,8 +34,18 @@ CHAINS = Registry(
 """Backends of robots that are learned as chains, by the same names."""
 
 
-def _table(robot: Robot) -> Registry:
-    return CHAINS if robot.learned == "chain" else BACKENDS
+HANDS = Registry(
+    "backend",
+    {
+        "fem": "softgym_envs.backends.fem:FEMBackend",
+        "surrogate": "softgym_envs.backends.chain_hand:ChainHandBackend",
+    },
+    base="softgym_envs.backends.backend:Backend",
+)
+"""Backends of hands of fingers that are learned as chains, by the same names."""
+
+LEARNED = {"potential": BACKENDS, "chain": CHAINS, "hand": HANDS}
+"""Backends by what is learned of a robot."""
 
 
 def check_backend(name: str, robot: Robot, options: Mapping[str, object]) -> None:
@@ -44,7 +54,7 @@ def check_backend(name: str, robot: Robot, options: Mapping[str, object]) -> Non
     Raises:
         ValueError: for an unknown name or option, or a value of the wrong type.
     """
-    check_options(f"backend '{name}'", _table(robot).resolve(name), 2, options)
+    check_options(f"backend '{name}'", LEARNED[robot.learned].resolve(name), 2, options)
 
 
 def make_backend(name: str, robot: Robot, **options: object) -> Backend:
@@ -53,4 +63,4 @@ def make_backend(name: str, robot: Robot, **options: object) -> Backend:
     Raises:
         ValueError: for an unknown name or option.
     """
-    return _table(robot).make(name, robot, **options)
+    return LEARNED[robot.learned].make(name, robot, **options)

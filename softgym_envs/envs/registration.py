@@ -76,7 +76,7 @@ def _row(robot: str, task: str, max_episode_steps: int, backend: str = "surrogat
 
 MOVING = {"dynamics": True}
 # One implicit step per control step damps all vibrations, but objects fall.
-SLOW = {"dynamics": True, "time_step": 0.05}
+SLOW = {"dynamics": True, "time_step": 0.05, "stiffness_damping": 0.0}
 COARSE = {"mesh_size": 0.020}
 
 ENVIRONMENTS: dict[str, EnvironmentRow] = {
@@ -94,7 +94,7 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/GripperManipulate-v0": _row("three_finger_gripper", "track", 100),
     "SoftGym/FingerGrasp-v0": _row("grasping_finger", "grasp", 25, backend="fem", backend_mesh=COARSE),
     "SoftGym/GripperLift-v0": _row(
-        "contact_aided_gripper", "lift", 30, backend="fem", robot_options=COARSE, backend_options=SLOW
+        "contact_aided_gripper", "lift", 30, backend="fem", backend_mesh=COARSE, backend_options=SLOW
     ),
     "SoftGym/TetrapodReach-v0": _row("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
     "SoftGym/TetrapodTrack-v0": _row("tetrapod", "track", 100, backend="fem", backend_options=MOVING),

@@ -141,8 +141,8 @@ class Robot(ABC):
             actuators are driven by efforts. Surrogates rely on it; without it, they learn unstable states too.
         free_object: whether the robot holds an object that can fall. Many commands then have no static equilibrium, so
             pictures are framed by the robot at rest.
-        learned: how the robot is learned: one ``"potential"`` of its actuators and effectors, or a ``"chain"`` of
-            segments for any contacts.
+        learned: how the robot is learned: one ``"potential"`` of its actuators and effectors, a ``"chain"`` of
+            segments for any contacts, or a ``"hand"`` of such chains.
         non_mechanical_options: options that do not change the condensed model.
     """
 

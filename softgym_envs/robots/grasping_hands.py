@@ -33,6 +33,15 @@ ROUNDING = 1.0e-3
 CLOSING_RATE = math.radians(2.0)
 """Largest change of a servo's angle in a control step [rad]."""
 
+ON_TABLE = 2.0e-4
+"""Gap between box and table in the drawing [m]: within the distance of contact, so that the table carries the box."""
+
+TABLE_STIFFNESS, TABLE_HEIGHT, TABLE_MODULUS, TABLE_DENSITY = 100.0, 0.2, 1.0e6, 1000.0
+"""Column below the table: stiffness along z [N/m], height [m], Young's modulus [Pa] and density [kg/m3]."""
+
+TABLE_WEIGHT = 0.5 * 9.81 * TABLE_DENSITY * TABLE_STIFFNESS * TABLE_HEIGHT**2 / TABLE_MODULUS
+"""Part of the column's weight that the table carries [N]."""
+
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Turns a finger so that it points down (-z) and closes along +x."""
 
@@ -113,6 +122,7 @@ class ContactAidedGripper(Robot):
     rest_mode = "displacement"
     convex = False
     free_object = True
+    learned = "hand"
     goal_axes = np.array([0.0, 0.0, 1.0])
     goal_tolerance = 1.0e-3
     workspace_scale = 0.010
@@ -173,8 +183,7 @@ class ContactAidedGripper(Robot):
             servos.append((self.finger.add_to(builder, mesh, own, turn=turn @ UPRIGHT, shift=shift), turn @ UPRIGHT))
         table = _add_table(builder)
         half = 0.5 * np.array(self.box)
-        middle = half[2] + 2e-4  # within the distance of contact, so that the table carries the box from the start
-        frame = builder.add_frame([0.0, 0.0, middle])
+        frame = builder.add_frame([0.0, 0.0, half[2] + ON_TABLE])
         builder.add_mass(frame, design["object_mass"], box_inertia(design["object_mass"], half))
         model = builder.build()
         for actuator, (servo, turn) in zip(self.actuators, servos, strict=False):
@@ -198,22 +207,21 @@ class ContactAidedGripper(Robot):
 
 
 def _add_table(builder: ModelBuilder) -> int:
-    """Add the frame of a table at z = 0 that can only move along z, on a column as soft as a spring of 100 N/m.
+    """Add the frame of a table at z = 0 that can only move along z, on a soft column.
 
     Its first director points up. Without the column nothing but the drive would hold the table, and a condensed model
     needs a body that is held without its drives.
     """
     up = np.column_stack([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    height, modulus, stiffness = 0.2, 1.0e6, 100.0
-    foot = builder.add_frame([0.0, 0.0, -height], up, fixed=True, fixed_spin=True)
-    middle = builder.add_frame([0.0, 0.0, -0.5 * height], up)
+    foot = builder.add_frame([0.0, 0.0, -TABLE_HEIGHT], up, fixed=True, fixed_spin=True)
+    middle = builder.add_frame([0.0, 0.0, -0.5 * TABLE_HEIGHT], up)
     table = builder.add_frame(np.zeros(3), up, fixed=(True, True, False), fixed_spin=True)
-    side = math.sqrt(stiffness * height / modulus)
+    side = math.sqrt(TABLE_STIFFNESS * TABLE_HEIGHT / TABLE_MODULUS)
     builder.add_beam(
         [foot, middle, table],
         section=Section.rectangle(side, side),
-        young_modulus=modulus,
+        young_modulus=TABLE_MODULUS,
         poisson_ratio=0.3,
-        density=1000.0,
+        density=TABLE_DENSITY,
     )
     return table
