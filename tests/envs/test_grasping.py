@@ -11,6 +11,7 @@ from softgym_envs.envs import SoftRobotEnv
 from softgym_envs.envs.tasks.grasp import Grasp
 from softgym_envs.envs.tasks.lift import Lift
 from softgym_envs.envs.tasks.registry import make_task
+from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import InfeasibleDesign, WeightsError
 
 BACKENDS = pytest.mark.parametrize("backend", ["fem", "surrogate"])
@@ -112,7 +113,9 @@ def test_a_box_that_is_dropped_ends_the_episode(backend):
 
     dropped: list[bool] = []
     infos = episode(env, drop, 30, seed=0, options={"goal": (0.0, 0.0, 0.033)})
-    assert dropped and len(infos) < 30 and infos[-1]["lost"] and infos[-1]["reward_hold"] == pytest.approx(0.8, abs=0.01)
+    assert (
+        dropped and len(infos) < 30 and infos[-1]["lost"] and infos[-1]["reward_hold"] == pytest.approx(0.8, abs=0.01)
+    )
     env.reset()
     assert not env.step(np.zeros(3, dtype=np.float32))[4]["lost"]  # the next episode begins anew
 
@@ -186,4 +189,4 @@ def test_a_grasp_needs_contacts():
 
 def test_batched_environments_refuse_tasks_that_read_states():
     with pytest.raises(ValueError, match="task 'grasp' reads forces of contacts"):
-        gymnasium.make_vec("SoftGym/Reach-v0", num_envs=2, robot="finger", task="grasp")
+        SoftRobotVectorEnv("finger", "grasp", 2)
