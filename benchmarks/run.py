@@ -36,6 +36,7 @@ from benchmarks import (
     side_by_side,
     speed,
     strategies,
+    trust,
     validation,
 )
 from softgym_envs.config import provenance
@@ -57,6 +58,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "inference": speed.inference,
     "memory": speed.memory,
     "test_set": accuracy.test_set,
+    "trust": trust.trust,
     "trajectories": accuracy.trajectories,
     "slack": accuracy.slack_states,
     "mesh_motion": accuracy.mesh_motion,

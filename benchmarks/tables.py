@@ -199,14 +199,29 @@ def test_set() -> str:
         ("W, between actuators, relative error, median [%]", ".2g"),
         ("W, actuators to effector, relative error, median [%]", ".2g"),
         ("W, effector, relative error, median [%]", ".2g"),
-        ("effector errors below the uncertainty [%]", ".0f"),
-        ("trusted [%]", ".1f"),
     )
     for row in rows:
         row[1] = f"{int(row[1].partition(' /')[0]):,}"
     head = ["weights", "training states", "effector error, mean [mm]", "worst [mm]", "`W_aa`, median error [%]"]
-    head += ["`W_ea` [%]", "`W_ee` [%]", "errors below the uncertainty [%]", "trusted [%]"]
-    return markdown(head, rows, "lrrrrrrrr")
+    head += ["`W_ea` [%]", "`W_ee` [%]"]
+    return markdown(head, rows, "lrrrrrr")
+
+
+def trust() -> str:
+    """Errors, coverage and trust of calibrated weights, by stratum."""
+    rows = []
+    for name, title in WEIGHTS.items():
+        found = {k.removeprefix(f"{name}: "): v for k, v in results("trust").items() if k.startswith(f"{name}: ")}
+        for stratum, row in found.items():
+            if not isinstance(row, dict):
+                continue
+            cells = [str(row["states"]), *(short(row[k]) for k in ("mean", "worst"))]
+            cells += [f"{row['coverage']:.1f}", f"{row['trusted']:.0f}", short(row["worst_trusted"])]
+            cells.append(f"{found['goal tolerance [mm]']:.3g}")
+            rows.append([title, stratum, *cells])
+            title = ""
+    head = ["weights", "stratum", "states", "error, mean [mm]", "worst [mm]", "covered [%]", "trusted [%]"]
+    return markdown([*head, "worst trusted [mm]", "goal tolerance [mm]"], rows, "llrrrrrrr")
 
 
 def buckling() -> str:
@@ -473,7 +488,8 @@ TABLES: dict[str, Callable[[], str]] = {
     function.__name__: function
     for function in (
         headlines, codesign, codesign_goals, codesign_bodies, learners, strategies, kills, profile, agents, carry,
-        test_set, buckling, predicted_tracking, trajectories, design_gradients, networks, design_optima,
+        test_set, trust, buckling, predicted_tracking, trajectories, design_gradients, networks,
+        design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop,
         validation, contact, surrogate_speed, fem_speed, deployed, provenance,
     )

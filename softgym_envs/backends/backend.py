@@ -49,6 +49,7 @@ class State:
             surrogate). In dynamics: the tangent of the time step, including inertia, is positive definite.
         uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM.
         trusted: the state lies where the learned model may be trusted; always True for FEM.
+        doubt: why it is not trusted, 0 if it is: a sum of numbers in `softgym_envs.surrogate.domain.DOUBTS`.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
         contacts: where the body touches, with forces and gaps; None if it cannot touch anything.
         memory: what the backend needs to go on from here where friction depends on the path; None without contact.
@@ -67,6 +68,7 @@ class State:
     stable: bool = True
     uncertainty: float = 0.0
     trusted: bool = True
+    doubt: int = 0
     contacts: Contacts | None = None
     memory: Any = None
 

@@ -33,7 +33,7 @@ class BatchState:
         slack: which actuators are slack, shape (B, n_a).
         converged: whether the state was found, shape (B,); rows without a state must not be used.
         uncertainty: uncertainty of the effector [m], shape (B,).
-        trusted: whether the model may be trusted, shape (B,).
+        doubt: why the model is not trusted, 0 where it is (`softgym_envs.surrogate.domain.DOUBTS`), shape (B,).
     """
 
     displacement: np.ndarray
@@ -42,7 +42,12 @@ class BatchState:
     slack: np.ndarray
     converged: np.ndarray
     uncertainty: np.ndarray
-    trusted: np.ndarray
+    doubt: np.ndarray
+
+    @property
+    def trusted(self) -> np.ndarray:
+        """Whether the model may be trusted, shape (B,)."""
+        return self.doubt == 0
 
 
 def solve_efforts(model: SurrogateModel, context: Context, effort: np.ndarray, start: np.ndarray) -> BatchState:
@@ -57,7 +62,7 @@ def solve_efforts(model: SurrogateModel, context: Context, effort: np.ndarray, s
             break
         displacement = displacement + np.clip(step, -limit, limit) * moving[:, None]
     return BatchState(
-        displacement, found, effector, np.zeros(found.shape, bool), ~moving, *model.trust(context, displacement, spread)
+        displacement, found, effector, np.zeros(found.shape, bool), ~moving, *model.doubt(context, displacement, spread)
     )
 
 
@@ -99,7 +104,8 @@ def solve_displacements(
     loose = unilateral & (displacement > target + (10.0 * TOLERANCE) * model.span)
     if loose.any():
         effort = np.where(loose, 0.0, np.where(unilateral, np.maximum(effort, 0.0), effort))
-    return BatchState(displacement, effort, effector, loose, converged, *model.trust(context, displacement, spread))
+    judged = model.doubt(context, displacement, spread, target)
+    return BatchState(displacement, effort, effector, loose, converged, *judged)
 
 
 def displacement_gradient(
@@ -205,7 +211,8 @@ class SurrogateBody:
             condensed=partial(_condensed, self.model, self._context, displacement, effort, effector),
             velocity=np.zeros((len(effector) // 3, 3)),
             uncertainty=float(found.uncertainty[0]),
-            trusted=bool(found.trusted[0]),
+            trusted=bool(found.doubt[0] == 0),
+            doubt=int(found.doubt[0]),
         )
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from softgym_envs.backends.surrogate import TOLERANCE
+from softgym_envs.surrogate.domain import EDGE, SLACK
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import PotentialEnsemble
@@ -64,7 +65,9 @@ class TorchBatch:
         self._effort_scale = put(model.energy_scale / model.half_range)
         self._effector_scale, self._effector_mean = model.effector_scale, put(model.effector_mean)
         domain = model.domain
-        self._inflation, self._limit = domain.inflation, domain.limit
+        self._domain, self._calibration = domain, domain.calibration
+        floor, power = domain.calibration.floor, domain.calibration.power
+        self._scale, self._limit = domain.inflation * floor ** (1.0 - power), domain.limit
         self._growth = domain.growth if domain.limits_growth else None
         self._low, self._high = (put((bound - model.middle) / model.half_range) for bound in (domain.low, domain.high))
         self._design_low, self._design_high = (put(b, torch.float64) for b in (domain.design_low, domain.design_high))
@@ -84,6 +87,11 @@ class TorchBatch:
         bodies = self._ensemble.coefficients(features.to(self.dtype))
         stiffness = self._features.stiffness(designs) * self._correction.factor(features)
         bodies["effort"] = stiffness.to(self.dtype) * self._effort_scale
+        share = self._domain.at_bounds(designs.cpu().numpy())
+        for name, values in zip(
+            ("factor", "corner"), self._calibration.body_factors(share, len(self._domain.columns)), strict=True
+        ):
+            bodies[name] = torch.as_tensor(values, dtype=self.dtype, device=designs.device)
         bodies["known"] = ((designs >= self._design_low) & (designs <= self._design_high)).all(dim=1)
         zero = (-self.middle / self.half_range).expand(len(designs), -1)
         if self._growth is not None:
@@ -95,23 +103,41 @@ class TorchBatch:
             u = self._without_effort(bodies, zero)
             gradient = self._ensemble.gradient(bodies, u)
         bodies["rest"], bodies["rest_effort"] = u, gradient * bodies["effort"]
-        bodies["rest_effector"], bodies["rest_uncertainty"], bodies["rest_trusted"] = self.measure(bodies, u)
+        judged = self.measure(bodies, u, zero if self._loaded else u)
+        bodies["rest_effector"], bodies["rest_uncertainty"], bodies["rest_trusted"] = judged
         return bodies
 
-    def measure(self, bodies: Bodies, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """First effector [m] (B, 3), its uncertainty [m] (B,), and whether it is trusted (B,), at displacements u."""
+    def measure(self, bodies: Bodies, u: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """First effector [m] (B, 3), its uncertainty [m] (B,), and whether it is trusted (B,).
+
+        As `SurrogateModel.trust`, at displacements ``u`` under commands ``target``, both scaled, shape (B, n).
+        """
         x = self._ensemble.effectors(bodies, u)
         mean = x.mean(dim=0)
         effector = (mean * self._effector_scale + self._effector_mean)[:, :3]
         if self._calibrated:
             square = ((x - mean) ** 2).mean(dim=0).reshape(len(u), -1, 3).sum(dim=2)
-            uncertainty = torch.sqrt(square.amax(dim=1)) * (self._effector_scale * self._inflation)
+            calibration, variance = self._calibration, square.amax(dim=1) * self._effector_scale**2
+            uncertainty = (
+                self._scale * bodies["factor"] * (variance + calibration.floor**2) ** (0.5 * calibration.power)
+            )
+            if calibration.slack_corners != calibration.corners:
+                slack = (self._pulls & (u > target + SLACK)).any(dim=1)
+                ends = ((target.abs() - 1.0) / EDGE + 1.0).clamp(0.0, 1.0).mean(dim=1)
+                uncertainty = torch.where(slack, uncertainty * bodies["corner"] ** ends, uncertainty)
         else:
             uncertainty = torch.full_like(mean[:, 0], torch.inf)
+        soft = None
+        if self._growth is not None:
+            K = self._ensemble.curvature(bodies, u)
+            soft = ~_definite(self._growth * K - bodies["unmoved"])
+            if self._calibration.buckling != 1.0:
+                near = ~_definite(self._calibration.soft * K - bodies["unmoved"])
+                uncertainty = torch.where(near, uncertainty * self._calibration.buckling, uncertainty)
         inside = ((u >= self._low) & (u <= self._high)).all(dim=1)
         trusted = inside & bodies["known"] & ((uncertainty <= self._limit) | torch.isinf(uncertainty))
-        if self._growth is not None:
-            trusted &= _definite(self._growth * self._ensemble.curvature(bodies, u) - bodies["unmoved"])
+        if soft is not None:
+            trusted &= ~soft
         return effector, uncertainty, trusted
 
     def efforts(self, bodies: Bodies, target: Tensor, u: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from softgym_envs.version import __version__
 SECTIONS = {
     "Environments": (environments.list_, environments.rollout, environments.view),
     "Robots": (robots.show, robots.export),
-    "Surrogates": (surrogates.dataset, surrogates.fit, surrogates.deploy),
+    "Surrogates": (surrogates.dataset, surrogates.fit, surrogates.calibrate_trust, surrogates.deploy),
     "Agents": (agents.train, agents.evaluate, agents.results, agents.deploy_policy),
     "Design and control": (codesign.codesign, codesign.optimise, codesign.sensitivity, codesign.calibrate),
     "Configurations": (configs.configs,),

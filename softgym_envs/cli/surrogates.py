@@ -46,6 +46,43 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
     click.echo(json.dumps(errors, indent=2))
 
 
+@click.command("calibrate-trust")
+@click.argument("robot")
+@options.robot_option
+@click.option("--weights", type=options.PATH, help="Folder of the weights (default: the shipped weights).")
+@click.option("--folder", type=options.PATH, help="Folder of the FEM states; an interrupted run continues.")
+@click.option("--bodies", type=click.IntRange(1), default=64, show_default=True, help="Bodies of each stratum.")
+@click.option("--states", type=click.IntRange(1), default=5, show_default=True, help="Commands of each body.")
+@click.option("--attacks", type=click.IntRange(1), default=500, show_default=True, help="States of the search.")
+@click.option("--seed", type=click.IntRange(0), default=11, show_default=True, help="Seed of all states.")
+def calibrate_trust(
+    robot: str,
+    options_: tuple[str, ...],
+    weights: Path | None,
+    folder: Path | None,
+    bodies: int,
+    states: int,
+    attacks: int,
+    seed: int,
+) -> None:
+    """Calibrate the uncertainty of a surrogate on FEM.
+
+    The uncertainty bounds 95 % of the errors in every stratum of states under given commands, and no trusted state that
+    a search finds is off by more than the goal tolerance. The result is written to the card of the weights.
+    """
+    from dataclasses import asdict
+
+    from softgym_envs.surrogate.calibration import calibrate
+    from softgym_envs.surrogate.pretrained import pretrained_folder
+
+    body = options.robot_of(robot, options_)
+    found = calibrate(
+        weights or pretrained_folder(body), body, bodies=bodies, states=states, attacks=attacks, seed=seed,
+        state_folder=folder,
+    )  # fmt: skip
+    click.echo(json.dumps({name: asdict(row) for name, row in found.items()}, indent=2))
+
+
 @click.command()
 @click.argument("robot", shell_complete=options.complete_robot)
 @click.argument("files", nargs=-1, required=True, type=options.PATH)

@@ -277,6 +277,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             "stable": state.stable,
             "uncertainty": state.uncertainty,
             "trusted": state.trusted,
+            "doubt": state.doubt,
             "converged": converged,
         }
         if state.contacts is not None:

@@ -239,7 +239,7 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         """Return the effectors [m] (B, 3) that commands (B, n_a) lead to; NaN where no equilibrium is found."""
         target = self._scaled(commands)
         u, _, found = self._model.search(bodies, target, target, MAX_NEWTON_STEPS, stop=True)
-        return torch.where(found[:, None], self._model.measure(bodies, u)[0], torch.nan)
+        return torch.where(found[:, None], self._model.measure(bodies, u, u)[0], torch.nan)
 
     def _scaled(self, command: Tensor) -> Tensor:
         return (command - self._model.middle) / self._model.half_range
@@ -408,7 +408,7 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self, bodies: Bodies, state: dict[str, Tensor], command: Tensor, u: Tensor, gradient: Tensor, found: Tensor
     ) -> Result:
         """Return the state after a search, with observation, reward, info and the rows that end."""
-        effector, uncertainty, trusted = self._model.measure(bodies, u)
+        effector, uncertainty, trusted = self._model.measure(bodies, u, self._scaled(command))
         effort, slack = self._model.efforts(bodies, self._scaled(command), u, gradient)
         new = {
             "command": command,

@@ -368,7 +368,7 @@ class SoftRobotVectorEnv(VectorEnv):
             **{f"reward_{name}": term for name, term in terms.items()},
             "stable": every,
         }
-        for name in ("displacement", "effort", "uncertainty", "trusted", "converged"):
+        for name in ("displacement", "effort", "uncertainty", "trusted", "doubt", "converged"):
             info[name] = getattr(state, name).copy()
         info |= {f"_{name}": every for name in tuple(info)}
         return info, reward

@@ -1,14 +1,125 @@
-"""The region in which a trained model may be trusted, read from its card."""
+"""The region in which a trained model may be trusted, and the calibration of its uncertainty, read from its card."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any
 
+import numba
 import numpy as np
 
 from softgym_envs.robots.base import Robot
+
+#: Why a state is not trusted. Batched states hold the sum of these numbers, 0 for a trusted state.
+OUTSIDE, SPREAD, SOFT = 1, 2, 4
+
+DOUBTS = {OUTSIDE: "outside box", SPREAD: "spread", SOFT: "softening"}
+"""The reasons in words: body or displacements lie outside the box of the training states; the uncertainty is above the
+limit; the actuators are so soft that the body may be about to buckle."""
+
+SLACK = 1e-3
+"""Actuators that end farther beyond their commands than this are slack [half their range]."""
+
+EDGE = 0.1
+"""A variable counts as being at its bound within this part of half its range, linearly from 0 to 1."""
+
+
+def doubt_text(code: int) -> str:
+    """Return the reasons of a state's doubt in words, empty for a trusted state."""
+    return ", ".join(text for number, text in DOUBTS.items() if code & number) if code else ""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How the spread of the ensemble becomes a bound on 95 % of the effector errors under given commands.
+
+    ``uncertainty = factor * floor^(1 - power) * (spread^2 + floor^2)^(power / 2)``. The factor depends on where the
+    body lies in the design box: the logarithm is interpolated between those of bodies inside, on a face and at a vertex
+    of the box. The default bounds the error by the spread itself.
+
+    Attributes:
+        floor: spread that means nothing: members of an ensemble share some errors [m].
+        power: how the error grows with the spread.
+        inside: factor of bodies far from the bounds of all design variables.
+        faces: of bodies with one variable at its bound.
+        corners: of bodies with all variables at their bounds.
+        slack_corners: of these under commands at a vertex of their box that leave an actuator slack.
+        buckling: additional factor of states softer than `soft`.
+        soft: growth (see `Domain`) from which states count as near buckling.
+    """
+
+    floor: float = 0.0
+    power: float = 1.0
+    inside: float = 1.0
+    faces: float = 1.0
+    corners: float = 1.0
+    slack_corners: float = 1.0
+    buckling: float = 1.0
+    soft: float = np.inf
+
+    @classmethod
+    def of_card(cls, values: Mapping[str, Any]) -> Calibration:
+        """Read the calibration from a card.
+
+        Raises:
+            ValueError: for unknown names, or values that are not positive.
+        """
+        names = {f.name for f in fields(cls)}
+        if unknown := sorted(values.keys() - names):
+            raise ValueError(f"the calibration of the card has unknown entries: {', '.join(unknown)}")
+        found = cls(**{name: float(value) for name, value in values.items()})
+        for name in names:
+            value = getattr(found, name)
+            if not (value > 0.0 or (name == "floor" and value == 0.0 and found.power == 1.0)):
+                raise ValueError(f"the calibration of the card has {name} = {value}; it must be positive")
+        return found
+
+    def body_factors(self, share: np.ndarray, variables: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the factor of bodies (B,), and by how much it is multiplied at slack corners of the commands (B,).
+
+        Args:
+            share: part of the design variables that lie at their bounds, shape (B,).
+            variables: number of these variables.
+        """
+        nodes = {0.0: self.inside, 1.0 / max(variables, 1): self.faces, 1.0: self.corners}
+        factor = np.exp(np.interp(share, list(nodes), np.log(list(nodes.values()))))
+        return factor, (self.slack_corners / self.corners) ** share
+
+
+@numba.njit(cache=True, error_model="numpy")
+def judge(
+    displacement, command, spread, slot, low, high, command_low, command_high, pulls,
+    factor, corner, known, scale, floor, power, limit, uncertainty, doubt,
+):  # fmt: skip
+    """Fill ``uncertainty`` and ``doubt`` (B,) of states by displacements, commands (B, n) and spread (B,).
+
+    ``scale`` multiplies the uncertainty, of all rows (1,) or of each (B,).
+    """
+    n = displacement.shape[1]
+    edge = 1.0 / EDGE
+    for row in range(len(displacement)):
+        body = slot[row]
+        code = 0 if known[body] else OUTSIDE
+        slack, ends = False, 0.0
+        for i in range(n):
+            d, c = displacement[row, i], command[row, i]
+            if not low[i] <= d <= high[i]:
+                code = OUTSIDE
+            half = 0.5 * (command_high[i] - command_low[i])
+            slack = slack or pulls[i] and d > c + SLACK * half
+            away = abs(c - 0.5 * (command_high[i] + command_low[i])) / half
+            ends += min(max((away - 1.0) * edge + 1.0, 0.0), 1.0)
+        sigma = spread[row]
+        if floor > 0.0:
+            sigma = np.hypot(sigma, floor)
+        value = scale[min(row, len(scale) - 1)] * factor[body] * sigma**power
+        if slack and corner[body] != 1.0:
+            value *= corner[body] ** (ends / n)
+        uncertainty[row] = value
+        if not value <= limit and not np.isinf(sigma):
+            code |= SPREAD
+        doubt[row] = code
 
 
 @dataclass(frozen=True)
@@ -21,10 +132,17 @@ class Domain:
         design_low: smallest values of all design variables in the order of the space, shape (d,), likewise; -inf for
             variables without bounds.
         design_high: largest values, shape (d,), likewise.
-        inflation: factor that turns the spread of the ensemble into a bound on 95 % of the validation errors.
+        inflation: factor of the uncertainty.
         limit: largest trusted uncertainty of the effector [m].
         growth: how many times softer than at zero displacement the actuators of a trusted state may be; infinite for
             robots that do not buckle.
+        calibration: how the spread becomes an uncertainty.
+        command_low: smallest commands, shape (n_a,).
+        command_high: largest commands, shape (n_a,).
+        unilateral: actuators that cannot push, shape (n_a,).
+        columns: design variables with bounds, in the order of the space.
+        middle: of the bounds of these, shape (k,).
+        half: half of their ranges, shape (k,).
     """
 
     low: np.ndarray
@@ -34,11 +152,25 @@ class Domain:
     inflation: float
     limit: float
     growth: float
+    calibration: Calibration
+    command_low: np.ndarray
+    command_high: np.ndarray
+    unilateral: np.ndarray
+    columns: list[int] = field(default_factory=list)
+    middle: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    half: np.ndarray = field(default_factory=lambda: np.ones(0))
 
     @property
     def limits_growth(self) -> bool:
         """Whether states are also judged by how soft their actuators are."""
         return bool(np.isfinite(self.growth))
+
+    def at_bounds(self, designs: np.ndarray) -> np.ndarray:
+        """Return the part of the design variables of bodies (B, d) that lie at their bounds, shape (B,)."""
+        if not self.columns:
+            return np.zeros(len(designs))
+        away = np.abs(designs[:, self.columns] - self.middle) / self.half
+        return np.clip((away - 1.0) / EDGE + 1.0, 0.0, 1.0).mean(axis=1)
 
     @classmethod
     def of_card(cls, card: Mapping[str, Any], robot: Robot) -> Domain:
@@ -59,6 +191,7 @@ class Domain:
         if unknown := sorted(designs.keys() - set(names)):
             raise ValueError(f"the card's domain has unknown design variables: {', '.join(unknown)}")
         design_low, design_high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+        bounded = sorted(((names.index(name), *ends) for name, ends in designs.items() if ends[1] > ends[0]))
         for name, (low, high) in designs.items():
             slack = 0.01 * (high - low) + 1e-9 * abs(high)
             design_low[names.index(name)], design_high[names.index(name)] = low - slack, high + slack
@@ -70,4 +203,11 @@ class Domain:
             float(domain.get("inflation", 1.0)),
             float(domain.get("limit", np.inf)),
             float(domain.get("growth", np.inf)),
+            Calibration.of_card(domain.get("calibration", {})),
+            robot.lower,
+            robot.upper,
+            robot.unilateral,
+            [column for column, _, _ in bounded],
+            np.array([0.5 * (low + high) for _, low, high in bounded]),
+            np.array([0.5 * (high - low) for _, low, high in bounded]),
         )

@@ -19,7 +19,7 @@ from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row, effo
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.correction import EffortCorrection
-from softgym_envs.surrogate.domain import Domain
+from softgym_envs.surrogate.domain import SOFT, Domain, judge
 from softgym_envs.surrogate.features import Features
 
 
@@ -139,6 +139,8 @@ class SurrogateModel(ABC):
         arrays = self._prepare(features)
         low, high = self.domain.design_low, self.domain.design_high
         arrays["known"] = np.all((designs >= low) & (designs <= high), axis=1)
+        calibration, share = self.domain.calibration, self.domain.at_bounds(designs)
+        arrays["factor"], arrays["corner"] = calibration.body_factors(share, len(self.domain.columns))
         stiffness = self.features.stiffness(designs) * self.correction.factor(features)
         context = Context(stiffness, arrays, np.arange(len(designs)))
         if self.domain.limits_growth:
@@ -236,25 +238,49 @@ class SurrogateModel(ABC):
         """Return the inverse of W between actuators alone, (B, n_a, n_a), at displacements (B, n_a)."""
         return self._stiffness(context, displacement) * context.stiffness[context.slot][:, :, None]
 
-    def trust(self, context: Context, displacement: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def trust(
+        self, context: Context, displacement: np.ndarray, spread: np.ndarray, command: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Judge predictions: return their uncertainty [m] and whether they are trusted, both (B,); see `doubt`."""
+        uncertainty, doubt = self.doubt(context, displacement, spread, command)
+        return uncertainty, doubt == 0
+
+    def doubt(
+        self, context: Context, displacement: np.ndarray, spread: np.ndarray, command: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Judge predictions at displacements (B, n_a) by their spread (B,).
 
+        Args:
+            context: prepared bodies.
+            displacement: reached displacements, shape (B, n_a).
+            spread: of the ensemble [m], shape (B,).
+            command: commanded displacements, shape (B, n_a); default the reached ones.
+
         Returns:
-            The uncertainty of the effector [m] (B,): the spread, inflated to a bound on 95 % of the validation errors;
-            and whether the prediction is trusted (B,): body and displacement lie where the model was trained, and the
-            uncertainty is not larger than in 98 % of the validation states. A model without an ensemble is judged by
-            its domain alone. For a robot that can buckle (its card limits the growth), the predicted `growth` must not
-            exceed that of 98 % of the validation states either, because states that are about to buckle were left out
-            of the training.
+            The uncertainty of the effector [m] (B,), a bound on 95 % of the errors (see
+            `softgym_envs.surrogate.domain.Calibration`); and why predictions are not trusted (B,), sums of the numbers
+            in `softgym_envs.surrogate.domain.DOUBTS`, 0 for a trusted one. A model without an ensemble is judged by its
+            domain alone.
         """
-        domain = self.domain
-        uncertainty = domain.inflation * spread
-        inside = ((displacement >= domain.low) & (displacement <= domain.high)).all(axis=1)
-        trusted = inside & context.arrays["known"][context.slot] & ((uncertainty <= domain.limit) | np.isinf(spread))
+        domain, calibration = self.domain, self.domain.calibration
+        scale, floor, power = domain.inflation, calibration.floor, calibration.power
+        scale *= floor ** (1.0 - power)
+        scales, soft, arrays = np.array([scale]), None, context.arrays
         if domain.limits_growth:
-            unmoved = context.arrays["unmoved"][context.slot]
-            trusted &= definite(domain.growth * self._curvature(context, displacement) - unmoved)
-        return uncertainty, trusted
+            unmoved, K = arrays["unmoved"][context.slot], self._curvature(context, displacement)
+            soft = ~definite(domain.growth * K - unmoved)
+            if calibration.buckling != 1.0:
+                near = ~definite(calibration.soft * K - unmoved)
+                scales = np.where(near, scale * calibration.buckling, scale)
+        uncertainty, doubt = np.empty(len(displacement)), np.empty(len(displacement), dtype=np.int8)
+        judge(
+            displacement, displacement if command is None else command, spread, context.slot, domain.low, domain.high,
+            domain.command_low, domain.command_high, domain.unilateral, arrays["factor"], arrays["corner"],
+            arrays["known"], scales, floor, power, domain.limit, uncertainty, doubt,
+        )  # fmt: skip
+        if soft is not None:
+            doubt[soft] |= SOFT
+        return uncertainty, doubt
 
     def growth(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         """Return how many times softer the actuators are at displacements (B, n_a) than at zero, shape (B,).

@@ -355,10 +355,11 @@ def _widened(before: Model, after: Model, data: Mapping[str, np.ndarray], withhe
         domain["growth"] = max(domain["growth"], min(float(learned.max()), bound))
     if withheld.any():
         designs, displacement, truth = (data[k][withheld] for k in ("design", "displacement", "effector"))
-        _, effector, spread = after.state(after.context(designs), displacement)
+        context = after.context(designs)
+        _, effector, spread = after.state(context, displacement)
         error = np.linalg.norm((effector - truth).reshape(len(truth), -1, 3), axis=2).max(axis=1)
-        least = 0.25 * domain["limit"] / domain["inflation"]
-        domain["inflation"] = max(domain["inflation"], float(np.quantile(error / np.maximum(spread, least), 0.95)))
+        uncertainty = np.maximum(after.trust(context, displacement, spread)[0], 0.25 * domain["limit"])
+        domain["inflation"] *= max(1.0, float(np.quantile(error / uncertainty, 0.95)))
     card["domain"] = domain
     return card
 

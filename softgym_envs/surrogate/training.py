@@ -140,6 +140,22 @@ else:
     ]
 
 
+class TrustConfig(Config):
+    """Calibration of the uncertainty after the training (`softgym_envs.surrogate.calibration`).
+
+    Attributes:
+        bodies: bodies of each stratum.
+        states: commands of each body.
+        attacks: states of the search for the worst trusted ones.
+        seed: of all these states.
+    """
+
+    bodies: int = Field(default=64, gt=0)
+    states: int = Field(default=5, gt=0)
+    attacks: int = Field(default=500, gt=0)
+    seed: int = Field(default=11, ge=0)
+
+
 class FitConfig(Config):
     """Configuration of a surrogate: robot, data and network.
 
@@ -153,6 +169,7 @@ class FitConfig(Config):
         workers: number of processes that solve FEM states.
         executor: ``"loky"`` for processes of this machine, or ``"ray"`` for tasks of a cluster.
         seed: seed of the training.
+        trust: calibrate the uncertainty under commands, by stratum; None leaves it calibrated on the validation states.
     """
 
     robot: str
@@ -164,6 +181,7 @@ class FitConfig(Config):
     workers: int = Field(default=2, gt=0)
     executor: Literal["loky", "ray"] = "loky"
     seed: int = 0
+    trust: TrustConfig | None = None
 
     @model_validator(mode="after")
     def _pretrained_kind(self) -> FitConfig:
@@ -211,9 +229,9 @@ def domain_of(
 
     Returns:
         ``displacement`` and ``design`` ranges; ``inflation``: factor that turns the spread of the ensemble into a bound
-        on 95 % of the validation errors; ``limit``: uncertainty that 98 % of the validation states stay below [m]; and,
-        if more than `BUCKLING` of the training states were left out, ``growth``: how many times softer than at zero
-        displacement the actuators are, a bound on 98 % of the validation states.
+        on 95 % of the validation errors; ``limit``: uncertainty that 98 % of the validation states stay below, at most
+        the goal tolerance [m]; and, if more than `BUCKLING` of the training states were left out, ``growth``: how many
+        times softer than at zero displacement the actuators are, a bound on 98 % of the validation states.
     """
     stable = stable_rows(model.robot, training)
     training = {name: column[stable] for name, column in training.items()}
@@ -232,7 +250,8 @@ def domain_of(
     if np.isfinite(spread).all():
         distance = np.linalg.norm((effector - data["effector"]).reshape(len(spread), -1, 3), axis=2).max(axis=1)
         domain["inflation"] = float(np.quantile(distance / np.maximum(spread, 1e-12), 0.95))
-        domain["limit"] = domain["inflation"] * float(np.quantile(spread, 0.98))
+        limit = domain["inflation"] * float(np.quantile(spread, 0.98))
+        domain["limit"] = min(limit, model.robot.goal_tolerance)
     if model.robot.convex and 1.0 - stable.mean() > BUCKLING:
         domain["growth"] = float(np.quantile(model.growth(context, data["displacement"]), 0.98))
     return domain
@@ -348,5 +367,9 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         np.savez_compressed(stream, allow_pickle=False, **history)
     save_resolved(folder, config)
     load_model(folder, robot)  # fail now if the written files cannot be read
+    if config.trust is not None:
+        from softgym_envs.surrogate.calibration import calibrate
+
+        calibrate(folder, robot, **config.trust.model_dump(), state_folder=data_folder / "judged")
     shutil.rmtree(folder / "parts", ignore_errors=True)
     return errors

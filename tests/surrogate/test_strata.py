@@ -73,7 +73,7 @@ def test_states_are_the_equilibria_under_their_commands(tmp_path):
     from softgym_envs.backends.fem import FEMBackend
 
     robot = make_robot("trunk")
-    states = solve_commands(robot, draw_commands(robot, "slack corners", 3, 4, seed=2))
+    states = solve_commands(robot, draw_commands(robot, "slack corners", 3, 4, seed=2), second_start=True)
     assert len(states) == 12 and states.found.all() and (states.stratum == "slack corners").all()
     assert states.slack.any(axis=1).mean() > 0.8
     assert states.apart.max() < 1e-6
@@ -100,7 +100,7 @@ def test_a_second_start_tells_other_equilibria(monkeypatch):
 
     half = solve_commands(robot, Commands(commands.stratum, commands.design, 0.5 * commands.command))
     monkeypatch.setattr(strata, "solve_path", elsewhere)
-    states = solve_commands(robot, commands)
+    states = solve_commands(robot, commands, second_start=True)
     # The state from rest counts; the other one is only compared with it.
     assert states.apart == pytest.approx(np.abs(states.effector - half.effector).max(axis=1), rel=1e-6)
     assert states.apart.min() > 1e-3

@@ -75,7 +75,7 @@ class JudgedStates:
         growth: how many times softer the actuators are than at rest, in the softest direction; infinite for states that
             are stable only while their actuators are held, shape (N,).
         apart: distance of the effector from that of the equilibrium found from another start [m], shape (N,): more than
-            round-off if the command has several equilibria.
+            round-off if the command has several equilibria. NaN without a second start.
         found: whether there is an equilibrium, shape (N,); other rows hold NaN.
     """
 
@@ -203,11 +203,12 @@ def _vertices(dimension: int, count: int, rng: np.random.Generator) -> np.ndarra
     return (numbers[:, None] >> np.arange(dimension) & 1).astype(float)
 
 
-def solve_commands(robot: Robot, commands: Commands) -> JudgedStates:
+def solve_commands(robot: Robot, commands: Commands, *, second_start: bool = False) -> JudgedStates:
     """Return the FEM equilibria under commands; bodies that are infeasible or have no state at rest are left out.
 
-    Each state is reached from rest, and once more from the nearest state before it, which leads elsewhere if there are
-    several equilibria. Cables of a robot whose energy is not convex can push, as they can in its learned model.
+    Each state is reached from the nearest state before it, as an environment reaches it. With ``second_start`` it is
+    reached from rest, at about twice the cost, and compared with the other one: they differ if there are several
+    equilibria. Cables of a robot whose energy is not convex can push, as they can in its learned model.
     """
     count, size, span = len(robot.actuators), 3 * len(robot.effectors), robot.upper - robot.lower
     parts = []
@@ -237,16 +238,12 @@ def solve_commands(robot: Robot, commands: Commands) -> JudgedStates:
             apart=np.full(rows, np.nan),
             found=np.zeros(rows, dtype=bool),
         )
-        for k, other in solve_path(robot, statics, rest, wanted):
-            if other is None:
+        for k, found in solve_path(robot, statics, rest, wanted):
+            if found is None:
                 continue
-            statics.restore(rest.x, rest.effort)
-            try:
-                found = statics.solve(wanted[k])
-            except ConvergenceError:  # too far for one step
-                found = other
-            statics.restore(other.x, other.effort)
-            part.apart[k] = np.abs(found.condensed.delta.e - other.condensed.delta.e).max()
+            if second_start:
+                other, found = found, _from_rest(statics, rest, wanted[k], found)
+                part.apart[k] = np.abs(found.condensed.delta.e - other.condensed.delta.e).max()
             part.displacement[k], part.effort[k] = found.condensed.delta.a, found.condensed.lambda_.a
             part.effector[k], part.found[k] = found.condensed.delta.e, True
             part.slack[k] = statics.unilateral & (part.displacement[k] > wanted[k] + SLACK * span)
@@ -255,6 +252,17 @@ def solve_commands(robot: Robot, commands: Commands) -> JudgedStates:
                 part.stratum[k] = TOUCHING
         parts.append(part)
     return JudgedStates.join(parts)
+
+
+def _from_rest(statics: Statics, rest: Equilibrium, command: np.ndarray, known: Equilibrium) -> Equilibrium:
+    """Return the equilibrium under a command that is reached from rest, or the known one, where solving goes on."""
+    statics.restore(rest.x, rest.effort)
+    try:
+        found = statics.solve(command)
+    except ConvergenceError:  # too far for one step
+        found = known
+    statics.restore(known.x, known.effort)
+    return found
 
 
 def growth_of(rest: Equilibrium, found: Equilibrium) -> float:

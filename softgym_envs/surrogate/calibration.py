@@ -1,0 +1,416 @@
+"""Calibration of what a model says about its own errors, on FEM equilibria under given commands.
+
+Split conformal prediction (Vovk et al. 2005; Angelopoulos & Bates 2023, arXiv:2107.07511), in strata (Mondrian): the
+factors of `Calibration` are such that in each stratum of the calibration states the uncertainty bounds 95 % of the
+errors. The network is not trained again.
+
+A state is trusted if its uncertainty is below a limit. The limit is at most the robot's goal tolerance, and lower if a
+search for the worst trusted states, in which finite elements judge states that gradients of the spread propose, finds
+errors above the tolerance.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.errors import WeightsError
+from softgym_envs.robots.base import Robot
+from softgym_envs.storage import write_json
+from softgym_envs.surrogate.data.sampling import pushed
+from softgym_envs.surrogate.data.strata import Commands, JudgedStates, draw_commands, solve_commands, strata_of
+from softgym_envs.surrogate.domain import Calibration
+from softgym_envs.surrogate.features import learned_variables
+from softgym_envs.surrogate.model import SurrogateModel
+from softgym_envs.surrogate.weight_files import load_model
+
+COVERAGE = 0.95
+SAFETY = 0.8
+"""The limit of trust, relative to the smallest uncertainty with which an error above the tolerance was found."""
+
+FACTOR_OF = {
+    "inside": "inside",
+    "faces": "faces",
+    "corners": "corners",
+    "slack corners": "slack_corners",
+    "near buckling": "buckling",
+}
+"""Entry of `Calibration` that is fitted to a stratum."""
+
+ROUNDS = 4
+POOL = 8
+"""Bodies and commands from which an adversary chooses each of its own."""
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Predictions of a model for N judged states.
+
+    Attributes:
+        error: largest distance of an effector from that of FEM [m], shape (N,).
+        spread: of the ensemble [m], shape (N,).
+        uncertainty: [m], shape (N,).
+        trusted: shape (N,).
+        growth: predicted growth (see `Domain`), shape (N,); 1 for robots that do not buckle.
+        found: the model and FEM both have an equilibrium, shape (N,).
+    """
+
+    error: np.ndarray
+    spread: np.ndarray
+    uncertainty: np.ndarray
+    trusted: np.ndarray
+    growth: np.ndarray
+    found: np.ndarray
+
+
+@dataclass(frozen=True)
+class StratumReport:
+    """How a model does in one stratum.
+
+    Attributes:
+        states: number of states in which FEM and the model have an equilibrium.
+        mean: mean error of the effector [m].
+        worst: largest error [m].
+        coverage: share of the errors below their uncertainty.
+        trusted: share of the states that are trusted.
+        worst_trusted: largest error of a trusted state [m].
+        unsolved: trusted states without an equilibrium on FEM.
+    """
+
+    states: int
+    mean: float
+    worst: float
+    coverage: float
+    trusted: float
+    worst_trusted: float
+    unsolved: int
+
+
+def reached(model: SurrogateModel, context: Any, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the displacements (B, n_a) that a model predicts under commands, and whether it found them (B,)."""
+    if not model.robot.convex:  # its cables can push
+        return command, np.ones(len(command), dtype=bool)
+    displacement, _, found = model.search(context, command, command, model.robot.unilateral, 5e-5, 25)
+    return displacement, found
+
+
+def predict(model: SurrogateModel, states: JudgedStates) -> Predictions:
+    """Return a model's predictions under the commands of judged states."""
+    context = model.context(states.design)
+    displacement, found = reached(model, context, states.command)
+    effector, spread = model.effector(context, displacement)
+    uncertainty, trusted = model.trust(context, displacement, spread, states.command)
+    off = (effector - states.effector).reshape(len(states), -1, 3)
+    growth = model.growth(context, displacement) if model.domain.limits_growth else np.ones(len(states))
+    error = np.linalg.norm(off, axis=2).max(axis=1)
+    return Predictions(error, spread, uncertainty, trusted & found, growth, found & states.found)
+
+
+def report(model: SurrogateModel, states: JudgedStates) -> dict[str, StratumReport]:
+    """Return how a model does in each stratum of judged states."""
+    every, result = predict(model, states), {}
+    for stratum in dict.fromkeys(states.stratum.tolist()):
+        rows = (states.stratum == stratum) & every.found
+        trusted = rows & every.trusted
+        result[str(stratum)] = StratumReport(
+            states=int(rows.sum()),
+            mean=float(every.error[rows].mean()),
+            worst=float(every.error[rows].max()),
+            coverage=float((every.error <= every.uncertainty)[rows].mean()),
+            trusted=float(every.trusted[rows].mean()),
+            worst_trusted=float(every.error[trusted].max(initial=0.0)),
+            unsolved=int((every.trusted & ~states.found & (states.stratum == stratum)).sum()),
+        )
+    return result
+
+
+# -- states --------------------------------------------------------------------------------------------------------
+
+
+def judged_states(
+    model: SurrogateModel, bodies: int, states: int, seed: int, folder: str | Path | None = None
+) -> JudgedStates:
+    """Return FEM states of all strata of a model's robot.
+
+    Args:
+        model: predicts which states are near buckling.
+        bodies: in each stratum.
+        states: commands of each body.
+        seed: of the bodies and commands.
+        folder: where each stratum is kept once it is solved; an interrupted run continues with the next one.
+    """
+    robot, parts = model.robot, []
+    for stratum in strata_of(robot, buckles=model.domain.limits_growth):
+        path = None if folder is None else Path(folder) / f"{stratum.replace(' ', '_')}_{bodies}x{states}_{seed}.npz"
+        if path is not None and path.exists():
+            parts.append(JudgedStates.load(path))
+            continue
+        parts.append(solve_commands(robot, draw_commands(robot, stratum, bodies, states, seed, softness(model))))
+        if path is not None:
+            parts[-1].save(path)
+    return JudgedStates.join(parts)
+
+
+def softness(model: SurrogateModel) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return the function that predicts the growth (N,) of bodies (N, d) under commands (N, n_a)."""
+
+    def growth(designs: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        context = model.context(designs)
+        displacement, found = reached(model, context, commands)
+        return np.where(found, np.nan_to_num(model.growth(context, displacement), posinf=0.0), 0.0)
+
+    return growth
+
+
+# -- calibration ---------------------------------------------------------------------------------------------------
+
+
+def with_domain(model: SurrogateModel, **entries: Any) -> SurrogateModel:
+    """Return a model with other entries of its card's domain."""
+    domain = {**model.card.get("domain", {}), **entries}
+    return type(model)(model.robot, model.tensors, {**model.card, "domain": domain})
+
+
+def conformal_quantile(scores: np.ndarray) -> float:
+    """Return the smallest bound that covers a new score with a probability of at least `COVERAGE`."""
+    rank = min(int(np.ceil((len(scores) + 1) * COVERAGE)), len(scores))
+    return float(np.sort(scores)[rank - 1])
+
+
+def fit_calibration(model: SurrogateModel, states: JudgedStates) -> Calibration:
+    """Return the calibration of a model on judged states.
+
+    Floor and power are those with the least pinball loss of the logarithmic errors, all strata being equally important.
+    """
+    plain = predict(model, states)
+    states, kept = states.rows(plain.found), plain.found
+    error, spread, growth = plain.error[kept], plain.spread[kept], plain.growth[kept]
+    context = model.context(states.design)
+    displacement, _ = reached(model, context, states.command)
+    rows = {name: states.stratum == name for name in FACTOR_OF if (states.stratum == name).any()}
+    share, bare = model.domain.at_bounds(states.design), copy.copy(model)
+
+    def ratios(calibration: Calibration) -> np.ndarray:
+        """Return the errors relative to the uncertainty."""
+        bare.domain = replace(model.domain, inflation=1.0, limit=np.inf, calibration=calibration)
+        factors = calibration.body_factors(share, len(model.domain.columns))
+        context.arrays["factor"], context.arrays["corner"] = (f[context.slot] for f in factors)
+        return error / bare.trust(context, displacement, spread, states.command)[0]
+
+    soft = float(np.quantile(growth[rows["near buckling"]], 0.1)) if "near buckling" in rows else np.inf
+    typical, best, least = float(np.median(spread[rows["inside"]])), Calibration(), np.inf
+    for floor in (0.3 * typical, typical, 3.0 * typical):
+        for power in (0.5, 0.75, 1.0, 1.25):
+            found = Calibration(floor=floor, power=power, soft=soft)
+            # Each factor mainly acts on its own stratum.
+            for _ in range(20):
+                ratio = ratios(found)
+                quantile = {name: conformal_quantile(ratio[which]) for name, which in rows.items()}
+                scaled = {FACTOR_OF[s]: getattr(found, FACTOR_OF[s]) * quantile[s] for s in rows}
+                found = replace(found, **scaled)
+                if "slack corners" not in rows:
+                    found = replace(found, slack_corners=found.corners)
+                if all(abs(np.log(q)) < 1e-3 for q in quantile.values()):
+                    break
+            beyond = np.log(ratios(found))
+            pinball = np.maximum(COVERAGE * beyond, (COVERAGE - 1.0) * beyond)
+            loss = float(np.mean([pinball[which].mean() for which in rows.values()]))
+            if loss < least:
+                best, least = found, loss
+    return best
+
+
+def _calibrated(model: SurrogateModel, calibration: Calibration, limit: float = np.inf) -> SurrogateModel:
+    entries = {k: v for k, v in asdict(calibration).items() if np.isfinite(v)}
+    return with_domain(model, inflation=1.0, limit=limit, calibration=entries)
+
+
+def safe_limit(judged: Predictions, tolerance: float) -> float:
+    """Return the largest uncertainty to be trusted: at most the tolerance [m], below that of all errors above it."""
+    wrong = judged.found & (judged.error > tolerance)
+    return min(tolerance, SAFETY * float(judged.uncertainty[wrong].min(initial=np.inf)))
+
+
+def calibrate(
+    folder: str | Path, robot: Robot, *, bodies: int = 64, states: int = 5, attacks: int = 500, seed: int = 11,
+    state_folder: str | Path | None = None,
+) -> dict[str, StratumReport]:  # fmt: skip
+    """Calibrate the weights of a folder and write the result to their card.
+
+    Args:
+        folder: the weights.
+        robot: their robot.
+        bodies: bodies of each stratum.
+        states: commands of each body.
+        attacks: states of the search for the worst trusted ones.
+        seed: of all random numbers.
+        state_folder: where the FEM states are kept, so that an interrupted run continues.
+
+    Returns:
+        How the calibrated model does on the calibration states, by stratum; ``adversarial`` for those of the search.
+
+    Raises:
+        WeightsError: if the weights are not an ensemble.
+    """
+    model = load_model(folder, robot)
+    if not model.ensemble:
+        raise WeightsError(f"'{folder}': only an ensemble can be calibrated; these weights are '{model.network}'")
+    known = judged_states(model, bodies, states, seed, state_folder)
+    calibration = fit_calibration(model, known)
+    model = _calibrated(model, calibration, robot.goal_tolerance)
+    path = None if state_folder is None else Path(state_folder) / f"adversarial_{attacks}_{seed}.npz"
+    if path is not None and path.exists():
+        attacked = JudgedStates.load(path)
+    else:
+        attacked = attack(model, attacks, states, seed)
+        if path is not None:
+            attacked.save(path)
+    everything = JudgedStates.join([known, attacked])
+    limit = safe_limit(predict(model, everything), robot.goal_tolerance)
+    model = _calibrated(model, calibration, limit)
+    found = report(model, everything)
+    card_path = Path(folder) / "model.json"
+    card = json.loads(card_path.read_text())
+    entries = {k: v for k, v in asdict(calibration).items() if np.isfinite(v)}
+    card["domain"] |= {"inflation": 1.0, "limit": limit, "calibration": entries}
+    card["calibration"] = {
+        "bodies": bodies, "states": states, "attacks": attacks, "seed": seed,
+        "strata": {name: asdict(row) for name, row in found.items()},
+    }  # fmt: skip
+    write_json(card_path, card)
+    return found
+
+
+# -- the worst trusted states --------------------------------------------------------------------------------------
+
+
+def attack(model: SurrogateModel, count: int, states: int, seed: int) -> JudgedStates:
+    """Search for trusted states with large errors; return all that were judged, in the stratum ``adversarial``.
+
+    In each of `ROUNDS` rounds, gradients of the spread move bodies and commands from anywhere in their boxes to where
+    the spread is largest, and each body keeps the trusted commands with the largest uncertainty. From the second round
+    on, half of the bodies start near those with the largest errors on FEM so far.
+
+    Args:
+        model: a calibrated model.
+        count: number of states.
+        states: commands of each body.
+        seed: of the random numbers.
+    """
+    rng = np.random.default_rng([seed, 99])
+    robot = model.robot
+    d, n, bodies = len(learned_variables(robot)), len(robot.actuators), max(1, count // (ROUNDS * states))
+    parts: list[JudgedStates] = []
+    origin: list[tuple[np.ndarray, np.ndarray]] = []
+    scores: list[np.ndarray] = []
+    for _ in range(ROUNDS):
+        x = pushed(rng.random((POOL * bodies, d)), rng)
+        c = pushed(rng.random((POOL * bodies * states, n)), rng).reshape(-1, states, n)
+        x, c = _choose(model, *_climb(model, x, c), rng, bodies)
+        if parts:
+            # The worst bodies so far, a little changed.
+            old_x, old_c = (np.concatenate(column) for column in zip(*origin, strict=True))
+            order = np.argsort(-np.concatenate(scores))[: max(1, bodies // 4)]
+            parents = rng.choice(order, POOL * bodies)
+            near_x = np.clip(old_x[parents] + 0.08 * rng.standard_normal((len(parents), d)), 0.0, 1.0)
+            near_c = np.clip(old_c[parents] + 0.08 * rng.standard_normal(old_c[parents].shape), 0.0, 1.0)
+            near_x, near_c = _choose(model, near_x, near_c, rng, bodies)
+            half = bodies // 2
+            x, c = (
+                np.concatenate([x[: bodies - half], near_x[:half]]),
+                np.concatenate([c[: bodies - half], near_c[:half]]),
+            )
+        designs = _designs(robot, x)
+        command = robot.displacements(c.reshape(-1, n)).reshape(c.shape)
+        found = solve_commands(robot, Commands(np.full(len(x), "adversarial"), designs, command))
+        parts.append(found)
+        judged = predict(model, found)
+        error = np.where(judged.found & judged.trusted, judged.error, 0.0)
+        score = np.zeros(len(x))
+        # Bodies that could not be built are missing.
+        index = {row.tobytes(): k for k, row in enumerate(designs)}
+        for row in range(len(found)):
+            k = index[found.design[row].tobytes()]
+            score[k] = max(score[k], error[row])
+        origin.append((x, c))
+        scores.append(score)
+    return JudgedStates.join(parts)
+
+
+def _designs(robot: Robot, x: np.ndarray) -> np.ndarray:
+    """Return designs (B, len(space)) of points x (B, d) of the unit cube of the learned variables."""
+    space, names = robot.design_space, learned_variables(robot)
+    designs = np.tile(space.complete(None).array, (len(x), 1))
+    for k, name in enumerate(names):
+        designs[:, space.names.index(name)] = space[name].low + x[:, k] * (space[name].high - space[name].low)
+    return designs
+
+
+def _judge_points(model: SurrogateModel, x: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Judge bodies x (B, d) under commands c (B, S, n), both in the unit cube.
+
+    Returns:
+        Uncertainty (B, S), whether it is trusted (B, S), and the reached displacements (B * S, n).
+    """
+    robot, (B, S, n) = model.robot, c.shape
+    command = robot.displacements(c.reshape(-1, n))
+    context = model.context(_designs(robot, x)).rows(np.repeat(np.arange(B), S))
+    displacement, found = reached(model, context, command)
+    _, spread = model.effector(context, displacement)
+    uncertainty, trusted = model.trust(context, displacement, spread, command)
+    return uncertainty.reshape(B, S), (trusted & found).reshape(B, S), displacement
+
+
+def _choose(
+    model: SurrogateModel, x: np.ndarray, c: np.ndarray, rng: np.random.Generator, bodies: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Choose the bodies with the largest uncertainties that are still trusted, with trusted commands where possible."""
+    uncertainty, trusted, _ = _judge_points(model, x, c)
+    score = np.where(trusted, uncertainty, 0.0)
+    chosen = np.argsort(-np.sort(score, axis=1)[:, c.shape[1] // 2])[:bodies]
+    x, c, score = x[chosen], c[chosen], score[chosen]
+    # Untrusted commands are drawn towards the best trusted one, or to rest.
+    best = np.take_along_axis(c, score.argmax(axis=1)[:, None, None], axis=1)
+    lost = (score == 0.0)[:, :, None]
+    part = rng.random((*c.shape[:2], 1))
+    return x, np.where(lost, best + 0.3 * part * (c - best), c)
+
+
+def _climb(
+    model: SurrogateModel, x: np.ndarray, c: np.ndarray, steps: int = 8, size: float = 0.06
+) -> tuple[np.ndarray, np.ndarray]:
+    """Move bodies x (B, d) and commands c (B, S, n) up the gradient of the spread, as long as they are trusted."""
+    import torch
+
+    from softgym_envs.surrogate.potential.model import Model
+    from softgym_envs.surrogate.potential.torch import PotentialEnsemble
+
+    assert isinstance(model, Model)
+    ensemble = PotentialEnsemble.of_model(model, dtype=torch.float32)
+    robot, (B, S, n) = model.robot, c.shape
+    columns = [robot.design_space.names.index(name) for name in learned_variables(robot)]
+    _, trusted, displacement = _judge_points(model, x, c)
+    for _ in range(steps):
+        values = torch.tensor(_designs(robot, x), requires_grad=True)
+        u = torch.tensor((displacement - model.middle) / model.half_range, dtype=torch.float32, requires_grad=True)
+        features = model.features.design(values).to(torch.float32).repeat_interleave(S, dim=0)
+        members = ensemble.effectors(ensemble.coefficients(features), u)
+        spread = ((members - members.mean(dim=0)) ** 2).mean(dim=0).sum(dim=1)
+        # Only trusted states count, so that no body leaves the region of trust altogether.
+        torch.log(spread)[torch.as_tensor(trusted.ravel())].sum().backward()
+        assert values.grad is not None and u.grad is not None
+        new_x = np.clip(x + size * np.sign(values.grad.numpy()[:, columns]), 0.0, 1.0)
+        new_c = np.clip(c + size * np.sign(u.grad.numpy()).reshape(B, S, n), 0.0, 1.0)
+        _, kept, moved = _judge_points(model, new_x, new_c)
+        better = kept.sum(axis=1) >= trusted.sum(axis=1)
+        x = np.where(better[:, None], new_x, x)
+        c = np.where(better[:, None, None], new_c, c)
+        trusted = np.where(better[:, None], kept, trusted)
+        displacement = np.where(np.repeat(better, S)[:, None], moved, displacement)
+    return x, c
