@@ -7,6 +7,7 @@
 #   make bench    speed and accuracy               make clean         remove caches and build leftovers
 #   make docs     site, in site/                   make docs-images   pictures of the site, in docs/images/
 #   make setup    set-up only                      make lock          renew requirements.lock
+#   make test-clients           the snippets for other libraries, each in an environment of its own
 #
 # PYTHON=python3.12      use another interpreter (3.11 to 3.14; requirements.lock is made for 3.11)
 # PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"    install the small torch without CUDA
@@ -35,7 +36,7 @@ CHROMIUM_CHECK := command -v chromium || command -v chromium-browser || command 
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: setup test-programs demo check test slow-tests lint types bench docs docs-images lock clean
+.PHONY: setup test-programs demo check test test-clients slow-tests lint types bench docs docs-images lock clean
 
 setup: $(VENV)/.stamp-system
 
@@ -87,6 +88,10 @@ check: lint types setup
 
 test: setup test-programs
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
+
+# ARGS="torchrl skrl" runs these clients only.
+test-clients: setup
+	$(BIN)/python examples/clients/run.py $(ARGS)
 
 # Run this on an idle machine.
 slow-tests: setup test-programs

@@ -13,6 +13,7 @@ EXTRAS = {
     "video": ("imageio_ffmpeg",),
     "codesign": ("optuna", "cmaes", "jinja2", "plotly"),
     "onnx": ("onnx",),
+    "minari": ("minari", "h5py", "jax"),
     "design": ("SALib",),
 }
 """Extra in pyproject.toml -> modules that it installs."""

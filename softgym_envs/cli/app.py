@@ -15,7 +15,7 @@ from softgym_envs.extras import explain
 from softgym_envs.version import __version__
 
 SECTIONS = {
-    "Environments": (environments.list_, environments.rollout, environments.view),
+    "Environments": (environments.list_, environments.rollout, environments.record, environments.view),
     "Robots": (robots.show, robots.export),
     "Surrogates": (surrogates.dataset, surrogates.fit, surrogates.calibrate_trust, surrogates.deploy),
     "Agents": (agents.train, agents.evaluate, agents.results, agents.deploy_policy),

@@ -107,6 +107,49 @@ def rollout(
 
 
 @click.command()
+@click.argument("environment")
+@click.argument("name")
+@click.option("--agent", default="qp", show_default=True, help=AGENT_HELP)
+@click.option("--backend", help="surrogate or fem (default: the environment's).")
+@options.design
+@click.option("--episodes", default=100, show_default=True, help="Number of episodes.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the first episode; the others count on.")
+def record(
+    environment: str,
+    name: str,
+    agent: str,
+    backend: str | None,
+    design: tuple[str, ...],
+    episodes: int,
+    seed: int,
+) -> None:
+    """Record episodes as a Minari dataset, for offline learning.
+
+    NAME is that of the dataset, such as softgym/finger-reach/qp-v0.
+    """
+    import softgym_envs  # noqa: F401 - registers the IDs
+    from agents.baselines import BASELINES
+    from agents.config import EnvironmentConfig
+    from agents.offline import record_episodes
+    from agents.policy import Policy
+    from softgym_envs.config import check_config
+
+    if episodes < 1:
+        raise ConfigError(f"--episodes {episodes} must be at least 1")
+    options.check_agent(agent)
+    policy = None if agent in BASELINES else Policy(agent)
+    trained = {} if policy is None else policy.environment.model_dump()
+    config = check_config(EnvironmentConfig, {**trained, "id": environment}, "record")
+    if policy is not None:
+        policy.check_environment(config)
+    if backend is not None:
+        config = config.on(backend)
+    chosen = options.design_of(design) or None
+    dataset = record_episodes(name, agent, config, episodes=episodes, design=chosen, seed=seed)
+    click.echo(f"wrote {dataset.total_episodes} episodes, {dataset.total_steps} steps: minari.load_dataset('{name}')")
+
+
+@click.command()
 @click.argument("recording", type=options.PATH)
 def view(recording: Path) -> None:
     """Open a recording in the rerun viewer.
