@@ -332,4 +332,6 @@ def _with_dtype(value: Any) -> Any:
     """Return a value of ``info`` with a dtype, which TorchRL reads."""
     if isinstance(value, (bool, np.bool_)):
         return np.array(value)  # Gymnasium batches arrays of booleans, but not NumPy's boolean scalars
+    if isinstance(value, int):
+        return np.int64(value)
     return np.float64(value) if isinstance(value, float) else value

@@ -160,7 +160,8 @@ def check_info(info):
     """TorchRL reads the dtype of every value; Gymnasium batches booleans only if they are arrays."""
     flags = ("is_success", "lost", "stable", "trusted", "converged")
     assert {name for name, value in info.items() if value.dtype == bool} == set(flags)
-    assert all(value.dtype == float for name, value in info.items() if name not in flags)
+    assert info["doubt"].dtype == np.int64
+    assert all(value.dtype == float for name, value in info.items() if name not in (*flags, "doubt"))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
