@@ -5,14 +5,17 @@ from typing import TYPE_CHECKING
 from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from agents.config import EnvironmentConfig as EnvironmentConfig
-    from agents.config import TrainConfig as TrainConfig
-    from agents.evaluation import evaluate as evaluate
-    from agents.export import export_policy_onnx as export_policy_onnx
-    from agents.export_c import export_policy_c as export_policy_c
-    from agents.policy import Policy as Policy
-    from agents.training import train as train
-    from agents.vec_env import SB3VecEnv as SB3VecEnv
+    from softgym_envs.agents.config import EnvironmentConfig as EnvironmentConfig
+    from softgym_envs.agents.config import TrainConfig as TrainConfig
+    from softgym_envs.agents.evaluation import evaluate as evaluate
+    from softgym_envs.agents.export import export_policy_onnx as export_policy_onnx
+    from softgym_envs.agents.export_c import export_policy_c as export_policy_c
+    from softgym_envs.agents.policy import Policy as Policy
+    from softgym_envs.agents.training import train as train
+    from softgym_envs.agents.vec_env import SB3VecEnv as SB3VecEnv
+
+if __name__ != "softgym_envs.agents":  # this folder is softgym_envs/agents, by a link
+    raise ImportError(f"the package is softgym_envs.agents: import that in place of {__name__}")
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,

@@ -146,7 +146,7 @@ class EnvironmentConfig(Config):
         return self._wrapped(env) if self.residual_scale else env
 
     def _wrapped(self, env: gymnasium.Env) -> gymnasium.Wrapper:
-        from agents.residual import ResidualQP
+        from softgym_envs.agents.residual import ResidualQP
 
         return ResidualQP(env, self.residual_scale)
 
@@ -158,7 +158,7 @@ class EnvironmentConfig(Config):
             envs = gymnasium.make_vec(self._spec(), num_envs=num_envs, **self._options(overrides))
             if not self.residual_scale:
                 return envs
-            from agents.residual import VectorResidualQP
+            from softgym_envs.agents.residual import VectorResidualQP
 
             return VectorResidualQP(envs, self.residual_scale)
         return gymnasium.make_vec(
@@ -269,7 +269,7 @@ class GradientConfig(Config):
 
 
 class AnalyticConfig(GradientConfig):
-    """Hyperparameters of the analytic policy gradient (`agents.learners.analytic`)."""
+    """Hyperparameters of the analytic policy gradient (`softgym_envs.agents.learners.analytic`)."""
 
     slack_pull: float = Field(
         default=0.3, ge=0, description="how strongly commands of slack cables follow the displacement that is reached"
@@ -277,7 +277,7 @@ class AnalyticConfig(GradientConfig):
 
 
 class CloningConfig(GradientConfig):
-    """Hyperparameters of the imitation of the inverse QP (`agents.learners.cloning`)."""
+    """Hyperparameters of the imitation of the inverse QP (`softgym_envs.agents.learners.cloning`)."""
 
     batch_size: int = Field(default=256, gt=0)
     gradient_steps: int = Field(default=8, gt=0, description="per step of all environments together")

@@ -10,9 +10,9 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from agents.baselines import BASELINES, Agent, make_baseline
-from agents.config import EnvironmentConfig
-from agents.policy import Policy
+from softgym_envs.agents.baselines import BASELINES, Agent, make_baseline
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.policy import Policy
 from softgym_envs.errors import DataError
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.config import EnvironmentConfig
-from agents.policy import Policy
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.policy import Policy
 from softgym_envs.storage import atomic_write
 from softgym_envs.version import __version__
 

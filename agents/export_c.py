@@ -8,8 +8,8 @@ from string import Template
 
 import numpy as np
 
-from agents.export import input_sizes, spaces_of
-from agents.policy import Policy
+from softgym_envs.agents.export import input_sizes, spaces_of
+from softgym_envs.agents.policy import Policy
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.export.c_text import check_identifier, comment, initialiser, number

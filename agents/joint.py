@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.storage import read_json, write_json
 
 if TYPE_CHECKING:
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 class DesignProposer(ABC):
     """Draws the bodies of training episodes, in unit coordinates [-1, 1] of the sampled variables.
 
-    `agents.training.train` calls `attach` once, `begin` before and `save` after each part of the training, and `finish`
-    at the end.
+    `softgym_envs.agents.training.train` calls `attach` once, `begin` before and `save` after each part of the
+    training, and `finish` at the end.
     """
 
     def attach(self, model: SAC, config: TrainConfig, folder: Path) -> None:

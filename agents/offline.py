@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from agents.baselines import BASELINES
-from agents.config import EnvironmentConfig
-from agents.evaluation import make_agent
+from softgym_envs.agents.baselines import BASELINES
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.extras import require
 
 if TYPE_CHECKING:

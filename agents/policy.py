@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.config import EnvironmentConfig
+from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.config import check_config
 from softgym_envs.envs.options import design_names
 from softgym_envs.errors import ConfigError, DataError, WeightsError, unknown_name

@@ -9,7 +9,7 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 
-from agents.baselines import InverseQPAgent, make_controller
+from softgym_envs.agents.baselines import InverseQPAgent, make_controller
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel

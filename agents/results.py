@@ -1,4 +1,4 @@
-"""Tables and learning curves of stored runs, which `agents.sweep` writes."""
+"""Tables and learning curves of stored runs, which `softgym_envs.agents.sweep` writes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
-from agents.config import EnvironmentConfig
-from agents.statistics import Estimate, crossed_estimate, stratified_estimate
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.statistics import Estimate, crossed_estimate, stratified_estimate
 from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json
 
 if TYPE_CHECKING:
-    from agents.training import CurvePoint
+    from softgym_envs.agents.training import CurvePoint
 
 RESULTS = Path(__file__).parent / "results"
 """Stored runs of the configurations in ``configs/agents``."""
@@ -155,7 +155,8 @@ def load_runs(folder: str | Path = RESULTS) -> list[StoredRuns]:
             same.baselines.update(baselines)
     if not found:
         raise DataError(
-            f"'{folder}' contains no results (<config>/seed<k>.json); create them with python -m agents.sweep"
+            f"'{folder}' contains no results (<config>/seed<k>.json); create them with "
+            "python -m softgym_envs.agents.sweep"
         )
     return found
 

@@ -1,8 +1,8 @@
 """Train and evaluate many configurations with several seeds, one process each.
 
-    python -m agents.sweep --configs configs/agents/*.yaml --seeds 0 1 2 --processes 16 --folder results/agents
+    python -m softgym_envs.agents.sweep --configs configs/agents/*.yaml --seeds 0 1 2 --processes 16 --folder results
 
-Trainings go to ``FOLDER/runs/<config>/seed<k>``. Results, which `agents.results` reads, go to
+Trainings go to ``FOLDER/runs/<config>/seed<k>``. Results, which `softgym_envs.agents.results` reads, go to
 ``FOLDER/results/<config>``: ``seed<k>.json`` for each policy and ``baselines.json`` for the agents that need no
 training, all on the same unseen goals. Finished jobs are not repeated, and an interrupted training resumes from its
 checkpoint. A folder with results of another configuration or number of goals is refused.
@@ -22,14 +22,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.config import check_config, difference, load_config, provenance
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.executors import parallel_map
 from softgym_envs.storage import read_json, write_json
 
 if TYPE_CHECKING:
-    from agents.results import Evaluations
+    from softgym_envs.agents.results import Evaluations
 
 TEST_SEED = 2_000_003
 """Seed of the goals that are used neither for training nor for choosing policies."""
@@ -37,7 +37,7 @@ TEST_SEED = 2_000_003
 
 def unseen_goals(environment: EnvironmentConfig, count: int) -> tuple[list[dict[str, float]] | None, np.ndarray]:
     """Return bodies (None: the single body) and goals [m] (n, p, 3) of the final evaluation; n = 1 if all are equal."""
-    from agents.evaluation import evaluation_set
+    from softgym_envs.agents.evaluation import evaluation_set
 
     designs, goals = evaluation_set(environment, count, TEST_SEED)
     if designs is None and (goals == goals[0]).all():
@@ -49,7 +49,7 @@ def _evaluations(
     environment: EnvironmentConfig, agents: dict[str, str | Path], goals: int, fem_goals: int
 ) -> Evaluations:
     """Evaluate agents on the environment's backend and on FEM: ``{backend: {agent: evaluation}}``, in SI units."""
-    from agents.evaluation import evaluate
+    from softgym_envs.agents.evaluation import evaluate
 
     counts = _counts(environment, goals, fem_goals)
     designs, paths = unseen_goals(environment, max(counts.values()))
@@ -126,8 +126,8 @@ def _finished(result: Path, config: TrainConfig, goals: int, fem_goals: int) -> 
 
 def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goals: int) -> Path:
     """Train one configuration with one seed, evaluate its policy and return the file of the result."""
-    from agents.policy import Policy
-    from agents.training import train
+    from softgym_envs.agents.policy import Policy
+    from softgym_envs.agents.training import train
 
     name = path.stem
     result = folder / "results" / name / f"seed{seed}.json"
@@ -155,7 +155,7 @@ def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goal
 
 def evaluate_baselines(path: Path, folder: Path, goals: int, fem_goals: int) -> Path:
     """Evaluate the agents that need no training on the goals of a configuration; return the file of the result."""
-    from agents.baselines import baselines_for
+    from softgym_envs.agents.baselines import baselines_for
 
     result = folder / "results" / path.stem / "baselines.json"
     config = load_config(path, TrainConfig)
@@ -256,8 +256,10 @@ def sweep(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of ``python -m agents.sweep``."""
-    parser = argparse.ArgumentParser(prog="python -m agents.sweep", description=(__doc__ or "").split("\n")[0])
+    """Entry point of ``python -m softgym_envs.agents.sweep``."""
+    parser = argparse.ArgumentParser(
+        prog="python -m softgym_envs.agents.sweep", description=(__doc__ or "").split("\n")[0]
+    )
     parser.add_argument("--configs", type=Path, nargs="+", required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--processes", type=int, default=os.cpu_count())

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
-from agents.config import TrainConfig
-from agents.evaluation import Evaluation, evaluate, evaluation_set
-from agents.learners import make_learner
-from agents.learners.base import Learner, Tensors
-from agents.policy import Policy, read_tensors, save_policy
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.evaluation import Evaluation, evaluate, evaluation_set
+from softgym_envs.agents.learners import make_learner
+from softgym_envs.agents.learners.base import Learner, Tensors
+from softgym_envs.agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.config import difference, load_config, provenance, save_resolved
 from softgym_envs.errors import DataError
 from softgym_envs.extras import require
@@ -24,7 +24,7 @@ from softgym_envs.storage import atomic_write, read_json
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
 
-    from agents.joint import DesignProposer
+    from softgym_envs.agents.joint import DesignProposer
 
 
 EVALUATION_SEED = 1_000_003
@@ -192,7 +192,7 @@ def _model(learner: Learner) -> SAC:
     Raises:
         ValueError: for another learner than SAC.
     """
-    from agents.learners.sac import SACLearner
+    from softgym_envs.agents.learners.sac import SACLearner
 
     if not isinstance(learner, SACLearner):
         raise ValueError(f"joint training needs learner 'sac', got '{learner.config.learner}'")

@@ -87,8 +87,8 @@ def search(payload: float, generations: int = 8, members: int = 2, seed: int = 0
 
 def carry() -> dict[str, object]:
     """TetrapodCarry: farthest position to the right, position at the end [mm] and return, by agent and payload."""
-    from agents.evaluation import make_agent
-    from agents.policy import policy_path
+    from softgym_envs.agents.evaluation import make_agent
+    from softgym_envs.agents.policy import policy_path
 
     swings = {entry["payload"]: entry["parameters"] for entry in json.loads(DATA.read_text())}
     results: dict[str, object] = {}

@@ -23,11 +23,11 @@ import numpy as np
 import yaml
 
 from benchmarks.postgres_server import PostgresServer, temporary_server
-from codesign.config import JOURNAL, StudyConfig
-from codesign.folder import StudyFolder
-from codesign.records import TrialResult
-from codesign.scheduling.optuna_study import open_study
-from codesign.scheduling.storage import StudyStorage
+from softgym_envs.codesign.config import JOURNAL, StudyConfig
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.records import TrialResult
+from softgym_envs.codesign.scheduling.optuna_study import open_study
+from softgym_envs.codesign.scheduling.storage import StudyStorage
 
 TRIALS = 200
 WORKERS = 2
@@ -107,9 +107,9 @@ class Sweep:
         self._context = multiprocessing.get_context("forkserver")  # imports of the workers run once
         self._context.set_forkserver_preload(
             [
-                "codesign.scheduling.worker",
-                "codesign.scheduling.postgres",
-                "agents.evaluation",
+                "softgym_envs.codesign.scheduling.worker",
+                "softgym_envs.codesign.scheduling.postgres",
+                "softgym_envs.agents.evaluation",
                 "optuna",
                 "psycopg",
                 "sqlalchemy.orm",
@@ -147,7 +147,7 @@ class Sweep:
 
 
 def _work(path: str) -> None:
-    from codesign.scheduling.worker import run_trials
+    from softgym_envs.codesign.scheduling.worker import run_trials
 
     run_trials(StudyFolder(path))
 
@@ -216,8 +216,8 @@ def kills() -> dict[str, object]:
 
 def _timed_worker(path: str, output: str, started: str) -> None:
     """Run a worker and write how long it was inside training, evaluation and the queue [s]."""
-    import codesign.phases.trial
-    import codesign.scheduling.worker
+    import softgym_envs.codesign.phases.trial
+    import softgym_envs.codesign.scheduling.worker
 
     spent = Counter[str]()
 
@@ -233,12 +233,12 @@ def _timed_worker(path: str, output: str, started: str) -> None:
 
         setattr(module, name, wrapper)
 
-    timed(codesign.phases.trial, "train")
-    timed(codesign.phases.trial, "assess")
+    timed(softgym_envs.codesign.phases.trial, "train")
+    timed(softgym_envs.codesign.phases.trial, "assess")
     for name in ("claim", "finish"):
-        timed(codesign.scheduling.worker.TrialQueue, name)
+        timed(softgym_envs.codesign.scheduling.worker.TrialQueue, name)
     spent["start"] = time.time() - float(started)
-    codesign.scheduling.worker.run_trials(StudyFolder(path))
+    softgym_envs.codesign.scheduling.worker.run_trials(StudyFolder(path))
     Path(output).write_text(json.dumps(spent))
 
 

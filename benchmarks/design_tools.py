@@ -28,9 +28,9 @@ def optima() -> dict[str, object]:
 
     Designs are length, height and joint height [mm]; angles are in rad, forces in N.
     """
-    from codesign.tools.config import OptimiseConfig
-    from codesign.tools.gradient import optimise
-    from codesign.tools.search import search
+    from softgym_envs.codesign.tools.config import OptimiseConfig
+    from softgym_envs.codesign.tools.gradient import optimise
+    from softgym_envs.codesign.tools.search import search
     from softgym_envs.config import check_config
 
     bodies = {
@@ -78,9 +78,9 @@ def optima() -> dict[str, object]:
 
 def calibration() -> dict[str, object]:
     """Calibration of the one-cable finger from FEM states: Poisson's ratio, Young's modulus, noise of 1 %."""
-    from codesign.tools.calibration import calibrate
-    from codesign.tools.config import CalibrationConfig
-    from codesign.tools.measurements import measure
+    from softgym_envs.codesign.tools.calibration import calibrate
+    from softgym_envs.codesign.tools.config import CalibrationConfig
+    from softgym_envs.codesign.tools.measurements import measure
     from softgym_envs.config import check_config
     from softgym_envs.robots.registry import make_robot
 

@@ -18,10 +18,10 @@ from typing import Any
 import click
 import numpy as np
 
-from agents.config import EnvironmentConfig
-from agents.evaluation import evaluate
-from agents.statistics import crossed_estimate
-from codesign.snapshot import load_study
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.evaluation import evaluate
+from softgym_envs.agents.statistics import crossed_estimate
+from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.robots.grasping import KINDS
 

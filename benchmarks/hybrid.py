@@ -45,7 +45,7 @@ def flagging(model, data: dict[str, np.ndarray], limit: float) -> dict[str, obje
 
 def _follow(env: gymnasium.Env, goals: np.ndarray) -> list[np.ndarray]:
     """Run the inverse QP to each goal and return the last command of each episode."""
-    from agents.evaluation import make_agent
+    from softgym_envs.agents.evaluation import make_agent
 
     act, last = make_agent("qp"), []
     for goal in goals:

@@ -61,11 +61,11 @@ class LearnerRow:
 
 def measure(task: str, learner: str, seed: int, folder: Path) -> LearnerRow:
     """Train and evaluate one policy."""
-    from agents.config import TrainConfig
-    from agents.evaluation import evaluate
-    from agents.policy import Policy
-    from agents.sweep import unseen_goals
-    from agents.training import train
+    from softgym_envs.agents.config import TrainConfig
+    from softgym_envs.agents.evaluation import evaluate
+    from softgym_envs.agents.policy import Policy
+    from softgym_envs.agents.sweep import unseen_goals
+    from softgym_envs.agents.training import train
 
     name = task if learner == "sac" else f"{task}_{learner}"
     update = {"seed": seed, "evaluation_episodes": GOALS, "report_every": REPORTS[learner]}

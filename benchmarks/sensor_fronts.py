@@ -30,10 +30,10 @@ def front(stem: str) -> dict[str, object]:
     Args:
         stem: name of the configuration in ``configs/design``.
     """
-    from codesign.tools.config import OptimiseConfig
-    from codesign.tools.metrics import METRICS
-    from codesign.tools.plots import draw_front
-    from codesign.tools.search import search
+    from softgym_envs.codesign.tools.config import OptimiseConfig
+    from softgym_envs.codesign.tools.metrics import METRICS
+    from softgym_envs.codesign.tools.plots import draw_front
+    from softgym_envs.codesign.tools.search import search
     from softgym_envs.config import load_config
 
     folder = Path("results") / stem

@@ -136,7 +136,7 @@ STRATEGIES: dict[str, dict[str, Any]] = {
 
 def _question(**changes: Any) -> Any:
     """Return the study of the question with some values replaced."""
-    from codesign.config import StudyConfig
+    from softgym_envs.codesign.config import StudyConfig
 
     base = load_config(QUESTION, StudyConfig).model_dump(mode="json")
     base["goals"]["count"], base["training"] = GOALS, SAC
@@ -161,10 +161,10 @@ def _truth(path: Path, values: tuple[float, ...], folder: Path) -> Path:
     """Score of one body of the grid: train from the design-conditioned policy, and evaluate."""
     import torch
 
-    from agents.evaluation import evaluate
-    from agents.training import train
-    from codesign.folder import StudyFolder
-    from codesign.phases.trial import training_config
+    from softgym_envs.agents.evaluation import evaluate
+    from softgym_envs.agents.training import train
+    from softgym_envs.codesign.folder import StudyFolder
+    from softgym_envs.codesign.phases.trial import training_config
 
     torch.set_num_threads(1)
     study = StudyFolder.create(folder / "question", _question(**PLAIN, strategy="qp", trials=1))
@@ -191,8 +191,8 @@ def _truth(path: Path, values: tuple[float, ...], folder: Path) -> Path:
 
 
 def _run_study(path: Path, name: str, repeat: int) -> Path:
-    from codesign.folder import StudyFolder
-    from codesign.study import run_study
+    from softgym_envs.codesign.folder import StudyFolder
+    from softgym_envs.codesign.study import run_study
 
     cost = run_study(_study(name, repeat), path.parent, progress=False).cost
     folder = StudyFolder(path.parent)
@@ -291,12 +291,12 @@ def _judge(truth: list[dict[str, Any]], runs: list[dict[str, Any]], kept: dict[s
     from scipy.interpolate import RBFInterpolator
     from scipy.optimize import minimize
 
-    from agents.evaluation import evaluate
+    from softgym_envs.agents.evaluation import evaluate
     from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
     config = _question()
     space = config.space
-    from codesign.goals import draw_goals
+    from softgym_envs.codesign.goals import draw_goals
 
     goals = np.array(draw_goals(config)["selection"])
     x = np.array([point["unit"] for point in truth])

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from agents.results import LEARNERS, MODEL_BASED
 from benchmarks.learners import REPORTS, TASKS, spread
 from benchmarks.recorded import figure, number, records, results
+from softgym_envs.agents.results import LEARNERS, MODEL_BASED
 
 WEIGHTS = {
     "finger_1cable": "finger, 1 cable",
@@ -168,7 +168,7 @@ def profile() -> str:
 
 def agents() -> str:
     """Policies and baselines on unseen goals, from the stored runs."""
-    from agents.results import load_runs, table
+    from softgym_envs.agents.results import load_runs, table
 
     return table(load_runs()).replace("\n## ", "\n### ").strip()
 

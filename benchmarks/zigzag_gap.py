@@ -354,8 +354,8 @@ def force_band(rows: Sequence[tuple[Setup, Reading]], curves: Mapping[Setup, Cur
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
     """Draw the forces and energies of finger B over one quantity at a time, and the curve of finger 203."""
-    from codesign.report.plots import BASELINE, MUTED, WINNER
-    from codesign.tools.plots import figure
+    from softgym_envs.codesign.report.plots import BASELINE, MUTED, WINNER
+    from softgym_envs.codesign.tools.plots import figure
 
     one = result["designs"]["B"]
     nominal, measured, published = one["nominal"], one["measured"], one["published"]

@@ -18,7 +18,7 @@ import click
 
 from benchmarks.zigzag_designs import DESIGNS
 from benchmarks.zigzag_study import MESHES, evaluate_all
-from codesign.tools.config import SensitivityConfig
+from softgym_envs.codesign.tools.config import SensitivityConfig
 from softgym_envs.config import load_config, provenance
 from softgym_envs.storage import JsonLines
 

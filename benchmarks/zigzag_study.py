@@ -19,8 +19,8 @@ import click
 import numpy as np
 
 from benchmarks.zigzag_designs import DESIGNS, SIMULATED
-from codesign.tools.config import OptimiseConfig
-from codesign.tools.records import FrontDesign
+from softgym_envs.codesign.tools.config import OptimiseConfig
+from softgym_envs.codesign.tools.records import FrontDesign
 from softgym_envs.config import load_config, provenance
 from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
 from softgym_envs.robots.geometry.export import export_body
@@ -109,8 +109,8 @@ def draw(path: Path, all_designs: np.ndarray, values: Sequence[Value], shapes: M
         values: of the chosen and the built designs.
         shapes: outlines [m], shape (k, 2), by name.
     """
-    from codesign.report.plots import BASELINE, MUTED, WINNER
-    from codesign.tools.plots import figure
+    from softgym_envs.codesign.report.plots import BASELINE, MUTED, WINNER
+    from softgym_envs.codesign.tools.plots import figure
 
     with figure(path, 3, width=4.4, height=4.2) as axes:
         for axis, column, words in ((axes[0], 1, "energy"), (axes[1], 2, "resistance [m]")):

@@ -9,23 +9,26 @@ from typing import TYPE_CHECKING
 from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from codesign.config import StudyConfig as StudyConfig
-    from codesign.objectives import Objective as Objective
-    from codesign.objectives import Outcome as Outcome
-    from codesign.report.page import write_report as write_report
-    from codesign.snapshot import load_study as load_study
-    from codesign.study import run_study as run_study
-    from codesign.tools.calibration import calibrate as calibrate
-    from codesign.tools.config import CalibrationConfig as CalibrationConfig
-    from codesign.tools.config import OptimiseConfig as OptimiseConfig
-    from codesign.tools.config import SensitivityConfig as SensitivityConfig
-    from codesign.tools.gradient import optimise as optimise
-    from codesign.tools.measurements import measure as measure
-    from codesign.tools.metrics import Course as Course
-    from codesign.tools.metrics import Metric as Metric
-    from codesign.tools.metrics import design_metric as design_metric
-    from codesign.tools.search import search as search
-    from codesign.tools.sensitivity import analyse_sensitivity as analyse_sensitivity
+    from softgym_envs.codesign.config import StudyConfig as StudyConfig
+    from softgym_envs.codesign.objectives import Objective as Objective
+    from softgym_envs.codesign.objectives import Outcome as Outcome
+    from softgym_envs.codesign.report.page import write_report as write_report
+    from softgym_envs.codesign.snapshot import load_study as load_study
+    from softgym_envs.codesign.study import run_study as run_study
+    from softgym_envs.codesign.tools.calibration import calibrate as calibrate
+    from softgym_envs.codesign.tools.config import CalibrationConfig as CalibrationConfig
+    from softgym_envs.codesign.tools.config import OptimiseConfig as OptimiseConfig
+    from softgym_envs.codesign.tools.config import SensitivityConfig as SensitivityConfig
+    from softgym_envs.codesign.tools.gradient import optimise as optimise
+    from softgym_envs.codesign.tools.measurements import measure as measure
+    from softgym_envs.codesign.tools.metrics import Course as Course
+    from softgym_envs.codesign.tools.metrics import Metric as Metric
+    from softgym_envs.codesign.tools.metrics import design_metric as design_metric
+    from softgym_envs.codesign.tools.search import search as search
+    from softgym_envs.codesign.tools.sensitivity import analyse_sensitivity as analyse_sensitivity
+
+if __name__ != "softgym_envs.codesign":  # this folder is softgym_envs/codesign, by a link
+    raise ImportError(f"the package is softgym_envs.codesign: import that in place of {__name__}")
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,

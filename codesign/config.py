@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from agents.config import check_hindsight, check_start
-from agents.joint import PROPOSERS
-from codesign.parts import (
+from softgym_envs.agents.config import check_hindsight, check_start
+from softgym_envs.agents.joint import PROPOSERS
+from softgym_envs.codesign.parts import (
     PRUNERS,
     STRATEGIES,
     FinalistsConfig,
@@ -21,9 +21,9 @@ from codesign.parts import (
     Strategy,
     TrainingConfig,
 )
-from codesign.problem import StudyProblem, refuse
-from codesign.sampling import SamplerConfig
-from codesign.variables import is_option
+from softgym_envs.codesign.problem import StudyProblem, refuse
+from softgym_envs.codesign.sampling import SamplerConfig
+from softgym_envs.codesign.variables import is_option
 from softgym_envs.config import BesideConfig
 from softgym_envs.envs.tasks.reach import Reach
 

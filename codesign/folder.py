@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from codesign.config import JOURNAL, StudyConfig
-from codesign.goals import draw_goals
-from codesign.records import Account, TrialResult
-from codesign.scheduling.connect import open_storage
-from codesign.scheduling.storage import SharedStorage, StudyStorage, file_lock
+from softgym_envs.codesign.config import JOURNAL, StudyConfig
+from softgym_envs.codesign.goals import draw_goals
+from softgym_envs.codesign.records import Account, TrialResult
+from softgym_envs.codesign.scheduling.connect import open_storage
+from softgym_envs.codesign.scheduling.storage import SharedStorage, StudyStorage, file_lock
 from softgym_envs.config import check_compatible, check_config, load_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.storage import atomic_write, read_json, write_json
@@ -33,7 +33,7 @@ TEST_SETTINGS = ("finalists.steps", "finalists.fem_options")
 SHARED_POLICY = "shared_policy/policy.safetensors"
 """File of the shared policy, relative to the folder of a study."""
 SHARED_POLICY_RECORD = "shared_policy/shared_policy.json"
-"""File of its `codesign.records.SharedPolicy`, relative to the folder of a study."""
+"""File of its `softgym_envs.codesign.records.SharedPolicy`, relative to the folder of a study."""
 
 
 class StudyFolder:
@@ -147,7 +147,7 @@ class StudyFolder:
         return Account.read(path) if path.exists() else Account()
 
     def lock(self, name: str) -> BaseFileLock:
-        """Return a lock shared by all processes of the folder; see `codesign.scheduling.storage.file_lock`."""
+        """Return a lock shared by all processes of the folder, a `file_lock`."""
         return file_lock(self.path, name)
 
     def policy(self, name: str) -> Path:

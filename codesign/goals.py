@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from codesign.config import StudyConfig
-from codesign.variables import is_option
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.variables import is_option
 
 STREAM = 0x60A15
 """Separates the seeds of a study's goals from those of trainings, which draw goals from the same task."""
@@ -61,7 +61,7 @@ def draw_goals(config: StudyConfig) -> dict[str, Any]:
     goals = config.goals
     count = goals.count + goals.unseen_count
     if goals.source == "task":
-        from agents.evaluation import sample_goals
+        from softgym_envs.agents.evaluation import sample_goals
 
         # Larger than 32 bits, unlike the seeds of trainings.
         seed = (1 << 64) + int(np.random.SeedSequence([goals.seed, STREAM]).generate_state(1, np.uint64)[0])

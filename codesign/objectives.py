@@ -19,7 +19,7 @@ from softgym_envs.errors import unknown_name
 from softgym_envs.registry import import_object
 
 if TYPE_CHECKING:
-    from agents.evaluation import Evaluation
+    from softgym_envs.agents.evaluation import Evaluation
     from softgym_envs.mechanics.model import MechanicalModel
     from softgym_envs.robots.base import Robot
 

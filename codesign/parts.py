@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from agents.config import LearnerConfig
-from codesign.sampling import check_options
+from softgym_envs.agents.config import LearnerConfig
+from softgym_envs.codesign.sampling import check_options
 from softgym_envs.config import Config
 
 
@@ -18,7 +18,9 @@ class Strategy:
 
     trains: bool = False  # each trial trains a policy of its own
     policy: bool = False  # the study needs a given policy: as the start of trainings, else as shared policy
-    proposer: str | None = None  # name in `agents.joint.PROPOSERS` if bodies and a shared policy are trained together
+    proposer: str | None = (
+        None  # name in `softgym_envs.agents.joint.PROPOSERS` if bodies and a shared policy are trained together
+    )
 
     @property
     def shares_policy(self) -> bool:
@@ -107,7 +109,7 @@ class GoalsConfig(Config):
 
 
 class TrainingConfig(LearnerConfig):
-    """Training for one body, in a trial or as a finalist; see `agents.config.TrainConfig`.
+    """Training for one body, in a trial or as a finalist; see `softgym_envs.agents.config.TrainConfig`.
 
     All trials have the same seed and then differ by their bodies only.
     """
@@ -126,7 +128,9 @@ class JointConfig(TrainingConfig):
     steps: int = Field(default=40_000, ge=1)
     report_every: int = Field(default=4_000, ge=1)
     keep: int = Field(default=4, ge=1, le=32, description="number of the most promising bodies that become trials")
-    options: dict[str, int | float] = Field(default_factory=dict, description="of the proposer, see agents.joint")
+    options: dict[str, int | float] = Field(
+        default_factory=dict, description="of the proposer, see softgym_envs.agents.joint"
+    )
 
 
 class ScreenConfig(Config):

@@ -7,9 +7,9 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from agents.config import EnvironmentConfig
-from codesign.objectives import OBJECTIVES, Objective, find_objective, objective_name
-from codesign.variables import OptionRange, make_variables, split_values, with_options
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.codesign.objectives import OBJECTIVES, Objective, find_objective, objective_name
+from softgym_envs.codesign.variables import OptionRange, make_variables, split_values, with_options
 from softgym_envs.config import Config
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.envs.tasks.registry import make_task
@@ -23,7 +23,7 @@ def refuse(wrong: bool, message: str) -> None:
 
 
 class StudyProblem(Config):
-    """Bodies and objectives of a study; `codesign.config.StudyConfig` documents the keys."""
+    """Bodies and objectives of a study; `softgym_envs.codesign.config.StudyConfig` documents the keys."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     title: str = ""

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from codesign.folder import StudyFolder
-from codesign.records import FinalistTest, TestGroup, TrialResult
-from codesign.report.results import Comparison, StudyResults
-from codesign.report.units import present
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.records import FinalistTest, TestGroup, TrialResult
+from softgym_envs.codesign.report.results import Comparison, StudyResults
+from softgym_envs.codesign.report.units import present
 
 SCREEN_INTERVAL = 10.0
 """Least time between two lines about the screen, whose bodies take a moment each [s]."""

@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from agents.evaluation import Evaluation
-from codesign.objectives import Measurement
+from softgym_envs.agents.evaluation import Evaluation
+from softgym_envs.codesign.objectives import Measurement
 from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json, write_json
 

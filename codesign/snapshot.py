@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from codesign.config import StudyConfig
-from codesign.folder import SHARED_POLICY_RECORD, StudyFolder
-from codesign.objectives import Objective
-from codesign.records import (
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import SHARED_POLICY_RECORD, StudyFolder
+from softgym_envs.codesign.objectives import Objective
+from softgym_envs.codesign.records import (
     Account,
     Finalist,
     FinalistTest,
@@ -97,7 +97,7 @@ class StudySnapshot:
         """Optuna study in memory with the complete trials that satisfy the constraints, for Optuna's own analyses."""
         import optuna
 
-        from codesign.scheduling.optuna_study import distributions
+        from softgym_envs.codesign.scheduling.optuna_study import distributions
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         study = optuna.create_study(directions=self.config.directions)

@@ -13,23 +13,23 @@ from typing import Any
 
 import numpy as np
 
-from agents.policy import Policy
-from codesign.config import StudyConfig
-from codesign.folder import StudyFolder
-from codesign.objectives import Objective, Outcome
-from codesign.phases.finalists import check_tests, finalist_jobs
-from codesign.phases.screen import kept_bodies, screen_jobs
-from codesign.phases.shared_policy import promising_bodies, shared_policy_jobs
-from codesign.progress import Progress
-from codesign.records import Account, Job
-from codesign.report.files import write_results
-from codesign.report.results import StudyResults
-from codesign.sampling import make_sampler
-from codesign.scheduling.jobs import missing_jobs
-from codesign.scheduling.optuna_study import distributions, make_pruner
-from codesign.scheduling.processes import run_workers
-from codesign.scheduling.queue import TrialQueue
-from codesign.snapshot import load_study
+from softgym_envs.agents.policy import Policy
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.objectives import Objective, Outcome
+from softgym_envs.codesign.phases.finalists import check_tests, finalist_jobs
+from softgym_envs.codesign.phases.screen import kept_bodies, screen_jobs
+from softgym_envs.codesign.phases.shared_policy import promising_bodies, shared_policy_jobs
+from softgym_envs.codesign.progress import Progress
+from softgym_envs.codesign.records import Account, Job
+from softgym_envs.codesign.report.files import write_results
+from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.sampling import make_sampler
+from softgym_envs.codesign.scheduling.jobs import missing_jobs
+from softgym_envs.codesign.scheduling.optuna_study import distributions, make_pruner
+from softgym_envs.codesign.scheduling.processes import run_workers
+from softgym_envs.codesign.scheduling.queue import TrialQueue
+from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.envs.options import design_names
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign, SoftGymError
 from softgym_envs.extras import require
@@ -69,7 +69,7 @@ def run_study(
         ValueError: if the environment cannot be made.
         WeightsError: if the policy to start from is missing or damaged.
         SoftGymError: if an error of the suite ended a worker.
-        codesign.scheduling.processes.WorkerError: if any other exception ended a worker; with its traceback.
+        softgym_envs.codesign.scheduling.processes.WorkerError: if any other exception ended a worker.
     """
     require("codesign")
     if objective is not None:

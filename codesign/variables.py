@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import Field
 
-from agents.config import EnvironmentConfig
+from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.config import Config
 from softgym_envs.designs import DesignSpace, DesignVariable
 

@@ -22,9 +22,9 @@ import numpy as np
 from PIL import Image, ImageSequence
 from site_writing import DOCS, environment_pages
 
-from agents.evaluation import make_agent
 from benchmarks import convergence_tables
 from softgym_envs import make_robot
+from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.backends import make_backend
 from softgym_envs.robots import ROBOTS
 from softgym_envs.viewer.image import ImageRenderer, render_bodies

@@ -22,8 +22,8 @@ PACKAGES = {
     "softgym_envs.backends": "Backends",
     "softgym_envs.control": "Control",
     "softgym_envs.viewer": "Pictures",
-    "agents": "Agents",
-    "codesign": "Co-design",
+    "softgym_envs.agents": "Agents",
+    "softgym_envs.codesign": "Co-design",
 }
 """Packages that export public names and the module of the exceptions, with the titles of their pages."""
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from codesign.scheduling import worker
 from softgym_envs.cli import app
+from softgym_envs.codesign.scheduling import worker
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -242,10 +242,10 @@ def test_malformed_files(softgym, tmp_path, text):
 @pytest.mark.parametrize(
     ("module", "name", "arguments", "resumes"),
     [
-        ("agents.training", "train", ["train", "--config", CONFIG, "--folder", "x"], True),
-        ("agents.evaluation", "evaluate", ["evaluate", "--config", CONFIG, "--goals", "1"], False),
-        ("codesign.tools.search", "search", ["optimise", "--config", FRONT], True),
-        ("codesign.tools.gradient", "optimise", ["optimise", "--config", STRENGTH], False),
+        ("softgym_envs.agents.training", "train", ["train", "--config", CONFIG, "--folder", "x"], True),
+        ("softgym_envs.agents.evaluation", "evaluate", ["evaluate", "--config", CONFIG, "--goals", "1"], False),
+        ("softgym_envs.codesign.tools.search", "search", ["optimise", "--config", FRONT], True),
+        ("softgym_envs.codesign.tools.gradient", "optimise", ["optimise", "--config", STRENGTH], False),
     ],
 )
 def test_an_interrupted_command_says_whether_it_can_continue(

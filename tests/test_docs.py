@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from codesign.config import StudyConfig
+from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.config import check_config
 from softgym_envs.envs.options import EnvironmentOptions
 from softgym_envs.envs.registration import ENVIRONMENTS

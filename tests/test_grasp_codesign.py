@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from agents.config import EnvironmentConfig
 from benchmarks.grasp_codesign import Scene, compare, draw_scenes
 from softgym_envs import make_robot
+from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.robots.grasping import KINDS
 
 COARSE = {"control_points": 7, "element": "linear"}

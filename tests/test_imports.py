@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("softgym_envs", "agents", "codesign")
+FOLDERS = ("softgym_envs", "agents", "codesign")
+"""Folders of the package; the last two are linked into the first."""
 
 # From the bottom to the top. A package imports from packages in lower layers and from itself.
 LAYERS = [
@@ -25,21 +26,23 @@ LAYERS = [
     {"softgym_envs.backends"},
     {"softgym_envs.control"},
     {"softgym_envs.envs"},
-    {"agents"},
-    {"codesign"},
+    {"softgym_envs.agents"},
+    {"softgym_envs.codesign"},
     {"softgym_envs.viewer", "softgym_envs.testing"},
     {"softgym_envs.cli"},
 ]
 LEVEL = {package: level for level, layer in enumerate(LAYERS) for package in layer}
 # The viewer is imported only inside the functions that draw.
-LAZY = {("softgym_envs.envs", "softgym_envs.viewer"), ("codesign", "softgym_envs.viewer")}
+LAZY = {("softgym_envs.envs", "softgym_envs.viewer"), ("softgym_envs.codesign", "softgym_envs.viewer")}
 HEAVY = ("torch", "gmsh", "stable_baselines3", "optuna", "rerun", "pyvista", "vtk", "numba", "scipy", "matplotlib")
 
-FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 
 def module_name(path):
     parts = path.relative_to(ROOT).with_suffix("").parts
+    if parts[0] in ("agents", "codesign"):
+        parts = ("softgym_envs", *parts)
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
@@ -70,7 +73,7 @@ def imports_of(path):
         else:
             continue
         for name in names:
-            if name.split(".")[0] in (*PACKAGES, "benchmarks"):
+            if name.split(".")[0] in ("softgym_envs", "benchmarks"):
                 yield name, id(node) in lazy, node.lineno
 
 
@@ -97,11 +100,20 @@ def test_imports_go_downwards(path):
 def test_the_checker_detects_a_forbidden_import(tmp_path):
     path = tmp_path / "bad.py"
     path.write_text(
-        "from softgym_envs import viewer\n\ndef f():\n    import agents.training\n    from softgym_envs.envs import x\n"
+        "from softgym_envs import viewer\n\ndef f():\n    import softgym_envs.agents.training\n"
+        "    from softgym_envs.envs import x\n"
     )
     found = [(name, lazy) for name, lazy, _ in imports_of(path)]
-    assert found == [("softgym_envs.viewer", False), ("agents.training", True), ("softgym_envs.envs.x", True)]
-    assert [package_of(name) for name, _ in found] == ["softgym_envs.viewer", "agents", "softgym_envs.envs"]
+    assert found == [
+        ("softgym_envs.viewer", False),
+        ("softgym_envs.agents.training", True),
+        ("softgym_envs.envs.x", True),
+    ]
+    assert [package_of(name) for name, _ in found] == [
+        "softgym_envs.viewer",
+        "softgym_envs.agents",
+        "softgym_envs.envs",
+    ]
 
 
 def loaded_by(statement):
@@ -124,7 +136,7 @@ def test_the_light_import_registers_the_environments():
 
 # -- structure ----------------------------------------------------------------------------------------------------
 
-STRUCTURED = (*PACKAGES, "benchmarks")
+STRUCTURED = (*FOLDERS, "benchmarks")
 MODULES = {module_name(path): path for package in STRUCTURED for path in (ROOT / package).rglob("*.py")}
 MAX_LINES = 600
 
@@ -194,15 +206,28 @@ def test_files_are_short(path):
 
 def test_the_checkers_detect_circles_and_private_names(tmp_path):
     sources = {
-        "agents.one": "def f():\n    from agents import two\n",
-        "agents.two": "from agents.three import _hidden, shown\n",
-        "agents.three": "import agents.one\n",
-        "agents.four": "from agents.one import f\n",
+        "softgym_envs.agents.one": "def f():\n    from softgym_envs.agents import two\n",
+        "softgym_envs.agents.two": "from softgym_envs.agents.three import _hidden, shown\n",
+        "softgym_envs.agents.three": "import softgym_envs.agents.one\n",
+        "softgym_envs.agents.four": "from softgym_envs.agents.one import f\n",
     }
     modules = {}
     for name, text in sources.items():
         modules[name] = tmp_path / f"{name}.py"
         modules[name].write_text(text)
-    assert circles(import_graph(modules)) == [["agents.one", "agents.three", "agents.two"]]
+    assert circles(import_graph(modules)) == [
+        ["softgym_envs.agents.one", "softgym_envs.agents.three", "softgym_envs.agents.two"]
+    ]
     found = {name: list(private_imports(path)) for name, path in modules.items()}
-    assert found == {**dict.fromkeys(sources, []), "agents.two": ["line 1: agents.three._hidden"]}
+    assert found == {
+        **dict.fromkeys(sources, []),
+        "softgym_envs.agents.two": ["line 1: softgym_envs.agents.three._hidden"],
+    }
+
+
+@pytest.mark.parametrize("name", ["agents", "codesign"])
+def test_the_folders_are_imported_under_one_name_only(name):
+    assert (ROOT / "softgym_envs" / name).resolve() == ROOT / name
+    code = f"import softgym_envs.{name}; import {name}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert f"ImportError: the package is softgym_envs.{name}: import that in place of {name}" in done.stderr

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import yaml
 
-from agents.config import TrainConfig
-from agents.evaluation import evaluate, sample_goals
-from agents.training import train
 from softgym_envs import make_robot
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.evaluation import evaluate, sample_goals
+from softgym_envs.agents.training import train
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "05_own_robot.py"
 ENVIRONMENT = {"robot": "own_robot:Arm", "task": "reach", "robot_options": {"layers": 4}, "max_episode_steps": 10}

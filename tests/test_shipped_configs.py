@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from agents.config import TrainConfig
-from codesign.tools.config import CalibrationConfig
+from softgym_envs.agents.config import TrainConfig
 from softgym_envs.cli import configs, options
+from softgym_envs.codesign.tools.config import CalibrationConfig
 from softgym_envs.config import load_config
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -12,10 +12,10 @@ import pytest
 import yaml
 
 import softgym_envs  # noqa: F401 - registers the environments
-from agents.config import TrainConfig
-from codesign.config import StudyConfig
-from codesign.tools.config import CalibrationConfig, OptimiseConfig
 from softgym_envs import make_robot
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.tools.config import CalibrationConfig, OptimiseConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import SoftGymError
 from softgym_envs.mechanics import MechanicalModel

@@ -8,8 +8,8 @@ from click.testing import CliRunner
 
 from benchmarks import zigzag_study
 from benchmarks.zigzag_designs import DESIGNS
-from codesign.tools.config import OptimiseConfig
-from codesign.tools.records import FrontDesign
+from softgym_envs.codesign.tools.config import OptimiseConfig
+from softgym_envs.codesign.tools.records import FrontDesign
 from softgym_envs.config import load_config, save_resolved
 from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
 from softgym_envs.storage import write_json

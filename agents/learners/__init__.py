@@ -5,16 +5,16 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from agents.config import TrainConfig
+from softgym_envs.agents.config import TrainConfig
 
 if TYPE_CHECKING:
-    from agents.learners.base import Learner
+    from softgym_envs.agents.learners.base import Learner
 
 LEARNERS = {
-    "sac": "agents.learners.sac:SACLearner",
-    "ppo": "agents.learners.ppo:PPOLearner",
-    "analytic": "agents.learners.analytic:AnalyticLearner",
-    "cloning": "agents.learners.cloning:CloningLearner",
+    "sac": "softgym_envs.agents.learners.sac:SACLearner",
+    "ppo": "softgym_envs.agents.learners.ppo:PPOLearner",
+    "analytic": "softgym_envs.agents.learners.analytic:AnalyticLearner",
+    "cloning": "softgym_envs.agents.learners.cloning:CloningLearner",
 }
 
 

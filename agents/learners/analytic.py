@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from agents.config import TrainConfig
-from agents.learners.gradient import GradientLearner
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.learners.gradient import GradientLearner
 from softgym_envs.envs.gradients import StepGradient
 
 #: Smallest reward whose logarithm is followed; below, gradients would be without bound.

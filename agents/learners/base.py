@@ -1,4 +1,4 @@
-"""The Learner base class: what `agents.training.train` needs of a learning method."""
+"""The Learner base class: what `softgym_envs.agents.training.train` needs of a learning method."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.config import TrainConfig
+from softgym_envs.agents.config import TrainConfig
 from softgym_envs.errors import WeightsError
 
 Tensors = dict[str, np.ndarray]
@@ -32,7 +32,7 @@ def check_weights(shapes: Mapping[str, Sequence[int]], tensors: Mapping[str, np.
 
 
 class Learner(ABC):
-    """A policy in training. One file per method, and a row in `agents.learners`.
+    """A policy in training. One file per method, and a row in `softgym_envs.agents.learners`.
 
     `train` makes a learner, restores or loads its weights, calls `learn` for one part of the training after the other,
     evaluates the policy in between and stores `weights` and `state`. A resumed training must give the same policy as

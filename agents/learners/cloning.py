@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from agents.config import TrainConfig
-from agents.learners.base import Tensors
-from agents.learners.gradient import GradientLearner
-from agents.residual import BatchQP
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.learners.base import Tensors
+from softgym_envs.agents.learners.gradient import GradientLearner
+from softgym_envs.agents.residual import BatchQP
 
 
 class CloningLearner(GradientLearner):

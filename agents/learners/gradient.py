@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.config import GradientConfig, TrainConfig
-from agents.learners.base import Learner, Tensors, check_weights
+from softgym_envs.agents.config import GradientConfig, TrainConfig
+from softgym_envs.agents.learners.base import Learner, Tensors, check_weights
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 if TYPE_CHECKING:

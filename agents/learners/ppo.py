@@ -12,10 +12,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.optim import Optimizer
 
-from agents.config import TrainConfig
-from agents.learners.base import Tensors, check_weights
-from agents.learners.sb3 import SB3Learner
-from agents.vec_env import SB3VecEnv
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.learners.base import Tensors, check_weights
+from softgym_envs.agents.learners.sb3 import SB3Learner
+from softgym_envs.agents.vec_env import SB3VecEnv
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 #: Parts of the model of stable-baselines3, and their names in a policy file.

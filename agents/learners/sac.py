@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.config import TrainConfig
-from agents.learners.base import Tensors, check_weights
-from agents.learners.sb3 import SB3Learner
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.learners.base import Tensors, check_weights
+from softgym_envs.agents.learners.sb3 import SB3Learner
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
@@ -88,9 +88,9 @@ def make_model(config: TrainConfig) -> SAC:
     """Return the model of stable-baselines3 of a training."""
     from stable_baselines3 import SAC
 
-    from agents.hindsight import HindsightBuffer
-    from agents.vec_env import SB3VecEnv
-    from agents.warm_up import PostureSAC
+    from softgym_envs.agents.hindsight import HindsightBuffer
+    from softgym_envs.agents.vec_env import SB3VecEnv
+    from softgym_envs.agents.warm_up import PostureSAC
 
     env = SB3VecEnv(config.environment.make_vec(config.num_envs))
     sac = config.sac

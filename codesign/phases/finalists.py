@@ -7,14 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from agents.config import EnvironmentConfig
-from agents.policy import Policy
-from agents.training import train
-from codesign.config import StudyConfig
-from codesign.folder import SHARED_POLICY, StudyFolder
-from codesign.phases.trial import assess, training_config
-from codesign.records import Finalist, FinalistTest, FinalistTraining, Job, PlannedTest
-from codesign.snapshot import StudySnapshot
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.policy import Policy
+from softgym_envs.agents.training import train
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
+from softgym_envs.codesign.phases.trial import assess, training_config
+from softgym_envs.codesign.records import Finalist, FinalistTest, FinalistTraining, Job, PlannedTest
+from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import read_json
 

@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from codesign.folder import StudyFolder
-from codesign.phases.trial import assess
-from codesign.records import Job, ScreenResult
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.phases.trial import assess
+from softgym_envs.codesign.records import Job, ScreenResult
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 

@@ -1,7 +1,7 @@
 """Shared policy: it observes the body and scores every design when trials do not train.
 
 It is given (strategy ``"policy"``), or trained together with the bodies before the first trial (``"critic"``,
-``"distribution"``; see `agents.joint`). The most promising bodies of that training then become trials.
+``"distribution"``; see `softgym_envs.agents.joint`). The most promising bodies of that training then become trials.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from agents.config import TrainConfig
-from agents.joint import PROPOSERS
-from agents.policy import policy_path
-from agents.training import cpu_before, train
-from codesign.config import StudyConfig
-from codesign.folder import SHARED_POLICY, SHARED_POLICY_RECORD, StudyFolder
-from codesign.records import Job, SharedPolicy
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.joint import PROPOSERS
+from softgym_envs.agents.policy import policy_path
+from softgym_envs.agents.training import cpu_before, train
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import SHARED_POLICY, SHARED_POLICY_RECORD, StudyFolder
+from softgym_envs.codesign.records import Job, SharedPolicy
 from softgym_envs.storage import atomic_write, read_json
 
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from agents.config import EnvironmentConfig, TrainConfig
-from agents.evaluation import Evaluation, evaluate
-from agents.training import cpu_before, train
-from codesign.config import StudyConfig
-from codesign.folder import SHARED_POLICY, StudyFolder
-from codesign.objectives import Objective, Outcome
-from codesign.phases.shared_policy import shared_policy
-from codesign.records import Assessment, TrialResult
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.evaluation import Evaluation, evaluate
+from softgym_envs.agents.training import cpu_before, train
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
+from softgym_envs.codesign.objectives import Objective, Outcome
+from softgym_envs.codesign.phases.shared_policy import shared_policy
+from softgym_envs.codesign.records import Assessment, TrialResult
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import read_json
 

@@ -6,12 +6,19 @@ import warnings
 
 import numpy as np
 
-from codesign.config import StudyConfig
-from codesign.objectives import OBJECTIVES, Objective
-from codesign.records import Finalist, TestGroup
-from codesign.report.results import BodyStatistics, Comparison, Cost, StudyResults, Transfer, VariableResult
-from codesign.report.statistics import Interval, mean_interval, rank_correlation, rate_interval
-from codesign.snapshot import StudySnapshot
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.objectives import OBJECTIVES, Objective
+from softgym_envs.codesign.records import Finalist, TestGroup
+from softgym_envs.codesign.report.results import (
+    BodyStatistics,
+    Comparison,
+    Cost,
+    StudyResults,
+    Transfer,
+    VariableResult,
+)
+from softgym_envs.codesign.report.statistics import Interval, mean_interval, rank_correlation, rate_interval
+from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.config import provenance
 
 FEW_GOALS = 10

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation import make_agent
-from codesign.phases.finalists import finalist_environment, policy_file
-from codesign.records import Finalist
-from codesign.report.results import StudyResults
-from codesign.snapshot import StudySnapshot
+from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.backends.backend import State
+from softgym_envs.codesign.phases.finalists import finalist_environment, policy_file
+from softgym_envs.codesign.records import Finalist
+from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 

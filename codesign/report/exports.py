@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign.phases.finalists import policy_file
-from codesign.report.episodes import Episode
-from codesign.report.results import StudyResults
-from codesign.snapshot import StudySnapshot
+from softgym_envs.codesign.phases.finalists import policy_file
+from softgym_envs.codesign.report.episodes import Episode
+from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.robots.base import Robot
 
 EMBEDDED = 1_000_000
@@ -112,7 +112,7 @@ def _body(robot: Robot, path: Path, design: dict[str, float]) -> None:
 
 
 def _onnx(policy: Path, path: Path) -> None:
-    from agents.export import export_policy_onnx
+    from softgym_envs.agents.export import export_policy_onnx
 
     export_policy_onnx(policy, path)
 

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation import Evaluation
-from codesign.config import StudyConfig
-from codesign.records import Finalist, TestGroup, TrialResult
-from codesign.report.collect import collect
-from codesign.report.results import StudyResults
-from codesign.snapshot import StudySnapshot
+from softgym_envs.agents.evaluation import Evaluation
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.records import Finalist, TestGroup, TrialResult
+from softgym_envs.codesign.report.collect import collect
+from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.storage import atomic_write
 
 

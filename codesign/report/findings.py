@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from codesign.report.results import StudyResults
-from codesign.report.statistics import mean_interval
-from codesign.report.units import present
-from codesign.snapshot import StudySnapshot
+from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.report.statistics import mean_interval
+from softgym_envs.codesign.report.units import present
+from softgym_envs.codesign.snapshot import StudySnapshot
 
 NEGLIGIBLE = 0.1
 """A difference of mean distances below this share of the success distance does not matter."""

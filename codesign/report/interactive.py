@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from codesign.records import TrialResult
-from codesign.report.episodes import Episode
-from codesign.report.plots import BASELINE, MUTED, VIOLATES, WINNER
-from codesign.report.results import StudyResults
-from codesign.report.units import present, shown_unit
-from codesign.snapshot import StudySnapshot
+from softgym_envs.codesign.records import TrialResult
+from softgym_envs.codesign.report.episodes import Episode
+from softgym_envs.codesign.report.plots import BASELINE, MUTED, VIOLATES, WINNER
+from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.report.units import present, shown_unit
+from softgym_envs.codesign.snapshot import StudySnapshot
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure

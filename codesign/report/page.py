@@ -10,18 +10,18 @@ import numpy as np
 import yaml
 from markupsafe import Markup
 
-from codesign.objectives import OBJECTIVES
-from codesign.report import interactive, plots, tables
-from codesign.report.collect import FEW_GOALS
-from codesign.report.episodes import Episode, run_episodes
-from codesign.report.exports import Download, write_exports
-from codesign.report.files import write_results
-from codesign.report.findings import findings
-from codesign.report.results import Comparison, StudyResults
-from codesign.report.statistics import MIN_GOALS, kendall_tau, rank_correlation
-from codesign.report.tables import BACKENDS, SHOWN_ALWAYS, millimetres, percent
-from codesign.report.units import present
-from codesign.snapshot import StudySnapshot, load_study
+from softgym_envs.codesign.objectives import OBJECTIVES
+from softgym_envs.codesign.report import interactive, plots, tables
+from softgym_envs.codesign.report.collect import FEW_GOALS
+from softgym_envs.codesign.report.episodes import Episode, run_episodes
+from softgym_envs.codesign.report.exports import Download, write_exports
+from softgym_envs.codesign.report.files import write_results
+from softgym_envs.codesign.report.findings import findings
+from softgym_envs.codesign.report.results import Comparison, StudyResults
+from softgym_envs.codesign.report.statistics import MIN_GOALS, kendall_tau, rank_correlation
+from softgym_envs.codesign.report.tables import BACKENDS, SHOWN_ALWAYS, millimetres, percent
+from softgym_envs.codesign.report.units import present
+from softgym_envs.codesign.snapshot import StudySnapshot, load_study
 from softgym_envs.errors import SoftGymError
 from softgym_envs.storage import atomic_write
 

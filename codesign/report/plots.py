@@ -1,4 +1,4 @@
-"""Figures of a report, as SVG data for HTML, with the units of `codesign.report.units`."""
+"""Figures of a report, as SVG data for HTML, with the units of `softgym_envs.codesign.report.units`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from codesign.objectives import OBJECTIVES
-from codesign.report.results import StudyResults
-from codesign.report.units import present
-from codesign.snapshot import StudySnapshot
+from softgym_envs.codesign.objectives import OBJECTIVES
+from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.report.units import present
+from softgym_envs.codesign.snapshot import StudySnapshot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from codesign.records import Finalist, FinalistTraining, Record, TestGroup
-from codesign.report.statistics import Interval
+from softgym_envs.codesign.records import Finalist, FinalistTraining, Record, TestGroup
+from softgym_envs.codesign.report.statistics import Interval
 
 LIMIT_MARGIN = 0.02
 """A variable this close to an end of its range, as a fraction of the range, is at its limit."""

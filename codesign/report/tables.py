@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from codesign.objectives import OBJECTIVES, Objective
-from codesign.records import TrialResult
-from codesign.report.results import Comparison, Cost, StudyResults, Transfer, VariableResult
-from codesign.report.units import present, shown_unit
-from codesign.snapshot import StudySnapshot
+from softgym_envs.codesign.objectives import OBJECTIVES, Objective
+from softgym_envs.codesign.records import TrialResult
+from softgym_envs.codesign.report.results import Comparison, Cost, StudyResults, Transfer, VariableResult
+from softgym_envs.codesign.report.units import present, shown_unit
+from softgym_envs.codesign.snapshot import StudySnapshot
 
 AGENTS = {"policy": "Policy", "qp": "Inverse QP"}
 BACKENDS = {"fem": "FEM", "surrogate": "Surrogate"}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from codesign.config import JOURNAL, StudyConfig
-from codesign.scheduling.storage import StudyStorage
+from softgym_envs.codesign.config import JOURNAL, StudyConfig
+from softgym_envs.codesign.scheduling.storage import StudyStorage
 
 
 def open_storage(folder: Path, config: StudyConfig, *, wait: bool = True) -> StudyStorage:
@@ -14,9 +14,9 @@ def open_storage(folder: Path, config: StudyConfig, *, wait: bool = True) -> Stu
     Without ``wait``, a database that does not answer is a ConfigError at once, as for a wrong address.
     """
     if config.storage == JOURNAL:
-        from codesign.scheduling.journal import JournalStorage
+        from softgym_envs.codesign.scheduling.journal import JournalStorage
 
         return JournalStorage(folder)
-    from codesign.scheduling.postgres import PostgresStorage
+    from softgym_envs.codesign.scheduling.postgres import PostgresStorage
 
     return PostgresStorage(config.storage, config.name, grace=config.heartbeat, patience=config.patience, wait=wait)

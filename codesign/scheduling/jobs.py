@@ -6,8 +6,8 @@ import json
 import time
 from collections.abc import Iterable
 
-from codesign.folder import StudyFolder
-from codesign.records import Job
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.records import Job
 from softgym_envs.storage import write_json
 
 POLL = 0.5

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from codesign.scheduling.storage import StudyStorage, file_lock
+from softgym_envs.codesign.scheduling.storage import StudyStorage, file_lock
 from softgym_envs.storage import drop_torn_line
 
 if TYPE_CHECKING:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING
 
-from codesign.config import StudyConfig
-from codesign.folder import StudyFolder
-from codesign.parts import PRUNERS
-from codesign.sampling import construct, make_sampler
-from codesign.scheduling.storage import StudyStorage
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.parts import PRUNERS
+from softgym_envs.codesign.sampling import construct, make_sampler
+from softgym_envs.codesign.scheduling.storage import StudyStorage
 from softgym_envs.errors import DataError
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from codesign.scheduling.storage import SharedStorage
+from softgym_envs.codesign.scheduling.storage import SharedStorage
 from softgym_envs.errors import ConfigError, SoftGymError
 
 if TYPE_CHECKING:

@@ -11,10 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from codesign.config import JOURNAL, StudyConfig
-from codesign.folder import StudyFolder
-from codesign.scheduling.queue import CALL
+import softgym_envs
 from softgym_envs import errors
+from softgym_envs.codesign.config import JOURNAL, StudyConfig
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.scheduling.queue import CALL
 from softgym_envs.executors import ray_cluster
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -34,7 +35,7 @@ def run_workers(
 
     Args:
         folder: the study; its configuration names the executor.
-        phase: name in `codesign.scheduling.worker.PHASES`.
+        phase: name in `softgym_envs.codesign.scheduling.worker.PHASES`.
         count: number of workers.
         tick: called every ``interval`` seconds, and once at the end.
         interval: [s].
@@ -53,7 +54,7 @@ def run_workers(
 
 def _search_path() -> str:
     """``PYTHONPATH`` with which workers find the same modules as this process, those next to its script included."""
-    own = [str(Path(__file__).resolve().parents[2])]
+    own = [str(Path(softgym_envs.__file__).resolve().parents[1])]
     installed = tuple({os.path.join(prefix, "") for prefix in (sys.prefix, sys.base_prefix)})
     given = [os.path.abspath(entry) for entry in sys.path if not entry.startswith(installed)]
     return os.pathsep.join(
@@ -65,7 +66,7 @@ def _run_processes(
     folder: StudyFolder, phase: str, count: int, tick: Callable[[], None], interval: float
 ) -> str | None:
     environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": _search_path()}
-    command = [sys.executable, "-m", "codesign.scheduling.worker", str(folder.path), phase]
+    command = [sys.executable, "-m", "softgym_envs.codesign.scheduling.worker", str(folder.path), phase]
     with tempfile.TemporaryFile("w+") as output:
 
         def start() -> subprocess.Popen[bytes]:
@@ -145,6 +146,6 @@ def _run_on_ray(folder: StudyFolder, phase: str, count: int, tick: Callable[[], 
 
 def _task(path: str, config: dict[str, Any], phase: str) -> None:
     """One worker as a Ray task, perhaps on a machine that has no folder of the study yet."""
-    from codesign.scheduling.worker import PHASES
+    from softgym_envs.codesign.scheduling.worker import PHASES
 
     PHASES[phase](StudyFolder.create(path, StudyConfig.model_validate(config), wait=True))

@@ -1,8 +1,8 @@
 """Queue of a study's trials.
 
 Workers change the queue one at a time, so no trial is lost, run twice or added beyond the budget. A trial belongs to
-one worker, which shows that it is alive (`codesign.scheduling.storage`). If the worker dies (``kill -9``, power cut),
-the trial is recovered: its result is used if it was already written, otherwise its body is queued again.
+one worker, which shows that it is alive (`softgym_envs.codesign.scheduling.storage`). If the worker dies (``kill -9``,
+power cut), the trial is recovered: its result is used if it was already written, otherwise its body is queued again.
 
 A body counts as the cause of its worker's death if the call that started the worker is still alive. It does not if the
 call ended as well: Ctrl-C, ``kill -9`` of all processes and a power cut say nothing about a body. A body that also ends
@@ -20,10 +20,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from codesign.folder import StudyFolder
-from codesign.records import TrialResult
-from codesign.sampling import trial_seed
-from codesign.scheduling.optuna_study import distributions, open_study
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.records import TrialResult
+from softgym_envs.codesign.sampling import trial_seed
+from softgym_envs.codesign.scheduling.optuna_study import distributions, open_study
 
 if TYPE_CHECKING:
     import optuna

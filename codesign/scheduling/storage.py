@@ -1,7 +1,7 @@
 """Storage and locks of a study: what its processes share.
 
-`codesign.scheduling.journal.JournalStorage` keeps trials in the folder of the study, for the processes of one machine.
-`codesign.scheduling.postgres.PostgresStorage` keeps them in a database, for many machines.
+`softgym_envs.codesign.scheduling.journal.JournalStorage` keeps trials in the folder of the study, for the processes of
+one machine. `softgym_envs.codesign.scheduling.postgres.PostgresStorage` keeps them in a database, for many machines.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One worker process of a study: ``python -m codesign.scheduling.worker FOLDER PHASE``; see `.processes`."""
+"""One worker process of a study: ``python -m softgym_envs.codesign.scheduling.worker FOLDER PHASE``."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from codesign.folder import StudyFolder
-from codesign.phases.finalists import fetch_policies, finalist_jobs
-from codesign.phases.screen import screen_jobs
-from codesign.phases.shared_policy import shared_policy_jobs
-from codesign.phases.trial import give_up, run_trial
-from codesign.scheduling.jobs import run_pending
-from codesign.scheduling.queue import TrialQueue
-from codesign.snapshot import load_study
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.phases.finalists import fetch_policies, finalist_jobs
+from softgym_envs.codesign.phases.screen import screen_jobs
+from softgym_envs.codesign.phases.shared_policy import shared_policy_jobs
+from softgym_envs.codesign.phases.trial import give_up, run_trial
+from softgym_envs.codesign.scheduling.jobs import run_pending
+from softgym_envs.codesign.scheduling.queue import TrialQueue
+from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.errors import SoftGymError
 
 

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.tools.grasps import GraspConfig
-from codesign.tools.metrics import Course, Metric, find_metrics
-from codesign.variables import split_values
 from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.registry import make_backend
+from softgym_envs.codesign.tools.grasps import GraspConfig
+from softgym_envs.codesign.tools.metrics import Course, Metric, find_metrics
+from softgym_envs.codesign.variables import split_values
 from softgym_envs.errors import ConfigError
 from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.robots.base import Robot
@@ -65,7 +65,7 @@ class Evaluator:
 
     Args:
         robot: the robot.
-        metrics: metrics, or their names or paths, see `codesign.tools.metrics.find_metric`.
+        metrics: metrics, or their names or paths, see `softgym_envs.codesign.tools.metrics.find_metric`.
         backend: ``"fem"`` or ``"surrogate"``.
         actuation: full command: displacements of the actuators, shape (n_a,); default: half of their upper limits.
         steps: states beyond rest along the actuation, evenly spaced.

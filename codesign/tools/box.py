@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.variables import OptionRange, is_option, make_variables
+from softgym_envs.codesign.variables import OptionRange, is_option, make_variables
 from softgym_envs.designs import DesignSpace
 from softgym_envs.errors import ConfigError
 
@@ -19,7 +19,7 @@ class Box:
 
     Logarithmic variables are uniform in their logarithm. A *design* here also has the values of free robot options, as
     ``robot.<option>``. The arguments after ``space`` are keys of
-    `codesign.tools.config.BodiesConfig`.
+    `softgym_envs.codesign.tools.config.BodiesConfig`.
 
     Raises:
         DesignError: for an unknown name, or a value or a bound outside the robot's own bounds.

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from codesign.tools.config import CalibrationConfig
-from codesign.tools.folder import run_folder
-from codesign.tools.measurements import Measurements, read_measurements
-from codesign.tools.misfit import FEMMisfit, LearnedMisfit, Misfit
-from codesign.tools.parameters import Parameters
-from codesign.tools.plots import draw_calibration
-from codesign.tools.records import CalibrationResult, Fit
+from softgym_envs.codesign.tools.config import CalibrationConfig
+from softgym_envs.codesign.tools.folder import run_folder
+from softgym_envs.codesign.tools.measurements import Measurements, read_measurements
+from softgym_envs.codesign.tools.misfit import FEMMisfit, LearnedMisfit, Misfit
+from softgym_envs.codesign.tools.parameters import Parameters
+from softgym_envs.codesign.tools.plots import draw_calibration
+from softgym_envs.codesign.tools.records import CalibrationResult, Fit
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import write_json

@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from codesign.sampling import SamplerConfig
-from codesign.tools.bodies import Evaluator, LearnedBodies, check_metrics, full_command
-from codesign.tools.box import Box
-from codesign.tools.grasps import GraspConfig
-from codesign.tools.metrics import METRICS, Metric, find_metric
-from codesign.tools.nuisance import ContactConfig, OffsetConfig, check_nuisances
-from codesign.variables import OptionRange, change_options
+from softgym_envs.codesign.sampling import SamplerConfig
+from softgym_envs.codesign.tools.bodies import Evaluator, LearnedBodies, check_metrics, full_command
+from softgym_envs.codesign.tools.box import Box
+from softgym_envs.codesign.tools.grasps import GraspConfig
+from softgym_envs.codesign.tools.metrics import METRICS, Metric, find_metric
+from softgym_envs.codesign.tools.nuisance import ContactConfig, OffsetConfig, check_nuisances
+from softgym_envs.codesign.variables import OptionRange, change_options
 from softgym_envs.config import BesideConfig, Config
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
@@ -37,7 +37,7 @@ def _metric_name(value: Any) -> Any:
 
 
 MetricName = Annotated[str, BeforeValidator(_metric_name)]
-"""Name in `codesign.tools.metrics.METRICS`, or path of a metric of your own, ``"my_module:my_metric"``."""
+"""Name in `softgym_envs.codesign.tools.metrics.METRICS`, or path of a metric of your own, ``"my_module:my_metric"``."""
 
 FolderName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from codesign.records import Record
-from codesign.tools.bodies import Evaluator
+from softgym_envs.codesign.records import Record
+from softgym_envs.codesign.tools.bodies import Evaluator
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.executors import parallel_map
 

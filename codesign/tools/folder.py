@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from codesign.scheduling.storage import file_lock
+from softgym_envs.codesign.scheduling.storage import file_lock
 from softgym_envs.config import Config, check_compatible, load_config, save_resolved
 from softgym_envs.errors import ConfigError
 

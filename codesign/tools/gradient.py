@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.tools.box import Box
-from codesign.tools.config import GradientConfig, ObjectiveConfig, OptimiseConfig
-from codesign.tools.folder import run_folder
-from codesign.tools.plots import draw_descents
-from codesign.tools.records import BestDesign, Descent, GradientResult
+from softgym_envs.codesign.tools.box import Box
+from softgym_envs.codesign.tools.config import GradientConfig, ObjectiveConfig, OptimiseConfig
+from softgym_envs.codesign.tools.folder import run_folder
+from softgym_envs.codesign.tools.plots import draw_descents
+from softgym_envs.codesign.tools.records import BestDesign, Descent, GradientResult
 from softgym_envs.config import provenance
 from softgym_envs.storage import write_json
 

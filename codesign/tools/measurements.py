@@ -12,9 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from codesign.tools.contact import Plane, step_towards_plane
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.registry import make_backend
+from softgym_envs.codesign.tools.contact import Plane, step_towards_plane
 from softgym_envs.errors import DataError, unknown_name
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write

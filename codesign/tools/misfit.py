@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.tools.bodies import RobotMaker, learned_model
-from codesign.tools.contact import Plane, step_towards_plane
-from codesign.tools.measurements import Measurements
-from codesign.tools.parameters import Parameters
-from codesign.variables import split_values
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import solve_displacements, solve_efforts
+from softgym_envs.codesign.tools.bodies import RobotMaker, learned_model
+from softgym_envs.codesign.tools.contact import Plane, step_towards_plane
+from softgym_envs.codesign.tools.measurements import Measurements
+from softgym_envs.codesign.tools.parameters import Parameters
+from softgym_envs.codesign.variables import split_values
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import Context

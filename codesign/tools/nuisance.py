@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from codesign.tools.measurements import columns_of
+from softgym_envs.codesign.tools.measurements import columns_of
 from softgym_envs.config import Config
 from softgym_envs.errors import unknown_name
 from softgym_envs.robots.base import Robot

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.tools.box import Box
-from codesign.tools.measurements import columns_of
-from codesign.tools.nuisance import ContactConfig, Nuisances, OffsetConfig
+from softgym_envs.codesign.tools.box import Box
+from softgym_envs.codesign.tools.measurements import columns_of
+from softgym_envs.codesign.tools.nuisance import ContactConfig, Nuisances, OffsetConfig
 from softgym_envs.robots.base import Robot
 
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from codesign.report.plots import BASELINE, MUTED, OTHER, STYLE, WINNER
-from codesign.report.units import shown_unit
-from codesign.tools.metrics import Metric
-from codesign.tools.records import CalibrationResult
+from softgym_envs.codesign.report.plots import BASELINE, MUTED, OTHER, STYLE, WINNER
+from softgym_envs.codesign.report.units import shown_unit
+from softgym_envs.codesign.tools.metrics import Metric
+from softgym_envs.codesign.tools.records import CalibrationResult
 from softgym_envs.storage import atomic_write
 
 

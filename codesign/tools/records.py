@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from codesign.records import Record
+from softgym_envs.codesign.records import Record
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from codesign.sampling import make_sampler
-from codesign.tools.config import OptimiseConfig, SearchConfig
-from codesign.tools.evaluation import Evaluation, evaluate_each
-from codesign.tools.folder import run_folder
-from codesign.tools.plots import draw_front
-from codesign.tools.records import FrontDesign, SearchResult
+from softgym_envs.codesign.sampling import make_sampler
+from softgym_envs.codesign.tools.config import OptimiseConfig, SearchConfig
+from softgym_envs.codesign.tools.evaluation import Evaluation, evaluate_each
+from softgym_envs.codesign.tools.folder import run_folder
+from softgym_envs.codesign.tools.plots import draw_front
+from softgym_envs.codesign.tools.records import FrontDesign, SearchResult
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.storage import atomic_write, drop_torn_line, write_json

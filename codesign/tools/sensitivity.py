@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from codesign.tools.bodies import Evaluator
-from codesign.tools.box import Box
-from codesign.tools.config import SensitivityConfig
-from codesign.tools.evaluation import Evaluation, evaluate_each
-from codesign.tools.folder import run_folder
-from codesign.tools.metrics import find_metric
-from codesign.tools.plots import draw_sensitivity
-from codesign.tools.records import SensitivityResult
+from softgym_envs.codesign.tools.bodies import Evaluator
+from softgym_envs.codesign.tools.box import Box
+from softgym_envs.codesign.tools.config import SensitivityConfig
+from softgym_envs.codesign.tools.evaluation import Evaluation, evaluate_each
+from softgym_envs.codesign.tools.folder import run_folder
+from softgym_envs.codesign.tools.metrics import find_metric
+from softgym_envs.codesign.tools.plots import draw_sensitivity
+from softgym_envs.codesign.tools.records import SensitivityResult
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
 from softgym_envs.storage import JsonLines, write_json

@@ -4,7 +4,7 @@ import gymnasium
 from stable_baselines3 import PPO
 
 import softgym_envs  # noqa: F401 - registers the environments
-from agents import SB3VecEnv
+from softgym_envs.agents import SB3VecEnv
 
 envs = SB3VecEnv(gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=64))
 model = PPO("MlpPolicy", envs, n_steps=50, batch_size=800, n_epochs=2, device="cpu")

@@ -24,8 +24,8 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
 
     An interrupted run continues from its last checkpoint.
     """
-    from agents.config import TrainConfig
-    from agents.training import train as run
+    from softgym_envs.agents.config import TrainConfig
+    from softgym_envs.agents.training import train as run
     from softgym_envs.config import load_config
 
     with options.resumable():
@@ -60,11 +60,11 @@ def evaluate(
 
     CONFIG is the configuration file that they were trained with.
     """
-    from agents.baselines import BASELINES
-    from agents.config import TrainConfig
-    from agents.evaluation import evaluate as run
-    from agents.evaluation import sample_goals
-    from agents.policy import Policy
+    from softgym_envs.agents.baselines import BASELINES
+    from softgym_envs.agents.config import TrainConfig
+    from softgym_envs.agents.evaluation import evaluate as run
+    from softgym_envs.agents.evaluation import sample_goals
+    from softgym_envs.agents.policy import Policy
     from softgym_envs.config import load_config, provenance
     from softgym_envs.storage import write_json
 
@@ -104,7 +104,7 @@ def evaluate(
 @options.as_json
 def results(folder: Path | None, output: Path | None, curves: Path | None, as_json: bool) -> None:
     """Print a table of training runs and draw their learning curves."""
-    from agents.results import RESULTS, draw_curves, load_runs, summary, table
+    from softgym_envs.agents.results import RESULTS, draw_curves, load_runs, summary, table
     from softgym_envs.storage import atomic_write
 
     runs = load_runs(folder or RESULTS)
@@ -129,8 +129,8 @@ def deploy_policy(policy: str, files: tuple[Path, ...], name: str) -> None:
     POLICY is a file or the name of a shipped policy. FILES end with .h or .onnx. Both map sensor values in SI units to
     commands.
     """
-    from agents.export import export_policy_onnx
-    from agents.export_c import export_policy_c
+    from softgym_envs.agents.export import export_policy_onnx
+    from softgym_envs.agents.export_c import export_policy_c
 
     for file in files:
         if file.suffix not in (".h", ".onnx"):

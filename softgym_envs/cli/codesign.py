@@ -29,9 +29,9 @@ def codesign(
 
     An interrupted study continues where it stopped.
     """
-    from codesign.config import StudyConfig
-    from codesign.report.page import write_report
-    from codesign.study import run_study
+    from softgym_envs.codesign.config import StudyConfig
+    from softgym_envs.codesign.report.page import write_report
+    from softgym_envs.codesign.study import run_study
     from softgym_envs.config import load_config
 
     study = load_config(config, StudyConfig, (*overrides, *([f"storage={storage}"] if storage else [])))
@@ -51,8 +51,8 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
     The method is one at a time, Morris or Sobol. An interrupted run continues where it stopped.
     """
     require("codesign")
-    from codesign.tools.config import SensitivityConfig
-    from codesign.tools.sensitivity import analyse_sensitivity
+    from softgym_envs.codesign.tools.config import SensitivityConfig
+    from softgym_envs.codesign.tools.sensitivity import analyse_sensitivity
     from softgym_envs.config import load_config
 
     study = load_config(config, SensitivityConfig, overrides)
@@ -77,9 +77,9 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
     The solver is an Optuna sampler, whose interrupted runs continue where they stopped, or gradient descent.
     """
     require("codesign")
-    from codesign.tools import gradient
-    from codesign.tools.config import OptimiseConfig
-    from codesign.tools.search import search
+    from softgym_envs.codesign.tools import gradient
+    from softgym_envs.codesign.tools.config import OptimiseConfig
+    from softgym_envs.codesign.tools.search import search
     from softgym_envs.config import load_config
 
     study = load_config(config, OptimiseConfig, overrides)
@@ -107,8 +107,8 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
 def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> None:
     """Fit design variables to measured states in a CSV or JSON file."""
     require("codesign")
-    from codesign.tools.calibration import calibrate as run
-    from codesign.tools.config import CalibrationConfig
+    from softgym_envs.codesign.tools.calibration import calibrate as run
+    from softgym_envs.codesign.tools.config import CalibrationConfig
     from softgym_envs.config import load_config
 
     study = load_config(config, CalibrationConfig, overrides)

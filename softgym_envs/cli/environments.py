@@ -58,10 +58,10 @@ def rollout(
 ) -> None:
     """Run one episode and print its result."""
     import softgym_envs  # noqa: F401 - registers the IDs
-    from agents.baselines import BASELINES
-    from agents.config import EnvironmentConfig
-    from agents.evaluation import make_agent
-    from agents.policy import Policy
+    from softgym_envs.agents.baselines import BASELINES
+    from softgym_envs.agents.config import EnvironmentConfig
+    from softgym_envs.agents.evaluation import make_agent
+    from softgym_envs.agents.policy import Policy
     from softgym_envs.config import check_config
 
     if record is not None and video is not None:
@@ -128,10 +128,10 @@ def record(
     NAME is that of the dataset, such as softgym/finger-reach/qp-v0.
     """
     import softgym_envs  # noqa: F401 - registers the IDs
-    from agents.baselines import BASELINES
-    from agents.config import EnvironmentConfig
-    from agents.offline import record_episodes
-    from agents.policy import Policy
+    from softgym_envs.agents.baselines import BASELINES
+    from softgym_envs.agents.config import EnvironmentConfig
+    from softgym_envs.agents.offline import record_episodes
+    from softgym_envs.agents.policy import Policy
     from softgym_envs.config import check_config
 
     if episodes < 1:

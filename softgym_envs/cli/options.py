@@ -97,8 +97,8 @@ def check_agent(name: str) -> None:
     Raises:
         ConfigError: with the nearest name, and the allowed ones.
     """
-    from agents.baselines import BASELINES
-    from agents.policy import shipped_policies
+    from softgym_envs.agents.baselines import BASELINES
+    from softgym_envs.agents.policy import shipped_policies
 
     names = [*BASELINES, *shipped_policies()]
     if name not in names and not name.endswith(".safetensors"):

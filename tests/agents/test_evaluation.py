@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from agents.config import EnvironmentConfig
-from agents.evaluation import Evaluation
-from agents.vec_env import SB3VecEnv
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.evaluation import Evaluation
+from softgym_envs.agents.vec_env import SB3VecEnv
 from softgym_envs.errors import DataError
 
 

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from agents.config import TrainConfig
-from agents.export import export_policy_onnx
-from agents.export_c import export_policy_c
-from agents.policy import Policy
-from agents.training import train
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.export import export_policy_onnx
+from softgym_envs.agents.export_c import export_policy_c
+from softgym_envs.agents.policy import Policy
+from softgym_envs.agents.training import train
 
 CC = shutil.which("cc") or shutil.which("gcc")
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler")

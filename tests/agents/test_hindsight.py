@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from agents.config import EnvironmentConfig, TrainConfig
-from agents.hindsight import HindsightBuffer
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.hindsight import HindsightBuffer
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.robots.registry import make_robot

@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from agents.config import TrainConfig
-from agents.joint import PROPOSERS, CriticProposer, DistributionProposer, critic_values
-from agents.learners.sac import make_model
-from agents.training import train
-from agents.vec_env import SB3VecEnv
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.joint import PROPOSERS, CriticProposer, DistributionProposer, critic_values
+from softgym_envs.agents.learners.sac import make_model
+from softgym_envs.agents.training import train
+from softgym_envs.agents.vec_env import SB3VecEnv
 
 ENVIRONMENT = {
     "id": "SoftGym/FingerReach-v0",

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from agents.config import TrainConfig
-from agents.evaluation import evaluate, sample_goals
-from agents.learners import LEARNERS
-from agents.learners.analytic import AnalyticLearner
-from agents.learners.cloning import CloningLearner
-from agents.learners.ppo import PPOLearner
-from agents.policy import Policy, read_tensors
-from agents.residual import BatchQP
-from agents.training import train
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.evaluation import evaluate, sample_goals
+from softgym_envs.agents.learners import LEARNERS
+from softgym_envs.agents.learners.analytic import AnalyticLearner
+from softgym_envs.agents.learners.cloning import CloningLearner
+from softgym_envs.agents.learners.ppo import PPOLearner
+from softgym_envs.agents.policy import Policy, read_tensors
+from softgym_envs.agents.residual import BatchQP
+from softgym_envs.agents.training import train
 from softgym_envs.errors import DataError, WeightsError
 
 CONFIG = TrainConfig.model_validate(

@@ -4,8 +4,8 @@ from importlib.util import find_spec
 
 import pytest
 
-from agents.config import EnvironmentConfig
-from agents.offline import record_episodes
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.offline import record_episodes
 from softgym_envs.errors import MissingLibrary
 
 FINGER = EnvironmentConfig(id="SoftGym/FingerReach-v0", max_episode_steps=3)

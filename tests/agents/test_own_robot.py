@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import yaml
 
-from agents.config import EnvironmentConfig, TrainConfig
-from agents.evaluation import evaluate, sample_goals
-from agents.policy import Policy
-from agents.training import train
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.evaluation import evaluate, sample_goals
+from softgym_envs.agents.policy import Policy
+from softgym_envs.agents.training import train
 from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError
 from softgym_envs.robots.soft_finger import SoftFinger

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from agents.baselines import BASELINES, InverseQPAgent, make_baseline
-from agents.config import EnvironmentConfig
-from agents.evaluation import evaluate, sample_goals
+from softgym_envs.agents.baselines import BASELINES, InverseQPAgent, make_baseline
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.evaluation import evaluate, sample_goals
 
 
 def on(identifier, **options):

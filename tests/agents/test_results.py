@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents import sweep
-from agents.config import EnvironmentConfig, TrainConfig
-from agents.results import draw_curves, load_runs, table
-from agents.statistics import crossed_estimate, interquartile_mean, stratified_estimate
+from softgym_envs.agents import sweep
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.results import draw_curves, load_runs, table
+from softgym_envs.agents.statistics import crossed_estimate, interquartile_mean, stratified_estimate
 from softgym_envs.config import load_config
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import ConfigError, DataError
@@ -94,7 +94,18 @@ def test_scores_that_cannot_be_resampled_have_no_interval():
 def swept(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweep")
     (folder / "tiny.yaml").write_text(TINY)
-    command = [sys.executable, "-m", "agents.sweep", "--configs", "tiny.yaml", "--seeds", "0", "3", "--processes", "2"]
+    command = [
+        sys.executable,
+        "-m",
+        "softgym_envs.agents.sweep",
+        "--configs",
+        "tiny.yaml",
+        "--seeds",
+        "0",
+        "3",
+        "--processes",
+        "2",
+    ]
     command += ["--folder", "out", "--goals", "5", "--fem-goals", "2"]
     done = subprocess.run(command, cwd=folder, env=_environment(), capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -124,7 +135,7 @@ def test_a_sweep_writes_results_of_every_seed_and_the_baselines(swept):
 def test_a_finished_sweep_runs_nothing_and_a_lost_result_is_computed_again(swept, monkeypatch):
     place = swept / "out" / "results" / "tiny"
     before = (place / "seed0.json").read_text()
-    monkeypatch.setattr("agents.training.make_learner", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr("softgym_envs.agents.training.make_learner", lambda *_: pytest.fail("trained again"))
     assert sweep.sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0
     (place / "seed0.json").unlink()
     assert sweep.sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0
@@ -191,8 +202,8 @@ def test_environments_on_fem_are_evaluated_on_the_goals_for_fem(tmp_path):
 
 
 def test_final_goals_are_unseen_and_equal_goals_are_evaluated_once():
-    from agents.evaluation import evaluation_set
-    from agents.training import EVALUATION_SEED
+    from softgym_envs.agents.evaluation import evaluation_set
+    from softgym_envs.agents.training import EVALUATION_SEED
 
     reach = EnvironmentConfig(id="SoftGym/FingerReach-v0")
     _, goals = sweep.unseen_goals(reach, 6)

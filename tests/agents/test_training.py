@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from safetensors import safe_open
 
-from agents import training
-from agents.config import EnvironmentConfig, TrainConfig
-from agents.evaluation import evaluate, sample_goals
-from agents.learners.sac import SACLearner
-from agents.policy import Policy
-from agents.training import train
+from softgym_envs.agents import training
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.evaluation import evaluate, sample_goals
+from softgym_envs.agents.learners.sac import SACLearner
+from softgym_envs.agents.policy import Policy
+from softgym_envs.agents.training import train
 from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError, DataError, WeightsError
 

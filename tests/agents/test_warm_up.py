@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from agents.config import EnvironmentConfig
-from agents.vec_env import SB3VecEnv
-from agents.warm_up import PostureSAC
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.vec_env import SB3VecEnv
+from softgym_envs.agents.warm_up import PostureSAC
 
 
 def test_each_episode_goes_straight_to_one_posture_and_stays():

@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 import yaml
 
-from codesign.config import StudyConfig
-from codesign.folder import StudyFolder
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import StudyFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = """
 import signal
 import sys
-from codesign.config import StudyConfig
-from codesign.study import run_study
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.study import run_study
 from softgym_envs.config import load_config
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if the parent runs in the background
 run_study(load_config(sys.argv[1], StudyConfig), sys.argv[2])

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from agents.evaluation import sample_goals
-from agents.policy import Policy, policy_path
-from codesign.config import StudyConfig
-from codesign.study import run_study
+from softgym_envs.agents.evaluation import sample_goals
+from softgym_envs.agents.policy import Policy, policy_path
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.study import run_study
 from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError, WeightsError
 from softgym_envs.storage import write_json
@@ -260,7 +260,7 @@ def test_wrong_values_are_found_before_the_folder_is_made(changes, words, tmp_pa
 def test_a_shared_policy_was_trained_on_what_varies(tmp_path, tiny, monkeypatch):
     policy = Policy("finger_reach_designs")
     monkeypatch.setattr(policy, "environment", policy.environment.model_copy(update={"sample_design": ["length"]}))
-    monkeypatch.setattr("codesign.study.Policy", lambda name: policy)
+    monkeypatch.setattr("softgym_envs.codesign.study.Policy", lambda name: policy)
     config = StudyConfig.model_validate(tiny(**SHARED, environment=SHOWN, variables=["length", "height"]))
     with pytest.raises(ConfigError, match="was trained without variation of height.*allowed variables: length"):
         run_study(config, tmp_path / "study", progress=False)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agents.evaluation import Evaluation
-from codesign import Objective, StudyConfig, load_study, run_study, write_report
-from codesign.objectives import OBJECTIVES, Outcome, find_objective, objective_name
 from softgym_envs import make_robot
+from softgym_envs.agents.evaluation import Evaluation
+from softgym_envs.codesign import Objective, StudyConfig, load_study, run_study, write_report
+from softgym_envs.codesign.objectives import OBJECTIVES, Outcome, find_objective, objective_name
 from softgym_envs.robots.soft_finger import SoftFinger
 from softgym_envs.robots.tetrapod import Tetrapod
 
@@ -121,7 +121,7 @@ def test_option_of_the_robot_as_a_variable(tmp_path, tiny):
     (variable,) = [variable for variable in results.variables if variable.name == name]
     assert variable.optimised and variable.unit == "m/s2"
     # The same body without gravity moves differently.
-    from codesign.phases.trial import assess
+    from softgym_envs.codesign.phases.trial import assess
 
     goals = load_study(tmp_path / "study").folder.goals["selection"]
     same = assess("qp", config, config.environment_of(second.options), goals, second.design)

@@ -15,14 +15,14 @@ import sqlalchemy as sql
 
 from benchmarks.codesign_scale import Sweep, faults
 from benchmarks.postgres_server import find_programs, temporary_server
-from codesign.config import StudyConfig
-from codesign.folder import StudyFolder
-from codesign.records import Account, Job, TrialResult
-from codesign.scheduling import worker
-from codesign.scheduling.jobs import missing_jobs, run_pending
-from codesign.scheduling.postgres import HEARTBEAT, PostgresStorage
-from codesign.scheduling.queue import TrialQueue
-from codesign.study import run_study
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.records import Account, Job, TrialResult
+from softgym_envs.codesign.scheduling import worker
+from softgym_envs.codesign.scheduling.jobs import missing_jobs, run_pending
+from softgym_envs.codesign.scheduling.postgres import HEARTBEAT, PostgresStorage
+from softgym_envs.codesign.scheduling.queue import TrialQueue
+from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.testing import wait_until
 

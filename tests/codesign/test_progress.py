@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from codesign.config import StudyConfig
-from codesign.progress import Countdown, duration
-from codesign.study import run_study
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.progress import Countdown, duration
+from softgym_envs.codesign.study import run_study
 
 
 def test_the_time_left_follows_from_the_mean_time_of_this_run():

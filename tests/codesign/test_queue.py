@@ -7,10 +7,10 @@ from contextlib import nullcontext
 import pytest
 from optuna.trial import TrialState
 
-from codesign.records import TrialResult
-from codesign.scheduling.journal import JOURNAL_LOCK
-from codesign.scheduling.optuna_study import open_study
-from codesign.scheduling.queue import TrialQueue
+from softgym_envs.codesign.records import TrialResult
+from softgym_envs.codesign.scheduling.journal import JOURNAL_LOCK
+from softgym_envs.codesign.scheduling.optuna_study import open_study
+from softgym_envs.codesign.scheduling.queue import TrialQueue
 
 
 def die(queue):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from agents.evaluation import Evaluation
-from codesign.records import FinalistTest, TrialResult
-from codesign.report.collect import collect
-from codesign.report.episodes import typical_goal
-from codesign.report.findings import findings
-from codesign.report.interactive import goal_outcomes, goal_views, history, slices
-from codesign.snapshot import load_study
+from softgym_envs.agents.evaluation import Evaluation
+from softgym_envs.codesign.records import FinalistTest, TrialResult
+from softgym_envs.codesign.report.collect import collect
+from softgym_envs.codesign.report.episodes import typical_goal
+from softgym_envs.codesign.report.findings import findings
+from softgym_envs.codesign.report.interactive import goal_outcomes, goal_views, history, slices
+from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.viewer.video import write_video
 
 BOX = {"height": (0.020, 0.022), "joint_height": (0.005, 0.008)}

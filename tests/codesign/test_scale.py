@@ -14,17 +14,17 @@ import pytest
 from optuna.trial import TrialState
 
 from benchmarks.codesign_scale import Sweep, faults
-from codesign.config import StudyConfig
-from codesign.folder import StudyFolder
-from codesign.phases.trial import give_up
-from codesign.report.files import write_results
-from codesign.scheduling import worker
-from codesign.scheduling.optuna_study import open_study
-from codesign.scheduling.processes import WorkerError, run_workers
-from codesign.scheduling.queue import CALL, TrialQueue
-from codesign.scheduling.worker import run_trials
-from codesign.snapshot import load_study
-from codesign.study import run_study
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.phases.trial import give_up
+from softgym_envs.codesign.report.files import write_results
+from softgym_envs.codesign.scheduling import worker
+from softgym_envs.codesign.scheduling.optuna_study import open_study
+from softgym_envs.codesign.scheduling.processes import WorkerError, run_workers
+from softgym_envs.codesign.scheduling.queue import CALL, TrialQueue
+from softgym_envs.codesign.scheduling.worker import run_trials
+from softgym_envs.codesign.snapshot import load_study
+from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import ConfigError, DataError, MeshingError, SoftGymError
 from softgym_envs.testing import wait_until
 

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codesign.config import StudyConfig
-from codesign.folder import SHARED_POLICY, StudyFolder
-from codesign.phases.shared_policy import joint_config
-from codesign.records import FinalistTest
-from codesign.report.page import write_report
-from codesign.report.statistics import kendall_tau
-from codesign.scheduling.optuna_study import open_study
-from codesign.snapshot import load_study
-from codesign.study import run_study
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
+from softgym_envs.codesign.phases.shared_policy import joint_config
+from softgym_envs.codesign.records import FinalistTest
+from softgym_envs.codesign.report.page import write_report
+from softgym_envs.codesign.report.statistics import kendall_tau
+from softgym_envs.codesign.scheduling.optuna_study import open_study
+from softgym_envs.codesign.snapshot import load_study
+from softgym_envs.codesign.study import run_study
 
 SHOWN = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
 LIMIT = 3.5e-5  # m3; bodies of the test lie on both sides
@@ -198,8 +198,8 @@ def test_report_opens_in_a_browser(run, tmp_path, require_program):
 
 
 def test_every_strategy_is_described():
-    from codesign.parts import STRATEGIES
-    from codesign.report.page import CONTROLLERS
+    from softgym_envs.codesign.parts import STRATEGIES
+    from softgym_envs.codesign.report.page import CONTROLLERS
 
     assert set(CONTROLLERS) == set(STRATEGIES)
 

@@ -13,15 +13,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from agents.evaluation import Evaluation
-from codesign.config import StudyConfig
-from codesign.folder import SHARED_POLICY, SHARED_POLICY_RECORD, StudyFolder
-from codesign.records import FinalistTest, SharedPolicy, TrialResult
-from codesign.report.page import write_report
-from codesign.report.statistics import kendall_tau, mean_interval, rank_correlation, rate_interval
-from codesign.scheduling.optuna_study import open_study
-from codesign.snapshot import load_study
-from codesign.study import run_study
+from softgym_envs.agents.evaluation import Evaluation
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.folder import SHARED_POLICY, SHARED_POLICY_RECORD, StudyFolder
+from softgym_envs.codesign.records import FinalistTest, SharedPolicy, TrialResult
+from softgym_envs.codesign.report.page import write_report
+from softgym_envs.codesign.report.statistics import kendall_tau, mean_interval, rank_correlation, rate_interval
+from softgym_envs.codesign.scheduling.optuna_study import open_study
+from softgym_envs.codesign.snapshot import load_study
+from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import WeightsError
 from softgym_envs.testing import wait_until
 

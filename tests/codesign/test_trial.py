@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from agents.evaluation import Evaluation
-from codesign.phases import trial as trial_module
-from codesign.phases.trial import run_trial
-from codesign.records import FinalistTest, TestGroup
-from codesign.scheduling.queue import TrialQueue
+from softgym_envs.agents.evaluation import Evaluation
+from softgym_envs.codesign.phases import trial as trial_module
+from softgym_envs.codesign.phases.trial import run_trial
+from softgym_envs.codesign.records import FinalistTest, TestGroup
+from softgym_envs.codesign.scheduling.queue import TrialQueue
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from agents.config import EnvironmentConfig
-from codesign.variables import OptionRange, make_variables, split_values, with_options
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.codesign.variables import OptionRange, make_variables, split_values, with_options
 
 RANGE = OptionRange(low=0.0, high=0.02, baseline=0.01, unit="m")
 ENVIRONMENT = EnvironmentConfig(id="SoftGym/FingerReach-v0", robot_options={"gravity": [0.0, 0.0, 0.0]})

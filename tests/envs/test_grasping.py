@@ -4,8 +4,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from agents.baselines import baselines_for, make_baseline
 from softgym_envs import make_robot
+from softgym_envs.agents.baselines import baselines_for, make_baseline
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.envs import SoftRobotEnv
 from softgym_envs.envs.tasks.grasp import Grasp

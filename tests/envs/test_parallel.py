@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import softgym_envs  # noqa: F401 - registers the environments
-from agents import SB3VecEnv
+from softgym_envs.agents import SB3VecEnv
 from softgym_envs.envs.parallel import ParallelVectorEnv
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import DesignError, InfeasibleDesign

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import softgym_envs
-from agents.vec_env import SB3VecEnv
+from softgym_envs.agents.vec_env import SB3VecEnv
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import DesignError
 

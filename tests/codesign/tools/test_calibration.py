@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.tools.box import Box
-from codesign.tools.calibration import calibrate, fit_gradient, profile_interval
-from codesign.tools.config import CalibrationConfig
-from codesign.tools.measurements import Measurements, measure, read_measurements, write_measurements
-from codesign.tools.misfit import LearnedMisfit, Misfit
-from codesign.tools.parameters import Parameters
 from softgym_envs import make_robot
+from softgym_envs.codesign.tools.box import Box
+from softgym_envs.codesign.tools.calibration import calibrate, fit_gradient, profile_interval
+from softgym_envs.codesign.tools.config import CalibrationConfig
+from softgym_envs.codesign.tools.measurements import Measurements, measure, read_measurements, write_measurements
+from softgym_envs.codesign.tools.misfit import LearnedMisfit, Misfit
+from softgym_envs.codesign.tools.parameters import Parameters
 from softgym_envs.config import check_config
 from softgym_envs.errors import ConfigError, DataError
 

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from codesign.tools.config import OptimiseConfig
-from codesign.tools.gradient import WeightedCost, descend, optimise
+from softgym_envs.codesign.tools.config import OptimiseConfig
+from softgym_envs.codesign.tools.gradient import WeightedCost, descend, optimise
 from softgym_envs.config import check_config
 from softgym_envs.errors import ConfigError
 

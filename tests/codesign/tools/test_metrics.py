@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.tools.bodies import Evaluator, LearnedBodies, full_command
-from codesign.tools.box import Box
-from codesign.tools.metrics import METRICS
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.codesign.tools.bodies import Evaluator, LearnedBodies, full_command
+from softgym_envs.codesign.tools.box import Box
+from softgym_envs.codesign.tools.metrics import METRICS
 from softgym_envs.errors import ConfigError, DesignError
 
 STATES = tuple(name for name, metric in METRICS.items() if metric.needs == "states")

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from codesign.tools.box import Box
-from codesign.tools.calibration import calibrate, make_misfit
-from codesign.tools.config import CalibrationConfig
-from codesign.tools.contact import Plane
-from codesign.tools.measurements import measure, write_measurements
-from codesign.tools.misfit import LearnedMisfit
-from codesign.tools.nuisance import ContactConfig, OffsetConfig
-from codesign.tools.parameters import Parameters
 from softgym_envs import make_robot
 from softgym_envs.cli.codesign import calibrate as calibrate_command
+from softgym_envs.codesign.tools.box import Box
+from softgym_envs.codesign.tools.calibration import calibrate, make_misfit
+from softgym_envs.codesign.tools.config import CalibrationConfig
+from softgym_envs.codesign.tools.contact import Plane
+from softgym_envs.codesign.tools.measurements import measure, write_measurements
+from softgym_envs.codesign.tools.misfit import LearnedMisfit
+from softgym_envs.codesign.tools.nuisance import ContactConfig, OffsetConfig
+from softgym_envs.codesign.tools.parameters import Parameters
 from softgym_envs.config import check_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
 

@@ -6,12 +6,12 @@ import csv
 
 import pytest
 
-from codesign.tools.bodies import Evaluator
-from codesign.tools.config import BodiesConfig, ObjectiveConfig, OptimiseConfig, SensitivityConfig
-from codesign.tools.metrics import METRICS, Metric, design_metric, find_metric
-from codesign.tools.search import search
-from codesign.tools.sensitivity import analyse_sensitivity
 from softgym_envs import make_robot
+from softgym_envs.codesign.tools.bodies import Evaluator
+from softgym_envs.codesign.tools.config import BodiesConfig, ObjectiveConfig, OptimiseConfig, SensitivityConfig
+from softgym_envs.codesign.tools.metrics import METRICS, Metric, design_metric, find_metric
+from softgym_envs.codesign.tools.search import search
+from softgym_envs.codesign.tools.sensitivity import analyse_sensitivity
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError
 

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from codesign.tools import calibration, gradient
-from codesign.tools import search as module
-from codesign.tools.box import Box
-from codesign.tools.config import CalibrationConfig, OptimiseConfig, SensitivityConfig
-from codesign.tools.search import search
-from codesign.tools.sensitivity import analyse_sensitivity, morris, one_at_a_time, sample, sobol
 from softgym_envs import make_robot
+from softgym_envs.codesign.tools import calibration, gradient
+from softgym_envs.codesign.tools import search as module
+from softgym_envs.codesign.tools.box import Box
+from softgym_envs.codesign.tools.config import CalibrationConfig, OptimiseConfig, SensitivityConfig
+from softgym_envs.codesign.tools.search import search
+from softgym_envs.codesign.tools.sensitivity import analyse_sensitivity, morris, one_at_a_time, sample, sobol
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 
@@ -53,7 +53,7 @@ class Stub:
 
 @pytest.fixture
 def stub(monkeypatch):
-    monkeypatch.setattr("codesign.tools.config.BodiesConfig.evaluator", lambda *arguments: Stub())
+    monkeypatch.setattr("softgym_envs.codesign.tools.config.BodiesConfig.evaluator", lambda *arguments: Stub())
     monkeypatch.setattr(Stub, "count", 0)
     monkeypatch.setattr(Stub, "stop", np.inf)
     return Stub
