@@ -330,7 +330,7 @@ def test_study_whose_constraints_nobody_satisfies(study, capsys):
     folder = study(trials=3, constraints={"mean_effort": 0.1, "success_rate": 1.0}, finalists={"count": 1})
     results = run_study(folder.config, folder.path)
     lines = capsys.readouterr().out.splitlines()
-    finished = [line for line in lines if line.startswith("[")]
+    finished = [line for line in lines if re.match(r"\[.*\] trial ", line)]
     assert len(finished) == 3
     for line in finished:
         assert re.search(

@@ -91,7 +91,7 @@ def test_your_own_task_in_every_environment():
 
 
 def test_batched_environments_need_a_surrogate():
-    with pytest.raises(ValueError, match=r"backend = 'fem' of robot 'spike' has no batched environment.*sync"):
+    with pytest.raises(ValueError, match=r"backend = 'fem' of robot 'spike' has no batched environment.*processes"):
         SoftRobotVectorEnv(Spike)
     env = gymnasium.make_vec("SoftGym/Reach-v0", num_envs=2, robot=Spike, vectorization_mode="sync")
     assert env.reset(seed=0)[0].shape[0] == 2

@@ -25,6 +25,8 @@ BODIES = {
 }
 SAMPLER = {"name": "nsgaii", "seed": 3, "options": {"population_size": 6}}
 
+ROOT = Path(__file__).resolve().parents[3]
+
 
 def configured(**changes):
     data = {
@@ -147,9 +149,9 @@ def test_folders_of_other_runs_are_not_changed(stub, tmp_path):
     descent = check_config(OptimiseConfig, {**configured().model_dump(), "solver": {"method": "gradient"}}, "test")
     with pytest.raises(ConfigError, match=f"'{tmp_path}' holds an optimisation with solver"):
         gradient.optimise(descent, tmp_path)
-    fit = {"name": "x", "robot": "finger", "robot_options": {"cables": 1}, "fit": ["poisson_ratio"], "data": "m.csv"}
+    fit = load_config(CalibrationConfig, ROOT / "configs/design/finger_calibration.yaml")
     with pytest.raises(ConfigError, match=f"'{tmp_path}' does not hold a calibration: its config.yaml"):
-        calibration.calibrate(check_config(CalibrationConfig, fit, "test"), tmp_path)
+        calibration.calibrate(fit, tmp_path)
     assert contents() == before
     (tmp_path / "config.yaml").unlink()
     with pytest.raises(ConfigError, match="holds journal.log but no config.yaml"):
