@@ -25,8 +25,6 @@ BODIES = {
 }
 SAMPLER = {"name": "nsgaii", "seed": 3, "options": {"population_size": 6}}
 
-ROOT = Path(__file__).resolve().parents[3]
-
 
 def configured(**changes):
     data = {
@@ -149,7 +147,7 @@ def test_folders_of_other_runs_are_not_changed(stub, tmp_path):
     descent = check_config(OptimiseConfig, {**configured().model_dump(), "solver": {"method": "gradient"}}, "test")
     with pytest.raises(ConfigError, match=f"'{tmp_path}' holds an optimisation with solver"):
         gradient.optimise(descent, tmp_path)
-    fit = load_config(CalibrationConfig, ROOT / "configs/design/finger_calibration.yaml")
+    fit = load_config(CONFIGS / "finger_calibration.yaml", CalibrationConfig)
     with pytest.raises(ConfigError, match=f"'{tmp_path}' does not hold a calibration: its config.yaml"):
         calibration.calibrate(fit, tmp_path)
     assert contents() == before
