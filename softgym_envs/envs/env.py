@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import prod
 from typing import TYPE_CHECKING, Any
@@ -328,10 +328,11 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             self._renderer = None
 
 
+# Gymnasium batches arrays of booleans, but not NumPy's boolean scalars.
+_TYPED: dict[type, Callable[[Any], Any]] = {bool: np.array, np.bool_: np.array, int: np.int64, float: np.float64}
+
+
 def _with_dtype(value: Any) -> Any:
     """Return a value of ``info`` with a dtype, which TorchRL reads."""
-    if isinstance(value, (bool, np.bool_)):
-        return np.array(value)  # Gymnasium batches arrays of booleans, but not NumPy's boolean scalars
-    if isinstance(value, int):
-        return np.int64(value)
-    return np.float64(value) if isinstance(value, float) else value
+    typed = _TYPED.get(type(value))
+    return value if typed is None else typed(value)
