@@ -20,7 +20,7 @@ from softgym_envs.errors import ConfigError
 @options.folder
 @click.option("--initial", type=options.PATH, help="Policy to start from.")
 def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
-    """Train a SAC policy.
+    """Train a policy by any learner.
 
     An interrupted run continues from its last checkpoint.
     """
