@@ -23,8 +23,8 @@ from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.grasping_hands import (
     ON_TABLE,
     ROUNDING,
+    TABLE_MASS,
     TABLE_STIFFNESS,
-    TABLE_WEIGHT,
     ContactAidedGripper,
 )
 from softgym_envs.surrogate.chain.contact import FOLDED, STICK, STIFFNESS, table_of
@@ -99,8 +99,8 @@ class ChainHand:
         prepared = self._prepared = model.prepare(own, 1)
         self._self_contact = robot.self_contact
         self._chain, self._bodies = prepared.chain, prepared.bodies
-        self._modulus = float(own[0, names.index("young_modulus")])
-        stiffness = STIFFNESS * self._modulus if robot.contact_stiffness is None else robot.contact_stiffness
+        modulus = design["young_modulus"]
+        stiffness = STIFFNESS * modulus if robot.contact_stiffness is None else robot.contact_stiffness
         distance = robot.contact_distance
         law = np.array([distance, stiffness, STICK * stiffness / distance])
         half = np.array([0.5 * length for length in robot.box])
@@ -127,6 +127,7 @@ class ChainHand:
         mass_of_box = design["object_mass"]
         self._masses = np.array([mass_of_box, mass_of_box, mass_of_box * (half[0] ** 2 + half[2] ** 2) / 3.0])
         self._weight = mass_of_box * gravity
+        self._table_weight = TABLE_MASS * gravity
         self._reach = FOLDED * distance
         self._height = half[2]
         self.memory = self._at_rest(rest)
@@ -188,7 +189,7 @@ class ChainHand:
         if not find_hand(q, box, start.drives, targets, finger, below, (masses, free, self._weight), efforts):
             return None
         commit_hand(q, box, targets[2], finger, below)
-        efforts[2] += TABLE_STIFFNESS * targets[2] - TABLE_WEIGHT
+        efforts[2] += TABLE_STIFFNESS * targets[2] - self._table_weight
         velocity = np.zeros(3) if duration is None else (box - start.box) / duration
         folded = self._clearance(q) < self._reach
         fold = np.where(targets[:2] >= start.fold, start.fold, np.inf)
@@ -346,6 +347,8 @@ class ChainHandBackend(Backend):
             raise ValueError(f"control_step = {control_step} s must be positive and finite")
         if robot.obstacles:
             raise ValueError(f"robot '{robot.name}' touches further obstacles, which needs backend='fem'")
+        if robot.gravity[0] != 0.0 or robot.gravity[1] != 0.0:
+            raise ValueError(f"gravity = {robot.gravity} m/s2 must be along z on a learned hand; or use backend='fem'")
         self.robot, self.control_step = robot, control_step
         self.model = load_chain(robot.finger, weights)
         self._max_effort = np.array([actuator.max_effort for actuator in robot.actuators])

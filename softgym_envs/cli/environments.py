@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,7 +14,25 @@ from softgym_envs.cli import options
 from softgym_envs.errors import ConfigError
 from softgym_envs.extras import require
 
+if TYPE_CHECKING:
+    from softgym_envs.agents.config import EnvironmentConfig
+
 AGENT_HELP = "qp, qp_static, qp_model, qp_pi, random, or a policy (a file or the name of a shipped policy)."
+
+
+def _environment(id: str, agent: str, backend: str | None, verb: str) -> EnvironmentConfig:
+    """Return the environment for an agent: a policy needs the same observations and actions as in training."""
+    from softgym_envs.agents.baselines import BASELINES
+    from softgym_envs.agents.config import EnvironmentConfig
+    from softgym_envs.agents.policy import Policy
+    from softgym_envs.config import check_config
+
+    policy = None if agent in BASELINES else Policy(agent)
+    trained = {} if policy is None else policy.environment.model_dump()
+    config = check_config(EnvironmentConfig, {**trained, "id": id}, verb)
+    if policy is not None:
+        policy.check_environment(config)
+    return config if backend is None else config.on(backend)
 
 
 @click.command("list")
@@ -58,11 +76,7 @@ def rollout(
 ) -> None:
     """Run one episode and print its result."""
     import softgym_envs  # noqa: F401 - registers the IDs
-    from softgym_envs.agents.baselines import BASELINES
-    from softgym_envs.agents.config import EnvironmentConfig
     from softgym_envs.agents.evaluation import make_agent
-    from softgym_envs.agents.policy import Policy
-    from softgym_envs.config import check_config
 
     if record is not None and video is not None:
         raise ConfigError("--record and --video exclude each other; run the episode twice")
@@ -72,14 +86,7 @@ def rollout(
         check_video(video)  # before the work begins
     chosen = options.design_of(design)
     options.check_agent(agent)
-    # A policy needs the same observations and actions as in training.
-    policy = None if agent in BASELINES else Policy(agent)
-    trained = {} if policy is None else policy.environment.model_dump()
-    config = check_config(EnvironmentConfig, {**trained, "id": environment}, "rollout")
-    if policy is not None:
-        policy.check_environment(config)
-    if backend is not None:
-        config = config.on(backend)
+    config = _environment(environment, agent, backend, "rollout")
     act = make_agent(agent, seed)
     drawn = {"render_mode": "rgb_array"} if video is not None else {}
     env = config.make(**({"design": chosen} if chosen else {}), **drawn)
@@ -128,22 +135,12 @@ def record(
     NAME is that of the dataset, such as softgym/finger-reach/qp-v0.
     """
     import softgym_envs  # noqa: F401 - registers the IDs
-    from softgym_envs.agents.baselines import BASELINES
-    from softgym_envs.agents.config import EnvironmentConfig
     from softgym_envs.agents.offline import record_episodes
-    from softgym_envs.agents.policy import Policy
-    from softgym_envs.config import check_config
 
     if episodes < 1:
         raise ConfigError(f"--episodes {episodes} must be at least 1")
     options.check_agent(agent)
-    policy = None if agent in BASELINES else Policy(agent)
-    trained = {} if policy is None else policy.environment.model_dump()
-    config = check_config(EnvironmentConfig, {**trained, "id": environment}, "record")
-    if policy is not None:
-        policy.check_environment(config)
-    if backend is not None:
-        config = config.on(backend)
+    config = _environment(environment, agent, backend, "record")
     chosen = options.design_of(design) or None
     dataset = record_episodes(name, agent, config, episodes=episodes, design=chosen, seed=seed)
     click.echo(f"wrote {dataset.total_episodes} episodes, {dataset.total_steps} steps: minari.load_dataset('{name}')")

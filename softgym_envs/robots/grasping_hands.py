@@ -39,8 +39,8 @@ ON_TABLE = 2.0e-4
 TABLE_STIFFNESS, TABLE_HEIGHT, TABLE_MODULUS, TABLE_DENSITY = 100.0, 0.2, 1.0e6, 1000.0
 """Column below the table: stiffness along z [N/m], height [m], Young's modulus [Pa] and density [kg/m3]."""
 
-TABLE_WEIGHT = 0.5 * 9.81 * TABLE_DENSITY * TABLE_STIFFNESS * TABLE_HEIGHT**2 / TABLE_MODULUS
-"""Part of the column's weight that the table carries [N]."""
+TABLE_MASS = 0.5 * TABLE_DENSITY * TABLE_STIFFNESS * TABLE_HEIGHT**2 / TABLE_MODULUS
+"""Part of the column's mass whose weight the table carries [kg]."""
 
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Turns a finger so that it points down (-z) and closes along +x."""
