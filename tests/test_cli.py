@@ -148,6 +148,7 @@ STRENGTH = "configs/design/finger_strength.yaml"
         (["rolout"], ["unknown verb 'rolout'; did you mean 'rollout'?"]),
         (["bench", "nothing"], ["nothing"]),
         (["show", "finegr"], ["unknown robot 'finegr'; did you mean 'finger'? allowed: finger, diamond"]),
+        (["show", "SoftGym/FingerReach-v0"], ["'SoftGym/FingerReach-v0' is an environment; its robot is 'finger'"]),
         (["show", "finger", "--option", "cabels=1"], ["unknown option 'cabels'; did you mean 'cables'? allowed: "]),
         (["show", "finger", "--option", "cables=two"], ["cables = 'two' must be an integer"]),
         (["show", "finger", "--desing", "length=0.04"], ["No such option '--desing'. Did you mean '--design'?"]),

@@ -1,9 +1,12 @@
 """Core without extras: one line says what to install; the first use says that it compiles."""
 
+import ast
 import os
+import re
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import numba
@@ -33,6 +36,7 @@ def without(monkeypatch):
         ("pyvista", "viewer", ["show", "finger", "--picture", "x.png"]),
         ("rerun", "viewer", ["rollout", "SoftGym/FingerReach-v0", "--record", "x.rrd"]),
         ("optuna", "codesign", ["codesign", "--config", "finger_reach"]),
+        ("markupsafe", "codesign", ["codesign", "--config", "finger_reach"]),
         ("gmsh", "geometry", ["show", "finger", "--option", "mesh_size=0.0061"]),
     ],
 )
@@ -70,6 +74,28 @@ def test_extras_are_those_of_the_package():
     assert set(EXTRAS) <= set(extras)
     page = (ROOT / "docs" / "install.md").read_text()
     assert [extra for extra in set(extras) - {"test", "docs", "compare"} if f"`{extra}`" not in page] == []
+
+
+def test_every_imported_library_is_of_the_core_or_of_an_extra():
+    """A library that comes only with another one is missing without it, and no line would say what to install."""
+    core = {re.split(r"[<>=;\[]", line)[0] for line in PROJECT["dependencies"]}
+    distributions = packages_distributions()
+    known = {module for modules in EXTRAS.values() for module in modules}
+    found = {}
+    for folder in ("softgym_envs", "agents", "codesign"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+                names += [node.module] if isinstance(node, ast.ImportFrom) else []
+                found |= {name.partition(".")[0]: path.relative_to(ROOT) for name in names}
+    ours = {"softgym_envs", "benchmarks", "__main__", "pydantic_core"}  # the last one is a part of pydantic
+    others = {module: path for module, path in found.items() if module not in {*sys.stdlib_module_names, *ours}}
+    assert "numpy" in others and "markupsafe" in others
+    assert {
+        module: str(path)
+        for module, path in others.items()
+        if module not in known and not {module, *(name.lower() for name in distributions.get(module, []))} & core
+    } == {}
 
 
 def test_system_packages_are_the_same_everywhere():

@@ -29,6 +29,7 @@ def codesign(
 
     An interrupted study continues where it stopped.
     """
+    require("codesign")
     from softgym_envs.codesign.config import StudyConfig
     from softgym_envs.codesign.report.page import write_report
     from softgym_envs.codesign.study import run_study

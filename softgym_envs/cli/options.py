@@ -138,10 +138,15 @@ def robot_of(name: str, pairs: tuple[str, ...]) -> Robot:
     """Return a robot made with the options of ``--option name=value``.
 
     Raises:
+        ConfigError: for the ID of an environment.
         ValueError: for an unknown robot or a wrong option.
     """
     from softgym_envs.config import read_value
+    from softgym_envs.envs.registration import ENVIRONMENTS
     from softgym_envs.robots.registry import make_robot
+
+    if name in ENVIRONMENTS:
+        raise ConfigError(f"'{name}' is an environment; its robot is '{ENVIRONMENTS[name].robot}'")
 
     return make_robot(name, **{key: read_value(text) for key, text in _split("option", pairs)})
 
