@@ -28,6 +28,8 @@ class Evaluation:
         successes: whether each episode ended within the task's success distance, shape (n,); in an average of several
             evaluations, the share that did.
         efforts: mean actuator effort over the episode [N, ...], shape (n,).
+        ends: first effector at the end of each episode [m], shape (n, 3); in an average of several evaluations, the
+            mean of their ends.
         steps: environment steps.
         seconds: wall-clock time [s].
         cpu_seconds: CPU time of this process [s].
@@ -38,6 +40,7 @@ class Evaluation:
     returns: np.ndarray
     successes: np.ndarray
     efforts: np.ndarray
+    ends: np.ndarray
     steps: int
     seconds: float = 0.0
     cpu_seconds: float = 0.0
@@ -105,20 +108,22 @@ class Evaluation:
         """Return the evaluation that `to_json` wrote; the summary follows from the values for each goal.
 
         Raises:
-            DataError: if a field is missing or not an array of numbers.
+            DataError: if a field is missing or not an array of numbers with a row for each goal.
         """
         try:
             columns = {name: np.asarray(data[name]) for name in _PER_GOAL}
             cost = int(data["steps"]), float(data["seconds"]), float(data["cpu_seconds"])
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"stored evaluation cannot be read: {type(error).__name__} {error}") from None
-        sizes = {column.shape for column in columns.values()}
-        if len(sizes) != 1 or any(column.ndim != 1 or column.dtype.kind not in "bif" for column in columns.values()):
-            raise DataError(f"stored evaluation must hold numbers for each goal, got shapes {sorted(sizes)}")
+        shapes = {name: column.shape for name, column in columns.items()}
+        count = np.size(columns["distances"])
+        expected = {name: (count, 3) if name == "ends" else (count,) for name in _PER_GOAL}
+        if shapes != expected or any(column.dtype.kind not in "bif" for column in columns.values()):
+            raise DataError(f"stored evaluation must hold numbers for each goal, got shapes {shapes}")
         return cls(**columns, steps=cost[0], seconds=cost[1], cpu_seconds=cost[2])
 
 
-_PER_GOAL = ("distances", "mean_distances", "returns", "successes", "efforts")
+_PER_GOAL = ("distances", "mean_distances", "returns", "successes", "efforts", "ends")
 _SUMMARY = (
     "success_rate",
     "mean_distance",
@@ -255,12 +260,19 @@ def _evaluate(
                 ended = terminated or truncated
             steps += count
             rows.append(
-                (info["distance"], distance / count, total, info["is_success"] and info["converged"], effort / count)
+                (
+                    info["distance"],
+                    distance / count,
+                    total,
+                    info["is_success"] and info["converged"],
+                    effort / count,
+                    info["effector"],
+                )
             )
     finally:
         env.close()
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return Evaluation(columns[0], columns[1], columns[2], columns[3].astype(bool), columns[4], steps)
+    return Evaluation(columns[0], columns[1], columns[2], columns[3].astype(bool), columns[4], columns[5], steps)
 
 
 def _evaluate_batch(
@@ -274,6 +286,7 @@ def _evaluate_batch(
     count = len(goals)
     env = environment.make_vec(count, sample_design=False)
     columns = {name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "length")}
+    ends = np.zeros((count, 3))
     running = np.ones(count, dtype=bool)
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
@@ -281,6 +294,7 @@ def _evaluate_batch(
             observation, reward, terminated, truncated, info = env.step(policy(observation))
             last = info.get("final_info", info)
             columns["distance"] = np.where(running, last["distance"], columns["distance"])
+            ends = np.where(running[:, None], last["effector"], ends)
             columns["success"] = np.where(running, last["is_success"] & last["converged"], columns["success"])
             columns["mean"] += running * last["distance"]
             columns["return"] += running * reward
@@ -296,5 +310,6 @@ def _evaluate_batch(
         columns["return"],
         columns["success"].astype(bool),
         columns["effort"] / length,
+        ends,
         int(length.sum()),
     )

@@ -260,7 +260,7 @@ class TestGroup:
         data |= {**self.mean.to_json(), "worst_distance": self.worst_distance}
         data["values"] = {name: self.value(name) for name in self.tests[0].values}
         if len(self.tests) > 1:
-            names = ("distances", "mean_distances", "returns", "successes", "efforts")
+            names = ("distances", "mean_distances", "returns", "successes", "efforts", "ends")
             data["seeds"] = [test.seed for test in self.tests]
             data["of_seeds"] = {name: self.table(name).tolist() for name in names}
         return data

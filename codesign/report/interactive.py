@@ -9,7 +9,7 @@ import numpy as np
 
 from softgym_envs.codesign.records import TrialResult
 from softgym_envs.codesign.report.episodes import Episode
-from softgym_envs.codesign.report.plots import BASELINE, MUTED, VIOLATES, WINNER
+from softgym_envs.codesign.report.plots import BASELINE, COLOURS, MUTED, VIOLATES, WINNER
 from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.report.units import present, shown_unit
 from softgym_envs.codesign.snapshot import StudySnapshot
@@ -188,11 +188,14 @@ class GoalOutcomes:
     Attributes:
         points: the goals, the last ones of paths [m], shape (n, 3).
         distances: final distances of baseline and winner [m], shape (2, n).
+        ends: where the effector ends, for each training of baseline and winner [m], shape (trainings, n, 3) each.
         kinds: index into `GOAL_KINDS`, shape (n,).
     """
 
-    def __init__(self, points: np.ndarray, distances: np.ndarray, reached: np.ndarray) -> None:
-        self.points, self.distances = points, distances
+    def __init__(
+        self, points: np.ndarray, distances: np.ndarray, reached: np.ndarray, ends: dict[str, np.ndarray]
+    ) -> None:
+        self.points, self.distances, self.ends = points, distances, ends
         self.kinds = np.select([reached.all(axis=0), reached[1], reached[0]], [0, 1, 2], 3)
 
     @property
@@ -221,12 +224,13 @@ def goal_outcomes(snapshot: StudySnapshot, results: StudyResults) -> GoalOutcome
         return None
     if snapshot.config.environment.task_class.goal_unit != "m":
         return None
-    tests = {group.key: group.mean for group in snapshot.unseen_tests}
+    tests = {group.key: group for group in snapshot.unseen_tests}
     found = [tests[body.trial, rows[0].agent, "fem"] for body in (results.baseline, results.winner)]
     return GoalOutcomes(
         snapshot.folder.goals["unseen"][:, -1],
-        np.array([each.distances for each in found]),
-        np.array([each.successes >= 0.5 for each in found]),
+        np.array([group.mean.distances for group in found]),
+        np.array([group.mean.successes >= 0.5 for group in found]),
+        {role: group.table("ends") for role, group in zip(("baseline", "winner"), found, strict=True)},
     )
 
 
@@ -239,6 +243,18 @@ def goal_views(outcomes: GoalOutcomes) -> list[tuple[str, Figure]]:
     for a, b in shown:
         axes = [{"title": f"{'xyz'[axis]} [mm]", **_GRID} for axis in (a, b)]
         figure = _figure(330, showlegend=False, xaxis=axes[0], yaxis={**axes[1], "scaleanchor": "x"})
+        for role, ends in outcomes.ends.items():
+            starts = np.broadcast_to(outcomes.points, ends.shape).reshape(-1, 3)
+            lines = 1e3 * np.stack([starts, ends.reshape(-1, 3)], axis=1)
+            figure.add_scatter(
+                x=_broken(lines[:, :, a]),
+                y=_broken(lines[:, :, b]),
+                mode="lines+markers",
+                name=f"end of the {role}",
+                hoverinfo="skip",
+                line={"color": COLOURS[role], "width": 1},
+                marker={"color": COLOURS[role], "size": [0, 4, 0] * len(lines)},
+            )
         for kind, (name, symbol, colour, _) in enumerate(GOAL_KINDS):
             chosen = outcomes.kinds == kind
             figure.add_scatter(
@@ -252,6 +268,11 @@ def goal_views(outcomes: GoalOutcomes) -> list[tuple[str, Figure]]:
             )
         views.append((f"{'xyz'[a]}{'xyz'[b]}", figure))
     return views
+
+
+def _broken(lines: np.ndarray) -> list[float | None]:
+    """Return lines of two points (n, 2) as one line that is broken after each of them."""
+    return [value for start, end in lines.tolist() for value in (start, end, None)]
 
 
 # -- bodies in motion -----------------------------------------------------------------------------------------------

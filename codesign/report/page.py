@@ -82,6 +82,7 @@ def _context(snapshot: StudySnapshot, results: StudyResults, episodes: Sequence[
         "comparison_goals": results.comparison[0].goals if results.comparison else 0,
         "radius": f"{1e3 * results.success_distance:g} mm",
         "goal_legend": outcomes.legend if outcomes else [],
+        "end_legend": plots.COLOURS,
         "goal_views": []
         if outcomes is None
         else [Markup(interactive.html(figure, f"goals-{plane}")) for plane, figure in interactive.goal_views(outcomes)],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softgym_envs.agents.config import EnvironmentConfig
-from softgym_envs.agents.evaluation import Evaluation
+from softgym_envs.agents.evaluation import Evaluation, evaluate, sample_goals
 from softgym_envs.agents.vec_env import SB3VecEnv
 from softgym_envs.errors import DataError
 
@@ -14,8 +14,9 @@ from softgym_envs.errors import DataError
 def some(count, seed):
     rng = np.random.default_rng(seed)
     distances, means, returns, efforts = rng.random((4, count))
+    successes, ends = rng.random(count) < 0.5, rng.random((count, 3))
     return Evaluation(
-        distances, means, returns, rng.random(count) < 0.5, efforts, steps=50 * count, seconds=1.5, cpu_seconds=1.25
+        distances, means, returns, successes, efforts, ends, steps=50 * count, seconds=1.5, cpu_seconds=1.25
     )
 
 
@@ -24,7 +25,7 @@ def test_merge_joins_goals_and_adds_costs():
     whole = Evaluation.merge(parts)
     assert len(whole) == 8 and whole.steps == 400 and whole.seconds == 3.0 and whole.cpu_seconds == 2.5
     np.testing.assert_array_equal(whole.efforts[3:], parts[1].efforts)
-    assert whole.successes.dtype == bool
+    assert whole.successes.dtype == bool and whole.ends.shape == (8, 3)
     for name in ("success_rate", "mean_distance", "mean_tracking_distance", "mean_return", "mean_effort"):
         expected = np.average([getattr(part, name) for part in parts], weights=[3, 5])
         assert getattr(whole, name) == pytest.approx(expected, rel=1e-12)
@@ -54,6 +55,7 @@ def test_a_damaged_file_is_named():
     for change, message in (
         ({"efforts": None}, "numbers for each goal"),
         ({"efforts": [1.0]}, "numbers for each goal"),
+        ({"ends": [0.0, 0.1, 0.2]}, "numbers for each goal"),
         ({"steps": "many"}, "ValueError"),
     ):
         with pytest.raises(DataError, match=message):
@@ -61,6 +63,14 @@ def test_a_damaged_file_is_named():
     del data["returns"]
     with pytest.raises(DataError, match="KeyError 'returns'"):
         Evaluation.from_json(data)
+
+
+@pytest.mark.parametrize("agent", ["finger_reach", "qp"])  # as a batch, and one episode after the other
+def test_ends_are_as_far_from_the_goals_as_the_distances_say(agent):
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0")
+    goals = sample_goals(environment, 3, seed=1)
+    outcome = evaluate(agent, environment, goals)
+    np.testing.assert_allclose(np.linalg.norm(outcome.ends - goals[:, -1], axis=1), outcome.distances, atol=1e-9)
 
 
 def test_tasks_that_read_states_run_one_environment_at_a_time():

@@ -35,7 +35,9 @@ class StiffFinger(SoftFinger):
 def outcome(distances, efforts):
     distances, efforts = np.array(distances), np.array(efforts)
     ones = np.ones(len(distances))
-    return Outcome(Evaluation(distances, distances, ones, ones, efforts, steps=1), ROBOT.design_space.baseline, ROBOT)
+    ends = np.zeros((len(distances), 3))
+    evaluation = Evaluation(distances, distances, ones, ones, efforts, ends, steps=1)
+    return Outcome(evaluation, ROBOT.design_space.baseline, ROBOT)
 
 
 def test_names_of_objectives():

@@ -21,7 +21,8 @@ BOX = {"height": (0.020, 0.022), "joint_height": (0.005, 0.008)}
 def evaluation(distances):
     distances = np.asarray(distances, dtype=float)
     ones = np.ones(len(distances))
-    return Evaluation(distances, distances, ones, distances < 2e-3, ones, steps=1)
+    ends = distances[:, None] * [0.0, 0.6, -0.8]  # any point
+    return Evaluation(distances, distances, ones, distances < 2e-3, ones, ends, steps=1)
 
 
 def write_trial(folder, number, score, place, controller="qp"):
@@ -112,8 +113,17 @@ def test_outcomes_of_goals(tested):
     ]
     views = goal_views(outcomes)
     assert 1 <= len(views) <= 3
-    for _, figure in views:
-        assert sum(len(trace.x) for trace in figure.data) == 6
+    for plane, figure in views:
+        traces = {trace.name: trace for trace in figure.data}
+        ends = {name: traces.pop(f"end of the {name}") for name in ("baseline", "winner")}
+        assert sum(len(trace.x) for trace in traces.values()) == 6
+        goals = 1e3 * snapshot.folder.goals["unseen"][:, -1, "xyz".index(plane[0])]
+        for name, distances in (("baseline", [5, 1, 5, 5, 5, 5]), ("winner", [1, 1, 4, 4, 4, 1])):
+            assert list(ends[name].x[0::3]) == pytest.approx(goals) and set(ends[name].x[2::3]) == {None}
+            if plane == "yz":
+                assert list(ends[name].x[1::3]) == pytest.approx(0.6 * np.array(distances))
+                assert list(ends[name].y[1::3]) == pytest.approx(-0.8 * np.array(distances))
+    assert "yz" in dict(views)
 
 
 def test_plots_show_every_complete_trial(tested):

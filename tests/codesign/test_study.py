@@ -178,7 +178,8 @@ def test_tables(finished):
 
 
 def evaluation(distance, effort=0.5):
-    return Evaluation(*(np.full(2, value) for value in (distance, distance, 1.0, 0.5, effort)), steps=1)
+    columns = (np.full(2, value) for value in (distance, distance, 1.0, 0.5, effort))
+    return Evaluation(*columns, ends=np.zeros((2, 3)), steps=1)
 
 
 def write_trial(folder, number, distance, effort=0.5):

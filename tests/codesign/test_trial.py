@@ -21,6 +21,7 @@ def evaluation(distances, steps=50, **changes):
     distances = np.array(distances, dtype=float)
     ones = np.ones(len(distances))
     fields = {"mean_distances": distances, "returns": ones, "successes": distances < 2e-3, "efforts": ones}
+    fields["ends"] = np.zeros((len(distances), 3))
     return Evaluation(distances=distances, steps=steps, **{**fields, **changes})
 
 
