@@ -85,12 +85,18 @@ def calibrate_trust(
 
 @click.command()
 @click.argument("robot", shell_complete=options.complete_robot)
-@click.argument("files", nargs=-1, required=True, type=options.PATH)
+@click.argument("files", nargs=-1, type=options.PATH)
 @options.robot_option
 @options.design
 @click.option("--weights", type=options.PATH, help="Folder of the weights (default: the shipped weights).")
 @click.option("--members", type=int, help="Number of ensemble members to average (default: all).")
 @click.option("--name", default="softgym", show_default=True, help="Prefix of the names that a header defines.")
+@click.option("--controller", type=options.PATH, help="Write controller.h and an example main.c to this folder.")
+@click.option(
+    "--max-effort", type=float, help="Controller: command efforts up to this [N, Pa, ...] instead of displacements."
+)
+@click.option("--effort-rate", type=float, help="Controller: largest change of an effort per step (default: 1/40).")
+@click.option("--gains", type=float, nargs=2, help="Controller: proportional and integral gain per step.")
 def deploy(
     robot: str,
     files: tuple[Path, ...],
@@ -99,20 +105,29 @@ def deploy(
     weights: Path | None,
     members: int | None,
     name: str,
+    controller: Path | None,
+    max_effort: float | None,
+    effort_rate: float | None,
+    gains: tuple[float, float] | None,
 ) -> None:
-    """Write a surrogate as a C header or an ONNX graph.
+    """Write a surrogate as a C header or an ONNX graph, or a whole controller in C.
 
-    FILES end with .h (a C header of one body) or .onnx (a graph that takes the design as an input).
+    FILES end with .h (a C header of one body) or .onnx (a graph that takes the design as an input). --controller writes
+    one header with the model, the inverse QP and its PI correction, and a program that steps it.
     """
     from softgym_envs.surrogate.export.c import export_c
     from softgym_envs.surrogate.export.common import FORMATS
     from softgym_envs.surrogate.export.onnx import export_onnx
     from softgym_envs.surrogate.pretrained import pretrained_model
 
+    if not files and controller is None:
+        raise ConfigError("nothing to write: name FILES that end with .h or .onnx, or --controller FOLDER")
+    if controller is None and not (max_effort is effort_rate is gains is None):
+        raise ConfigError("--max-effort, --effort-rate and --gains need --controller FOLDER")
     for file in files:
         if file.suffix not in FORMATS:
             raise ConfigError(f"'{file}' must end with {' or '.join(FORMATS)}")
-    if design and all(file.suffix == ".onnx" for file in files):
+    if design and files and controller is None and all(file.suffix == ".onnx" for file in files):
         raise ConfigError("--design applies to C headers (.h) only: an .onnx graph takes the design as an input")
     model = pretrained_model(options.robot_of(robot, options_), weights)
     chosen = options.design_of(design)
@@ -122,3 +137,20 @@ def deploy(
         else:
             export_onnx(model, file, members=members)
         click.echo(f"wrote {file}")
+    if controller is not None:
+        from softgym_envs.control.embedded import PICorrection
+        from softgym_envs.control.export.c import COMPILE, export_controller_c
+        from softgym_envs.control.inverse_qp import InverseQP
+
+        if effort_rate is not None and max_effort is None:
+            raise ConfigError("--effort-rate needs --max-effort: without it the controller commands displacements")
+        qp = InverseQP.for_robot(model.robot)
+        if max_effort is not None:
+            qp = InverseQP.by_efforts(model.robot, max_effort, effort_rate or max_effort / 40.0)
+        correction = None if gains is None else PICorrection(*gains)
+        paths = export_controller_c(
+            model, chosen, controller, controller=qp, correction=correction, members=members, name=name
+        )
+        for path in paths:
+            click.echo(f"wrote {path}")
+        click.echo(f"compile with: cd {controller} && {COMPILE}")

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from softgym_envs.control.coupling import HeldObject as HeldObject
     from softgym_envs.control.embedded import EmbeddedLoop as EmbeddedLoop
     from softgym_envs.control.embedded import PICorrection as PICorrection
+    from softgym_envs.control.export.c import export_controller_c as export_controller_c
     from softgym_envs.control.finger_models import SurrogateFingers as SurrogateFingers
     from softgym_envs.control.fingers import CoupledFingers as CoupledFingers
     from softgym_envs.control.inverse_qp import InverseQP as InverseQP
@@ -23,6 +24,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "contact_qp": ["ContactQP", "ForceGoal"],
         "coupling": ["HeldObject"],
         "embedded": ["EmbeddedLoop", "PICorrection"],
+        "export.c": ["export_controller_c"],
         "finger_models": ["SurrogateFingers"],
         "fingers": ["CoupledFingers"],
         "inverse_qp": ["InverseQP"],

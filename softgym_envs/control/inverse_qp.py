@@ -161,6 +161,32 @@ class InverseQP:
         }
         return cls(**{**arguments, **options})
 
+    @classmethod
+    def by_efforts(cls, robot: Robot, largest: float, rate: float, **options: Any) -> Self:
+        """Return the controller of a robot that commands efforts and does not bound displacements.
+
+        Args:
+            robot: the robot.
+            largest: largest effort of every actuator [N, Pa, ...].
+            rate: largest change of an effort per call.
+            **options: arguments of the class, which replace those of the robot.
+
+        Raises:
+            ValueError: for an effort or rate that is not positive.
+        """
+        if not (0.0 < largest < np.inf and 0.0 < rate < np.inf):
+            raise ValueError(f"the largest effort and its rate must be positive, got {largest} and {rate}")
+        unbounded = np.full(len(robot.actuators), np.inf)
+        drive = {
+            "lower": -unbounded,
+            "upper": unbounded,
+            "rates": unbounded,
+            "max_effort": np.full(len(unbounded), largest),
+            "effort_rates": np.full(len(unbounded), rate),
+            "mode": "effort",
+        }
+        return cls.for_robot(robot, **{**drive, **options})
+
     def _make_qp(self) -> Any:
         """Return a new solver; a solver that failed would warm-start from its bad result."""
         n = len(self.rates)

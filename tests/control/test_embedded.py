@@ -197,8 +197,10 @@ def test_bad_measurements_are_rejected():
         np.testing.assert_array_equal(loop.effort, kept)
     with pytest.raises(ValueError, match="goal must be 3 finite"):
         loop.step(np.full(3, np.nan))
-    with pytest.raises(ValueError, match="commands efforts"):
-        EmbeddedLoop(ChamberRobot(), InverseQP(np.zeros(3), np.ones(3), np.ones(3), np.ones(3, dtype=bool)))
+    mixed = ["effort", "displacement", "effort"]
+    with pytest.raises(ValueError, match="mixes two"):
+        bounds = np.zeros(3), np.ones(3), np.ones(3), np.ones(3, dtype=bool)
+        EmbeddedLoop(ChamberRobot(), InverseQP(*bounds, mode=mixed))
     for arguments in ((np.nan, 0.0), (0.1, -1.0)):
         with pytest.raises(ValueError, match="finite and not negative"):
             PICorrection(*arguments)

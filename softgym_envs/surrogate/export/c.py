@@ -54,8 +54,7 @@ def export_c(
     path = check_path(path, ".h")
     check_identifier(name)
     potential = exportable(model, members)
-    complete = potential.robot.design_space.complete(design)
-    text = _header(potential, complete, name)
+    text = header_text(potential, design, name)
     with atomic_write(path, "w") as stream:
         stream.write(text)
     return path
@@ -111,9 +110,10 @@ def _constants(model: Model, design: Design) -> dict[str, tuple[str, np.ndarray]
     return singles
 
 
-def _header(model: Model, design: Design, name: str) -> str:
-    """Return the text of the header."""
+def header_text(model: Model, given: Mapping[str, float] | None, name: str) -> str:
+    """Return the text of the header of one body; see `export_c` for the arguments and errors."""
     robot, n, e = model.robot, model.count, model.effectors
+    design = robot.design_space.complete(given)
     constants = _constants(model, design)
     upper = name.upper()
     sizes = {
