@@ -11,7 +11,7 @@ from numba import njit
 from scipy.sparse import coo_matrix, csr_matrix
 
 from softgym_envs.mechanics.constraints.constraint import Constraint
-from softgym_envs.mechanics.elements.block import ElementBlock
+from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates
 from softgym_envs.mechanics.frames import KinematicMap
 from softgym_envs.mechanics.kinematics import Kinematics
 
@@ -21,16 +21,6 @@ def _subtract_entries(values, places, entries):
     for k in range(places.shape[0]):
         if places[k] >= 0:
             values[places[k]] -= entries[k]
-
-
-@njit(cache=True)
-def _symmetric_product(low, high, values, vector):
-    out = np.zeros_like(vector)
-    for k in range(low.shape[0]):
-        out[low[k]] += values[k] * vector[high[k]]
-        if low[k] != high[k]:
-            out[high[k]] += values[k] * vector[low[k]]
-    return out
 
 
 @njit(cache=True)
@@ -94,14 +84,12 @@ class MassAndDamping(NamedTuple):
     Attributes:
         mass: mass matrix.
         mass_damping: Rayleigh's alpha [1/s].
-        stiffness_damping: Rayleigh's beta [s].
-        viscosity: stiffness values that beta multiplies, see `Assembly.viscosity`; needed where beta is not zero.
+        stiffness_damping: Rayleigh's beta [s], see `ElementBlock.add_damping`.
     """
 
     mass: MassMatrix
     mass_damping: float = 0.0
     stiffness_damping: float = 0.0
-    viscosity: np.ndarray | None = None
 
 
 class Inertia(ABC):
@@ -109,17 +97,23 @@ class Inertia(ABC):
 
     Attributes:
         body: mass and damping of the body.
+        start: rows at the start of the step [m], shape (n, 3).
         acceleration_factor: derivative of accelerations with respect to displacements [1/s2].
         velocity_factor: derivative of velocities with respect to displacements [1/s].
     """
 
     body: MassAndDamping
+    start: np.ndarray
     acceleration_factor: float
     velocity_factor: float
 
     @abstractmethod
     def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return velocities [m/s] and accelerations [m/s2] of the rows (n, 3) if the step ends at rows ``x`` (n, 3)."""
+
+    @abstractmethod
+    def middle(self, x: np.ndarray) -> np.ndarray:
+        """Return the rows (n, 3) at which the velocities strain the body if the step ends at rows ``x`` (n, 3)."""
 
 
 class Assembly:
@@ -161,14 +155,13 @@ class Assembly:
         self.size = sum(constraint.size for constraint, _ in self._rows)
         stiffness = [block.stiffness for block in self.blocks if block.stiffness > 0.0]
         self.bond_stiffness = 100.0 * float(np.mean(stiffness)) if stiffness else 1.0
-        self._known_dofs = np.flatnonzero(kinematics.number >= 0)
         self._targets = []
         for constraint, _ in self._rows:
             equations = kinematics.number[constraint.dofs]
             keep = np.flatnonzero(equations >= 0)
             self._targets.append((keep, equations[keep]))
         self._make_pattern()
-        self._values = np.empty(len(self._low))
+        self._values = np.empty(len(self.keys))
         self._gradient = np.empty_like(nodes)
 
     def _make_pattern(self) -> None:
@@ -210,7 +203,6 @@ class Assembly:
         self._hessian_maps = [next(following) if c in curved else None for c, _ in self._rows]
         self._bond_maps = [next(following) for _ in self._bonds]
         self.keys = np.concatenate([direct, extra])
-        self._low, self._high = self.keys // total, self.keys % total
 
     def _plan_expansion(self, kinematic_map: KinematicMap, direct: np.ndarray, extra: np.ndarray) -> np.ndarray:
         """Return the keys of direct entries and of those to which carried rows contribute; keep where the latter go."""
@@ -309,38 +301,35 @@ class Assembly:
             entries += np.bincount(place, weights=values[keep], minlength=len(entries))
         return MassMatrix(matrix, entries)
 
-    def viscosity(self, x: np.ndarray) -> np.ndarray:
-        """Stiffness of the elements against strain rates at rows ``x`` (n, 3), see `ElementBlock.add_viscosity`.
-
-        The values are in the layout of the tangent before the kinematic map is applied.
-        """
-        values = np.zeros_like(self._values)
-        for block, scatter in zip(self.blocks, self._block_maps, strict=True):
-            block.add_viscosity(x, values, scatter)
-        return values
-
-    def damping_force(self, body: MassAndDamping, velocity: np.ndarray) -> np.ndarray:
-        """Force [N] (n, 3) of the stiffness-proportional damping at velocities of the rows (n, 3)."""
-        assert body.viscosity is not None
-        moved = np.zeros(self.kinematics.total)
-        numbers = self.kinematics.number[self._known_dofs]
-        moved[numbers] = velocity.ravel()[self._known_dofs]
-        force = _symmetric_product(self._low, self._high, body.viscosity, moved)
-        out = np.zeros_like(velocity)
-        out.ravel()[self._known_dofs] = body.stiffness_damping * force[numbers]
-        return out
-
     def inertia_force(self, inertia: Inertia, x: np.ndarray) -> np.ndarray:
         """Return the derivative of the energy that a time step adds [N], shape (n, 3), at rows ``x`` (n, 3)."""
+        force = np.zeros_like(x)
+        self._add_inertia(inertia, x, force, None)
+        return force
+
+    def dissipated_power(self, inertia: Inertia, x: np.ndarray) -> float:
+        """Return the power [W] that damping takes at the end of a time step at rows ``x`` (n, 3)."""
+        velocity, _ = inertia.motion(x)
+        drag = inertia.body.mass_damping * float(np.vdot(velocity, inertia.body.mass.rows @ velocity))
+        return drag + self._add_damping(inertia, x, velocity, np.zeros_like(x), None)
+
+    def _add_inertia(self, inertia: Inertia, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None) -> None:
         body = inertia.body
         velocity, acceleration = inertia.motion(x)
-        force = body.mass.rows @ (acceleration + body.mass_damping * velocity)
-        return force + self.damping_force(body, velocity) if body.stiffness_damping else force
+        gradient += body.mass.rows @ (acceleration + body.mass_damping * velocity)
+        if values is not None:
+            values += (inertia.acceleration_factor + body.mass_damping * inertia.velocity_factor) * body.mass.entries
+        self._add_damping(inertia, x, velocity, gradient, values)
 
-    def _add_inertia(self, inertia: Inertia, x: np.ndarray, gradient: np.ndarray, values: np.ndarray) -> None:
-        body = inertia.body
-        gradient += self.inertia_force(inertia, x)
-        values += (inertia.acceleration_factor + body.mass_damping * inertia.velocity_factor) * body.mass.entries
-        if body.stiffness_damping:
-            assert body.viscosity is not None
-            values += (body.stiffness_damping * inertia.velocity_factor) * body.viscosity
+    def _add_damping(
+        self, inertia: Inertia, x: np.ndarray, velocity: np.ndarray, gradient: np.ndarray, values: np.ndarray | None
+    ) -> float:
+        """Add the forces against strain rates and return their power [W]."""
+        beta = inertia.body.stiffness_damping
+        if not beta:
+            return 0.0
+        rates = StrainRates(inertia.start, inertia.middle(x), velocity, inertia.velocity_factor, beta)
+        return sum(
+            block.add_damping(x, rates, gradient, values, None if values is None else scatter)
+            for block, scatter in zip(self.blocks, self._block_maps, strict=True)
+        )

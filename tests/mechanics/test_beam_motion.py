@@ -14,7 +14,7 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.solvers import block_cholesky
 from softgym_envs.mechanics.solvers.beam_body import is_beam_body
-from softgym_envs.mechanics.solvers.beam_equations import Step, assemble, motion_of, move, point_states
+from softgym_envs.mechanics.solvers.beam_equations import Step, assemble, motion_of, move, point_strains
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.schemes import ImplicitEuler
@@ -42,12 +42,12 @@ def equations_at(solver, x, *, full=True):
     """The compiled equations of one step of a solver that ends at rows ``x``."""
     beams = BeamMotion(solver.model, solver._mass)
     body = beams.body
-    states = np.zeros((len(body.elements.frames), 2, 7, 3))
-    point_states(body.elements, solver.x, states)
+    start = np.zeros((len(body.elements.frames), 2, 6))
+    point_strains(body.elements, solver.x, start)
     step = Step(
         solver.x,
         solver.velocity,
-        states,
+        start,
         solver.model.loads,
         solver.step,
         solver.mass_damping,
@@ -133,7 +133,7 @@ def test_equations_of_a_time_step_are_those_of_the_general_assembly(damping):
     solver = moving_tetrapod(**damping)
     model, start = solver.model, solver.x
     x = start + model.kinematics.displacement(start, 1e-2 * np.random.default_rng(1).normal(size=model.equations))
-    inertia = ImplicitEuler(start, solver.velocity, H, solver._mass_and_damping())
+    inertia = ImplicitEuler(start, solver.velocity, H, solver._body)
     found = model.assembly.evaluate(x, solver.effort, model.loads, inertia)
     compare_equations(model, found, *equations_at(solver, x))
 
@@ -145,8 +145,8 @@ def test_equations_of_an_equilibrium_are_those_of_the_general_assembly(rng):
     effort = 1e4 * rng.uniform(size=9) * np.repeat([1.0, 1e-6], [6, 3])
     found = model.assembly.evaluate(x, effort, model.loads)
     beams = BeamMotion(model, model.assembly.mass_matrix())
-    states = np.zeros((len(beams.body.elements.frames), 2, 7, 3))
-    step = Step(x, np.zeros_like(x), states, model.loads, np.inf, 0.0, 0.0)
+    start = np.zeros((len(beams.body.elements.frames), 2, 6))
+    step = Step(x, np.zeros_like(x), start, model.loads, np.inf, 0.0, 0.0)
     assemble(beams.body, x, effort, step, beams.equations, True)
     compare_equations(model, found, beams.body, beams.equations)
 

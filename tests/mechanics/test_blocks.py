@@ -15,7 +15,7 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements import averaged, beams, quadratic, tetrahedra
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.beams import Beam, Section
-from softgym_envs.mechanics.elements.block import ElementBlock
+from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, add_midside_nodes, split_triangles
 from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.frames import frame_rows
@@ -69,13 +69,17 @@ def element_matrix(block, x):
     return energy, gradient, symmetric(stencils, values, x.size)
 
 
-def viscosity_matrix(block, x):
-    """The block's whole stiffness against strain rates (3 n, 3 n) at rows ``x``."""
+STEP, BETA = 0.05, 0.01
+
+
+def damping(block, x, start):
+    """Power [W], forces (n, 3) and tangent (3 n, 3 n) of a block at the end ``x`` of an implicit Euler step."""
     stencils = block.stencils()
     places, count = places_of(stencils)
-    values = np.zeros(count)
-    block.add_viscosity(x, values, places)
-    return symmetric(stencils, values, x.size)
+    values, gradient = np.zeros(count), np.zeros_like(x)
+    rates = StrainRates(start, 0.5 * (start + x), (x - start) / STEP, 1.0 / STEP, BETA)
+    power = block.add_damping(x, rates, gradient, values, places)
+    return power, gradient, symmetric(stencils, values, x.size)
 
 
 def test_every_block_is_tested():
@@ -123,23 +127,46 @@ def test_tangent_at_rest_has_no_negative_eigenvalue_and_six_rigid_motions(body):
             assert soft == 6
 
 
-def test_viscosity_is_the_stiffness_without_stress(body, rng):
-    """At rest it is the tangent; elsewhere it has no negative eigenvalue and does not resist rigid motions."""
-    x = moved(body, rng)
-    turning, shift = np.cross([0.3, -0.5, 0.8], x), np.array([0.1, 0.2, -0.3])
-    frames = body.frames.rows[:, None] + np.arange(1, 4)
-    shifts = np.tile(shift, (len(x), 1))
-    shifts[frames.ravel()] = 0.0  # directors only turn
+def test_damping_at_rest_is_the_elastic_tangent(body):
     for block in body.blocks:
-        at_rest = viscosity_matrix(block, body.nodes)
-        tangent = element_matrix(block, body.nodes)[2]
-        np.testing.assert_allclose(at_rest, tangent, rtol=0, atol=1e-9 * np.abs(tangent).max())
-        matrix = viscosity_matrix(block, x)
-        scale = np.abs(matrix).max()
-        assert np.linalg.eigvalsh(matrix)[0] > -1e-10 * scale
-        np.testing.assert_allclose(matrix @ (turning + shifts).ravel(), 0.0, atol=1e-11 * scale)
-        # Under stress the tangent differs.
-        assert np.abs(matrix - element_matrix(block, x)[2]).max() > 1e-5 * scale
+        power, gradient, matrix = damping(block, body.nodes, body.nodes)
+        tangent = BETA / STEP * element_matrix(block, body.nodes)[2]
+        np.testing.assert_allclose(matrix, tangent, rtol=0, atol=1e-9 * np.abs(tangent).max())
+        assert power == 0.0 and not gradient.any()
+
+
+def test_forces_and_tangent_of_damping_are_derivatives(body, rng):
+    """Half of the power times the step is their potential."""
+    start = moved(body, rng)
+    x = start + 2e-3 * rng.standard_normal(start.shape)
+    for block in body.blocks:
+        power, gradient, matrix = damping(block, x, start)
+        assert power > 0.0
+        for direction in rng.standard_normal((4, *x.shape)):
+            h = 1e-6
+            ends = [damping(block, x + s * h * direction, start)[:2] for s in (1, -1)]
+            slope, change = ((a - b) / (2 * h) for a, b in zip(*ends, strict=True))
+            assert 0.5 * STEP * slope == pytest.approx(np.vdot(gradient, direction), rel=1e-5)
+            expected = (matrix @ direction.ravel()).reshape(-1, 3)
+            np.testing.assert_allclose(change, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def test_a_rigid_motion_in_a_step_is_not_damped(body, rng):
+    """A rotation of any angle causes no force, and one after a deformation turns the forces and keeps the power."""
+    start = moved(body, rng)
+    x = start + 2e-3 * rng.standard_normal(start.shape)
+    turn = Rotation.from_rotvec([0.5, -0.9, 0.4]).as_matrix()
+    shifts = np.tile([0.5, -0.2, 0.3], (len(x), 1))
+    shifts[(body.frames.rows[:, None] + np.arange(1, 4)).ravel()] = 0.0  # directors only turn
+    for block in body.blocks:
+        power, gradient, _ = damping(block, x, start)
+        scale = np.abs(gradient).max()
+        none, force, _ = damping(block, start @ turn.T + shifts, start)
+        assert abs(none) < 1e-12 * power
+        np.testing.assert_allclose(force, 0.0, atol=1e-9 * scale)
+        same, force, _ = damping(block, x @ turn.T + shifts, start)
+        assert same == pytest.approx(power, rel=1e-9)
+        np.testing.assert_allclose(force, gradient @ turn.T, rtol=0, atol=1e-9 * scale)
 
 
 def test_a_rigid_motion_causes_no_strain(body, rng):

@@ -7,12 +7,12 @@ from typing import Unpack
 import numpy as np
 from numba import njit
 
+from softgym_envs.mechanics.elements.block import StrainRates
 from softgym_envs.mechanics.elements.tetrahedra import (
     SolidOptions,
     Tetrahedra,
     add_forces,
     deformation_gradients,
-    viscosity,
 )
 
 
@@ -119,14 +119,25 @@ class AveragedTetrahedra(Tetrahedra):
             )
         return float(self._energy @ self.volumes + 0.5 * (lame * mean**2) @ self._node_volumes), 0
 
-    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
-        deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
-        # F^-T is the gradient of the rate of dilation.
-        viscosity(self._F, self.mu, self._zero, self._stress, self._tangent)
-        self._add_stiffness(self._tangent, values, scatter)
-        _patch_gradients(self._element_slots, self._shares, self.gradients, self._stress, self._patch_gradient)
-        lame = self._nodal_sum(self.lame)
-        _add_patches(self._pointers, self._patch_gradient, lame, scatter[1], self._starts, values)
+    def add_damping(
+        self,
+        x: np.ndarray,
+        rates: StrainRates,
+        gradient: np.ndarray,
+        values: np.ndarray | None,
+        scatter: list[np.ndarray] | None,
+    ) -> float:
+        self._fill_rates(x, rates)
+        mean = self._nodal_sum(self._traces) / self._node_volumes
+        lame = rates.damping * self._nodal_sum(self.lame) / self._node_volumes
+        pressure = (lame * mean)[self._slot].mean(axis=1)
+        power = self._add_resistance(rates, self._zero, pressure, gradient, values, scatter)
+        if values is not None:
+            assert scatter is not None
+            _patch_gradients(self._element_slots, self._shares, self.gradients, self._slope, self._patch_gradient)
+            viscosity = rates.factor * lame * self._node_volumes
+            _add_patches(self._pointers, self._patch_gradient, viscosity, scatter[1], self._starts, values)
+        return power
 
     def _nodal_sum(self, per_element: np.ndarray) -> np.ndarray:
         """Sum of a quarter of each element's volume times its value over the elements of each node."""

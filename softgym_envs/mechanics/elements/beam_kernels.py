@@ -39,19 +39,6 @@ def strains(z, out):
 
 
 @njit(cache=True, error_model="numpy")
-def strain_changes(z, change, out):
-    """Fill ``out`` (6,) with the derivative of the strains at ``z`` along ``change`` (7, 3)."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        stretch, bend = 0.0, 0.0
-        for d in range(3):
-            stretch += z[0, d] * change[1 + i, d] + change[0, d] * z[1 + i, d]
-            bend += z[1 + k, d] * change[4 + j, d] + change[1 + k, d] * z[4 + j, d]
-            bend -= z[1 + j, d] * change[4 + k, d] + change[1 + j, d] * z[4 + k, d]
-        out[i], out[3 + i] = stretch, 0.5 * bend
-
-
-@njit(cache=True, error_model="numpy")
 def pull_back(z, stress, gradient):
     """Add to ``gradient`` (7, 3) the derivative by ``z`` of the work that ``stress`` (6,) does on the strains."""
     for i in range(3):

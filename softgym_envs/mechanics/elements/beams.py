@@ -20,7 +20,7 @@ from numba import njit
 
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.beam_kernels import interpolate, pull_back, strains
-from softgym_envs.mechanics.elements.block import ElementBlock, lower_pairs
+from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
 from softgym_envs.mechanics.elements.tetrahedra import check_density, element_masses
 
 
@@ -95,11 +95,8 @@ _SLOPE = np.array([True, False, False, False, True, True, True])
 
 
 @njit(cache=True, error_model="numpy")
-def _evaluate(x, rows, shape, slope, weights, rest, stiffness, row_of, is_slope, stressed, forces, matrix):
-    """Energy; forces (m, k, 4, 3) and, unless ``matrix`` is empty, element matrices (m, 12 k, 12 k).
-
-    Without ``stressed``, the matrices omit the terms of the stress.
-    """
+def _evaluate(x, rows, shape, slope, weights, rest, stiffness, row_of, is_slope, forces, matrix):
+    """Energy; forces (m, k, 4, 3) and, unless ``matrix`` is empty, element matrices (m, 12 k, 12 k)."""
     m, k = rows.shape
     z, unit, column, gradient = np.empty((7, 3)), np.zeros((7, 3)), np.empty((7, 3)), np.empty((7, 3))
     stress, alone = np.empty(6), np.zeros(6)
@@ -142,7 +139,7 @@ def _evaluate(x, rows, shape, slope, weights, rest, stiffness, row_of, is_slope,
                         ci = c * g[i]
                         for j in range(21):
                             hessian[i, j] += ci * g[j]
-            for v in range(7 if stressed else 0):
+            for v in range(7):
                 # Strains are products of rows, so their second derivative is the gradient of a unit state.
                 unit[v, 0] = 1.0
                 column[:] = 0.0
@@ -334,9 +331,13 @@ class Beam(ElementBlock):
 
     def strains(self, x: np.ndarray) -> np.ndarray:
         """Strains (Gamma, K) beyond those at rest at the Gauss points, shape (m, q, 6) [1, 1/m]."""
+        return self._total_strains(x) - self.rest
+
+    def _total_strains(self, x: np.ndarray) -> np.ndarray:
+        """Strains at the Gauss points, those at rest included, shape (m, q, 6)."""
         out = np.empty((*self.weights.shape, 6))
         _strains_at(x, self.rows, self.shape, self.slope, out)
-        return out - self.rest
+        return out
 
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
         rows = self.rows[:, :, None] + np.arange(4)
@@ -345,34 +346,56 @@ class Beam(ElementBlock):
     def add(
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
+        energy = self._add(x, self.rest, self.element_stiffness, gradient, values, scatter)
+        return (energy, 0) if np.isfinite(energy) else (np.inf, len(self.rows))
+
+    def add_damping(
+        self,
+        x: np.ndarray,
+        rates: StrainRates,
+        gradient: np.ndarray,
+        values: np.ndarray | None,
+        scatter: list[np.ndarray] | None,
+    ) -> float:
+        # Damping acts like elasticity of stiffness `viscosity` with a strain at rest that lies `change` behind. The
+        # factor is zero where velocities are given; the tangent does not matter there.
+        factor = rates.factor or 1.0
+        half = 0.5 / factor * rates.velocity
+        # Strains are quadratic in the rows, so this difference is exactly their rate over the factor.
+        change = self._total_strains(rates.middle + half) - self._total_strains(rates.middle - half)
+        viscosity = rates.damping * factor * self.element_stiffness
+        stored = self._add(x, self._total_strains(x) - change, viscosity, gradient, values, scatter)
+        return 2.0 * factor * stored
+
+    def _add(
+        self,
+        x: np.ndarray,
+        rest: np.ndarray,
+        stiffness: np.ndarray,
+        gradient: np.ndarray,
+        values: np.ndarray | None,
+        scatter: list[np.ndarray] | None,
+    ) -> float:
+        """Add forces and tangent for strains at rest (m, q, 6) and a stiffness (m, 6), and return the energy."""
         matrix = self._none if values is None else self._matrix
-        energy = self._fill(x, matrix)
-        if not np.isfinite(energy):
-            return np.inf, len(self.rows)
-        empty = np.empty(0)
-        places = np.empty((0, 0), dtype=np.int32) if scatter is None else scatter[0]
-        _scatter(self.rows, self._forces, matrix, gradient, empty if values is None else values, places)
-        return float(energy), 0
-
-    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
-        self._fill(x, self._matrix, stressed=False)
-        _scatter(self.rows, self._forces, self._matrix, np.zeros_like(x), values, scatter[0])
-
-    def _fill(self, x: np.ndarray, matrix: np.ndarray, *, stressed: bool = True) -> float:
-        return _evaluate(
+        energy = _evaluate(
             x,
             self.rows,
             self.shape,
             self.slope,
             self.weights,
-            self.rest,
-            self.element_stiffness,
+            rest,
+            stiffness,
             _ROW,
             _SLOPE,
-            stressed,
             self._forces,
             matrix,
         )
+        if np.isfinite(energy):
+            empty = np.empty(0)
+            places = np.empty((0, 0), dtype=np.int32) if scatter is None else scatter[0]
+            _scatter(self.rows, self._forces, matrix, gradient, empty if values is None else values, places)
+        return float(energy)
 
     def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
         _add_warped(x, step, self.rows, self.shape, self.slope, self.weights, out)

@@ -3,8 +3,29 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import numpy as np
+
+
+class StrainRates(NamedTuple):
+    """What determines the rates of strain in a time step.
+
+    The rate of a strain that is quadratic in the rows is its derivative at `middle` along `velocity`.
+
+    Attributes:
+        start: rows at the start of the step [m], shape (n, 3).
+        middle: rows at which the velocity acts [m], shape (n, 3).
+        velocity: of the rows [m/s], shape (n, 3).
+        factor: derivative of velocities with respect to displacements [1/s].
+        damping: Rayleigh's beta [s].
+    """
+
+    start: np.ndarray
+    middle: np.ndarray
+    velocity: np.ndarray
+    factor: float
+    damping: float
 
 
 def lower_pairs(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,11 +83,29 @@ class ElementBlock(ABC):
         """
 
     @abstractmethod
-    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
-        """Add the stiffness against strain rates at positions ``x`` (n, 3), for damping; at rest it is the elastic one.
+    def add_damping(
+        self,
+        x: np.ndarray,
+        rates: StrainRates,
+        gradient: np.ndarray,
+        values: np.ndarray | None,
+        scatter: list[np.ndarray] | None,
+    ) -> float:
+        """Add the forces against the rates of strain, and their tangent, if a time step ends at rows ``x`` (n, 3).
 
-        It is positive semidefinite and does not resist rigid motions. The tangent under stress has neither property:
-        damping with it would feed energy into compressed parts.
+        The stress is the elastic one of the strain rates times Rayleigh's beta, without that of the strain itself:
+        it dissipates energy in any state, and a rigid motion, however fast, causes none.
+
+        Args:
+            x: positions at the end of the step [m], shape (n, 3).
+            rates: see `StrainRates`.
+            gradient: output, as for `add`.
+            values: output, as for `add`: the exact tangent if the velocity acts at the middle of the step. Otherwise
+                it omits what the motion of `middle` adds to the rates.
+            scatter: as for `add`.
+
+        Returns:
+            The dissipated power [W].
         """
 
     @abstractmethod

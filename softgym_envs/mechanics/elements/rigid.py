@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgym_envs.mechanics.elements.block import ElementBlock, lower_pairs
+from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
 
 
 def box_inertia(mass: float, half_extents: np.ndarray) -> np.ndarray:
@@ -56,8 +56,16 @@ class RigidBody(ElementBlock):
     ) -> tuple[float, int]:
         return 0.0, 0
 
-    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
+    def add_damping(
+        self,
+        x: np.ndarray,
+        rates: StrainRates,
+        gradient: np.ndarray,
+        values: np.ndarray | None,
+        scatter: list[np.ndarray] | None,
+    ) -> float:
         """A rigid part has no strain."""
+        return 0.0
 
     def nodal_masses(self, count: int) -> np.ndarray:
         masses = np.zeros(count)

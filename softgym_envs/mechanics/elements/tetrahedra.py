@@ -10,7 +10,8 @@ from numba import njit
 
 from softgym_envs.mechanics.constraints.averaging import averaged_points
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.elements.block import ElementBlock, lower_pairs
+from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
+from softgym_envs.mechanics.elements.damping import resist, strain_rates
 from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
 
 
@@ -61,37 +62,6 @@ def _add_tangent(gradients, volumes, tangent, scatter, out):
                         k += 1
                         if target >= 0:
                             out[target] += half[3 * j] * g[b, 0] + half[3 * j + 1] * g[b, 1] + half[3 * j + 2] * g[b, 2]
-
-
-@njit(cache=True, error_model="numpy")
-def viscosity(F, mu, lame, inverse, out):
-    """Second derivative (m, 9, 9) of ``mu D : D + lame / 2 (tr D)^2``, D = sym(F' F^-1), by F'; and F^-T (m, 9)."""
-    rate = np.empty((6, 9))
-    for e in range(F.shape[0]):
-        f = F[e]
-        c = inverse[e]
-        for i in range(3):
-            for j in range(3):
-                a, b, p, q = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
-                c[3 * i + j] = f[3 * a + p] * f[3 * b + q] - f[3 * a + q] * f[3 * b + p]
-        c /= f[0] * c[0] + f[1] * c[1] + f[2] * c[2]
-        # Rows: D_00, D_11, D_22 and sqrt(2) times D_01, D_02, D_12.
-        rate[:] = 0.0
-        s = np.sqrt(0.5)
-        k = 3
-        for i in range(3):
-            rate[i, 3 * i : 3 * i + 3] = c[3 * i : 3 * i + 3]
-            for j in range(i + 1, 3):
-                rate[k, 3 * i : 3 * i + 3] = s * c[3 * j : 3 * j + 3]
-                rate[k, 3 * j : 3 * j + 3] = s * c[3 * i : 3 * i + 3]
-                k += 1
-        for p in range(9):
-            for q in range(p + 1):
-                value = 0.0
-                for k in range(6):
-                    value += rate[k, p] * rate[k, q]
-                out[e, p, q] = 2.0 * mu[e] * value + lame[e] * c[p] * c[q]
-                out[e, q, p] = out[e, p, q]
 
 
 @njit(cache=True, error_model="numpy")
@@ -300,6 +270,8 @@ class SolidBlock(ElementBlock):
         self._energy = np.empty(count)
         self._stress = np.empty((count, 9))
         self._tangent = np.empty((count, 9, 9))
+        self._inverse, self._slope = np.empty((count, 9)), np.empty((count, 9))
+        self._rates, self._traces = np.empty((count, 6)), np.empty(count)
 
     @property
     def corners(self) -> np.ndarray:
@@ -352,10 +324,53 @@ class SolidBlock(ElementBlock):
             self._add_stiffness(self._tangent, values, scatter)
         return float(self._energy @ self.weights), 0
 
-    def add_viscosity(self, x: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:
-        deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
-        viscosity(self._F, self.mu, self.lame, self._stress, self._tangent)
-        self._add_stiffness(self._tangent, values, scatter)
+    def add_damping(
+        self,
+        x: np.ndarray,
+        rates: StrainRates,
+        gradient: np.ndarray,
+        values: np.ndarray | None,
+        scatter: list[np.ndarray] | None,
+    ) -> float:
+        self._fill_rates(x, rates)
+        return self._add_resistance(rates, self.lame, np.zeros_like(self.lame), gradient, values, scatter)
+
+    def _fill_rates(self, x: np.ndarray, rates: StrainRates) -> None:
+        """Fill the strain rates, and the deformation gradients at rows ``x`` (n, 3)."""
+        start, middle, velocity = (np.empty_like(self._F) for _ in range(3))
+        for rows, out in ((rates.start, start), (rates.middle, middle), (rates.velocity, velocity), (x, self._F)):
+            deformation_gradients(rows, self.connectivity, self.points, self.gradients, out)
+        strain_rates(start, middle, velocity, self._inverse, self._rates, self._traces)
+
+    def _add_resistance(
+        self,
+        rates: StrainRates,
+        lame: np.ndarray,
+        pressure: np.ndarray,
+        gradient: np.ndarray,
+        values: np.ndarray | None,
+        scatter: list[np.ndarray] | None,
+    ) -> float:
+        """Add the damping at the strain rates, with a further pressure [Pa] (m q,), and return its power [W]."""
+        beta, tangent = rates.damping, self._tangent if values is not None else self._tangent[:0]
+        resist(
+            self._F,
+            self._inverse,
+            self._rates,
+            beta * self.mu,
+            beta * lame,
+            pressure,
+            rates.factor,
+            self._energy,
+            self._stress,
+            self._slope,
+            tangent,
+        )
+        add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
+        if values is not None:
+            assert scatter is not None
+            self._add_stiffness(tangent, values, scatter)
+        return float(self._energy @ self.weights)
 
     @abstractmethod
     def _add_stiffness(self, tangent: np.ndarray, values: np.ndarray, scatter: list[np.ndarray]) -> None:

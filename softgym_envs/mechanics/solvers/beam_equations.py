@@ -17,7 +17,6 @@ from softgym_envs.mechanics.elements.beam_kernels import (
     add_turned,
     interpolate,
     pull_back,
-    strain_changes,
     strain_columns,
     strains,
 )
@@ -31,7 +30,7 @@ class Step(NamedTuple):
     Attributes:
         x: rows at the start [m], shape (n, 3).
         velocity: of the rows [m/s], shape (n, 3).
-        states: of the Gauss points at the start, shape (m, 2, 7, 3).
+        strains: at the Gauss points at the start, those at rest included, shape (m, 2, 6).
         loads: dead loads [N], shape (n, 3).
         h: duration [s]; infinite for an equilibrium.
         mass_damping: Rayleigh's alpha [1/s].
@@ -40,7 +39,7 @@ class Step(NamedTuple):
 
     x: np.ndarray
     velocity: np.ndarray
-    states: np.ndarray
+    strains: np.ndarray
     loads: np.ndarray
     h: float
     mass_damping: float
@@ -59,7 +58,7 @@ class Equations(NamedTuple):
         H: their gradients, shape (size, b, 6).
         energy: elastic energy [J], shape (1,).
         element: tangent of an element over the motions of its frames, shape (18, 18).
-        columns: derivatives of the strains, shape (18, 24).
+        columns: derivatives of the strains, shape (18, 12).
     """
 
     gradient: np.ndarray
@@ -85,33 +84,32 @@ def make_equations(body: BeamBody, size: int) -> Equations:
         H=np.zeros((size, count, SIZE)),
         energy=np.zeros(1),
         element=np.zeros((18, 18)),
-        columns=np.zeros((18, 24)),
+        columns=np.zeros((18, 12)),
     )
 
 
 @njit(cache=True, error_model="numpy")
-def point_states(elements, x, out):
-    """Fill ``out`` (m, 2, 7, 3) with the states of the Gauss points at rows ``x`` (n, 3)."""
+def point_strains(elements, x, out):
+    """Fill ``out`` (m, 2, 6) with the strains at the Gauss points, those at rest included, at rows ``x`` (n, 3)."""
+    z = np.empty((7, 3))
     for e in range(elements.frames.shape[0]):
         for q in range(2):
-            interpolate(x, elements.frames[e], elements.shape[q], elements.slope[e, q], out[e, q])
+            interpolate(x, elements.frames[e], elements.shape[q], elements.slope[e, q], z)
+            strains(z, out[e, q])
 
 
 @njit(cache=True, error_model="numpy")
 def drag_work(elements, x, step):
     """Return the work [J] that the stiffness damping takes on the way to rows ``x`` (n, 3)."""
-    z, rates = np.empty((7, 3)), np.empty(6)
+    z, end = np.empty((7, 3)), np.empty(6)
     work = 0.0
     for e in range(elements.frames.shape[0]):
         for q in range(2):
-            start = step.states[e, q]
             interpolate(x, elements.frames[e], elements.shape[q], elements.slope[e, q], z)
-            for v in range(7):
-                for d in range(3):
-                    z[v, d] -= start[v, d]
-            strain_changes(start, z, rates)
+            strains(z, end)
             for s in range(6):
-                work += step.stiffness_damping / step.h * elements.stiffness[e, q, s] * rates[s] ** 2
+                change = end[s] - step.strains[e, q, s]
+                work += step.stiffness_damping / step.h * elements.stiffness[e, q, s] * change**2
     return work
 
 
@@ -131,11 +129,11 @@ def _add_arm(rows, arm, a):
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def _fill_gram(columns, out):
-    """Fill ``out`` (18, 18) with ``C C^T`` for an array ``C`` (18, 24)."""
+    """Fill ``out`` (18, 18) with ``C C^T`` for an array ``C`` (18, 12)."""
     for i in range(18):
         for j in range(i + 1):
             value = 0.0
-            for r in range(24):
+            for r in range(12):
                 value += columns[i, r] * columns[j, r]
             out[i, j] = value
             out[j, i] = value
@@ -148,41 +146,31 @@ def _add_elements(elements, x, step, equations, full):
     matrix, columns = equations.element, equations.columns
     frames_of, shapes, slopes = elements.frames, elements.shape, elements.slope
     stiffnesses, rests, places = elements.stiffness, elements.rest, elements.place
-    z, change, pull = np.empty((7, 3)), np.empty((7, 3)), np.empty((7, 3))
-    stress, drag, scale = np.empty((2, 6)), np.empty(6), np.empty(6)
+    z, pull = np.empty((7, 3)), np.empty((7, 3))
+    stress, scale = np.empty((2, 6)), np.empty(6)
     arm = np.empty(3)
     rate = step.stiffness_damping / step.h
-    root = np.sqrt(rate)
     elastic = 0.0
     for e in range(frames_of.shape[0]):
         frames = frames_of[e]
         for q in range(2):
             shape, slope, stiffness, rest = shapes[q], slopes[e, q], stiffnesses[e, q], rests[e, q]
-            tension, start = stress[q], step.states[e, q]
+            tension, start = stress[q], step.strains[e, q]
             interpolate(x, frames, shape, slope, z)
             strains(z, tension)
             for s in range(6):
-                strain = tension[s] - rest[s]
-                tension[s] = stiffness[s] * strain
-                elastic += 0.5 * tension[s] * strain
+                strain, change = tension[s] - rest[s], tension[s] - start[s]
+                elastic += 0.5 * stiffness[s] * strain**2
+                tension[s] = stiffness[s] * (strain + rate * change)
             for v in range(7):
                 for d in range(3):
                     pull[v, d] = 0.0
-                    change[v, d] = z[v, d] - start[v, d]
             pull_back(z, tension, pull)
-            if rate > 0.0:
-                strain_changes(start, change, drag)
-                for s in range(6):
-                    drag[s] *= rate * stiffness[s]
-                pull_back(start, drag, pull)
             add_forces(pull, frames, shape, slope, gradient)
             if full:
                 for s in range(6):
-                    scale[s] = np.sqrt(stiffness[s])
-                strain_columns(x, frames, shape, slope, z, scale, columns[:, 12 * q : 12 * q + 6])
-                for s in range(6):
-                    scale[s] *= root
-                strain_columns(x, frames, shape, slope, start, scale, columns[:, 12 * q + 6 : 12 * q + 12])
+                    scale[s] = np.sqrt((1.0 + rate) * stiffness[s])
+                strain_columns(x, frames, shape, slope, z, scale, columns[:, 6 * q : 6 * q + 6])
         if not full:
             continue
         _fill_gram(columns, matrix)

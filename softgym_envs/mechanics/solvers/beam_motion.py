@@ -25,7 +25,7 @@ from softgym_envs.mechanics.solvers.beam_equations import (
     motion_of,
     move,
     multiply_mass,
-    point_states,
+    point_strains,
 )
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, factorise, solve_lower, solve_upper
 from softgym_envs.mechanics.solvers.complementarity import solve_row
@@ -227,7 +227,7 @@ def _march(
     body,
     equations,
     factor,
-    states,
+    start,
     x,
     velocity,
     effort,
@@ -258,8 +258,8 @@ def _march(
         kept[:] = x
         kept_effort[:] = effort
         kept_velocity[:] = velocity
-        point_states(body.elements, x, states)
-        step = Step(kept, kept_velocity, states, loads, h, alpha, beta)
+        point_strains(body.elements, x, start)
+        step = Step(kept, kept_velocity, start, loads, h, alpha, beta)
         if h < np.inf:  # start from where the current velocity leads
             motion_of(body.frames, body.components.free, x, velocity, h, factor.step)
             move(body.frames, x, factor.step, factor.turned)
@@ -325,7 +325,7 @@ class BeamMotion:
             efforts=np.zeros(size),
             turned=np.zeros((3, 3)),
         )
-        self._states = np.zeros((len(self.body.elements.frames), 2, 7, 3))
+        self._strains = np.zeros((len(self.body.elements.frames), 2, 6))
 
     @classmethod
     def of(cls, model: MechanicalModel, mass: MassMatrix) -> BeamMotion | None:
@@ -371,7 +371,7 @@ class BeamMotion:
             self.body,
             self.equations,
             self._factor,
-            self._states,
+            self._strains,
             x,
             velocity,
             effort,

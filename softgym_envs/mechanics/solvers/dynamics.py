@@ -9,8 +9,8 @@ The condensed model is that of the dynamic case (thesis, eq. 2.5-2.13): ``A`` in
   derivative of the end of the step.
 * ``"generalised_alpha"``: second order, with a chosen damping of the fastest motions (Chung and Hulbert 1993; for
   frames and constraints Arnold and Bruels 2007, Bruels and Cardona 2010). ``spectral_radius`` 1 is the trapezoidal
-  rule, which does not damp. The tangent omits the gyroscopic terms of rotating frames: Newton's method then converges
-  linearly, and ``W`` lacks these terms.
+  rule, which does not damp. The tangent omits the gyroscopic terms of rotating frames, and how the end of a step
+  changes the strain rates at a given velocity: Newton's method then converges linearly, and ``W`` lacks these terms.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ class Dynamics(Statics):
         scheme: a name of `SCHEMES`.
         spectral_radius: of the generalised alpha scheme; 1 does not damp, 0 damps motions too fast for the step most.
         mass_damping: Rayleigh's alpha [1/s].
-        stiffness_damping: Rayleigh's beta [s], applied to the stiffness against strain rates at the start of each step.
+        stiffness_damping: Rayleigh's beta [s], applied to the stiffness against rates of strain, which are zero in any
+            rigid motion.
         lumped: lump the masses.
         tolerance: largest remaining correction of any node at convergence [m].
         max_iterations: limit of Newton iterations per load increment.
@@ -129,6 +130,7 @@ class Dynamics(Statics):
             compiled=compiled and scheme == "euler",
         )
         self._mass = self._assembly.mass_matrix(lumped)
+        self._body = MassAndDamping(self._mass, self.mass_damping, self.stiffness_damping)
         self._lumped = lumped
 
     def reset(self) -> None:
@@ -334,7 +336,7 @@ class Dynamics(Statics):
     def _advance(self, target: np.ndarray, mode: str | Sequence[str], h: float, applied: AppliedLoads) -> Equilibrium:
         """Take one time step of ``h`` [s]; after an exception the caller restores the state."""
         x, v, effort = self.x, self.velocity, self.effort
-        body = self._mass_and_damping()
+        body = self._body
         inertia: ImplicitEuler | GeneralisedAlpha
         if self.scheme == "euler":
             inertia = ImplicitEuler(x, v, h, body)
@@ -351,16 +353,8 @@ class Dynamics(Statics):
         self.time += h
         rows = np.concatenate([np.arange(self._actuators), self._effectors, self._contacts])
         self._work += float(0.5 * (effort + self.effort)[rows] @ (found.delta - before)[rows])
-        drag = self.mass_damping * (self._mass.rows @ self.velocity)
-        if self.stiffness_damping:
-            drag = drag + self._assembly.damping_force(body, self.velocity)
-        self._dissipated += float(np.vdot(drag, self.x - x))
+        self._dissipated += h * self._assembly.dissipated_power(inertia, self.x)
         return found
-
-    def _mass_and_damping(self) -> MassAndDamping:
-        """Mass and damping of a step that starts at the current state."""
-        viscosity = self._assembly.viscosity(self.x) if self.stiffness_damping else None
-        return MassAndDamping(self._mass, self.mass_damping, self.stiffness_damping, viscosity)
 
     def _solve_with(
         self, inertia: Inertia, h: float, target: np.ndarray, mode: str | Sequence[str], applied: AppliedLoads
@@ -409,7 +403,7 @@ class Dynamics(Statics):
         change = (before - 2.0 * delta + after) / (0.01 * self.step) ** 2
         goal = self.effort.copy()
         goal[driven] = -(h**2) * change[driven]
-        with self._inertia_added(StartingAcceleration(kinematics, self.x, speed, h, self._mass_and_damping())):
+        with self._inertia_added(StartingAcceleration(kinematics, self.x, speed, h, self._body)):
             if not self._linearise():
                 raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
             try:

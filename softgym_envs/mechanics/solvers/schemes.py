@@ -15,13 +15,16 @@ class ImplicitEuler(Inertia):
     """Implicit Euler from rows ``x`` (n, 3) with velocities of the rows ``v`` (n, 3) over ``h`` [s]."""
 
     def __init__(self, x: np.ndarray, v: np.ndarray, h: float, body: MassAndDamping) -> None:
-        self._x, self._v, self._h = x, v, h
+        self.start, self._v, self._h = x, v, h
         self.body = body
         self.velocity_factor, self.acceleration_factor = 1.0 / h, 1.0 / h**2
 
     def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        velocity = (x - self._x) / self._h
+        velocity = (x - self.start) / self._h
         return velocity, (velocity - self._v) / self._h
+
+    def middle(self, x: np.ndarray) -> np.ndarray:
+        return 0.5 * (self.start + x)
 
 
 class StartingAcceleration(Inertia):
@@ -29,11 +32,14 @@ class StartingAcceleration(Inertia):
 
     def __init__(self, kinematics: Kinematics, x: np.ndarray, v: np.ndarray, h: float, body: MassAndDamping) -> None:
         self._motion = kinematics.row_velocity(x, v), kinematics.row_acceleration(x, v, np.zeros_like(v))
-        self.body = body
+        self.start, self.body = x, body
         self.velocity_factor, self.acceleration_factor = 0.0, 1.0 / h**2
 
     def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._motion
+
+    def middle(self, x: np.ndarray) -> np.ndarray:
+        return x
 
 
 class GeneralisedAlpha(Inertia):
@@ -61,7 +67,7 @@ class GeneralisedAlpha(Inertia):
         radius: float,
         body: MassAndDamping,
     ) -> None:
-        self._kinematics, self._x, self._v, self._a, self._h = kinematics, x, v, a, h
+        self._kinematics, self.start, self._v, self._a, self._h = kinematics, x, v, a, h
         self._acceleration = acceleration
         self._am, self._af = (2.0 * radius - 1.0) / (radius + 1.0), radius / (radius + 1.0)
         self._gamma = 0.5 - self._am + self._af
@@ -72,7 +78,7 @@ class GeneralisedAlpha(Inertia):
 
     def equations(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Velocities, their derivatives and auxiliary accelerations of the equations at the end, each (N,)."""
-        h, step = self._h, self._kinematics.increment(self._x, x)
+        h, step = self._h, self._kinematics.increment(self.start, x)
         a = ((step - h * self._v) / h**2 - (0.5 - self._beta) * self._a) / self._beta
         v = self._v + h * ((1.0 - self._gamma) * self._a + self._gamma * a)
         acceleration = ((1.0 - self._am) * a + self._am * self._a - self._af * self._acceleration) / (1.0 - self._af)
@@ -81,3 +87,6 @@ class GeneralisedAlpha(Inertia):
     def motion(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         v, acceleration, _ = self.equations(x)
         return self._kinematics.row_velocity(x, v), self._kinematics.row_acceleration(x, v, acceleration)
+
+    def middle(self, x: np.ndarray) -> np.ndarray:
+        return x
