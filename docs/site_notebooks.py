@@ -9,7 +9,15 @@ from typing import Any
 
 from site_writing import DOCS
 
-PAGES = ("tutorials/first_steps", "tutorials/own_robot", "tutorials/pressure", "tutorials/deploying", "inverse_qp")
+PAGES = (
+    "tutorials/first_steps",
+    "tutorials/own_robot",
+    "tutorials/training",
+    "tutorials/fitting",
+    "tutorials/pressure",
+    "tutorials/deploying",
+    "inverse_qp",
+)
 """Pages that are notebooks as well; all their code runs from top to bottom."""
 _BLOCK = re.compile(r'^```python(?: title="([^"]+)")?\n(.*?)^```$', flags=re.MULTILINE | re.DOTALL)
 

@@ -149,7 +149,9 @@ def test_notebooks_hold_the_code_of_their_pages():
         assert any(cell["cell_type"] == "markdown" for cell in cells)
 
 
-@pytest.mark.parametrize(("page", "config"), [("tutorials/codesign", StudyConfig), ("surrogates", FitConfig)])
+@pytest.mark.parametrize(
+    ("page", "config"), [("tutorials/codesign", StudyConfig), ("tutorials/fitting", FitConfig), ("surrogates", FitConfig)]
+
 def test_configurations_on_pages_are_valid(page, config):
     for _, text, _ in code_blocks(DOCS / f"{page}.md", "yaml"):
         check_config(config, yaml.safe_load(text), page)
