@@ -150,8 +150,9 @@ def test_notebooks_hold_the_code_of_their_pages():
 
 
 @pytest.mark.parametrize(
-    ("page", "config"), [("tutorials/codesign", StudyConfig), ("tutorials/fitting", FitConfig), ("surrogates", FitConfig)]
-
+    ("page", "config"),
+    [("tutorials/codesign", StudyConfig), ("tutorials/fitting", FitConfig), ("surrogates", FitConfig)],
+)
 def test_configurations_on_pages_are_valid(page, config):
     for _, text, _ in code_blocks(DOCS / f"{page}.md", "yaml"):
         check_config(config, yaml.safe_load(text), page)
