@@ -76,7 +76,7 @@ def _row(robot: str, task: str, max_episode_steps: int, backend: str = "surrogat
 
 MOVING = {"dynamics": True}
 # One implicit step per control step damps all vibrations, but objects fall.
-SLOW = {"dynamics": True, "time_step": 0.05, "stiffness_damping": 0.0}
+SLOW = {"dynamics": True, "time_step": 0.05}
 COARSE = {"mesh_size": 0.020}
 
 ENVIRONMENTS: dict[str, EnvironmentRow] = {

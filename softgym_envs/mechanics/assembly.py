@@ -301,11 +301,18 @@ class Assembly:
             entries += np.bincount(place, weights=values[keep], minlength=len(entries))
         return MassMatrix(matrix, entries)
 
-    def inertia_force(self, inertia: Inertia, x: np.ndarray) -> np.ndarray:
-        """Return the derivative of the energy that a time step adds [N], shape (n, 3), at rows ``x`` (n, 3)."""
-        force = np.zeros_like(x)
-        self._add_inertia(inertia, x, force, None)
-        return force
+    def inertial_work(self, inertia: Inertia, start: np.ndarray, end: np.ndarray) -> float:
+        """Return the work [J] against the forces that a time step adds, from rows ``start`` to ``end`` (n, 3).
+
+        It is exact for implicit Euler without rotating frames.
+        """
+        body, work, power = inertia.body, 0.0, 0.0
+        for x, sign in ((start, -1.0), (end, 1.0)):
+            velocity, acceleration = inertia.motion(x)
+            force = body.mass.rows @ (acceleration + body.mass_damping * velocity)
+            work += 0.5 * float(np.vdot(force, end - start))
+            power += sign * self._add_damping(inertia, x, velocity, np.zeros_like(x), None)
+        return work + (0.5 * power / inertia.velocity_factor if power else 0.0)
 
     def dissipated_power(self, inertia: Inertia, x: np.ndarray) -> float:
         """Return the power [W] that damping takes at the end of a time step at rows ``x`` (n, 3)."""
@@ -313,12 +320,11 @@ class Assembly:
         drag = inertia.body.mass_damping * float(np.vdot(velocity, inertia.body.mass.rows @ velocity))
         return drag + self._add_damping(inertia, x, velocity, np.zeros_like(x), None)
 
-    def _add_inertia(self, inertia: Inertia, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None) -> None:
+    def _add_inertia(self, inertia: Inertia, x: np.ndarray, gradient: np.ndarray, values: np.ndarray) -> None:
         body = inertia.body
         velocity, acceleration = inertia.motion(x)
         gradient += body.mass.rows @ (acceleration + body.mass_damping * velocity)
-        if values is not None:
-            values += (inertia.acceleration_factor + body.mass_damping * inertia.velocity_factor) * body.mass.entries
+        values += (inertia.acceleration_factor + body.mass_damping * inertia.velocity_factor) * body.mass.entries
         self._add_damping(inertia, x, velocity, gradient, values)
 
     def _add_damping(

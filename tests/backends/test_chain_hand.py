@@ -163,7 +163,7 @@ def test_wrong_input(robot):
 def test_against_finite_elements(robot):
     near = {"object_gap": 0.0085}
     learned = hand(robot, **near)
-    fem = FEMBackend(robot, near, dynamics=True, time_step=STEP, stiffness_damping=0.0)
+    fem = FEMBackend(robot, near, dynamics=True, time_step=STEP)
     for backend in (learned, fem):
         closed(backend, degrees=7.5, steps=3)
         lifted(backend, height=0.001, steps=1)
