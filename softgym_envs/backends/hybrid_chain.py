@@ -1,4 +1,4 @@
-"""The hybrid backend of learned chains: the chain where it is trusted, finite elements elsewhere.
+"""The hybrid backends of learned chains, alone or as a hand: the chain where it is trusted, finite elements elsewhere.
 
 Friction depends on the path, so finite elements follow the commands of the episode before they answer.
 """
@@ -13,12 +13,15 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
-from softgym_envs.backends.chain import ChainBody
+from softgym_envs.backends.chain import ChainBackend
+from softgym_envs.backends.chain_hand import ChainHandBackend
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.robots.base import Robot
 from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
-from softgym_envs.surrogate.chain.model import load_chain
+from softgym_envs.robots.grasping_hands import ContactAidedGripper
 
 
 class Followed(NamedTuple):
@@ -49,14 +52,15 @@ class HybridChainBackend(Backend):
     Attributes:
         calls: states requested by `step` and `probe`.
         fem_calls: solutions of finite elements, including those of bodies at rest.
-        model: the learned chain.
+        learned: backend of the learned chain.
 
     Raises:
         WeightsError: if the weights are damaged, or belong to a finger with another mesh or material.
         InfeasibleDesign: if the body cannot exist.
     """
 
-    robot: ContactAidedFinger
+    robot: Robot
+    learned: Backend
 
     def __init__(
         self,
@@ -64,23 +68,24 @@ class HybridChainBackend(Backend):
         design: Mapping[str, float] | None = None,
         weights: str | Path | None = None,
     ) -> None:
-        self.robot = robot
-        self.model = load_chain(robot.alone, weights)
+        self._start(robot, ChainBackend(robot, design, weights))
+
+    def _start(self, robot: Robot, learned: ChainBackend | ChainHandBackend) -> None:
+        self.robot, self.learned = robot, learned
         self.calls = self.fem_calls = 0
         self._fem: FEMBackend | None = None
         self.design = None  # type: ignore[assignment]  # until the first reset
-        self.reset(robot.design_space.complete(design))
+        self.reset(learned.design)
 
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)
         if complete != self.design:
-            body = ChainBody(self.robot, self.model, complete)
-            chain = body.rest()
+            chain = self.learned.reset(complete)
             rest = replace(chain, memory=Followed(chain, None, ()))
             if not chain.trusted:
                 fem = self._at_rest(complete)
                 rest = replace(fem, memory=Followed(chain, fem, ()))
-            self._body, self._rest, self.design = body, rest, complete
+            self._rest, self.design = rest, complete
         self.state = self._rest
         return self.state
 
@@ -89,8 +94,9 @@ class HybridChainBackend(Backend):
             raise ValueError("the hybrid backend does not support forces on effectors; use backend='fem'")
         known = self._known
         self.calls += 1
+        self.learned.restore(known.chain)
         try:
-            chain, found = self._body.solve(command, mode, known.chain), True
+            chain, found = self.learned.step(command, mode), True
         except ConvergenceError:
             chain, found = known.chain, False
         path = (*known.path, (np.array(command, dtype=float), mode))
@@ -104,7 +110,8 @@ class HybridChainBackend(Backend):
     def contact_model(self) -> CondensedModel:
         known = self._known
         if known.path or known.fem is None:
-            return self._body.contact_model(known.chain)
+            self.learned.restore(known.chain)
+            return self.learned.contact_model()
         assert self._fem is not None
         self._fem.restore(known.fem)
         return self._fem.contact_model()
@@ -124,11 +131,15 @@ class HybridChainBackend(Backend):
         assert isinstance(self.state.memory, Followed)
         return self.state.memory
 
-    def _at_rest(self, design: Mapping[str, float]) -> State:
+    def _finite_elements(self, design: Design) -> FEMBackend:
+        """Return the finite elements for a body."""
+        return FEMBackend(self.robot, design)
+
+    def _at_rest(self, design: Design) -> State:
         """Return the state of the finite elements at rest, for a new body."""
         self.fem_calls += 1
         if self._fem is None:
-            self._fem = FEMBackend(self.robot, design)
+            self._fem = self._finite_elements(design)
         return self._fem.reset(design)
 
     def _follow(self, start: State | None, path: tuple[tuple[np.ndarray, str], ...]) -> State:
@@ -140,3 +151,54 @@ class HybridChainBackend(Backend):
             state = self._fem.step(command, mode)
             self.fem_calls += 1
         return state
+
+
+class HybridHandBackend(HybridChainBackend):
+    """A hand of two learned chains with a free box where it is trusted, elsewhere finite elements in motion.
+
+    As for a single finger. A step of finite elements is one implicit time step with the damping of `FEMBackend`.
+
+    Args:
+        robot: a hand of two contact-aided fingers.
+        design: first design; missing variables take their baseline.
+        weights: folder of weights of its finger; default the shipped ones.
+        control_step: duration of one `step` [s].
+
+    Raises:
+        WeightsError: if the weights are damaged, or belong to a finger with another mesh or material.
+        InfeasibleDesign: if the body cannot exist.
+        ValueError: for a hand that cannot be learned, see `ChainHandBackend`.
+    """
+
+    moving = True
+
+    def __init__(
+        self,
+        robot: ContactAidedGripper,
+        design: Mapping[str, float] | None = None,
+        weights: str | Path | None = None,
+        control_step: float = 0.05,
+    ) -> None:
+        self.control_step = control_step
+        self._start(robot, ChainHandBackend(robot, design, weights, control_step))
+
+    def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
+        """Return the equilibrium under a command without going there."""
+        known = self._known
+        self.calls += 1
+        self.learned.restore(known.chain)
+        try:
+            chain = self.learned.probe(command, mode)
+        except ConvergenceError:
+            chain = None
+        if chain is not None and chain.trusted:
+            return chain
+        self._follow(known.fem, known.path)
+        assert self._fem is not None
+        self.fem_calls += 1
+        return self._fem.probe(command, mode)
+
+    def _finite_elements(self, design: Design) -> FEMBackend:
+        return FEMBackend(
+            self.robot, design, dynamics=True, control_step=self.control_step, time_step=self.control_step
+        )

@@ -39,6 +39,7 @@ HANDS = Registry(
     {
         "fem": "softgym_envs.backends.fem:FEMBackend",
         "surrogate": "softgym_envs.backends.chain_hand:ChainHandBackend",
+        "hybrid": "softgym_envs.backends.hybrid_chain:HybridHandBackend",
     },
     base="softgym_envs.backends.backend:Backend",
 )

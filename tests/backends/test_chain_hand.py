@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softgym_envs.backends.chain_hand import ChainHandBackend, HandMemory
+from softgym_envs.backends import hybrid_chain
+from softgym_envs.backends.chain_hand import ChainHand, ChainHandBackend, HandMemory
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.backends.hybrid_chain import HybridHandBackend
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.robots.registry import make_robot
@@ -154,10 +156,43 @@ def test_wrong_input(robot):
         ChainHandBackend(robot, control_step=0.0)
     with pytest.raises(ValueError, match="must be along z"):
         ChainHandBackend(make_robot("contact_aided_gripper", gravity=(1.0, 0.0, -9.81)))
-    with pytest.raises(ValueError, match="allowed: fem, surrogate"):
-        make_backend("hybrid", robot)
     with pytest.raises(InfeasibleDesign):
         hand(robot, **{f"d{k}": 0.008 if k % 2 else 0.028 for k in range(12)}, e1=0.015, e3=0.01)
+
+
+def test_hybrid_hands_follow_with_finite_elements(monkeypatch):
+    """Another learned hand stands for the finite elements: the same motion, asked for all commands of the episode."""
+    asked = []
+
+    class Recorder(ChainHandBackend):
+        def __init__(self, robot, design, *, dynamics, control_step, time_step):
+            assert dynamics and time_step == control_step
+            super().__init__(robot, design, control_step=control_step)
+
+        def step(self, command, mode="displacement", *, force=None):
+            asked.append(command)
+            return super().step(command, mode, force=force)
+
+    monkeypatch.setattr(hybrid_chain, "FEMBackend", Recorder)
+    robot = make_robot("contact_aided_gripper")
+    backend, alone = make_backend("hybrid", robot), hand(robot)
+    assert isinstance(backend, HybridHandBackend) and backend.moving
+    before = closed(backend)
+    np.testing.assert_array_equal(before.effector, closed(alone).effector)
+    assert before.trusted and not asked
+    monkeypatch.setattr(ChainHand, "trusted", property(lambda self: False))
+    found, expected = lifted(backend), lifted(alone)
+    assert len(asked) == 14  # nine to close, five to lift
+    np.testing.assert_array_equal(found.contacts.total, expected.contacts.total)
+    np.testing.assert_array_equal(found.velocity, expected.velocity)
+    target = np.radians([20.0, 20.0, 0.3])
+    np.testing.assert_array_equal(backend.probe(target).effort, alone.probe(target).effort)
+    assert backend.state is found and len(asked) == 14
+    monkeypatch.undo()
+    backend.restore(before)
+    assert backend.step(before.command).trusted
+    with pytest.raises(ValueError, match="was not computed by this hybrid backend"):
+        backend.restore(expected)
 
 
 def test_against_finite_elements(robot):
