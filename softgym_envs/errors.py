@@ -82,3 +82,22 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> str:
     if near and len(allowed) > MAX_NAMES:
         return f"unknown {kind} '{name}'; {hint}".rstrip()
     return f"unknown {kind} '{name}'; {hint}allowed: {', '.join(allowed) or 'none'}"
+
+
+def no_equilibrium(
+    target: Iterable[float], modes: Iterable[str], done: float, reached: Iterable[float]
+) -> ConvergenceError:
+    """Return the error for commands of actuators that have no equilibrium.
+
+    Args:
+        target: commands.
+        modes: what they command, ``"displacement"`` or ``"effort"``.
+        done: reached share of the load increment, in [0, 1).
+        reached: commands of the last equilibrium.
+    """
+    wanted, last = (", ".join(f"{value:.6g}" for value in values) for values in (target, reached))
+    return ConvergenceError(
+        f"no equilibrium for actuators [{wanted}] ({'/'.join(sorted(set(modes)))}): "
+        f"stopped at {100 * done:.1f} % of the increment, actuators [{last}]",
+        fraction=done,
+    )

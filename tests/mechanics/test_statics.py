@@ -7,9 +7,11 @@ import copy
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.linear import CholmodSolver, SuperLUSolver, make_solver
+from softgym_envs.mechanics.solvers.split import SplitCholesky
 from softgym_envs.mechanics.solvers.statics import NewtonFailure, Statics
 
 # -- reference ------------------------------------------------------------------------------------------------------
@@ -271,7 +273,7 @@ def test_continuation_towards_a_limit_terminates(fingers, monkeypatch):
     statics = Statics(model)
     limit, position, calls = 7.0, [0.0], []
 
-    def newton(target, driven):
+    def newton(target, driven, **options):
         calls.append(target[0])
         if len(calls) > 3000:
             raise AssertionError("endless continuation")
@@ -416,3 +418,28 @@ def test_a_changed_elasticity_is_detected(fingers):
     model.solids[0].set_elasticity(2.0e6, 0.45)
     after = statics.solve([0.005, 0.0])
     np.testing.assert_allclose(after.effort[0], 2.0 * before.effort[0], rtol=1e-6)
+
+
+def test_a_large_increment_is_divided_where_a_tangent_is_indefinite(monkeypatch):
+    pytest.importorskip("cvxopt")
+    design = {"length": 0.037, "height": 0.022, "joint_height": 0.008, "poisson_ratio": 0.499}
+    model = make_robot("finger", cables=2, design_box="wide").build(design)
+    in_steps = Statics(model)
+    for pull in np.linspace(0.002, 0.02, 10):
+        expected = in_steps.solve([pull, 0.0])
+    factorised = []
+    split = SplitCholesky.factorise
+    monkeypatch.setattr(SplitCholesky, "factorise", lambda *args: factorised.append(1) or split(*args))
+    found = Statics(model).solve([0.02, 0.0])
+    assert found.increments > 1 and not factorised
+    np.testing.assert_allclose(found.x, expected.x, atol=1e-9)
+
+
+@pytest.mark.parametrize("solver", ["cholmod", "superlu"])
+def test_short_increments_pass_over_indefinite_tangents(notched, solver):
+    model = MechanicalModel.from_mesh(notched.nodes, notched.tetrahedra, fixed=notched.fixed, solver=solver)
+    tip = np.array([0.1, 0.01, 0.01])
+    model.add_contact("tip", tip)
+    # Its driven tip does not let the compressed beam buckle, so there is no way around indefinite tangents.
+    found = Statics(model).solve([], contact=tip - [0.004, 0.0, 0.0], contact_mode="displacement")
+    assert not found.stable and found.increments > 1

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softgym_envs import make_robot
-from softgym_envs.errors import DataError, DesignError, InfeasibleDesign
+from softgym_envs.errors import ConvergenceError, DataError, DesignError, InfeasibleDesign
 from softgym_envs.surrogate.data import dataset
 from softgym_envs.surrogate.data.dataset import COLUMNS, generate_dataset, load_dataset
 from softgym_envs.surrogate.data.sampling import (
@@ -25,6 +26,7 @@ from softgym_envs.surrogate.data.sampling import (
     path_order,
     sample_group,
     select_states,
+    solve_path,
 )
 from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.testing import live_processes, wait_until
@@ -655,3 +657,25 @@ def test_ten_kills_lose_no_finished_shard_and_repeat_none(tmp_path, rng):
     assert {p.name: p.read_bytes() for p in whole.glob("shard_*")} == {name: s[2] for name, s in final.items()}
     assert equal(load_dataset(folder), data)
     assert (folder / "README.md").read_text() == (whole / "README.md").read_text()
+
+
+def test_a_solve_that_began_at_rest_is_not_repeated_from_rest():
+    class Statics:
+        calls = 0
+        fails = True
+
+        def solve(self, command):
+            self.calls += 1
+            if self.fails or command[0] > 0.01:
+                raise ConvergenceError("no equilibrium")
+            return SimpleNamespace(x=None, effort=None)
+
+        def restore(self, x, effort):
+            pass
+
+    robot, rest = make_robot("finger", cables=1), SimpleNamespace(x=None, effort=None)
+    commands, statics = np.array([[0.005], [0.015], [0.018]]), Statics()
+    assert [found for _, found in solve_path(robot, statics, rest, commands)] == [None] * 3 and statics.calls == 3
+    statics.calls, statics.fails = 0, False
+    assert [found is None for _, found in solve_path(robot, statics, rest, commands)] == [False, True, True]
+    assert statics.calls == 4  # only the second command began elsewhere

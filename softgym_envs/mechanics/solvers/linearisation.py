@@ -76,18 +76,19 @@ class Linearisation:
         assembled = self.assemble(x, effort)
         return assembled is not None and self.factorise(assembled, x, exact=exact)
 
-    def factorise(self, assembled: Assembled, x: np.ndarray, *, exact: bool = False) -> bool:
+    def factorise(self, assembled: Assembled, x: np.ndarray, *, exact: bool = False, definite: bool = False) -> bool:
         """Take over the equations that were assembled last and factorise their tangent. False if it is singular.
 
         Args:
             assembled: the equations.
             x: rows at which they were assembled, shape (n, 3).
             exact: do not leave out terms of contact.
+            definite: without contact, return False for an indefinite tangent too, which takes far longer to factorise.
         """
         self.residual, tangent, self.H, self.delta, self.elastic = assembled
         terms = self._terms
         extra = None if terms is None else terms.tangent
-        self.exact = self._tangent.factorise(tangent, extra, fallback=exact or terms is None)
+        self.exact = self._tangent.factorise(tangent, extra, fallback=exact or (terms is None and not definite))
         if not self.exact:
             if terms is None or exact:
                 return False

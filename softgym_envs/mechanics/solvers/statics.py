@@ -19,7 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from softgym_envs.errors import ConvergenceError
+from softgym_envs.errors import ConvergenceError, no_equilibrium
 from softgym_envs.mechanics.assembly import Assembled
 from softgym_envs.mechanics.condensation import CondensedModel, Row
 from softgym_envs.mechanics.contact.contact import ContactMemory
@@ -32,6 +32,10 @@ from softgym_envs.mechanics.solvers.prediction import LARGEST_BEND, Bend
 
 SHORT_STEP, MOST_SHORT_STEPS = 0.05, 6
 """In contact, an increment is divided after this number of steps in a row of less than this part of Newton's."""
+
+
+CAUTIOUS = 0.25
+"""Increments of displacements longer than this part of a step are divided where they meet an indefinite tangent."""
 
 
 class NewtonFailure(Exception):
@@ -176,11 +180,12 @@ class Statics:
         """Displacement of the rows (n, 3) for a step of the equations (N,) from ``x`` (n, 3)."""
         return self.model.warping.displacement(x, step)
 
-    def _newton(self, target: np.ndarray, driven: np.ndarray) -> int:
-        """Converge at one load level and return the iterations.
+    def _newton(self, target: np.ndarray, driven: np.ndarray, *, definite: bool = False) -> int:
+        """Converge at one load level and return the iterations; for the arguments see `_correction`.
 
         Raises:
-            NewtonFailure: if it does not converge; the caller restores the state.
+            NewtonFailure: if it does not converge, or meets an indefinite tangent although only ``definite`` ones are
+                allowed (which holds without contact). The caller restores the state.
         """
         linear = self.linearisation
         if not linear.current and not self._linearise():
@@ -218,7 +223,7 @@ class Statics:
                     assembled = linear.assemble(x, effort)
                     assert assembled is not None
             self.x, self.effort = x, effort
-            if not linear.factorise(assembled, x):
+            if not linear.factorise(assembled, x, definite=definite):
                 raise NewtonFailure
             step_q, step_effort = self._correction(None, linear.delta, effort, target, driven)
             if length == 1.0 and self._norm(step_q) <= self.tolerance:
@@ -461,8 +466,10 @@ class Statics:
             if ramped:
                 linear.loads = start_loads + level * (loads - start_loads)
                 linear.current = False
+            # A long increment of displacements that meets an indefinite tangent misses its equilibrium nearly always.
+            definite = "effort" not in modes and level - done > CAUTIOUS and linear.current and linear.positive_definite
             try:
-                iterations += self._newton(start + level * (goal - start), driven)
+                iterations += self._newton(start + level * (goal - start), driven, definite=definite)
             except BaseException as problem:
                 # After any exception, even Ctrl-C, the last equilibrium is restored.
                 self.x, self.effort = kept
@@ -472,13 +479,8 @@ class Statics:
                     raise
                 size = 0.5 * (level - done)
                 if size < 0.5**self.max_halvings or not (ramped or self._linearise()):
-                    reached = ", ".join(f"{v:.6g}" for v in (start + done * (goal - start))[:count])
-                    wanted = ", ".join(f"{v:.6g}" for v in target)
-                    raise ConvergenceError(
-                        f"no equilibrium for actuators [{wanted}] ({'/'.join(sorted(set(modes)))}): "
-                        f"stopped at {100 * done:.1f} % of the increment, actuators [{reached}]",
-                        fraction=done,
-                    ) from None
+                    reached = (start + done * (goal - start))[:count]
+                    raise no_equilibrium(target, modes, done, reached) from None
                 continue
             increments += 1
             done, self._current_loads = level, linear.loads

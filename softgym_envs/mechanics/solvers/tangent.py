@@ -53,7 +53,7 @@ class Tangent:
             values = self._merge(values, extra)
         self.solver = self._preferred
         if self._preferred.factorise(values):
-            return True
+            return fallback or self._preferred.positive_definite
         if not fallback or not isinstance(self._preferred, CholmodSolver):
             return False
         # Cholesky fails on a tangent that is indefinite although the constrained problem is stable.

@@ -169,17 +169,22 @@ def solve_path(
         The number of a command, and its equilibrium or None if there is none, in the order of the path.
     """
     span = robot.upper - robot.lower
-    for k in path_order((commands - robot.lower) / span, -robot.lower / span):
+    at_rest = True  # where the next solve starts
+
+    def solve(command: np.ndarray) -> Equilibrium | None:
         try:
-            found = statics.solve(commands[k])
+            return statics.solve(command)
         except ConvergenceError:
-            try:  # try again from rest
-                statics.restore(rest.x, rest.effort)
-                found = statics.solve(commands[k])
-            except ConvergenceError:
-                statics.restore(rest.x, rest.effort)
-                yield int(k), None
-                continue
+            return None
+
+    for k in path_order((commands - robot.lower) / span, -robot.lower / span):
+        found = solve(commands[k])
+        if found is None and not at_rest:
+            statics.restore(rest.x, rest.effort)
+            found = solve(commands[k])
+        if found is None:
+            statics.restore(rest.x, rest.effort)
+        at_rest = found is None or not commands[k].any()
         yield int(k), found
 
 
