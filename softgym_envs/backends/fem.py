@@ -84,6 +84,11 @@ class FEMBackend(Backend):
         self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
+    @property
+    def rest(self) -> State:
+        """State of the present body at rest."""
+        return self._rest
+
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)
         if complete != self.design:

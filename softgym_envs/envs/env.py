@@ -309,9 +309,12 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             gymnasium.logger.warn("render() needs render_mode='rgb_array' or 'human' in gymnasium.make")
             return None
         if self._renderer is None:
+            from softgym_envs.backends.fem import FEMBackend
             from softgym_envs.viewer.image import ImageRenderer
 
-            self._renderer = ImageRenderer(self.robot, self.render_size, window=self.render_mode == "human")
+            source = self.backend if isinstance(self.backend, FEMBackend) else None
+            window = self.render_mode == "human"
+            self._renderer = ImageRenderer(self.robot, self.render_size, window=window, source=source)
         state, goal, path = self.backend.state, self.goal, self._path
         distance = float(self.task.distance(self.task.measure(state), goal))
         text = f"distance {1e3 * distance:.1f} mm"

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from softgym_envs.backends.backend import State
+from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.scene import STUB, Scene, check_display
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
@@ -28,12 +29,20 @@ class ImageRenderer:
             its effectors.
         size: width and height [pixels].
         window: show the images in a window too.
+        source: finite elements of the robot whose states are rendered: their model is used instead of a new one.
 
     Raises:
         ValueError: for a size that is not two positive integers, or a window without a display.
     """
 
-    def __init__(self, robot: Robot, size: tuple[int, int] = (480, 480), *, window: bool = False) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        size: tuple[int, int] = (480, 480),
+        *,
+        window: bool = False,
+        source: FEMBackend | None = None,
+    ) -> None:
         if window:
             check_display()
         width, height = (int(n) for n in size)
@@ -42,7 +51,7 @@ class ImageRenderer:
         self.robot = robot
         self.size = (width, height)
         self._window = window
-        self._shapes = ShapeFinder(robot)
+        self._shapes = ShapeFinder(robot, source)
         self._scene: Scene | None = None
 
     def render(
@@ -115,11 +124,12 @@ class ImageRenderer:
     def _open(self) -> Scene:
         if self._scene is None:
             baseline = self.robot.design_space.baseline
-            model = self._shapes.load(baseline)
-            x = self._shapes.at(baseline)
-            lines = cable_lines(model, x, self._shapes.state, stub=STUB * self.robot.size)
+            model, rest = self._shapes.load(baseline), self._shapes.rest(baseline)
+            x = rest.nodes
+            assert x is not None
+            lines = cable_lines(model, x, rest, stub=STUB * self.robot.size)
             pulled = [_pulled(line, self.robot.upper[row]) for row, line in lines.items()]
-            seen = [BodySurface(model).points(x), *pulled, _reached(self.robot, self._shapes.state)]
+            seen = [BodySurface(model).points(x), *pulled, _reached(self.robot, rest)]
             self._scene = Scene(self.robot, self.size, np.concatenate(seen), window=self._window)
         return self._scene
 

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.extras import require
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
@@ -196,10 +197,12 @@ class ShapeFinder:
 
     Args:
         robot: the family of bodies.
+        source: finite elements whose model serves for their present design, instead of a new one. They are not moved.
     """
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, source: FEMBackend | None = None) -> None:
         self.robot = robot
+        self._source = source
         self._backend: FEMBackend | None = None
         self._target: np.ndarray | None = None
 
@@ -212,10 +215,16 @@ class ShapeFinder:
             ConvergenceError: if it has no equilibrium at rest.
         """
         complete = self.robot.design_space.complete(design)
-        if self._backend is None or complete != self._backend.design:
-            self._backend = FEMBackend(self.robot, complete)
-            self._target = None
-        return self._backend.model
+        if self._source is not None and complete == self._source.design:
+            return self._source.model
+        return self._own(complete).model
+
+    def rest(self, design: Mapping[str, float] | None = None) -> State:
+        """Return the state of a design at rest, with its nodes."""
+        complete = self.robot.design_space.complete(design)
+        if self._source is not None and complete == self._source.design:
+            return self._source.rest
+        return self._own(complete).rest
 
     @property
     def state(self) -> State:
@@ -233,11 +242,18 @@ class ShapeFinder:
 
         If no equilibrium is found, the last shape is returned, because an image should not end a rollout.
         """
-        self.load(design)
+        self._own(self.robot.design_space.complete(design))
         self._move(displacement)
         nodes = self._loaded_backend.state.nodes
         assert nodes is not None
         return nodes
+
+    def _own(self, design: Design) -> FEMBackend:
+        """Return finite elements of a design that may be moved."""
+        if self._backend is None or design != self._backend.design:
+            self._backend = FEMBackend(self.robot, design)
+            self._target = None
+        return self._backend
 
     @property
     def _loaded_backend(self) -> FEMBackend:

@@ -153,6 +153,15 @@ class TestShape:
         assert shapes.load(backend.design) is model
         assert shapes.load({"height": 0.021}) is not model
 
+    def test_given_finite_elements_are_used_and_not_moved(self, backend, states):
+        shapes, before = ShapeFinder(backend.robot, backend), backend.state
+        assert shapes.load(backend.design) is backend.model
+        np.testing.assert_array_equal(shapes.rest().nodes, ShapeFinder(backend.robot).rest().nodes)
+        bare = dataclasses.replace(states["bent"], nodes=None)
+        np.testing.assert_allclose(shapes.nodes({}, bare), states["bent"].nodes, atol=1e-6)
+        assert backend.state is before
+        assert shapes.load({"height": 0.021}) is not backend.model
+
     def test_surface_is_closed_and_faces_outwards(self, backend, states):
         surface = BodySurface(backend.model)
         points = surface.points(backend.model.nodes)
