@@ -98,7 +98,8 @@ def test_stable_baselines_trains_on_processes():
 
 
 PROGRAM = """
-import gymnasium, numpy as np, softgym_envs
+import gymnasium, numpy as np, signal, softgym_envs
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which shells take from processes in the background
 env = gymnasium.make_vec("SoftGym/FingerReach-v0", 2, backend="fem")
 env.reset(seed=0)
 print(*(process.pid for process in env.unwrapped.processes), flush=True)
