@@ -56,13 +56,16 @@ def figure(benchmark: str, name: str, form: str = "") -> str:
 
     Args:
         benchmark: its name in the results.
-        name: of the result, or a pattern with ``*``.
+        name: of the result, or a pattern with ``*``; ``"group: name"`` for one in a group of results.
         form: see `benchmarks.page`.
 
     Raises:
         DataError: if no result, or more than one, has this name.
     """
-    found = results(benchmark)
+    found = dict(results(benchmark))
+    for group, values in results(benchmark).items():
+        if isinstance(values, dict):
+            found |= {f"{group}: {inner}": value for inner, value in values.items()}
     how = FORMAT.fullmatch(form.strip())
     assert how is not None
     pattern = re.compile(re.escape(name).replace(r"\*", ".*"))
