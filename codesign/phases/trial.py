@@ -12,10 +12,10 @@ import numpy as np
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.evaluation import Evaluation, evaluate
 from softgym_envs.agents.training import cpu_before, train
-from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
 from softgym_envs.codesign.objectives import Objective, Outcome
 from softgym_envs.codesign.phases.shared_policy import shared_policy
+from softgym_envs.codesign.problem import StudyProblem
 from softgym_envs.codesign.records import Assessment, TrialResult
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import read_json
@@ -29,7 +29,7 @@ GOAL_BATCHES = 4
 
 def assess(
     agent: str | Path,
-    config: StudyConfig,
+    config: StudyProblem,
     environment: EnvironmentConfig,
     goals: np.ndarray,
     design: Mapping[str, float],
@@ -47,7 +47,7 @@ def assess(
 
 
 def _measured(
-    config: StudyConfig, environment: EnvironmentConfig, evaluation: Evaluation, design: Mapping[str, float]
+    config: StudyProblem, environment: EnvironmentConfig, evaluation: Evaluation, design: Mapping[str, float]
 ) -> Assessment:
     outcome = Outcome(evaluation, design, environment.make_robot())
     return Assessment(evaluation, {name: each.measure(outcome) for name, each in config.objectives.items()})

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.parts import PRUNERS
+from softgym_envs.codesign.problem import StudyProblem
 from softgym_envs.codesign.sampling import construct, make_sampler
 from softgym_envs.codesign.scheduling.storage import StudyStorage
 from softgym_envs.errors import DataError
@@ -28,7 +29,7 @@ def make_pruner(config: StudyConfig) -> optuna.pruners.BasePruner:
     return construct(getattr(optuna.pruners, PRUNERS[config.pruner.name]), options)
 
 
-def distributions(config: StudyConfig) -> dict[str, optuna.distributions.BaseDistribution]:
+def distributions(config: StudyProblem) -> dict[str, optuna.distributions.BaseDistribution]:
     """Return the range of each optimised variable [SI]."""
     import optuna
 

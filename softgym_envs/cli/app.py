@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import click
 
-from softgym_envs.cli import agents, bench, codesign, configs, environments, robots, surrogates
+from softgym_envs.cli import agents, bench, benchmark, codesign, configs, environments, robots, surrogates
 from softgym_envs.cli.options import Resumable
 from softgym_envs.errors import SoftGymError, unknown_name
 from softgym_envs.extras import explain
@@ -20,6 +20,7 @@ SECTIONS = {
     "Surrogates": (surrogates.dataset, surrogates.fit, surrogates.calibrate_trust, surrogates.deploy),
     "Agents": (agents.train, agents.evaluate, agents.results, agents.deploy_policy),
     "Design and control": (codesign.codesign, codesign.optimise, codesign.sensitivity, codesign.calibrate),
+    "Benchmark": (benchmark.benchmark,),
     "Configurations": (configs.configs,),
     "Development": (bench.bench,),
 }

@@ -12,6 +12,7 @@ from softgym_envs.storage import atomic_write
 
 VERBS = {
     "agents": "train, evaluate",
+    "benchmark": "benchmark",
     "codesign": "codesign",
     "design": "optimise, sensitivity, calibrate",
     "surrogate": "dataset, fit",

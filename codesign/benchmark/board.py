@@ -1,0 +1,156 @@
+"""Tables of the benchmark, as Markdown: the leaderboard, and the baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.agents.statistics import Estimate
+from softgym_envs.codesign.benchmark.frozen import load_definition, load_problem, problem_names
+from softgym_envs.codesign.benchmark.problem import TRACKS
+from softgym_envs.codesign.benchmark.runs import MethodRow, Run, method_rows, stored_runs
+from softgym_envs.codesign.benchmark.scoring import DATA, normalised, reference
+from softgym_envs.codesign.benchmark.submission import Submission
+
+SUBMISSIONS = DATA / "submissions"
+"""Accepted submissions, one JSON file each."""
+
+
+def problem_table() -> str:
+    """Return the table of all problems."""
+    rows = []
+    for name in problem_names():
+        problem = load_definition(name)
+        budget = problem.budgets["small"]
+        rows.append(
+            [
+                f"`{name}`",
+                problem.track,
+                problem.title,
+                str(len(problem.variables)),
+                problem.judge,
+                f"{budget.environment_steps:,}",
+            ]
+        )
+    return _table(["problem", "track", "about", "variables", "judge", "environment steps (small)"], rows)
+
+
+def tracks() -> str:
+    """Return the list of the tracks."""
+    return "\n".join(f"* **{key}**: {text}" for key, text in TRACKS.items())
+
+
+def method_table(runs: Sequence[tuple[Run, Any]] | None = None, data: Path = DATA) -> str:
+    """Return the table of the baselines, one row per problem, judge and method; default the stored runs."""
+    rows = method_rows(stored_runs(data) if runs is None else runs, data)
+    if not rows:
+        return "No runs are stored."
+    header = [
+        "problem",
+        "judge",
+        "method",
+        "seeds",
+        "regret at the end [%]",
+        "area [%]",
+        "steps to 1 %",
+        "CPU s to 1 %",
+        "score on FEM",
+        "at limits [%]",
+        "diversity",
+    ]
+    return _table(header, [_method_cells(row) for row in rows])
+
+
+def _method_cells(row: MethodRow) -> list[str]:
+    return [
+        f"`{row.problem}`",
+        row.judge,
+        row.method,
+        str(row.seeds),
+        _interval(row.regret, 100.0, 1),
+        f"{100 * row.area:.1f}",
+        f"{row.steps:,.0f}" if np.isfinite(row.steps) else "not reached",
+        f"{row.seconds:.1f}" if np.isfinite(row.seconds) else "not reached",
+        "not tested" if row.score is None else _interval(row.score, 1.0, 3),
+        f"{100 * row.at_bounds:.0f}",
+        f"{row.diversity:.2f}",
+    ]
+
+
+def _interval(estimate: Estimate, scale: float, digits: int) -> str:
+    value = f"{scale * estimate.value:.{digits}f}"
+    if np.isnan(estimate.low):
+        return value
+    return f"{value} ({scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f})"
+
+
+def leaderboard(folder: Path = SUBMISSIONS, data: Path = DATA) -> str:
+    """Return the leaderboard: the accepted submissions by problem, the best first.
+
+    Submissions to a former version of a problem are left out.
+    """
+    rows: list[tuple[str, float, list[str]]] = []
+    for path in sorted(folder.glob("*.json")):
+        submission = Submission.read(path)
+        if submission.problem not in problem_names():
+            continue
+        known = reference(load_problem(submission.problem, check=False), data)
+        if known is None or submission.hash != known.hash or not submission.claimed:
+            continue
+        score = normalised(known, submission.claimed)
+        spent = sum(row["environment_steps"] for row in submission.ledger)
+        seconds = sum(row["cpu_seconds"] for row in submission.ledger)
+        rows.append(
+            (
+                submission.problem,
+                -(score or 0.0),
+                [
+                    f"`{submission.problem}`",
+                    submission.method,
+                    submission.author or "-",
+                    submission.level,
+                    "-" if score is None else f"{score:.3f}",
+                    ", ".join(f"{value:.4g}" for value in submission.claimed[0]),
+                    f"{spent:,}",
+                    f"{seconds:.1f}",
+                    f"{submission.pretraining_steps:,}",
+                ],
+            )
+        )
+    if not rows:
+        return "No submissions are stored."
+    header = [
+        "problem",
+        "method",
+        "author",
+        "budget",
+        "score",
+        "on FEM [SI]",
+        "environment steps",
+        "CPU s",
+        "pre-training steps",
+    ]
+    return _table(header, [cells for *_, cells in sorted(rows, key=lambda row: row[:2])])
+
+
+def reference_table(data: Path = DATA) -> str:
+    """Return what is known about each problem on finite elements."""
+    rows = []
+    for name in problem_names():
+        known = reference(load_problem(name, check=False), data)
+        if known is None:
+            continue
+        best = "-" if not known.best else ", ".join(f"{value:.4g}" for value in known.best[0])
+        found = f"{known.found.get('method')}, judge {known.found.get('judge')}" if known.found else "-"
+        rows.append([f"`{name}`", ", ".join(f"{value:.4g}" for value in known.baseline), best, found])
+    if not rows:
+        return "No references are stored."
+    return _table(["problem", "baseline [SI]", "best known [SI]", "found by"], rows)
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(header) + " |", "| " + " | ".join("---" for _ in header) + " |"]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])

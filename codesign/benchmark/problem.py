@@ -1,0 +1,279 @@
+"""A problem of the benchmark: which bodies compete, who controls them, on which goals, and what a search may spend."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.training import train
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.goals import draw_goals
+from softgym_envs.codesign.parts import GoalsConfig, TrainingConfig, ZoneConfig
+from softgym_envs.codesign.phases.trial import assess
+from softgym_envs.codesign.problem import StudyProblem, refuse
+from softgym_envs.codesign.records import Record
+from softgym_envs.config import BesideConfig, Config
+from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign, unknown_name
+
+Judge = Literal["qp", "shared", "trained"]
+"""Who controls a body while it is scored: the inverse QP, one policy for all bodies, or a policy trained for it."""
+
+JUDGES: tuple[Judge, ...] = ("qp", "shared", "trained")
+GOAL_SETS = ("training", "search", "validation", "test")
+LEVELS = ("small", "medium", "large")
+TRACKS = {
+    "A": "design alone, under a fixed controller",
+    "B": "design and control",
+    "C": "several objectives",
+    "D": "transfer: the test goals lie where no search goal does",
+}
+"""Track of a problem -> what it asks for."""
+
+
+class GoalSet(Config):
+    """One set of goals; see `softgym_envs.codesign.parts.GoalsConfig` for the sources."""
+
+    source: Literal["family", "zone", "task"] = "family"
+    zone: ZoneConfig | None = None
+    command_low: float = Field(default=0.0, ge=0.0, lt=1.0)
+    count: int = Field(ge=1)
+    seed: int = Field(ge=0)
+
+
+class Budget(Config):
+    """What a search may spend; it ends at the limit that it reaches first."""
+
+    environment_steps: int = Field(gt=0, description="of trainings and of scores")
+    cpu_seconds: float = Field(gt=0.0, description="of trainings and of scores, without the optimiser's own time [s]")
+    fem_solves: int = Field(ge=0, description="environment steps on finite elements")
+
+
+class BenchmarkProblem(StudyProblem):
+    """A frozen problem of the benchmark.
+
+    Attributes:
+        name: ID with its version: ``finger-zone-v1``. Any change of the problem needs a new version.
+        track: key of `TRACKS`.
+        judge: who controls the bodies in the search, unless the optimiser chooses another judge, and in the final test.
+        policy: policy for all bodies: the judge ``"shared"``, and the start of the trainings of ``"trained"``.
+        training: training for one body, for the judge ``"trained"``.
+        goals: sets of goals by name, `GOAL_SETS`, each with a seed of its own.
+        budgets: by name, `LEVELS`.
+    """
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9-]*-v[1-9][0-9]*$")
+    track: Literal["A", "B", "C", "D"]
+    judge: Judge = "qp"
+    policy: Annotated[str | None, BesideConfig()] = None
+    training: TrainingConfig = Field(default_factory=TrainingConfig)
+    goals: dict[Literal["training", "search", "validation", "test"], GoalSet]
+    budgets: dict[Literal["small", "medium", "large"], Budget]
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        refuse(set(self.goals) != set(GOAL_SETS), f"goals must have the sets {', '.join(GOAL_SETS)}")
+        refuse(set(self.budgets) != set(LEVELS), f"budgets must have the levels {', '.join(LEVELS)}")
+        seeds = [goals.seed for goals in self.goals.values()]
+        refuse(len(set(seeds)) < len(seeds), f"the seeds of the goals must differ, got {seeds}")
+        refuse(self.judge not in self.judges, f"judge '{self.judge}' needs a 'policy'")
+        refuse(
+            bool(self.secondary_objectives) != (self.track == "C"),
+            "problems of track C, and only these, have secondary_objectives",
+        )
+        return self
+
+    @property
+    def judges(self) -> tuple[Judge, ...]:
+        """The judges that are available for this problem."""
+        trains = self.environment.batched
+        return tuple(
+            judge
+            for judge in JUDGES
+            if judge == "qp" or (judge == "shared" and self.policy) or (judge == "trained" and trains)
+        )
+
+    @property
+    def score_count(self) -> int:
+        """Number of objectives."""
+        return 1 + len(self.secondary_objectives)
+
+    def draw_goals(self, name: str) -> np.ndarray:
+        """Draw a set of goals [m], shape (count, p, 3), from its seed; the frozen problem keeps them."""
+        goals = self.goals[name]  # type: ignore[index]
+        config = GoalsConfig(
+            source=goals.source,
+            zone=goals.zone,
+            command_low=goals.command_low,
+            count=goals.count,
+            unseen_count=2,
+            training_count=1,
+            seed=goals.seed,
+        )
+        study = StudyConfig(
+            name="goals",
+            environment=self.environment,
+            variables=self.variables,
+            ranges=self.ranges,
+            strategy="qp",
+            trials=1,
+            goals=config,
+            finalists={"count": 0},  # type: ignore[arg-type]
+        )
+        return np.round(np.asarray(draw_goals(study)["selection"], dtype=float), 7)
+
+    def design_from_unit(self, point: Sequence[float]) -> dict[str, float]:
+        """Return the values [SI] of the variables at a point of the unit box [-1, 1]^n."""
+        return {
+            name: float(variable.from_unit(value))
+            for (name, variable), value in zip(self.optimised.items(), point, strict=True)
+        }
+
+    def checked(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Return values of the variables inside the box, in their order.
+
+        Raises:
+            DesignError: if a variable is missing, unknown or out of its bounds.
+        """
+        for name in values:
+            if name not in self.optimised:
+                raise DesignError(unknown_name("variable", name, self.optimised))
+        if missing := [name for name in self.optimised if name not in values]:
+            raise DesignError(f"problem '{self.name}': the design lacks {', '.join(missing)}")
+        return {name: variable.check(values[name]) for name, variable in self.optimised.items()}
+
+
+@dataclass(eq=False)
+class Score(Record):
+    """Outcome and cost of one body under one judge."""
+
+    design: dict[str, float]  # values of the variables [SI]
+    judge: str
+    share: float = 1.0  # of the goals and of the training's steps
+    values: dict[str, float] = field(default_factory=dict)  # of each objective [SI]; empty if infeasible
+    scores: list[float] = field(default_factory=list)  # of the objectives, larger is better; empty if infeasible
+    reason: str | None = None  # why the body is infeasible
+    environment_steps: int = 0
+    fem_solves: int = 0
+    cpu_seconds: float = 0.0
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the body exists and could be simulated."""
+        return self.reason is None
+
+    @property
+    def score(self) -> float:
+        """Score of the first objective; minus infinity if infeasible."""
+        return self.scores[0] if self.scores else -np.inf
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """Scores bodies of a problem on given goals.
+
+    Args:
+        problem: the problem.
+        training_goals: goals of trainings [m], shape (k, 3).
+        goals: goals of the score [m], shape (n, p, 3).
+        backend: of the score; default that of the problem. Trainings always run on that of the problem.
+    """
+
+    problem: BenchmarkProblem
+    training_goals: np.ndarray
+    goals: np.ndarray
+    backend: str | None = None
+
+    def __call__(
+        self,
+        values: Mapping[str, float],
+        judge: Judge,
+        *,
+        share: float = 1.0,
+        seed: int = 0,
+        policy: Path | None = None,
+    ) -> Score:
+        """Score one body.
+
+        Args:
+            values: values of the variables [SI].
+            judge: who controls it.
+            share: share of the goals and of the steps of the training, in (0, 1].
+            seed: added to that of the training.
+            policy: file of a policy that controls the body in place of the judge.
+
+        Raises:
+            DesignError: if the body is out of the box.
+            ValueError: for a judge that the problem does not have, or a share out of (0, 1].
+        """
+        problem = self.problem
+        if judge not in problem.judges:
+            raise ValueError(f"problem '{problem.name}': {unknown_name('judge', judge, problem.judges)}")
+        if not 0.0 < share <= 1.0:
+            raise ValueError(f"share = {share} must be in (0, 1]")
+        values = problem.checked(values)
+        design, options = problem.body(values)
+        result = Score(values, judge, share)
+        goals = self.goals[: max(1, round(share * len(self.goals)))]
+        environment = problem.environment_of(options)
+        tested = environment if self.backend is None else environment.on(self.backend)
+        began = time.process_time()
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                agent: str | Path = {"qp": "qp", "shared": problem.policy or ""}.get(judge, "")
+                if policy is not None:
+                    agent = policy
+                elif judge == "trained":
+                    config = self._training(design, options, share, seed)
+                    agent = train(config, Path(folder) / "policy", initial=problem.policy, progress=False)
+                    reports = -(-config.steps // config.report_every)
+                    result.environment_steps += config.steps
+                    result.environment_steps += reports * config.evaluation_episodes * problem.episode_steps
+                found = assess(agent, problem, tested, goals, design)
+            result.values = {name: float(value) for name, value in found.values.items()}
+            result.environment_steps += found.evaluation.steps
+            result.fem_solves = found.evaluation.steps if tested.backend == "fem" else 0
+            names = (problem.objective, *problem.secondary_objectives)
+            result.scores = [problem.objectives[name].score(result.values[name]) for name in names]
+            if broken := problem.violations_text(result.values, problem.constraints):
+                result.reason, result.scores = broken, []
+        except (InfeasibleDesign, ConvergenceError) as error:
+            result.reason = str(error)
+        result.cpu_seconds = time.process_time() - began
+        return result
+
+    def _training(
+        self, design: Mapping[str, float], options: Mapping[str, float], share: float, seed: int
+    ) -> TrainConfig:
+        problem, training = self.problem, self.problem.training
+        environment = problem.environment_of(options)
+        goals = {"goals": self.training_goals.tolist()} if len(self.training_goals) else {}
+        steps = max(training.num_envs, round(share * training.steps))
+        return TrainConfig(
+            environment=environment.model_copy(
+                update={
+                    "design": dict(design),
+                    "sample_design": False,
+                    "task_options": {**environment.task_options, **goals},
+                }
+            ),
+            **{
+                **training.model_dump(),
+                "steps": steps,
+                "report_every": min(steps, training.report_every),
+                "seed": training.seed + seed,
+            },
+        )
+
+
+def goal_key(goal: np.ndarray) -> str:
+    """Return a hash of one goal or path [m], rounded to a micrometre."""
+    return sha256(np.round(1e6 * np.atleast_2d(goal)).astype("<i8").tobytes()).hexdigest()[:16]

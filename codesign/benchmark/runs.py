@@ -1,0 +1,346 @@
+"""Runs of baselines on problems: resumable, one small JSON file each, and the tables made from them."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.agents.statistics import Estimate, stratified_estimate
+from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem
+from softgym_envs.codesign.benchmark.problem import Judge, Score
+from softgym_envs.codesign.benchmark.scoring import (
+    DATA,
+    Reference,
+    bounds_share,
+    front,
+    improvement,
+    make_reference,
+    normalised,
+    reference,
+)
+from softgym_envs.codesign.benchmark.search import Search, make_optimiser, solve
+from softgym_envs.codesign.records import Record
+from softgym_envs.config import provenance
+from softgym_envs.storage import atomic_write, read_json, write_json
+
+REGRET = 0.01
+"""Regret below which a search counts as finished."""
+
+
+@dataclass(eq=False)
+class Run(Record):
+    """One search by a baseline.
+
+    Attributes:
+        problem: ID with its version.
+        hash: of the frozen problem.
+        method: key of `softgym_envs.codesign.benchmark.search.METHODS`.
+        judge: who controlled the bodies in the search.
+        level: name of the budget.
+        seed: of the optimiser and of trainings.
+        designs: the winner; with several objectives, bodies of the front.
+        search_scores: their scores in the search.
+        curve: for each body that became the best: environment steps and CPU seconds until then, and its score under the
+            inverse QP on the validation goals, the same yardstick for all judges. Empty with several objectives.
+        bodies: number of bodies scored.
+        infeasible: number of these that could not be scored.
+        diversity: mean distance between bodies in the unit box, divided by its diagonal.
+        spent: environment steps, CPU seconds and solves on finite elements.
+        optimiser_seconds: CPU time of the optimiser itself [s].
+        commit: of the code.
+    """
+
+    problem: str
+    hash: str
+    method: str
+    judge: str
+    level: str
+    seed: int
+    designs: list[dict[str, float]]
+    search_scores: list[list[float]]
+    curve: list[list[float]] = field(default_factory=list)
+    bodies: int = 0
+    infeasible: int = 0
+    diversity: float = 0.0
+    spent: dict[str, float] = field(default_factory=dict)
+    optimiser_seconds: float = 0.0
+    commit: str | None = None
+
+
+def run(folder: Path, name: str, method: str, judge: Judge | None, level: str, seed: int) -> Run:
+    """Run a baseline, or return its result if the folder has it."""
+    problem = load_problem(name)
+    search = Search(problem, level, judge, seed)
+    path = folder / "runs" / name / f"{method}-{search.judge}-{level}-{seed}.json"
+    if path.is_file():
+        stored = Run.read(path)
+        if stored.hash == problem.hash:
+            return stored
+    own = solve(search, make_optimiser(method, problem, seed))
+    single = problem.definition.score_count == 1
+    winners = front(search.ledger) if not single else [search.best] if search.best else []
+    found = Run(
+        problem=name,
+        hash=problem.hash,
+        method=method,
+        judge=str(search.judge),
+        level=level,
+        seed=seed,
+        designs=[row.design for row in winners],
+        search_scores=[row.scores for row in winners],
+        curve=_curve(problem, search, folder) if single else [],
+        bodies=len(search.ledger),
+        infeasible=sum(not row.feasible for row in search.ledger),
+        diversity=_diversity(problem, search.ledger),
+        spent={key: round(value, 3) for key, value in search.spent.items()},
+        optimiser_seconds=round(own, 3),
+        commit=provenance()["commit"],
+    )
+    found.write(path)
+    return found
+
+
+def _curve(problem: FrozenProblem, search: Search, folder: Path) -> list[list[float]]:
+    rows = []
+    for index, row in search.incumbents:
+        spent = search.ledger[: index + 1]
+        value = tested(problem, row.design, "qp", "validation", None, folder).score
+        steps, seconds = sum(r.environment_steps for r in spent), sum(r.cpu_seconds for r in spent)
+        rows.append([steps, round(seconds, 3), value])
+    return rows
+
+
+def _diversity(problem: FrozenProblem, rows: Sequence[Score]) -> float:
+    variables = problem.definition.optimised
+    points = np.array([[float(variables[n].to_unit(value)) for n, value in row.design.items()] for row in rows])
+    if len(points) < 2:
+        return 0.0
+    distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    mean = distance.sum() / (len(points) * (len(points) - 1))
+    return round(float(mean / (2.0 * np.sqrt(points.shape[1]))), 4)
+
+
+def tested(
+    problem: FrozenProblem,
+    design: dict[str, float],
+    judge: Judge,
+    goals: str,
+    backend: str | None,
+    folder: Path,
+    seed: int = 0,
+) -> Score:
+    """Return the score of a body on a set of goals; computed once and kept in a folder."""
+    point = [round(float(problem.definition.optimised[name].to_unit(value)), 6) for name, value in design.items()]
+    key = json.dumps([problem.hash, point, judge, goals, backend, seed if judge == "trained" else 0])
+    path = folder / "scores" / problem.name / f"{sha256(key.encode()).hexdigest()[:24]}.json"
+    if path.is_file():
+        return Score.read(path)
+    found = problem.evaluator(goals, backend)(design, judge, seed=seed)
+    found.write(path)
+    return found
+
+
+# -- on finite elements -----------------------------------------------------------------------------------------------
+
+
+def check_winners(folder: Path, runs: Iterable[Run], data: Path = DATA) -> None:
+    """Test the winners of runs on finite elements, on test goals, and keep the best known body of each problem."""
+    from softgym_envs.codesign.benchmark.scoring import write_reference
+    from softgym_envs.codesign.benchmark.submission import is_better
+
+    for each in runs:
+        problem = load_problem(each.problem)
+        known = make_reference(problem, data)
+        judge = problem.definition.judge
+        scores = [tested(problem, design, judge, "test", "fem", folder, each.seed) for design in each.designs]
+        values = [score.scores for score in scores if score.feasible]
+        if values and is_better(known, values):
+            designs = [score.design for score in scores if score.feasible]
+            where = {"method": each.method, "judge": each.judge, "seed": each.seed, "level": each.level}
+            known = Reference(
+                known.problem, known.hash, known.baseline, values, designs, judge, {**where, "commit": each.commit}
+            )
+            write_reference(known, data)
+
+
+# -- stored results ---------------------------------------------------------------------------------------------------
+
+
+def collect(folder: Path, data: Path = DATA) -> Path:
+    """Write all runs of a folder and the tests of their winners into one small file of the package."""
+    rows = []
+    for path in sorted(folder.glob("runs/*/*.json")):
+        each = Run.read(path)
+        problem = load_problem(each.problem)
+        if each.hash != problem.hash:
+            continue
+        rows.append({**each.to_json(), "test": _stored_test(problem, each, folder)})
+    target = data / "runs.json"
+    with atomic_write(target, "w") as stream:
+        stream.write("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
+    return target
+
+
+def _stored_test(problem: FrozenProblem, each: Run, folder: Path) -> list[list[float]] | None:
+    judge, found = problem.definition.judge, []
+    for design in each.designs:
+        point = [round(float(problem.definition.optimised[name].to_unit(value)), 6) for name, value in design.items()]
+        key = json.dumps([problem.hash, point, judge, "test", "fem", each.seed if judge == "trained" else 0])
+        path = folder / "scores" / problem.name / f"{sha256(key.encode()).hexdigest()[:24]}.json"
+        if not path.is_file():
+            return None
+        found.append(Score.read(path).scores)
+    return found
+
+
+def stored_runs(data: Path = DATA) -> list[tuple[Run, list[list[float]] | None]]:
+    """Return the stored runs, each with the scores of its winners on finite elements, or None if not tested."""
+    path = data / "runs.json"
+    if not path.is_file():
+        return []
+    rows = []
+    for row in read_json(path):
+        test = row.pop("test")
+        rows.append((Run.from_json(row), test))
+    return rows
+
+
+# -- tables -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MethodRow:
+    """A method on one problem, over its seeds.
+
+    ``regret`` is 0 for the best body that any run found and 1 for the baseline, under the inverse QP on the validation
+    goals; ``area`` its mean over the logarithm of the environment steps; ``steps`` the median steps until it stays
+    below 1 %, infinite if more than half of the runs never get there; ``score`` the normalised score on finite
+    elements, ``exploitation`` the score on the surrogate minus that on finite elements.
+    """
+
+    problem: str
+    judge: str
+    method: str
+    seeds: int
+    regret: Estimate
+    area: float
+    steps: float
+    seconds: float
+    score: Estimate | None
+    at_bounds: float
+    diversity: float
+
+
+def method_rows(runs: Sequence[tuple[Run, list[list[float]] | None]], data: Path = DATA) -> list[MethodRow]:
+    """Return one row per problem, judge and method with a single objective."""
+    groups: dict[tuple[str, str, str], list[tuple[Run, Any]]] = defaultdict(list)
+    for each, test in runs:
+        if each.curve:
+            groups[each.problem, each.judge, each.method].append((each, test))
+    best: dict[str, float] = {}
+    first: dict[str, float] = {}
+    for each, _ in runs:
+        if each.curve:
+            best[each.problem] = max([best.get(each.problem, -np.inf), *(row[2] for row in each.curve)])
+            first[each.problem] = each.curve[0][2]
+    rows = []
+    for (name, judge, method), members in sorted(groups.items()):
+        problem = load_problem(name, check=False)
+        limit = problem.definition.budgets[members[0][0].level].environment_steps  # type: ignore[index]
+        span = best[name] - first[name]
+        curves = [[(r[0], (best[name] - r[2]) / span, r[1]) for r in each.curve] for each, _ in members]
+        ends = np.array([[curve[-1][1]] for curve in curves])
+        known = reference(problem, data)
+        scores = [normalised(known, test) for _, test in members if known is not None and test]
+        known_scores = np.array([[s] for s in scores if s is not None])
+        reached = [_reached(curve) for curve in curves]
+        rows.append(
+            MethodRow(
+                name,
+                judge,
+                method,
+                len(members),
+                stratified_estimate(ends),
+                float(np.mean([_area(curve, limit) for curve in curves])),
+                float(np.median([steps for steps, _ in reached])),
+                float(np.median([seconds for _, seconds in reached])),
+                stratified_estimate(known_scores) if len(known_scores) == len(members) else None,
+                float(np.mean([bounds_share(problem, each.designs[0]) for each, _ in members])),
+                float(np.mean([each.diversity for each, _ in members])),
+            )
+        )
+    return rows
+
+
+def _reached(curve: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
+    """Return environment steps and CPU seconds from which on the regret stays below `REGRET`; infinite if never."""
+    if curve[-1][1] >= REGRET:
+        return np.inf, np.inf
+    index = max((k + 1 for k, row in enumerate(curve) if row[1] >= REGRET), default=0)
+    return curve[index][0], curve[index][2]
+
+
+def _area(curve: Sequence[tuple[float, float, float]], limit: float) -> float:
+    """Return the mean regret over the logarithm of the environment steps, from the first body to the budget."""
+    steps = np.array([row[0] for row in curve] + [max(limit, curve[-1][0] + 1)])
+    widths = np.diff(np.log(steps))
+    return float(np.dot(widths, [row[1] for row in curve]) / widths.sum())
+
+
+def improvements(runs: Sequence[tuple[Run, Any]], judge: str, first: str, second: str) -> Estimate | None:
+    """Return the probability that a run of one method ends with less regret than one of another.
+
+    It is over the problems on which both ran with the same number of seeds; None if there are none.
+    """
+    table: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for each, _ in runs:
+        if each.judge == judge and each.curve:
+            table[each.problem][each.method].append(each.curve[-1][2])
+    names = [name for name, row in table.items() if row.get(first) and row.get(second)]
+    if not names:
+        return None
+    count = min(min(len(table[n][first]), len(table[n][second])) for n in names)
+    a, b = (np.array([table[n][m][:count] for n in names]).T for m in (first, second))
+    return improvement(a, b)
+
+
+def judges(folder: Path, name: str, bodies: int, seed: int = 0) -> dict[str, Any]:
+    """Compare the judges with specialists on finite elements, on bodies of a Sobol sequence and the search goals.
+
+    Returns:
+        The scores of each judge, and Kendall's tau and the mean difference to the specialists; also written to the
+        folder.
+    """
+    from scipy.stats import kendalltau, qmc
+
+    problem = load_problem(name)
+    points = 2.0 * qmc.Sobol(len(problem.variables), rng=np.random.default_rng(seed)).random(bodies) - 1.0
+    designs = [problem.design(point) for point in points]
+    specialist: Judge = "trained" if "trained" in problem.definition.judges else "qp"
+    exact = [tested(problem, d, specialist, "search", "fem", folder).score for d in designs]
+    found: dict[str, Any] = {
+        "problem": name,
+        "hash": problem.hash,
+        "designs": designs,
+        "specialist": specialist,
+        "exact": exact,
+        "judges": {},
+    }
+    for judge in problem.definition.judges:
+        scores = [tested(problem, d, judge, "search", None, folder).score for d in designs]
+        pairs = [(a, b) for a, b in zip(scores, exact, strict=True) if np.isfinite([a, b]).all()]
+        first, second = np.array(pairs).T
+        found["judges"][judge] = {
+            "scores": scores,
+            "kendall_tau": float(kendalltau(first, second).statistic),
+            "exploitation": float(np.mean(first - second)),
+        }
+    write_json(folder / "judges" / f"{name}.json", found)
+    return found

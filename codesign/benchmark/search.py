@@ -1,0 +1,173 @@
+"""Searches: any optimiser that can ask and tell, within a budget, with a ledger of every body it has tried."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from softgym_envs.codesign.benchmark.frozen import FrozenProblem
+from softgym_envs.codesign.benchmark.problem import LEVELS, Budget, Judge, Score
+from softgym_envs.codesign.sampling import SamplerConfig, make_sampler
+from softgym_envs.codesign.scheduling.optuna_study import distributions
+from softgym_envs.errors import SoftGymError, unknown_name
+
+
+class BudgetSpent(SoftGymError):
+    """A search asks for a score although its budget is spent."""
+
+
+class Optimiser(Protocol):
+    """What `solve` needs of an optimiser."""
+
+    def ask(self) -> Mapping[str, float]:
+        """Return the body to score next: a value of every variable [SI]."""
+
+    def tell(self, score: Score) -> None:
+        """Learn the outcome of the body that `ask` returned last."""
+
+
+@dataclass
+class Search:
+    """A search on a problem: scores bodies until the budget is spent, and keeps a ledger.
+
+    Args:
+        problem: the problem.
+        level: name of the budget: small, medium or large.
+        judge: who controls the bodies; default that of the problem.
+        seed: added to those of trainings.
+    """
+
+    problem: FrozenProblem
+    level: str = "small"
+    judge: Judge | None = None
+    seed: int = 0
+    ledger: list[Score] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.level not in LEVELS:
+            raise ValueError(unknown_name("level", self.level, LEVELS))
+        self.judge = self.judge or self.problem.definition.judge
+
+    @property
+    def limits(self) -> Budget:
+        """The budget."""
+        return self.problem.definition.budgets[self.level]  # type: ignore[index]
+
+    @property
+    def spent(self) -> dict[str, float]:
+        """What has been spent, by the names of `Budget`."""
+        return {name: sum(getattr(row, name) for row in self.ledger) for name in Budget.model_fields}
+
+    @property
+    def open(self) -> bool:
+        """Whether budget is left. The score that crosses a limit is the last one, and it counts."""
+        return all(value < max(getattr(self.limits, name), 1) for name, value in self.spent.items())
+
+    def evaluate(self, design: Mapping[str, float], budget: float = 1.0) -> Score:
+        """Score a body and write it into the ledger; see `FrozenProblem.evaluate`.
+
+        Raises:
+            BudgetSpent: if no budget is left.
+        """
+        if not self.open:
+            spent = ", ".join(f"{name} = {value:g}" for name, value in self.spent.items())
+            raise BudgetSpent(f"problem '{self.problem.name}': the budget '{self.level}' is spent ({spent})")
+        row = self.problem.evaluate(design, budget, judge=self.judge, seed=self.seed)
+        self.ledger.append(row)
+        return row
+
+    @property
+    def best(self) -> Score | None:
+        """The feasible body with the best score on all goals and steps; None if there is none."""
+        whole = [row for row in self.ledger if row.feasible and row.share == 1.0]
+        return max(whole, key=lambda row: row.score, default=None)
+
+    @property
+    def incumbents(self) -> list[tuple[int, Score]]:
+        """The bodies that were the best when they were scored, each with its place in the ledger."""
+        found: list[tuple[int, Score]] = []
+        for index, row in enumerate(self.ledger):
+            if row.feasible and row.share == 1.0 and (not found or row.score > found[-1][1].score):
+                found.append((index, row))
+        return found
+
+
+def solve(search: Search, optimiser: Optimiser) -> float:
+    """Run an optimiser until the budget is spent; return its own CPU time [s].
+
+    The first body is the baseline, for every optimiser.
+    """
+    began = time.process_time()
+    if not search.ledger:
+        search.evaluate(search.problem.definition.baseline_values)
+    while search.open:
+        design = optimiser.ask()
+        optimiser.tell(search.evaluate(design))
+    return time.process_time() - began - search.spent["cpu_seconds"]
+
+
+class OptunaOptimiser:
+    """A sampler of Optuna, asked and told.
+
+    Args:
+        problem: the problem.
+        sampler: the sampler and its options.
+    """
+
+    def __init__(self, problem: FrozenProblem, sampler: SamplerConfig) -> None:
+        import optuna
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        definition = problem.definition
+        self._study = optuna.create_study(directions=definition.directions, sampler=make_sampler(sampler, 0))
+        self._ranges = distributions(definition)
+        self._trial: Any = None
+
+    def ask(self) -> Mapping[str, float]:
+        """Return the body to score next."""
+        self._trial = self._study.ask(self._ranges)
+        return self._trial.params
+
+    def tell(self, score: Score) -> None:
+        """Learn the outcome; an infeasible body is a pruned trial."""
+        import optuna
+
+        if score.feasible:
+            self._study.tell(self._trial, score.scores)
+        else:
+            self._study.tell(self._trial, state=optuna.trial.TrialState.PRUNED)
+
+
+def _optuna(name: str, **options: Any) -> Callable[[FrozenProblem, int], Optimiser]:
+    def make(problem: FrozenProblem, seed: int) -> Optimiser:
+        return OptunaOptimiser(problem, SamplerConfig(name=name, seed=seed, options=options))  # type: ignore[arg-type]
+
+    return make
+
+
+METHODS: dict[str, Callable[[FrozenProblem, int], Optimiser]] = {
+    "random": _optuna("random"),
+    "sobol": _optuna("qmc"),
+    "tpe": _optuna("tpe", n_startup_trials=8),
+    "gp": _optuna("gp", n_startup_trials=8),
+    "cmaes": _optuna("cmaes"),
+    "nsgaii": _optuna("nsgaii", population_size=8),
+}
+"""Baselines: name -> function of problem and seed. A new one is one row."""
+
+SINGLE_OBJECTIVE = ("cmaes",)
+"""Methods that know a single objective only."""
+
+
+def make_optimiser(name: str, problem: FrozenProblem, seed: int) -> Optimiser:
+    """Return a baseline.
+
+    Raises:
+        ValueError: for an unknown name, or a method that does not know several objectives.
+    """
+    allowed = [each for each in METHODS if problem.definition.score_count == 1 or each not in SINGLE_OBJECTIVE]
+    if name not in allowed:
+        raise ValueError(f"problem '{problem.name}': {unknown_name('method', name, allowed)}")
+    return METHODS[name](problem, seed)

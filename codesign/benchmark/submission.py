@@ -1,0 +1,290 @@
+"""Submissions to the leaderboard: one JSON file each, and the check that decides whether a score stands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.agents.policy import Policy
+from softgym_envs.codesign.benchmark.frozen import FrozenProblem, file_hash, load_problem
+from softgym_envs.codesign.benchmark.problem import JUDGES, LEVELS, Budget, Score, goal_key
+from softgym_envs.codesign.benchmark.scoring import DATA, Reference, front, make_reference, normalised, write_reference
+from softgym_envs.codesign.benchmark.search import Search
+from softgym_envs.codesign.records import Record
+from softgym_envs.config import provenance
+from softgym_envs.errors import ConfigError, ConvergenceError, DataError, DesignError, InfeasibleDesign
+
+TOLERANCE = {"qp": 1e-3, "shared": 1e-3, "trained": 5e-2, "policy": 1e-3}
+"""Controller -> largest difference between a claimed score and the verified one, relative to the larger of both.
+
+On one machine both agree to the last digit. Other processors round differently, and a training amplifies that.
+"""
+
+
+class SubmissionRefused(DataError):
+    """A submission whose score does not stand."""
+
+
+@dataclass(eq=False)
+class Submission(Record):
+    """One search on one problem, as JSON.
+
+    Attributes:
+        problem: ID with its version.
+        hash: of the frozen problem.
+        method: name of the optimiser.
+        author: who submits.
+        level: name of the budget.
+        judge: who controlled the bodies in the search.
+        seed: of the search.
+        designs: the winner; with several objectives, at most eight bodies of the front.
+        controller: who controls it in the test: a judge, or ``"policy"``.
+        policy: for ``"policy"``: ``file`` beside the submission, its ``sha256`` (first half), and ``goals``, the hashes
+            of the goals that it was trained on.
+        claimed: scores of each body on the test goals, on finite elements; empty if they were not computed.
+        ledger: all scores of the search.
+        optimiser_seconds: CPU time of the optimiser itself [s].
+        pretraining_steps: environment steps behind whatever the method knew before it saw the problem.
+        provenance: versions, commit, time and machine.
+    """
+
+    problem: str
+    hash: str
+    method: str
+    author: str
+    level: str
+    judge: str
+    seed: int
+    designs: list[dict[str, float]]
+    controller: str
+    policy: dict[str, Any] | None = None
+    claimed: list[list[float]] = field(default_factory=list)
+    ledger: list[dict[str, Any]] = field(default_factory=list)
+    optimiser_seconds: float = 0.0
+    pretraining_steps: int = 0
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the check of an accepted submission found.
+
+    Attributes:
+        scores: of each body on the test goals, on finite elements.
+        normalised: 0 for the baseline under the inverse QP, 1 for the best known; None if no better body is known.
+        exploitation: search score on the surrogate minus that on finite elements on the same goals [SI]; how much the
+            search profited from errors of the surrogate. None with several objectives.
+        record: whether it is the best known now.
+    """
+
+    scores: list[list[float]]
+    normalised: float | None
+    exploitation: float | None
+    record: bool
+
+
+def submit(
+    search: Search, method: str, *, author: str = "", optimiser_seconds: float = 0.0, test: bool = False
+) -> Submission:
+    """Return the submission of a finished search.
+
+    Args:
+        search: the search; its best body is submitted, with several objectives the bodies of its front.
+        method: name of the optimiser.
+        author: who submits.
+        optimiser_seconds: CPU time of the optimiser itself [s].
+        test: whether to test the bodies on finite elements now, and claim these scores.
+
+    Raises:
+        DataError: if the search found no feasible body.
+    """
+    problem, best = search.problem, search.best
+    if best is None:
+        raise DataError(f"problem '{problem.name}': the search found no feasible body")
+    winners = [best] if problem.definition.score_count == 1 else front(search.ledger)
+    submission = Submission(
+        problem=problem.name,
+        hash=problem.hash,
+        method=method,
+        author=author,
+        level=search.level,
+        judge=str(search.judge),
+        seed=search.seed,
+        designs=[row.design for row in winners],
+        controller=problem.definition.judge,
+        ledger=[row.to_json() for row in search.ledger],
+        optimiser_seconds=optimiser_seconds,
+        provenance=provenance(),
+    )
+    if test:
+        submission.claimed = _tested(problem, submission, None)
+    return submission
+
+
+def verify(path: str | Path, *, data: Path = DATA, record: bool = False) -> Verdict:
+    """Check a submission: run its bodies again on finite elements, on the test goals (minutes).
+
+    Args:
+        path: the JSON file; a policy lies beside it.
+        data: folder of the references.
+        record: whether to store the bodies as the best known if they are.
+
+    Raises:
+        SubmissionRefused: one line that says why the score does not stand.
+        DataError: if the file cannot be read, or the frozen problem does not fit the installed package.
+    """
+    path = Path(path)
+    submission = Submission.read(path)
+    problem = _checked_problem(submission)
+    rows = _checked_ledger(problem, submission)
+    policy = _checked_policy(problem, submission, path.parent)
+    _check_search_score(problem, submission, rows)
+    scores = _tested(problem, submission, policy)
+    for claimed, found in zip(submission.claimed, scores, strict=False):
+        _compare(submission.controller, "score on the test goals", claimed, found)
+    known = make_reference(problem, data)
+    exploitation = None
+    if problem.definition.score_count == 1 and problem.definition.environment.backend == "surrogate":
+        evaluator = problem.evaluator("search", "fem")
+        judge = problem.definition.judge if policy is not None else submission.controller
+        exact = evaluator(submission.designs[0], judge, seed=submission.seed, policy=policy)  # type: ignore[arg-type]
+        learned = problem.evaluator("search")(submission.designs[0], judge, seed=submission.seed, policy=policy)  # type: ignore[arg-type]
+        exploitation = learned.score - exact.score
+    better = is_better(known, scores)
+    if better:
+        known.best, known.designs, known.controller = scores, submission.designs, submission.controller
+        known.found = {
+            "method": submission.method,
+            "author": submission.author,
+            "judge": submission.judge,
+            "seed": submission.seed,
+            "level": submission.level,
+            **{key: submission.provenance.get(key) for key in ("commit", "time")},
+        }
+        if record:
+            write_reference(known, data)
+    return Verdict(scores, normalised(known, scores), exploitation, better)
+
+
+def is_better(known: Reference, scores: list[list[float]]) -> bool:
+    """Return whether bodies beat the best known ones, and the baseline."""
+    level = Reference(known.problem, known.hash, known.baseline, scores)
+    if normalised(level, scores) is None:  # not better than the baseline
+        return False
+    if not known.best:
+        return True
+    value = normalised(known, scores)
+    return value is None or value > 1.0
+
+
+def _checked_problem(submission: Submission) -> FrozenProblem:
+    try:
+        problem = load_problem(submission.problem)
+    except ConfigError as error:
+        raise SubmissionRefused(str(error)) from None
+    if submission.hash != problem.hash:
+        raise SubmissionRefused(
+            f"the submission is for another version of '{problem.name}': its hash is {submission.hash[:12]}, that of "
+            f"the installed problem {problem.hash[:12]}"
+        )
+    if submission.level not in LEVELS:
+        raise SubmissionRefused(f"level '{submission.level}' does not exist; allowed: {', '.join(LEVELS)}")
+    limit = 1 if problem.definition.score_count == 1 else 8
+    if not 1 <= len(submission.designs) <= limit:
+        raise SubmissionRefused(f"{len(submission.designs)} bodies are submitted; allowed: 1 to {limit}")
+    for design in submission.designs:
+        try:
+            problem.definition.checked(design)
+        except DesignError as error:
+            raise SubmissionRefused(f"the body is not in the box of '{problem.name}': {error}") from None
+    return problem
+
+
+def _checked_ledger(problem: FrozenProblem, submission: Submission) -> list[Score]:
+    """Return the ledger; it must hold each submitted body and keep to the budget."""
+    rows = [Score.from_json(row) for row in submission.ledger]
+    limits = problem.definition.budgets[submission.level]  # type: ignore[index]
+    for name in Budget.model_fields:
+        before = sum(getattr(row, name) for row in rows[:-1])  # the score that crosses the limit counts
+        if before >= max(getattr(limits, name), 1):
+            raise SubmissionRefused(
+                f"the ledger exceeds the budget '{submission.level}': {name} = {before:g} before the last body; "
+                f"allowed: {getattr(limits, name):g}"
+            )
+    for design in submission.designs:
+        if not any(_same(problem, row.design, design) and row.share == 1.0 for row in rows):
+            raise SubmissionRefused("a submitted body is not in the ledger of the search, with all goals and steps")
+    return rows
+
+
+def _same(problem: FrozenProblem, first: Mapping[str, float], second: Mapping[str, float]) -> bool:
+    variables = problem.definition.optimised
+    return set(first) == set(second) and all(
+        abs(float(variables[name].to_unit(first[name]) - variables[name].to_unit(second[name]))) < 1e-9
+        for name in first
+    )
+
+
+def _checked_policy(problem: FrozenProblem, submission: Submission, folder: Path) -> Path | None:
+    """Return the file of the submitted policy; None if the controller is a judge."""
+    given = submission.policy
+    if submission.controller in JUDGES:
+        if submission.controller not in problem.definition.judges:
+            raise SubmissionRefused(f"problem '{problem.name}' has no judge '{submission.controller}'")
+        return None
+    if submission.controller != "policy" or not given:
+        raise SubmissionRefused(
+            f"controller '{submission.controller}' does not exist; allowed: {', '.join(JUDGES)}, or policy with a file"
+        )
+    path = folder / str(given.get("file"))
+    if not path.is_file():
+        raise SubmissionRefused(f"the policy '{given.get('file')}' does not lie beside the submission")
+    if file_hash(path) != given.get("sha256"):
+        raise SubmissionRefused(f"the policy '{path.name}' is not the one that was submitted: its SHA-256 differs")
+    policy = Policy(path)
+    named = set(given.get("goals", []))
+    trained = policy.environment.task_options.get("goals") or []
+    named |= {goal_key(np.asarray(goal, dtype=float)) for goal in trained}
+    if not problem.single_path and (leaked := named & problem.test_keys):
+        raise SubmissionRefused(
+            f"the policy '{path.name}' was trained on {len(leaked)} of the test goals of '{problem.name}'"
+        )
+    return path
+
+
+def _check_search_score(problem: FrozenProblem, submission: Submission, rows: list[Score]) -> None:
+    """Score each submitted body again on the search goals, as the search did."""
+    for design in submission.designs:
+        row = next(row for row in rows if _same(problem, row.design, design) and row.share == 1.0)
+        found = problem.evaluate(design, judge=submission.judge, seed=submission.seed)  # type: ignore[arg-type]
+        _compare(submission.judge, "score in the ledger", row.scores, found.scores)
+
+
+def _compare(controller: str, what: str, claimed: list[float], found: list[float]) -> None:
+    tolerance = TOLERANCE[controller]
+    for a, b in zip(claimed, found, strict=False):
+        if not abs(a - b) <= tolerance * max(abs(a), abs(b)):
+            raise SubmissionRefused(
+                f"the {what} is {a:.6g}, but running the body again gives {b:.6g} (tolerance {100 * tolerance:g} %)"
+            )
+    if len(claimed) != len(found):
+        raise SubmissionRefused(f"the {what} has {len(claimed)} values, but running the body again gives {len(found)}")
+
+
+def _tested(problem: FrozenProblem, submission: Submission, policy: Path | None) -> list[list[float]]:
+    """Return the scores of the bodies on the test goals, on finite elements."""
+    evaluator, found = problem.evaluator("test", "fem"), []
+    judge: Any = problem.definition.judge if policy is not None else submission.controller
+    for design in submission.designs:
+        try:
+            score = evaluator(design, judge, seed=submission.seed, policy=policy)
+        except (InfeasibleDesign, ConvergenceError) as error:
+            raise SubmissionRefused(f"the body cannot be tested: {error}") from None
+        if not score.feasible:
+            raise SubmissionRefused(f"the body is infeasible on finite elements: {score.reason}")
+        found.append(score.scores)
+    return found

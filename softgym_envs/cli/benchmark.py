@@ -1,0 +1,165 @@
+"""Verbs of the benchmark of co-design: list, show, run, verify, table, board, judges, freeze."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from softgym_envs.cli import options
+from softgym_envs.extras import require
+
+FOLDER = Path("results/benchmark")
+
+results = click.option(
+    "--folder", type=options.PATH, default=FOLDER, show_default=True, help="Folder for runs and scores."
+)
+
+
+@click.group()
+def benchmark() -> None:
+    """Compare optimisers of bodies and controllers on frozen problems.
+
+    Scores of submissions are those on finite elements.
+    """
+    require("codesign")
+
+
+@benchmark.command(name="list")
+def list_() -> None:
+    """List the problems."""
+    from softgym_envs.codesign.benchmark.frozen import load_definition, problem_names
+
+    click.echo(f"{'problem':28s} {'track':5s} {'variables':>9s} {'judge':8s} title")
+    for name in problem_names():
+        problem = load_definition(name)
+        click.echo(f"{name:28s} {problem.track:5s} {len(problem.variables):9d} {problem.judge:8s} {problem.title}")
+
+
+@benchmark.command()
+@click.argument("name")
+def show(name: str) -> None:
+    """Show a problem: its box, budgets, hashes and what is known about it."""
+    from softgym_envs.codesign.benchmark.frozen import load_problem
+    from softgym_envs.codesign.benchmark.problem import TRACKS
+    from softgym_envs.codesign.benchmark.scoring import reference
+
+    problem = load_problem(name)
+    definition = problem.definition
+    click.echo(f"{name}: {definition.title}\ntrack {definition.track}: {TRACKS[definition.track]}")
+    click.echo(f"objectives: {', '.join(definition.score_names)} (larger is better)")
+    click.echo(f"judges: {', '.join(definition.judges)}; default {definition.judge}\nvariables:")
+    for variable in definition.optimised.values():
+        unit = "" if variable.unit == "1" else f" {variable.unit}"
+        click.echo(
+            f"  {variable.name}: {variable.low:g} to {variable.high:g}{unit}, baseline {variable.baseline:g}{unit}"
+        )
+    for level, budget in definition.budgets.items():
+        limits = ", ".join(f"{key.replace('_', ' ')} {value:g}" for key, value in budget.model_dump().items())
+        click.echo(f"budget {level}: {limits}")
+    click.echo("hashes: " + ", ".join(f"{key} {value[:12]}" for key, value in problem.parts.items()))
+    known = reference(problem)
+    if known is not None:
+        click.echo(f"on finite elements, test goals: baseline {known.baseline}, best known {known.best or 'none'}")
+
+
+@benchmark.command()
+@click.argument("names", nargs=-1, required=True)
+@click.option("--method", "methods", multiple=True, required=True, help="Optimiser; several with several options.")
+@click.option("--judge", help="Who controls the bodies in the search (default: the problem's).")
+@click.option("--level", default="small", show_default=True, help="Budget: small, medium or large.")
+@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Number of seeds.")
+@click.option("--fem/--no-fem", default=False, help="Test the winners on finite elements too (minutes each).")
+@results
+def run(
+    names: tuple[str, ...],
+    methods: tuple[str, ...],
+    judge: str | None,
+    level: str,
+    seeds: int,
+    fem: bool,
+    folder: Path,
+) -> None:
+    """Run baselines on problems NAMES.
+
+    An interrupted call continues where it stopped.
+    """
+    from softgym_envs.codesign.benchmark import runs
+
+    with options.resumable():
+        for seed in range(seeds):
+            for name in names:
+                for method in methods:
+                    found = runs.run(folder, name, method, judge, level, seed)  # type: ignore[arg-type]
+                    click.echo(
+                        f"{name} {method} {found.judge} seed {seed}: {found.bodies} bodies, "
+                        f"{found.spent['cpu_seconds']:.1f} CPU s, best {found.search_scores[:1]}"
+                    )
+                    if fem:
+                        runs.check_winners(folder, [found])
+
+
+@benchmark.command()
+@click.argument("name")
+@click.option("--bodies", type=click.IntRange(min=3), default=16, show_default=True)
+@results
+def judges(name: str, bodies: int, folder: Path) -> None:
+    """Compare the judges of a problem with specialists on finite elements."""
+    from softgym_envs.codesign.benchmark import runs
+
+    with options.resumable():
+        found = runs.judges(folder, name, bodies)
+    for judge, row in found["judges"].items():
+        click.echo(f"{judge}: Kendall's tau {row['kendall_tau']:.2f}, mean exploitation {row['exploitation']:.3g} (SI)")
+
+
+@benchmark.command()
+@click.argument("path", type=options.PATH)
+@click.option("--record", is_flag=True, help="Store the bodies as the best known if they are (source checkout).")
+@click.option("--json", "as_json", is_flag=True, help="Print the verdict as JSON.")
+def verify(path: Path, record: bool, as_json: bool) -> None:
+    """Check a submission: run its bodies again on finite elements."""
+    from dataclasses import asdict
+
+    from softgym_envs.codesign.benchmark import verify as check
+
+    verdict = check(path, record=record)
+    if as_json:
+        click.echo(json.dumps(asdict(verdict)))
+        return
+    shown = "unknown" if verdict.normalised is None else f"{verdict.normalised:.4f}"
+    click.echo(f"accepted: normalised score {shown}; scores on finite elements {verdict.scores}")
+    if verdict.record:
+        click.echo("this is the best known")
+
+
+@benchmark.command()
+@results
+def table(folder: Path) -> None:
+    """Show the stored runs, or those of a folder, one row per problem, judge and method."""
+    from softgym_envs.codesign.benchmark import board, runs
+
+    if (folder / "runs").is_dir():
+        runs.collect(folder, folder)
+        click.echo(board.method_table(runs.stored_runs(folder)))
+    else:
+        click.echo(board.method_table(runs.stored_runs()))
+
+
+@benchmark.command(name="board")
+def board_() -> None:
+    """Show the leaderboard of the stored submissions."""
+    from softgym_envs.codesign.benchmark import board
+
+    click.echo(board.leaderboard())
+
+
+@benchmark.command()
+@click.argument("names", nargs=-1, required=True)
+def freeze(names: tuple[str, ...]) -> None:
+    """Freeze problems NAMES: draw their goals, and store these with the hashes (source checkout)."""
+    from softgym_envs.codesign.benchmark import frozen
+
+    for name in names:
+        click.echo(f"wrote {frozen.freeze(name)}")
