@@ -17,6 +17,7 @@ EXTRAS = {
     "onnx": ("onnx",),
     "minari": ("minari", "h5py", "jax"),
     "design": ("SALib",),
+    "benchmark": ("pyarrow",),
 }
 """Extra in pyproject.toml -> modules that it installs."""
 

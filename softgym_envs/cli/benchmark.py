@@ -163,3 +163,20 @@ def freeze(names: tuple[str, ...]) -> None:
 
     for name in names:
         click.echo(f"wrote {frozen.freeze(name)}")
+
+
+@benchmark.command()
+@click.argument("name")
+@click.option("--bodies", type=click.IntRange(min=1), default=100_000, show_default=True)
+@click.option("--qp-bodies", type=click.IntRange(min=0), default=1_000, show_default=True)
+@click.option("--output", type=options.PATH, help="Parquet file (default: the shipped table of the problem).")
+@results
+def tabulate(name: str, bodies: int, qp_bodies: int, output: Path | None, folder: Path) -> None:
+    """Score many bodies of a problem and write them as a table.
+
+    The shared policy scores all bodies, the inverse QP the first of them. An interrupted call continues.
+    """
+    from softgym_envs.codesign.benchmark.table import tabulate as run
+
+    with options.resumable():
+        click.echo(f"wrote {run(name, bodies, qp_bodies, folder, output)}")
