@@ -16,6 +16,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from site_api import PACKAGES, api_index, api_page
+from site_benchmark import benchmark_page
 from site_environments import environment_sections, environment_top
 from site_notebooks import PAGES, notebooks
 from site_robots import model_facts, robot_of, robot_sections
@@ -139,6 +140,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         return markdown.replace(HERE, lists[folder]()) if folder in lists else markdown
     if page.file.src_uri.removesuffix(".md") in PAGES:
         return f"{markdown}\n\n[This page as a notebook]({name}.ipynb){{ download }}\n"
+    if page.file.src_uri == "benchmark.md":
+        return benchmark_page(markdown)
     if page.file.src_uri == "gallery.md":
         return markdown.replace(HERE, gallery())
     if folder == "environments":

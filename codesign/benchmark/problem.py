@@ -218,7 +218,7 @@ class Evaluator:
         if judge not in problem.judges:
             raise ValueError(f"problem '{problem.name}': {unknown_name('judge', judge, problem.judges)}")
         if not 0.0 < share <= 1.0:
-            raise ValueError(f"share = {share} must be in (0, 1]")
+            raise ValueError(f"budget = {share} must be a share in (0, 1]")
         values = problem.checked(values)
         design, options = problem.body(values)
         result = Score(values, judge, share)

@@ -114,7 +114,7 @@ def submit(
         level=search.level,
         judge=str(search.judge),
         seed=search.seed,
-        designs=[row.design for row in winners],
+        designs=[dict(row.design) for row in winners],
         controller=problem.definition.judge,
         ledger=[row.to_json() for row in search.ledger],
         optimiser_seconds=optimiser_seconds,

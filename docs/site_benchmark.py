@@ -1,0 +1,21 @@
+"""Generated parts of the page of the benchmark: problems, leaderboard and tables of the baselines."""
+
+from __future__ import annotations
+
+import re
+
+from softgym_envs.codesign.benchmark import board
+
+PARTS = {
+    "tracks": board.tracks,
+    "problems": board.problem_table,
+    "references": board.reference_table,
+    "board": board.leaderboard,
+    "methods": board.method_table,
+}
+"""Name of a part, in ``<!-- benchmark: NAME -->`` -> the function that writes it."""
+
+
+def benchmark_page(markdown: str) -> str:
+    """Return the page with its generated parts."""
+    return re.sub(r"<!-- benchmark: (\w+) -->", lambda match: PARTS[match[1]](), markdown)

@@ -1,0 +1,121 @@
+"""Frozen problems: nothing that decides a score may change unnoticed, and searches keep to their budget."""
+
+import numpy as np
+import pytest
+import yaml
+
+from softgym_envs.codesign.benchmark import Search, load_problem, problem_names
+from softgym_envs.codesign.benchmark.frozen import freeze, load_definition
+from softgym_envs.codesign.benchmark.problem import GOAL_SETS, TRACKS, goal_key
+from softgym_envs.codesign.benchmark.search import METHODS, BudgetSpent, make_optimiser, solve
+from softgym_envs.errors import ConfigError, DataError, DesignError
+from tests.codesign.benchmark.conftest import tiny_definition
+
+NAMES = problem_names()
+
+
+def test_there_are_at_least_twelve_problems_in_all_tracks():
+    definitions = [load_definition(name) for name in NAMES]
+    assert len(NAMES) >= 12
+    assert {definition.track for definition in definitions} == set(TRACKS)
+    assert len({definition.robot.name for definition in definitions}) >= 7
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_decides_a_score_is_what_was_frozen(name):
+    """After a deliberate change: softgym benchmark freeze NAME, and a new version once the suite is released."""
+    problem = load_problem(name)
+    for key in GOAL_SETS:
+        assert len(problem.goals[key]) == problem.definition.goals[key].count
+    if not problem.single_path:
+        keys = [goal_key(goal) for key in GOAL_SETS for goal in problem.goals[key]]
+        assert len(keys) == len(set(keys))
+    assert set(problem.definition.baseline_values) == set(problem.variables)
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        ({"variables": ["length", "height"]}, "definition"),
+        ({"environment": {"id": "SoftGym/FingerReach-v0", "robot_options": {"unilateral": False}}}, "definition"),
+        ({"policy": "finger_reach"}, "policy"),
+    ],
+)
+def test_a_change_is_found(tiny, problems, change, part):
+    (problems / "tiny-v1.yaml").write_text(yaml.safe_dump(tiny_definition(**change)))
+    with pytest.raises(DataError, match=rf"problem 'tiny-v1' differs from what was frozen in: .*{part}"):
+        load_problem("tiny-v1")
+
+
+def test_a_changed_goal_is_found(tiny, problems):
+    path = problems / "tiny-v1.json"
+    x = repr(float(tiny.goals["test"][0, 0, 0]))
+    text = path.read_text()
+    assert x in text
+    path.write_text(text.replace(x, repr(float(x) + 1e-5)))
+    with pytest.raises(DataError, match=r"differs from what was frozen in: goals"):
+        load_problem("tiny-v1")
+
+
+def test_freezing_again_gives_the_same_problem(tiny):
+    freeze("tiny-v1")
+    assert load_problem("tiny-v1").hash == tiny.hash
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"name": "tiny"}, "name"),
+        ({"judge": "qp", "track": "C"}, "secondary_objectives"),
+        ({"policy": None}, "judge 'shared' needs a 'policy'"),
+        ({"goals": {"test": {"source": "family", "count": 1, "seed": 1}}}, "goals must have the sets"),
+    ],
+)
+def test_definitions_are_checked(problems, change, message):
+    (problems / "tiny-v1.yaml").write_text(yaml.safe_dump(tiny_definition(**change)))
+    with pytest.raises(ConfigError, match=message):
+        load_definition("tiny-v1")
+
+
+def test_unknown_problems_and_problems_that_are_not_frozen(problems):
+    with pytest.raises(ConfigError, match=r"unknown problem 'tyny-v1'; did you mean 'tiny-v1'"):
+        load_problem("tyny-v1")
+    with pytest.raises(DataError, match=r"'tiny-v1' is not frozen; run: softgym benchmark freeze tiny-v1"):
+        load_problem("tiny-v1")
+
+
+def test_an_evaluation_counts_what_it_costs(tiny):
+    baseline = tiny.definition.baseline_values
+    whole, half = tiny.evaluate(baseline), tiny.evaluate(baseline, 0.5)
+    assert (whole.environment_steps, half.environment_steps) == (100, 50)
+    assert whole.fem_solves == 0 and whole.score == -whole.values["mean_distance"] < 0.0
+    assert tiny.evaluate(baseline).score == whole.score
+    with pytest.raises(DesignError, match=r"'length' = 1 m is out of bounds"):
+        tiny.evaluate({**baseline, "length": 1.0})
+    with pytest.raises(DesignError, match=r"the design lacks height"):
+        tiny.evaluate({name: value for name, value in baseline.items() if name != "height"})
+    with pytest.raises(ValueError, match=r"budget = 0 must be a share in \(0, 1\]"):
+        tiny.evaluate(baseline, 0)
+    with pytest.raises(ValueError, match=r"unknown judge 'pq'; allowed: qp, shared, trained"):
+        tiny.evaluate(baseline, judge="pq")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_each_baseline_solves_and_repeats_itself(tiny, method):
+    found = []
+    for _ in range(2):
+        search = Search(tiny)
+        solve(search, make_optimiser(method, tiny, 3))
+        found.append(search)
+    assert [row.design for row in found[0].ledger] == [row.design for row in found[1].ledger]
+    assert found[0].ledger[0].design == tiny.definition.baseline_values
+    assert len(found[0].ledger) == 7 and found[0].spent["environment_steps"] == 700
+    assert found[0].best.score == max(row.score for row in found[0].ledger)
+    with pytest.raises(BudgetSpent, match=r"the budget 'small' is spent \(environment_steps = 700"):
+        found[0].evaluate(tiny.definition.baseline_values)
+
+
+def test_points_of_the_unit_box(tiny):
+    low, high = (tiny.design(np.full(3, sign)) for sign in (-1.0, 1.0))
+    for name, variable in tiny.definition.optimised.items():
+        assert (low[name], high[name]) == (pytest.approx(variable.low), pytest.approx(variable.high))

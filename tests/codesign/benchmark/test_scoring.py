@@ -1,0 +1,104 @@
+"""Scores, hypervolumes, statistics and tables."""
+
+import numpy as np
+import pytest
+
+from softgym_envs.codesign.benchmark import board, runs
+from softgym_envs.codesign.benchmark.problem import Score
+from softgym_envs.codesign.benchmark.scoring import Reference, front, hypervolume, improvement, normalised
+from softgym_envs.codesign.benchmark.search import make_optimiser, solve
+from softgym_envs.codesign.benchmark.table import Table, TableSearch, tabulate
+from softgym_envs.errors import DataError
+
+
+def test_hypervolume_of_known_sets():
+    worst = np.array([2.0, 2.0])
+    assert hypervolume(np.array([[1.0, 1.0]]), worst) == 1.0
+    assert hypervolume(np.array([[0.0, 1.0], [1.0, 0.0], [1.5, 1.5]]), worst) == 3.0
+    assert hypervolume(np.array([[3.0, 0.0]]), worst) == 0.0
+    cube = np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 0.0]])
+    assert hypervolume(cube, np.full(3, 2.0)) == 4.0
+
+
+def test_hypervolume_against_counting():
+    rng = np.random.default_rng(0)
+    points, samples = rng.random((6, 3)), rng.random((200_000, 3))
+    counted = (samples[:, None] >= points).all(axis=2).any(axis=1).mean()
+    assert hypervolume(points, np.ones(3)) == pytest.approx(counted, abs=5e-3)
+
+
+def test_normalised_scores():
+    known = Reference("p-v1", "0", [-4.0])
+    assert normalised(known, [[-3.0]]) is None
+    known.best = [[-2.0]]
+    assert [normalised(known, [[s]]) for s in (-4.0, -3.0, -2.0, -1.0)] == [0.0, 0.5, 1.0, 1.5]
+    both = Reference("p-v1", "0", [-1.0, -10.0], [[-0.5, -5.0]])
+    assert normalised(both, [[-1.0, -10.0]]) == 0.0 and normalised(both, [[-0.5, -5.0]]) == 1.0
+    assert normalised(both, [[-0.5, -10.0]]) == pytest.approx((1.5 - 1.0) / (2.25 - 1.0))
+
+
+def test_front_leaves_out_what_is_dominated():
+    rows = [Score({"x": i}, "qp", scores=list(s)) for i, s in enumerate([(1.0, 0.0), (0.0, 1.0), (0.0, 0.5)])]
+    assert [row.design["x"] for row in front(rows)] == [0, 1]
+
+
+def test_probability_of_improvement():
+    low, high = np.zeros((4, 2)), np.ones((5, 2))
+    assert improvement(high, low).value == 1.0 and improvement(low, high).value == 0.0
+    same = improvement(low, low)
+    assert (same.value, same.low, same.high) == (0.5, 0.5, 0.5)
+    mixed = improvement(np.array([[0.0], [2.0]]), np.array([[1.0], [1.0]]))
+    assert mixed.value == 0.5 and mixed.low == 0.0 and mixed.high == 1.0
+
+
+def make_run(method, seed, curve):
+    return runs.Run("finger-zone-v1", "0", method, "qp", "small", seed, [{"length": 0.1}], [[0.0]], curve=curve)
+
+
+def test_regret_area_and_steps_follow_from_the_curves(monkeypatch):
+    monkeypatch.setattr(runs, "bounds_share", lambda *_: 0.0)
+    first = [make_run("a", seed, [[600, 1.0, -4.0], [6000, 2.0, -2.0]]) for seed in (0, 1)]
+    second = [make_run("b", seed, [[600, 1.0, -4.0], [1200, 2.0, -3.0]]) for seed in (0, 1)]
+    a, b = runs.method_rows([(each, None) for each in (*first, *second)])
+    assert (a.regret.value, b.regret.value) == (0.0, 0.5)
+    assert (a.steps, a.seconds) == (6000, 2.0) and np.isinf(b.steps)
+    limit = 15_000
+    assert a.area == pytest.approx(np.log(10) / np.log(limit / 600))
+    assert b.area == pytest.approx((np.log(2) + 0.5 * np.log(limit / 1200)) / np.log(limit / 600))
+    found = runs.improvements([(each, None) for each in (*first, *second)], "qp", "a", "b")
+    assert found.value == 1.0
+    assert runs.improvements([(first[0], None)], "qp", "a", "b") is None
+
+
+def test_runs_resume_and_become_a_table(tiny, tmp_path):
+    found = runs.run(tmp_path, "tiny-v1", "random", None, "small", 0)
+    path = next(tmp_path.glob("runs/tiny-v1/*.json"))
+    stamp = path.stat().st_mtime_ns
+    assert runs.run(tmp_path, "tiny-v1", "random", None, "small", 0) == found
+    assert path.stat().st_mtime_ns == stamp
+    runs.collect(tmp_path, tmp_path)
+    assert runs.stored_runs(tmp_path) == [(found, None)]
+    text = board.method_table(runs.stored_runs(tmp_path), tmp_path)
+    assert "| `tiny-v1` | shared | random | 1 |" in text and "not tested" in text
+
+
+def test_tables(tiny, tmp_path):
+    output = tmp_path / "tiny.parquet"
+    tabulate("tiny-v1", 70, 2, tmp_path, output)
+    parts = {path: path.stat().st_mtime_ns for path in tmp_path.glob("tables/**/*.npz")}
+    assert len(parts) == 3  # two of the shared policy, one of the inverse QP
+    tabulate("tiny-v1", 70, 2, tmp_path, output)
+    assert {path: path.stat().st_mtime_ns for path in parts} == parts
+    table = Table.read("tiny-v1", output)
+    assert len(table) == 70 and np.isfinite(table.values["qp"][:, 0]).sum() == 2
+    for judge, index in (("shared", 69), ("qp", 1)):
+        design = tiny.design(table.points[index])
+        exact = tiny.evaluate(design, judge=judge).values["mean_distance"]
+        assert table.lookup(table.points[index : index + 1], judge)[0, 0] == pytest.approx(exact, rel=1e-4)
+    search = TableSearch.on(table, "small", "shared")
+    solve(search, make_optimiser("tpe", tiny, 0))
+    assert len(search.ledger) == 7 and search.best is not None
+    listed = {tuple(np.round(list(tiny.design(point).values()), 9)) for point in table.points}
+    assert all(tuple(np.round(list(row.design.values()), 9)) in listed for row in search.ledger)
+    with pytest.raises(DataError, match="cannot be read"):
+        Table.read("tiny-v1", tmp_path / "absent.parquet")
