@@ -67,7 +67,7 @@ def method_table(runs: Sequence[tuple[Run, Any]] | None = None, data: Path = DAT
 def _method_cells(row: MethodRow) -> list[str]:
     return [
         f"`{row.problem}`",
-        row.judge,
+        row.judge + (", table" if row.table else ""),
         row.method,
         str(row.seeds),
         _interval(row.regret, 100.0, 1),

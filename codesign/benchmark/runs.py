@@ -26,6 +26,7 @@ from softgym_envs.codesign.benchmark.scoring import (
     reference,
 )
 from softgym_envs.codesign.benchmark.search import Search, make_optimiser, solve
+from softgym_envs.codesign.benchmark.table import Table, TableSearch
 from softgym_envs.codesign.records import Record
 from softgym_envs.config import provenance
 from softgym_envs.storage import atomic_write, read_json, write_json
@@ -55,6 +56,7 @@ class Run(Record):
         spent: environment steps, CPU seconds and solves on finite elements.
         optimiser_seconds: CPU time of the optimiser itself [s].
         commit: of the code.
+        optimum: best score of a listed body, for a search on a table; the curve then holds the scores of the table.
     """
 
     problem: str
@@ -72,13 +74,19 @@ class Run(Record):
     spent: dict[str, float] = field(default_factory=dict)
     optimiser_seconds: float = 0.0
     commit: str | None = None
+    optimum: float | None = None
 
 
-def run(folder: Path, name: str, method: str, judge: Judge | None, level: str, seed: int) -> Run:
-    """Run a baseline, or return its result if the folder has it."""
-    problem = load_problem(name)
+def run(
+    folder: Path, name: str, method: str, judge: Judge | None, level: str, seed: int, table: Table | None = None
+) -> Run:
+    """Run a baseline, on a table if one is given, or return its result if the folder has it."""
+    problem = load_problem(name) if table is None else table.problem
     search = Search(problem, level, judge, seed)
-    path = folder / "runs" / name / f"{method}-{search.judge}-{level}-{seed}.json"
+    if table is not None:
+        search = TableSearch.on(table, level, judge or problem.definition.judge)
+    kind = "table-" if table is not None else ""
+    path = folder / "runs" / name / f"{kind}{method}-{search.judge}-{level}-{seed}.json"
     if path.is_file():
         stored = Run.read(path)
         if stored.hash == problem.hash:
@@ -95,23 +103,25 @@ def run(folder: Path, name: str, method: str, judge: Judge | None, level: str, s
         seed=seed,
         designs=[row.design for row in winners],
         search_scores=[row.scores for row in winners],
-        curve=_curve(problem, search, folder) if single else [],
+        curve=_curve(problem, search, folder, table is not None) if single else [],
         bodies=len(search.ledger),
         infeasible=sum(not row.feasible for row in search.ledger),
         diversity=_diversity(problem, search.ledger),
         spent={key: round(value, 3) for key, value in search.spent.items()},
         optimiser_seconds=round(own, 3),
         commit=provenance()["commit"],
+        optimum=None if table is None else table.best(str(search.judge)),
     )
     found.write(path)
     return found
 
 
-def _curve(problem: FrozenProblem, search: Search, folder: Path) -> list[list[float]]:
+def _curve(problem: FrozenProblem, search: Search, folder: Path, own: bool) -> list[list[float]]:
+    """Return the curve of `Run`, by the search's own scores or by the yardstick of the validation goals."""
     rows = []
     for index, row in search.incumbents:
         spent = search.ledger[: index + 1]
-        value = tested(problem, row.design, "qp", "validation", None, folder).score
+        value = row.score if own else tested(problem, row.design, "qp", "validation", None, folder).score
         steps, seconds = sum(r.environment_steps for r in spent), sum(r.cpu_seconds for r in spent)
         rows.append([steps, round(seconds, 3), value])
     return rows
@@ -220,13 +230,14 @@ class MethodRow:
     """A method on one problem, over its seeds.
 
     ``regret`` is 0 for the best body that any run found and 1 for the baseline, under the inverse QP on the validation
-    goals; ``area`` its mean over the logarithm of the environment steps; ``steps`` the median steps until it stays
-    below 1 %, infinite if more than half of the runs never get there; ``score`` the normalised score on finite
-    elements, ``exploitation`` the score on the surrogate minus that on finite elements.
+    goals; on a table 0 for its best body, by the table's scores. ``area`` is its mean over the logarithm of the
+    environment steps, ``steps`` and ``seconds`` the medians until it stays below 1 %, infinite if more than half of the
+    runs never get there; ``score`` is the normalised score on finite elements.
     """
 
     problem: str
     judge: str
+    table: bool
     method: str
     seeds: int
     regret: Estimate
@@ -240,22 +251,23 @@ class MethodRow:
 
 def method_rows(runs: Sequence[tuple[Run, list[list[float]] | None]], data: Path = DATA) -> list[MethodRow]:
     """Return one row per problem, judge and method with a single objective."""
-    groups: dict[tuple[str, str, str], list[tuple[Run, Any]]] = defaultdict(list)
+    groups: dict[tuple[str, bool, str, str], list[tuple[Run, Any]]] = defaultdict(list)
+    best: dict[tuple[str, str], float] = {}
+    first: dict[tuple[str, str], float] = {}
     for each, test in runs:
         if each.curve:
-            groups[each.problem, each.judge, each.method].append((each, test))
-    best: dict[str, float] = {}
-    first: dict[str, float] = {}
-    for each, _ in runs:
-        if each.curve:
-            best[each.problem] = max([best.get(each.problem, -np.inf), *(row[2] for row in each.curve)])
-            first[each.problem] = each.curve[0][2]
+            groups[each.problem, each.optimum is not None, each.judge, each.method].append((each, test))
+            found = [row[2] for row in each.curve] if each.optimum is None else [each.optimum]
+            key = each.problem, _yardstick(each)
+            best[key] = max([best.get(key, -np.inf), *found])
+            first[key] = each.curve[0][2]
     rows = []
-    for (name, judge, method), members in sorted(groups.items()):
+    for (name, listed, judge, method), members in sorted(groups.items()):
         problem = load_problem(name, check=False)
         limit = problem.definition.budgets[members[0][0].level].environment_steps  # type: ignore[index]
-        span = best[name] - first[name]
-        curves = [[(r[0], (best[name] - r[2]) / span, r[1]) for r in each.curve] for each, _ in members]
+        top = best[name, _yardstick(members[0][0])]
+        span = top - first[name, _yardstick(members[0][0])]
+        curves = [[(r[0], (top - r[2]) / span, r[1]) for r in each.curve] for each, _ in members]
         ends = np.array([[curve[-1][1]] for curve in curves])
         known = reference(problem, data)
         scores = [normalised(known, test) for _, test in members if known is not None and test]
@@ -265,6 +277,7 @@ def method_rows(runs: Sequence[tuple[Run, list[list[float]] | None]], data: Path
             MethodRow(
                 name,
                 judge,
+                listed,
                 method,
                 len(members),
                 stratified_estimate(ends),
@@ -277,6 +290,11 @@ def method_rows(runs: Sequence[tuple[Run, list[list[float]] | None]], data: Path
             )
         )
     return rows
+
+
+def _yardstick(each: Run) -> str:
+    """Return what the curve of a run was measured by; only equal yardsticks can be compared."""
+    return "qp" if each.optimum is None else f"table {each.judge}"
 
 
 def _reached(curve: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
@@ -294,14 +312,16 @@ def _area(curve: Sequence[tuple[float, float, float]], limit: float) -> float:
     return float(np.dot(widths, [row[1] for row in curve]) / widths.sum())
 
 
-def improvements(runs: Sequence[tuple[Run, Any]], judge: str, first: str, second: str) -> Estimate | None:
+def improvements(
+    runs: Sequence[tuple[Run, Any]], judge: str, first: str, second: str, *, listed: bool = False
+) -> Estimate | None:
     """Return the probability that a run of one method ends with less regret than one of another.
 
-    It is over the problems on which both ran with the same number of seeds; None if there are none.
+    It is over the problems on which both ran, on tables if ``listed``; None if there are none.
     """
     table: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for each, _ in runs:
-        if each.judge == judge and each.curve:
+        if each.judge == judge and each.curve and (each.optimum is not None) == listed:
             table[each.problem][each.method].append(each.curve[-1][2])
     names = [name for name, row in table.items() if row.get(first) and row.get(second)]
     if not names:

@@ -90,6 +90,10 @@ class Table:
         tree, rows = self._trees[judge]
         return rows[tree.query(np.asarray(points, dtype=float))[1]]
 
+    def best(self, judge: str) -> float:
+        """Return the best score of a listed body under a judge; larger is better."""
+        return self.problem.definition.primary.score(float(np.nanmin(self.values[judge][:, 0])))
+
     def lookup(self, points: np.ndarray, judge: str) -> np.ndarray:
         """Return `COLUMNS` [SI] of the nearest listed bodies, shape (k, 3), for points (k, n) of the unit box."""
         return self.values[judge][self.nearest(points, judge)]

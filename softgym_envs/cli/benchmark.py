@@ -70,6 +70,9 @@ def show(name: str) -> None:
 @click.option("--judge", help="Who controls the bodies in the search (default: the problem's).")
 @click.option("--level", default="small", show_default=True, help="Budget: small, medium or large.")
 @click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Number of seeds.")
+@click.option(
+    "--table", type=options.PATH, help="Choose among the bodies of this Parquet file (softgym benchmark tabulate)."
+)
 @click.option("--fem/--no-fem", default=False, help="Test the winners on finite elements too (minutes each).")
 @results
 def run(
@@ -78,6 +81,7 @@ def run(
     judge: str | None,
     level: str,
     seeds: int,
+    table: Path | None,
     fem: bool,
     folder: Path,
 ) -> None:
@@ -86,12 +90,16 @@ def run(
     An interrupted call continues where it stopped.
     """
     from softgym_envs.codesign.benchmark import runs
+    from softgym_envs.codesign.benchmark.table import Table
 
+    listed = None if table is None else Table.read(names[0], table)
+    if listed is not None and len(names) > 1:
+        raise ValueError("--table is of one problem; give one name")
     with options.resumable():
         for seed in range(seeds):
             for name in names:
                 for method in methods:
-                    found = runs.run(folder, name, method, judge, level, seed)  # type: ignore[arg-type]
+                    found = runs.run(folder, name, method, judge, level, seed, listed)  # type: ignore[arg-type]
                     click.echo(
                         f"{name} {method} {found.judge} seed {seed}: {found.bodies} bodies, "
                         f"{found.spent['cpu_seconds']:.1f} CPU s, best {found.search_scores[:1]}"
@@ -134,9 +142,9 @@ def verify(path: Path, record: bool, as_json: bool) -> None:
         click.echo("this is the best known")
 
 
-@benchmark.command()
+@benchmark.command(name="table")
 @results
-def table(folder: Path) -> None:
+def table_(folder: Path) -> None:
     """Show the stored runs, or those of a folder, one row per problem, judge and method."""
     from softgym_envs.codesign.benchmark import board, runs
 

@@ -100,5 +100,10 @@ def test_tables(tiny, tmp_path):
     assert len(search.ledger) == 7 and search.best is not None
     listed = {tuple(np.round(list(tiny.design(point).values()), 9)) for point in table.points}
     assert all(tuple(np.round(list(row.design.values()), 9)) in listed for row in search.ledger)
+    found = runs.run(tmp_path, "tiny-v1", "random", "shared", "small", 1, table)
+    assert found.optimum == pytest.approx(-table.values["shared"][:, 0].min())
+    assert found.curve[-1][2] == max(score[0] for score in found.search_scores) <= found.optimum
+    (row,) = runs.method_rows([(found, None)])
+    assert row.table and 0.0 <= row.regret.value <= 1.0
     with pytest.raises(DataError, match="cannot be read"):
         Table.read("tiny-v1", tmp_path / "absent.parquet")
