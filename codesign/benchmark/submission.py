@@ -125,12 +125,12 @@ def submit(
     return submission
 
 
-def verify(path: str | Path, *, data: Path = DATA, record: bool = False) -> Verdict:
+def verify(path: str | Path, *, data: Path | None = None, record: bool = False) -> Verdict:
     """Check a submission: run its bodies again on finite elements, on the test goals (minutes).
 
     Args:
         path: the JSON file; a policy lies beside it.
-        data: folder of the references.
+        data: folder of the references; default the shipped one.
         record: whether to store the bodies as the best known if they are.
 
     Raises:
@@ -146,6 +146,7 @@ def verify(path: str | Path, *, data: Path = DATA, record: bool = False) -> Verd
     scores = _tested(problem, submission, policy)
     for claimed, found in zip(submission.claimed, scores, strict=False):
         _compare(submission.controller, "score on the test goals", claimed, found)
+    data = data or DATA
     known = make_reference(problem, data)
     exploitation = None
     if problem.definition.score_count == 1 and problem.definition.environment.backend == "surrogate":
