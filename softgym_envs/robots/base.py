@@ -132,6 +132,8 @@ class Robot(ABC):
         effort_scale: typical effort of each actuator of the baseline body [N, ...], shape (n_a,).
         goal_axes: which coordinates of the first effector count towards a goal, 1 or 0, shape (3,).
         goal_tolerance: distance at which a goal counts as reached [m].
+        picture_axes: coordinates that pictures show towards the viewer, to the right and up: (0, 1, 2), (1, 2, 0) or
+            (2, 0, 1).
         workspace_scale: distance over which the effector typically moves [m], by default a quarter of the size; scales
             rewards and errors.
         rest_mode: state of the actuators at rest: ``"effort"`` (no effort) or ``"displacement"`` (held at zero).
@@ -155,6 +157,7 @@ class Robot(ABC):
     effort_scale: np.ndarray
     goal_axes: np.ndarray = np.ones(3)
     goal_tolerance: float = 0.002
+    picture_axes: tuple[int, int, int] = (0, 1, 2)
     workspace_scale: float
     rest_mode: str = "effort"
     stiffness_variable: str | None = None
