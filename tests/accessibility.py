@@ -68,8 +68,9 @@ class _Page(HTMLParser):
         if tag == "th":
             self._cells.append(text)
         if tag == "tr":
-            # A row of empty cells only, as Markdown makes it for a table without a head, is not shown.
-            if any(self._cells) and not all(self._cells):
+            # A row of empty cells only, as Markdown makes it for a table without a head, is not shown. The corner above
+            # the names of the rows may be empty.
+            if any(self._cells) and not all(self._cells[1:]):
                 self.found.append(f"a column has no title: {self._cells}")
             self._cells = []
         linked = tag != "a" or "href" in given
