@@ -12,12 +12,9 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
-from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
-
-SATURATED = 1.0 - 1e-9
-"""Part of its largest effort from which an actuator counts as saturated: round-off."""
 
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
@@ -193,12 +190,8 @@ class FEMBackend(Backend):
             start = self.state.command if self._mode == mode else self.state.displacement
         parts = start + np.arange(1, self._substeps + 1)[:, None] / self._substeps * (command - start)
         parts[-1] = command  # without round-off
-        done, motion = 0, None
-        if not (np.abs(self._dynamics.effort[: len(command)]) >= self._max_effort * SATURATED).any():
-            aims = np.clip(parts, -self._max_effort, self._max_effort) if mode == "effort" else parts
-            done, motion = self._dynamics.advance_compiled(
-                aims, mode, largest_effort=self._max_effort, effector_force=load
-            )
+        aims = np.clip(parts, -self._max_effort, self._max_effort) if mode == "effort" else parts
+        done, motion = self._dynamics.advance_compiled(aims, mode, largest_effort=self._max_effort, effector_force=load)
         for part in parts[done:]:
             motion = self._drive(self._dynamics, part, mode, load)
         assert motion is not None

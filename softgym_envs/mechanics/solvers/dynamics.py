@@ -255,7 +255,8 @@ class Dynamics(Statics):
         Args:
             targets: arguments of `advance` for each time step, shape (k, n_a).
             mode: as for `advance`.
-            largest_effort: of each actuator, shape (n_a,): a time step that exceeds one is not taken. Default none.
+            largest_effort: of each actuator, shape (n_a,): one whose commanded displacement needs more is driven by that
+                effort, until the command asks for less. Default none.
             **applied: as for `advance`.
 
         Returns:
