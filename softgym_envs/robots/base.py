@@ -143,6 +143,8 @@ class Robot(ABC):
             actuators are driven by efforts. Surrogates rely on it; without it, they learn unstable states too.
         free_object: whether the robot holds an object that can fall. Many commands then have no static equilibrium, so
             pictures are framed by the robot at rest.
+        made_of_beams: bodies are quadratic beams and rigid parts, moved by servos or chambers; finite elements step
+            many of them at once.
         learned: how the robot is learned: one ``"potential"`` of its actuators and effectors, a ``"chain"`` of
             segments for any contacts, or a ``"hand"`` of such chains.
         non_mechanical_options: options that do not change the condensed model.
@@ -163,6 +165,7 @@ class Robot(ABC):
     stiffness_variable: str | None = None
     convex: bool = True
     free_object: bool = False
+    made_of_beams: bool = False
     learned: str = "potential"
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")
