@@ -153,6 +153,10 @@ STRENGTH = "configs/design/finger_strength.yaml"
             ["environment.action_mode = absolute", "finger_reach", "increment"],
         ),
         (["fit", "--config", CONFIG, "--folder", "x"], ["robot", "required"]),
+        (
+            ["fit", "--config", "diamond_reach", "--folder", "x"],
+            ["for train, evaluate and codesign; allowed:"],
+        ),
         (["frobnicate"], ["frobnicate", "rollout"]),
         (["rolout"], ["unknown verb 'rolout'; did you mean 'rollout'?"]),
         (["bench", "nothing"], ["nothing"]),
