@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from pydantic import Field, field_validator, model_validator
 
 from softgym_envs.config import BesideConfig, Config
-from softgym_envs.envs.options import default_backend
+from softgym_envs.envs.options import EnvironmentOptions, default_backend, set_up
 from softgym_envs.envs.registration import EnvironmentRow, find_row
 from softgym_envs.envs.tasks.registry import TASKS
 from softgym_envs.registry import class_path
@@ -112,8 +112,10 @@ class EnvironmentConfig(Config):
 
     @property
     def batched(self) -> bool:
-        """Whether many episodes run at once: on surrogates, except for tasks that read whole states."""
-        return self.backend == "surrogate" and not self.task_class.needs_state
+        """Whether many episodes run at once in one process, see `SoftRobotVectorEnv`."""
+        row, options = self.row, {**self._options({}), **self.row.defaults}
+        del options["backend"]
+        return set_up(row.robot, row.task, self.backend, EnvironmentOptions.check(options)).together
 
     def on(self, backend: str) -> EnvironmentConfig:
         """Return the same environment on another backend, without the options of the present backend."""

@@ -55,12 +55,29 @@ def beams() -> dict[str, object]:
             W = [state.condensed.compliance for state in states]
             scale = np.sqrt(np.diag(W[1]))
             off = max(off, float(np.abs((W[0] - W[1]) / np.outer(scale, scale)).max()))
+        speeds["compiled, 32 at once"] = batch_speeds(identifier)
         for label, values in speeds.items():
             result[f"{name}: steps per CPU second, {label}"] = statistics.median(values)
         result[f"{name}: largest difference of the effector [m]"] = apart
         result[f"{name}: largest difference of W, scaled"] = off
         result[f"{name}: share of compiled steps over random bodies"] = compiled_share(identifier)
     return result
+
+
+def batch_speeds(identifier: str, count: int = 32) -> list[float]:
+    """Return environment steps per CPU second of a batch under the actions of the single environments, in blocks."""
+    env = gymnasium.make_vec(identifier, count, backend="fem", max_episode_steps=10**6)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    speeds = []
+    for block in range(BLOCKS + 1):
+        actions = rng.uniform(-1.0, 1.0, (STEPS, *env.action_space.shape)).astype(np.float32)  # type: ignore[misc]
+        start = time.process_time()
+        for action in actions:
+            env.step(action)
+        if block:  # the first one compiles
+            speeds.append(count * STEPS / (time.process_time() - start))
+    return speeds
 
 
 def compiled_share(identifier: str, bodies: int = 10, steps: int = 20) -> float:

@@ -51,7 +51,9 @@ FILM_SIZE, FILM_FRAMES = (360, 300), 30
 FILM_AGENTS = {"finger_grasp": "force", "gripper_lift": "close", "tetrapod_carry": "tetrapod_carry"}
 """Agents of the films of environments, where it is not the inverse QP."""
 FILM_STEPS = {"gripper_lift": 50, "tetrapod_carry": 60}
-FILM_BACKENDS = {"finger_grasp": "fem"}  # which knows the object
+FILM_OPTIONS: dict[str, dict[str, Any]] = {
+    "finger_grasp": {"backend": "fem", "robot_options": {"object": "hexagon"}}  # easier to see than a plane
+}
 
 
 def draw_robot(name: str) -> np.ndarray:
@@ -82,8 +84,8 @@ def draw_environment(name: str) -> np.ndarray:
 def draw_film(name: str, path: Path) -> None:
     """Write a small film of one episode of an environment."""
     identifier = environment_pages()[name]
-    backend = FILM_BACKENDS.get(name)
-    env = gymnasium.make(identifier, backend=backend, render_mode="rgb_array", render_size=FILM_SIZE)
+    options = {"backend": None, **FILM_OPTIONS.get(name, {})}
+    env = gymnasium.make(identifier, render_mode="rgb_array", render_size=FILM_SIZE, **options)
     observation, _ = env.reset(seed=1)
     unwrapped: Any = env.unwrapped
     act = make_agent(FILM_AGENTS.get(name, "qp"))

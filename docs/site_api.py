@@ -92,5 +92,5 @@ def api_index() -> str:
             [f"[`{name}`]({'#'.join(link(package, name))})", described(package, name)] for name in public_names(package)
         ]
         if rows:
-            parts += [f"## {title}\n\n`from {package} import ...`", table(["name", ""], rows)]
+            parts += [f"## {title}\n\n`from {package} import ...`", table(["name", "what it is"], rows)]
     return "\n\n".join(parts) + "\n"

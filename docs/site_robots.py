@@ -121,7 +121,7 @@ def robot_sections(name: str) -> dict[str, Callable[[], str]]:
     robot = robot_of(name)
 
     def model() -> str:
-        facts = table(["baseline body", ""], model_facts(robot))
+        facts = table(["baseline body", "value"], model_facts(robot))
         path = type(robot).reference_path
         text = "" if path is Robot.reference_path else f"\n\nReference path: {code(first_sentence(path.__doc__ or ''))}"
         return facts + text

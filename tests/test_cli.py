@@ -52,6 +52,15 @@ def test_rollout_evaluate_and_record(softgym, tmp_path):
     assert table["results"][0]["success_rate"] == 1.0
 
 
+def test_a_rollout_says_what_is_not_trusted_and_shows_forces_in_percent(softgym):
+    corner = {"module_length": 0.065, "outer_radius": 0.0052, "chamber_offset": 0.003, "chamber_radius": 0.0006}
+    design = [f"--design={name}={value}" for name, value in corner.items()]
+    status, out, _ = softgym("rollout", "SoftGym/TrunkReach-v0", "--agent", "random", *design)
+    assert status == 0 and re.search(r"\d+ of 51 states are not trusted: spread; compare with --backend fem", out)
+    status, out, _ = softgym("rollout", "SoftGym/FingerGrasp-v0", "--agent", "force", "--backend", "surrogate")
+    assert status == 0 and "trusted" not in out and re.search(r"final distance 0\.\d{3} %, success True", out)
+
+
 def test_results_as_json(softgym, tmp_path):
     status, out, _ = softgym("list", "--json")
     tables = json.loads(out)
@@ -144,6 +153,10 @@ STRENGTH = "configs/design/finger_strength.yaml"
             ["environment.action_mode = absolute", "finger_reach", "increment"],
         ),
         (["fit", "--config", CONFIG, "--folder", "x"], ["robot", "required"]),
+        (
+            ["fit", "--config", "diamond_reach", "--folder", "x"],
+            ["for train, evaluate and codesign; allowed:"],
+        ),
         (["frobnicate"], ["frobnicate", "rollout"]),
         (["rolout"], ["unknown verb 'rolout'; did you mean 'rollout'?"]),
         (["bench", "nothing"], ["nothing"]),

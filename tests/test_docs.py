@@ -20,6 +20,7 @@ from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.robots import ROBOTS
 from softgym_envs.surrogate.training import FitConfig
+from tests.accessibility import defects
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -140,6 +141,16 @@ def test_the_code_of_a_page_runs(page, tmp_path):
     assert ".save(" not in page.read_text() or list(tmp_path.glob("*.png"))
 
 
+def test_defects_of_a_page_are_found():
+    page = """<html><body><h2>A</h2><h4>B</h4><img src="x.png"><a href="y"></a>
+    <table><tr><th>a</th><th></th></tr></table><div role="region" aria-label="T"></div>
+    <div role="region" aria-label="T"></div></body></html>"""
+    found = " ".join(defects(page))
+    for words in ("language", "title", "[2, 4]", "level 4 follows", "x.png", "<a>", "column", "2 regions"):
+        assert words in found
+    assert defects('<html lang="en"><title>T</title><h1>A</h1><p>x<h2>B</h2><img src="x" alt="y"></html>') == []
+
+
 def test_notebooks_hold_the_code_of_their_pages():
     for path, text in importlib.import_module("site_notebooks").notebooks().items():
         cells = json.loads(text)["cells"]
@@ -172,6 +183,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     wanted = [f"environments/{writing.page_name(identifier)}.html" for identifier in ENVIRONMENTS]
     assert {*wanted, *(f"robots/{name}.html" for name in ROBOTS), "index.html"} <= set(pages)
     assert not list((tmp_path / "site").rglob("*.py"))
+    assert {page: found for page in pages if (found := defects((tmp_path / "site" / page).read_text()))} == {}
     # Nothing is loaded from elsewhere when a page is read.
     for page in pages:
         text = (tmp_path / "site" / page).read_text()

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from softgym_envs.agents.config import TrainConfig
-from softgym_envs.cli import configs, options
+from softgym_envs.cli import options
 from softgym_envs.codesign.tools.config import CalibrationConfig
 from softgym_envs.config import load_config
 
@@ -18,7 +18,7 @@ CALIBRATION = ROOT / "configs" / "design" / "finger_calibration.yaml"
 def test_every_configuration_is_listed_under_its_verbs(softgym):
     status, out, _ = softgym("configs")
     assert status == 0
-    assert set(configs.VERBS) == {path.name for path in (ROOT / "configs").iterdir()}
+    assert set(options.VERBS) == {path.name for path in (ROOT / "configs").iterdir()}
     listed = {line.strip() for line in out.splitlines()}
     assert {path.stem for path in (ROOT / "configs").glob("*/*.yaml")} < listed
 

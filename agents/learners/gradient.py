@@ -21,7 +21,7 @@ LARGEST_GRADIENT = 1.0
 
 
 class GradientLearner(Learner):
-    """A network that learns, without critic and exploration noise, in the batched environment on the surrogate.
+    """A network that learns, without critic and exploration noise, in the batched environment.
 
     The learning rate falls linearly with the steps to that given as final; without that, success oscillates.
 
@@ -33,21 +33,22 @@ class GradientLearner(Learner):
         env: the batched environment.
 
     Raises:
-        ValueError: for an environment that is not on the surrogate, or a correction of the QP.
+        ValueError: for an environment that is not batched, or a correction of the QP.
     """
 
     def __init__(self, config: TrainConfig, options: GradientConfig) -> None:
         import torch
 
         environment = config.environment
-        if environment.backend != "surrogate" or environment.residual_scale:
+        if not environment.batched or environment.residual_scale:
             raise ValueError(
-                f"learner '{config.learner}' needs environment.backend = surrogate and no residual_scale, got "
-                f"{environment.backend} and {environment.residual_scale:g}; allowed: learner 'sac' or 'ppo'"
+                f"learner '{config.learner}' needs environment.backend = surrogate, or fem for robots of beams, and no "
+                f"residual_scale, got {environment.backend} and {environment.residual_scale:g}; allowed: learner 'sac' "
+                "or 'ppo'"
             )
         super().__init__(config)
         self._options, self.step = options, 0
-        members = {"members": options.members} if options.members else {}
+        members = {"members": options.members} if options.members and environment.backend == "surrogate" else {}
         env = environment.make_vec(config.num_envs, backend_options={**environment.backend_options, **members})
         self.env: SoftRobotVectorEnv = env.unwrapped  # type: ignore[assignment]
         generator = torch.Generator().manual_seed(config.seed)

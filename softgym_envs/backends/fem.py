@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,11 @@ from softgym_envs.backends.backend import Backend, Snapshot, State
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
-from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
-
-SATURATED = 1.0 - 1e-9
-"""Part of its largest effort from which an actuator counts as saturated: round-off."""
 
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
@@ -46,6 +45,12 @@ class FEMBackend(Backend):
         scheme: time integration, see `Dynamics`.
         mass_damping: Rayleigh's alpha [1/s].
         stiffness_damping: Rayleigh's beta [s].
+
+    Attributes:
+        model: the present body.
+        substeps: time steps of a control step.
+        step_options: options of `Dynamics`.
+        largest_efforts: of the actuators, shape (n_a,).
     """
 
     model: MechanicalModel
@@ -71,16 +76,16 @@ class FEMBackend(Backend):
         self.robot = robot
         self.moving = dynamics
         self.control_step = control_step
-        self._substeps = max(1, int(np.ceil(control_step / time_step - 1e-9)))
-        self._options: dict[str, Any] = {
-            "step": control_step / self._substeps,
+        self.substeps = max(1, int(np.ceil(control_step / time_step - 1e-9)))
+        self.step_options: dict[str, Any] = {
+            "step": control_step / self.substeps,
             "scheme": scheme,
             "mass_damping": mass_damping,
             "stiffness_damping": stiffness_damping,
             "tolerance": 1e-9,
         }
-        self._max_effort = np.array([actuator.max_effort for actuator in robot.actuators])
-        self._limited = bool(np.isfinite(self._max_effort).any())
+        self.largest_efforts = np.array([actuator.max_effort for actuator in robot.actuators])
+        self._limited = bool(np.isfinite(self.largest_efforts).any())
         self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
@@ -102,7 +107,7 @@ class FEMBackend(Backend):
             if self.robot.rest_mode == "effort" and model.loads.any():
                 # Loads would move the actuators, so they are held.
                 rest = statics.solve(zero)
-            self._dynamics = Dynamics(model, **self._options) if self.moving else None
+            self._dynamics = Dynamics(model, **self.step_options) if self.moving else None
             self._rest = self._state(rest, zero, still=True)
             self.model, self._statics, self.design = model, statics, complete
         self.restore(self._rest)
@@ -110,7 +115,7 @@ class FEMBackend(Backend):
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        command = self._checked("command", command, len(self._max_effort))
+        command = self._checked("command", command, len(self.largest_efforts))
         load = None
         if force is not None:
             load = np.zeros(self.state.condensed.delta.e.size)
@@ -139,7 +144,7 @@ class FEMBackend(Backend):
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
         """Return the static equilibrium under a command without going there."""
         kept = self._motion
-        command = self._checked("command", command, len(self._max_effort))
+        command = self._checked("command", command, len(self.largest_efforts))
         try:
             return self._state(self._statics.solve(command, mode), command, still=True)
         finally:
@@ -164,6 +169,42 @@ class FEMBackend(Backend):
             velocity = None if state.motion is None else state.motion.velocity
             self._dynamics.restore(state.nodes, effort, velocity, memory=state.memory)
         self.state = state
+
+    @property
+    def tolerance(self) -> float:
+        """Largest remaining correction of any node of a solution [m]."""
+        return (self._dynamics or self._statics).tolerance
+
+    @property
+    def beams(self) -> BeamMotion | None:
+        """Compiled solver of the present body; None for a body that needs the general one."""
+        return (self._dynamics or self._statics).beam_solver()
+
+    def go_to(
+        self, x: np.ndarray, effort: np.ndarray, delta: np.ndarray, velocity: np.ndarray, command: np.ndarray
+    ) -> None:
+        """Go on from a state that another solver has found for the present body under commanded displacements.
+
+        Args:
+            x: nodes [m], shape (n, 3).
+            effort: of all constraint rows, shape (size,).
+            delta: their values, shape (size,).
+            velocity: of the nodes [m/s], shape (n, 3).
+            command: displacements that led there, shape (n_a,).
+        """
+        count, e = len(command), self.state.condensed.slices["e"]
+        self._statics.restore(x, effort)
+        if self._dynamics is not None:
+            self._dynamics.restore(x, effort, velocity)
+        self._mode = "displacement"
+        self.state = replace(
+            self._rest,
+            command=command.copy(),
+            displacement=delta[:count].copy(),
+            effort=effort[:count].copy(),
+            effector=delta[e].reshape(-1, 3).copy(),
+            nodes=x.copy(),
+        )
 
     def _more(self) -> tuple[str, tuple | None]:
         return self._mode, self._motion
@@ -191,14 +232,12 @@ class FEMBackend(Backend):
         start = self.state.effort
         if mode == "displacement":
             start = self.state.command if self._mode == mode else self.state.displacement
-        parts = start + np.arange(1, self._substeps + 1)[:, None] / self._substeps * (command - start)
+        parts = start + np.arange(1, self.substeps + 1)[:, None] / self.substeps * (command - start)
         parts[-1] = command  # without round-off
-        done, motion = 0, None
-        if not (np.abs(self._dynamics.effort[: len(command)]) >= self._max_effort * SATURATED).any():
-            aims = np.clip(parts, -self._max_effort, self._max_effort) if mode == "effort" else parts
-            done, motion = self._dynamics.advance_compiled(
-                aims, mode, largest_effort=self._max_effort, effector_force=load
-            )
+        aims = np.clip(parts, -self.largest_efforts, self.largest_efforts) if mode == "effort" else parts
+        done, motion = self._dynamics.advance_compiled(
+            aims, mode, largest_effort=self.largest_efforts, effector_force=load
+        )
         for part in parts[done:]:
             motion = self._drive(self._dynamics, part, mode, load)
         assert motion is not None
@@ -209,20 +248,20 @@ class FEMBackend(Backend):
         go = solver.advance if isinstance(solver, Dynamics) else solver.solve
         if not self._limited or mode == "effort":
             if mode == "effort":
-                command = np.clip(command, -self._max_effort, self._max_effort)
+                command = np.clip(command, -self.largest_efforts, self.largest_efforts)
             return go(command, mode, effector_force=load)
         present = solver.effort[: len(command)]
-        saturated, sign = np.abs(present) >= self._max_effort * SATURATED, np.sign(present)
+        saturated, sign = np.abs(present) >= self.largest_efforts * SATURATED, np.sign(present)
         count = len(command)
         for attempt in range(2 * count + 2):
             # A saturated actuator is released when its command asks for less than it has reached.
-            target = np.where(saturated, sign * self._max_effort, command)
+            target = np.where(saturated, sign * self.largest_efforts, command)
             modes = ["effort" if s else "displacement" for s in saturated]
             kept = (solver.x, solver.effort, solver.memory, getattr(solver, "snapshot", None))
             found = go(target, modes, effector_force=load)
             equilibrium = found.equilibrium if isinstance(found, Motion) else found
             effort, reached = equilibrium.effort[: len(command)], equilibrium.delta[: len(command)]
-            over = ~saturated & (np.abs(effort) > self._max_effort)
+            over = ~saturated & (np.abs(effort) > self.largest_efforts)
             # Stop releasing actuators after a while, so that the loop terminates.
             back = saturated & (sign * (command - reached) < 0.0) & (attempt <= count)
             if not (over.any() or back.any()):

@@ -9,6 +9,7 @@ from softgym_envs.registry import Registry, check_options
 
 if TYPE_CHECKING:
     from softgym_envs.backends.backend import Backend
+    from softgym_envs.backends.batch import BatchBackend
     from softgym_envs.robots.base import Robot
 
 BACKENDS = Registry(
@@ -45,6 +46,16 @@ HANDS = Registry(
 )
 """Backends of hands of fingers that are learned as chains, by the same names."""
 
+BATCHES = Registry(
+    "batched backend",
+    {
+        "fem": "softgym_envs.backends.fem_batch:FEMBatch",
+        "surrogate": "softgym_envs.backends.surrogate:SurrogateBatch",
+    },
+    base="softgym_envs.backends.batch:BatchBackend",
+)
+"""Backends that step many bodies at once, by the same names."""
+
 LEARNED = {"potential": BACKENDS, "chain": CHAINS, "hand": HANDS}
 """Backends by what is learned of a robot."""
 
@@ -65,3 +76,16 @@ def make_backend(name: str, robot: Robot, **options: object) -> Backend:
         ValueError: for an unknown name or option.
     """
     return LEARNED[robot.learned].make(name, robot, **options)
+
+
+def batches(name: str, robot: Robot, options: Mapping[str, object]) -> bool:
+    """Whether a backend with options steps many bodies of a robot at once (`BATCHES`)."""
+    if name == "fem":
+        return robot.made_of_beams and not robot.touches and options.get("scheme", "euler") == "euler"
+    return name == "surrogate"
+
+
+def make_batch_backend(name: str, robot: Robot, **options: object) -> BatchBackend:
+    """Return the batched backend with a name, for a robot for which `batches` holds."""
+    made: BatchBackend = BATCHES.resolve(name)(robot, **options)  # `check_backend` checks the options
+    return made

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.batch import BatchBackend, BatchState
 from softgym_envs.designs import Design
-from softgym_envs.errors import ConvergenceError
+from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import Context, SurrogateModel
@@ -20,34 +21,6 @@ from softgym_envs.surrogate.pretrained import pretrained_model
 #: A search ends when its next step is below this [quarter of the actuator range]: 3e-7 m for a cable of 20 mm. Single
 #: precision does not allow much less.
 TOLERANCE = 5e-5
-
-
-@dataclass(frozen=True)
-class BatchState:
-    """States of a batch of B bodies.
-
-    Attributes:
-        displacement: reached actuator displacements, shape (B, n_a).
-        effort: actuator efforts, shape (B, n_a).
-        effector: effector coordinates [m], shape (B, n_e).
-        slack: which actuators are slack, shape (B, n_a).
-        converged: whether the state was found, shape (B,); rows without a state must not be used.
-        uncertainty: uncertainty of the effector [m], shape (B,).
-        doubt: why the model is not trusted, 0 where it is (`softgym_envs.surrogate.domain.DOUBTS`), shape (B,).
-    """
-
-    displacement: np.ndarray
-    effort: np.ndarray
-    effector: np.ndarray
-    slack: np.ndarray
-    converged: np.ndarray
-    uncertainty: np.ndarray
-    doubt: np.ndarray
-
-    @property
-    def trusted(self) -> np.ndarray:
-        """Whether the model may be trusted, shape (B,)."""
-        return self.doubt == 0
 
 
 def solve_efforts(model: SurrogateModel, context: Context, effort: np.ndarray, start: np.ndarray) -> BatchState:
@@ -277,3 +250,96 @@ class SurrogateBackend(Backend):
 
     def restore(self, state: State) -> None:
         self.state = state
+
+
+class SurrogateBatch(BatchBackend):
+    """States of many bodies from a learned condensed model, evaluated together.
+
+    Args:
+        robot: the robot.
+        designs: bodies, shape (B, number of design variables).
+        weights: as for `SurrogateBackend`.
+        members: as for `SurrogateBackend`.
+
+    Attributes:
+        model: the learned model.
+
+    Raises:
+        WeightsError: if there are no weights for the robot, or they are damaged.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        designs: np.ndarray,
+        weights: str | Path | None = None,
+        members: int | None = None,
+    ) -> None:
+        self.robot = robot
+        self.model = pretrained_model(robot, weights, members)
+        self._unilateral = robot.unilateral
+        count = len(designs)
+        # One body for all rows, until they differ.
+        self._context = Context.shared(self.model.context(designs[:1]), count)
+        self.command = np.zeros((count, len(robot.actuators)))
+        rest = self._found_rest(self._context.rows(np.zeros(1, dtype=np.int64)), designs[:1])
+        self._rest, self.state = rest.repeat(count), rest.repeat(count)
+        other = np.flatnonzero((designs != designs[:1]).any(axis=1))
+        if len(other):
+            self.begin(other, designs[other])
+
+    def _found_rest(self, context: Context, designs: np.ndarray) -> BatchState:
+        rest = rest_state(self.model, context, self._unilateral)
+        if not rest.converged.all():
+            lost = designs[np.flatnonzero(~rest.converged)[0]].tolist()
+            design = dict(zip(self.robot.design_space.names, lost, strict=True))
+            raise ConvergenceError(f"the surrogate finds no equilibrium at rest of design {design}")
+        return rest
+
+    def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
+        context = self.model.context(designs)
+        self._context.put(index, context)
+        self._rest.put(index, self._found_rest(context, designs))
+        self.rest(index)
+        return {}
+
+    def rest(self, index: np.ndarray) -> None:
+        self.command[index] = 0.0
+        self.state.put(index, self._rest.rows(index))
+        self.state.slack[index] = False
+
+    def step(self, command: np.ndarray) -> None:
+        present = self.state
+        state = solve_displacements(
+            self.model, self._context, command, present.displacement, self._unilateral, present.slack
+        )
+        found = state.converged.copy()
+        if found.all():
+            self.command, self.state = command, replace(state, converged=found)
+        else:
+            self.command = np.where(found[:, None], command, self.command)
+            self.state = replace(state.where(found, present), converged=found)
+
+    def effectors(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        context = self._context.rows(index)
+        found = solve_displacements(self.model, context, commands, np.zeros_like(commands), self._unilateral)
+        return np.where(found.converged[:, None], found.effector[:, :3], np.nan)
+
+    @property
+    def stable(self) -> np.ndarray:
+        return np.ones(len(self.command), dtype=bool)
+
+    @property
+    def condensed(self) -> CondensedModel:
+        batch = self.model.condensed(self._context, self.state.displacement)
+        effort, delta = batch.effort.copy(), batch.delta.array
+        # Slack cables carry no effort; the network's may differ from zero by rounding.
+        effort[:, : self.model.count] = self.state.effort
+        free = delta - np.einsum("bij,bj->bi", batch.compliance, effort)
+        return CondensedModel(batch.compliance, free, effort, batch.roles, batch.rows)
+
+    def settled(self) -> BatchState:
+        return self.state
+
+    def gradient(self, effector: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return displacement_gradient(self.model, self._context, self.state, effector, effort)

@@ -77,17 +77,17 @@ def evaluate(
         if agent not in BASELINES:
             Policy(agent).check_environment(environment)
     points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
+    shown = environment.task_class.distance_text
     results: list[dict[str, Any]] = []
     say = partial(click.echo, err=as_json)  # stdout is for the JSON
-    say(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean mm':>9s} {'worst mm':>9s} {'return':>8s}")
+    say(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean':>11s} {'worst':>11s} {'return':>8s}")
     for backend in backends or (environment.backend,):
         for agent in agents:
             outcome = run(agent, environment.on(backend), points, design=chosen, seed=seed)
             results.append({"agent": agent, "backend": backend, **outcome.to_json()})
-            say(
-                f"{agent[-34:]:34s} {backend:10s} {outcome.success_rate:8.1%} {1e3 * outcome.mean_distance:9.3f} "
-                f"{1e3 * outcome.worst_distance:9.3f} {outcome.mean_return:8.2f}"
-            )
+            distances = (f"{shown(value, 3):>11s}" for value in (outcome.mean_distance, outcome.worst_distance))
+            rate, total = f"{outcome.success_rate:8.1%}", f"{outcome.mean_return:8.2f}"
+            say(f"{agent[-34:]:34s} {backend:10s} {rate} {' '.join(distances)} {total}")
     inputs = {"environment": environment.model_dump(mode="json"), "goals": goals, "seed": seed, "design": chosen}
     document = {**inputs, **provenance(), "results": results}
     if as_json:

@@ -10,15 +10,6 @@ from softgym_envs.cli import options
 from softgym_envs.errors import ConfigError
 from softgym_envs.storage import atomic_write
 
-VERBS = {
-    "agents": "train, evaluate",
-    "benchmark": "benchmark",
-    "codesign": "codesign",
-    "design": "optimise, sensitivity, calibrate",
-    "surrogate": "dataset, fit",
-}
-"""Folder of shipped configurations -> the verbs that read them."""
-
 
 @click.command()
 @click.option("--copy", type=options.PATH, metavar="FOLDER", help="Copy all of them to a new folder, to edit them.")
@@ -28,7 +19,7 @@ def configs(copy: Path | None) -> None:
     Every verb with --config accepts their names.
     """
     if copy is None:
-        for folder, verbs in VERBS.items():
+        for folder, verbs in options.VERBS.items():
             click.echo(f"{verbs}:")
             for name in options.shipped_configs(folder):
                 click.echo(f"  {name}")

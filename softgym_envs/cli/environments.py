@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import operator
 import os
 import sys
 from pathlib import Path
@@ -17,7 +19,7 @@ from softgym_envs.extras import require
 if TYPE_CHECKING:
     from softgym_envs.agents.config import EnvironmentConfig
 
-AGENT_HELP = "qp, qp_static, qp_model, qp_pi, random, or a policy (a file or the name of a shipped policy)."
+AGENT_HELP = "qp, qp_static, qp_model, qp_pi, force, close, random, or a policy (a file, or the name of a shipped one)."
 
 
 def _environment(id: str, agent: str, backend: str | None, verb: str) -> EnvironmentConfig:
@@ -77,6 +79,7 @@ def rollout(
     """Run one episode and print its result."""
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.agents.evaluation import make_agent
+    from softgym_envs.surrogate.domain import doubt_text
 
     if record is not None and video is not None:
         raise ConfigError("--record and --video exclude each other; run the episode twice")
@@ -98,15 +101,20 @@ def rollout(
         click.echo(f"wrote {record}; open it with 'softgym view {record}'")
         return
     observation, info = env.reset(seed=seed)
-    total, step, ended = 0.0, 0, False
+    total, step, ended, doubts = 0.0, 0, False, [int(info["doubt"])]
     frames: list[Any] = [env.render()] if video is not None else []
     while not ended:
         observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
         total, step, ended = total + float(reward), step + 1, terminated or truncated
+        doubts.append(int(info["doubt"]))
         if video is not None:
             frames.append(env.render())
     click.echo(f"{environment} on {config.backend}, agent {agent}: {step} steps, return {total:.2f}")
-    click.echo(f"final distance {1e3 * info['distance']:.3f} mm, success {info['is_success']}")
+    distance = config.task_class.distance_text(info["distance"], 3)
+    click.echo(f"final distance {distance}, success {info['is_success']}")
+    if doubted := [doubt for doubt in doubts if doubt]:
+        reasons = doubt_text(functools.reduce(operator.or_, doubted))
+        click.echo(f"{len(doubted)} of {len(doubts)} states are not trusted: {reasons}; compare with --backend fem")
     if video is not None:
         write_video(video, frames, fps=env.metadata["render_fps"])
         click.echo(f"wrote {video}")

@@ -21,6 +21,16 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 """Folder of the shipped configurations."""
 
 
+VERBS = {
+    "agents": "train, evaluate",
+    "benchmark": "benchmark",
+    "codesign": "codesign",
+    "design": "optimise, sensitivity, calibrate",
+    "surrogate": "dataset, fit",
+}
+"""Folder of shipped configurations -> the verbs that read them."""
+
+
 def shipped_configs(folder: str) -> list[str]:
     """Return the names of the shipped configurations of one kind: ``"agents"``, ``"codesign"``, ..."""
     return sorted(path.stem for path in (CONFIGS / folder).glob("*.yaml"))
@@ -39,6 +49,9 @@ class ConfigFile(click.ParamType):
         if path.exists() or path.suffix in (".yaml", ".yml") or path.name != str(value):
             return path
         names = shipped_configs(self.folder)
+        others = [verbs for folder, verbs in VERBS.items() if value in shipped_configs(folder)]
+        if value not in names and others:
+            raise ConfigError(f"configuration '{value}' is for {' and '.join(others)}; allowed: {', '.join(names)}")
         if value not in names:
             raise ConfigError(unknown_name("configuration file or name", value, names))
         return CONFIGS / self.folder / f"{value}.yaml"
@@ -102,7 +115,8 @@ def check_agent(name: str) -> None:
 
     names = [*BASELINES, *shipped_policies()]
     if name not in names and not name.endswith(".safetensors"):
-        raise ConfigError(f"{unknown_name('agent', name, names)}, or a .safetensors file")
+        text = unknown_name("agent", name, names)
+        raise ConfigError(f"{text}{' A' if text.endswith('?') else '; a'} policy file ends with .safetensors")
 
 
 def complete_environment(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:

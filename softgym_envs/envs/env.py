@@ -317,10 +317,10 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             self._renderer = ImageRenderer(self.robot, self.render_size, window=window, source=source)
         state, goal, path = self.backend.state, self.goal, self._path
         distance = float(self.task.distance(self.task.measure(state), goal))
-        text = f"distance {1e3 * distance:.1f} mm"
-        if self.task.goal_unit != "m":  # goals that are not places
+        place = self.task.goal_unit == "m"
+        text = f"{'distance' if place else 'error'} {self.task.distance_text(distance)}"
+        if not place:
             goal, path = state.effector[0], state.effector[:1]
-            text = f"error {1e2 * distance:.1f} %"
         image = self._renderer.render(self.backend.design, state, path, goal, text=text)
         return None if self.render_mode == "human" else image
 

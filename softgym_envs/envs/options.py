@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from softgym_envs.backends.registry import check_backend
+from softgym_envs.backends.registry import batches, check_backend
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.base import Task
@@ -84,6 +84,12 @@ class Setup:
     sampled: tuple[str, ...]
     shown: tuple[str, ...]
     action_mode: str
+
+    @property
+    def together(self) -> bool:
+        """Whether `SoftRobotVectorEnv` can step many of these environments together."""
+        rated = not (self.task.pushes or self.task.needs_state)
+        return rated and batches(self.backend, self.robot, self.backend_options)
 
     def spaces(self, *, moving: bool = False) -> AgentSpaces:
         """Return the agent's spaces; with ``moving``, observations include the effector's velocity."""

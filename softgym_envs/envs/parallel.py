@@ -40,7 +40,7 @@ def make_batch(
     """
     own = {name: value for name, value in options.items() if name in EnvironmentOptions.__dataclass_fields__}
     setup = set_up(robot, task, backend, EnvironmentOptions.check(own))
-    if setup.backend == "surrogate" and not (setup.task.pushes or setup.task.needs_state):
+    if setup.together:
         from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
         return SoftRobotVectorEnv(robot, task, num_envs, backend=backend, **options)

@@ -1,9 +1,9 @@
-"""SoftRobotVectorEnv: environments on the surrogate that step all bodies together."""
+"""SoftRobotVectorEnv: environments that step all bodies together."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from softgym_envs.backends.surrogate import BatchState, displacement_gradient, rest_state, solve_displacements
+from softgym_envs.backends.batch import BatchState
+from softgym_envs.backends.registry import batches, make_batch_backend
+from softgym_envs.envs.env import MAX_DRAWS
 from softgym_envs.envs.gradients import RewardGradient, StepGradient
 from softgym_envs.envs.options import (
     EnvironmentOptions,
@@ -23,17 +25,15 @@ from softgym_envs.envs.options import (
     set_up,
     take_reset_mask,
 )
-from softgym_envs.errors import ConvergenceError
+from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
-from softgym_envs.surrogate.model import Context
-from softgym_envs.surrogate.pretrained import pretrained_model
 
 if TYPE_CHECKING:
     from softgym_envs.envs.registration import RobotSource, TaskSource
 
 
 class SoftRobotVectorEnv(VectorEnv):
-    """``num_envs`` copies of a `SoftRobotEnv` on the surrogate backend, stepped together.
+    """``num_envs`` copies of a `SoftRobotEnv` that step together, on the surrogate or on finite elements of beams.
 
     Sub-environments that end are reset as Gymnasium's `AutoresetMode` says. ``"SameStep"``: the returned observation is
     the first of the next episode, and ``info["final_obs"]``, ``info["final_info"]`` hold the end of the last one.
@@ -46,14 +46,16 @@ class SoftRobotVectorEnv(VectorEnv):
         num_envs: number of sub-environments.
         max_episode_steps: time limit; default none.
         autoreset_mode: ``"SameStep"``, ``"NextStep"`` or ``"Disabled"``.
-        backend: ``"surrogate"``; ``gymnasium.make_vec`` steps other backends in processes (`ParallelVectorEnv`).
+        backend: ``"surrogate"``, or ``"fem"`` for robots of beams; ``gymnasium.make_vec`` steps the others in processes
+            (`ParallelVectorEnv`).
         render_mode: must be None; batches are not rendered.
         **options: ``design``, ``action_mode`` and the other arguments that the page of each environment ID lists;
             every sub-environment samples its own design.
 
     Raises:
-        ValueError: for a wrong option, or a robot without a surrogate.
+        ValueError: for a wrong option, or a robot whose bodies cannot be stepped together on this backend.
         DesignError: for a malformed design.
+        InfeasibleDesign: if the body cannot exist.
         WeightsError: if the surrogate's weights are damaged or belong to another robot.
     """
 
@@ -80,7 +82,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         setup = set_up(robot, task, backend, EnvironmentOptions.check(options))
         self.robot, self.task = setup.robot, setup.task
-        if setup.backend != "surrogate":
+        if not batches(setup.backend, self.robot, setup.backend_options):
             raise ValueError(
                 f"backend = {setup.backend!r} of robot '{self.robot.name}' has no batched environment; "
                 "allowed: 'surrogate', or gymnasium.make_vec, which steps it in processes"
@@ -89,54 +91,65 @@ class SoftRobotVectorEnv(VectorEnv):
         self.num_envs = num_envs
         self.render_mode = None
         self.design_space = self.robot.design_space
-        self.model = pretrained_model(self.robot, **setup.backend_options)
         self.max_episode_steps = max_episode_steps if max_episode_steps is not None else np.iinfo(np.int64).max
         self._fixed_design, self.sampled_variables = setup.design, setup.sampled
         #: Draws the sampled variables of sub-environments ``index`` in unit coordinates [-1, 1], shape (len(index),
         #: number of sampled variables). Replace this function to draw bodies in another way.
         self.design_sampler: Callable[[np.random.Generator, np.ndarray], np.ndarray] = self._draw_uniformly
-        self.spaces = setup.spaces()
+        self.designs = np.tile(self._fixed_design.array, (num_envs, 1))
+        self.backend = make_batch_backend(setup.backend, self.robot, designs=self.designs, **setup.backend_options)
+        self.spaces = setup.spaces(moving=self.backend.moving)
         self.single_action_space = self.spaces.action_space
         self.single_observation_space = self.spaces.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
         self._reward_gradient: RewardGradient | None = None  # made when it is first needed, because it loads torch
-        self._unilateral = self.robot.unilateral
-        self.designs = np.tile(self._fixed_design.array, (num_envs, 1))
-        # One body for all rows, until they differ.
-        self._context = Context.shared(self.model.context(self.designs[:1]), num_envs)
         self._unit_design = np.zeros((num_envs, len(setup.shown)))
-        self._command = np.zeros((num_envs, len(self.robot.actuators)))
         self._paths = np.zeros((num_envs, 1, 3))
         self._counts = np.ones(num_envs, dtype=np.int64)  # goals in each path
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)  # episodes that are over and not reset yet
         self._changed = np.zeros(num_envs, dtype=bool)  # bodies given in reset that differ from the fixed one
-        rest = rest_state(self.model, self._context.rows(np.zeros(1, dtype=np.int64)), self._unilateral)
-        self._rest, self._state = _repeat(rest, num_envs), _repeat(rest, num_envs)
-        self._set_rest(np.arange(num_envs), rest)
+        self._show_designs(np.arange(num_envs))
 
     def _draw_uniformly(self, rng: np.random.Generator, index: np.ndarray) -> np.ndarray:
         return rng.uniform(-1.0, 1.0, (len(self.sampled_variables), len(index))).T
 
     # -- bodies -----------------------------------------------------------------------------------------------------
 
-    def _begin_bodies(self, index: np.ndarray) -> None:
-        """Prepare the models of changed designs."""
-        context = self.model.context(self.designs[index])
-        self._context.put(index, context)
-        self._set_rest(index, rest_state(self.model, context, self._unilateral))
+    def _begin_bodies(self, index: np.ndarray, designs: np.ndarray) -> dict[int, InfeasibleDesign]:
+        """Change bodies, and return why some of them cannot exist."""
+        impossible = dict(self.backend.begin(index, designs))
+        self.designs[index] = designs
+        self._show_designs(index)
+        return impossible
 
-    def _set_rest(self, index: np.ndarray, rest: BatchState) -> None:
-        if not rest.converged.all():
-            lost = self.designs[index[np.flatnonzero(~rest.converged)[0]]].tolist()
-            design = dict(zip(self.design_space.names, lost, strict=True))
-            raise ConvergenceError(f"the surrogate finds no equilibrium at rest of design {design}")
-        _put(self._rest, index, rest)
+    def _show_designs(self, index: np.ndarray) -> None:
         for column, name in enumerate(self.spaces.design_names):
             values = self.designs[index, self.design_space.names.index(name)]
             self._unit_design[index, column] = self.design_space[name].to_unit(values)
+
+    def _draw_bodies(self, index: np.ndarray) -> None:
+        """Draw the sampled variables; bodies that cannot exist are drawn again.
+
+        Raises:
+            InfeasibleDesign: if `MAX_DRAWS` bodies in turn cannot exist.
+        """
+        names = self.design_space.names
+        columns = [names.index(name) for name in self.sampled_variables]
+        for attempt in range(MAX_DRAWS):
+            designs = np.tile(self._fixed_design.array, (len(index), 1))
+            for column, name, draws in zip(
+                columns, self.sampled_variables, self.design_sampler(self.np_random, index).T, strict=True
+            ):
+                designs[:, column] = self.design_space[name].from_unit(draws)
+            impossible = self._begin_bodies(index, designs)
+            if not impossible:
+                return
+            if attempt == MAX_DRAWS - 1:
+                raise next(iter(impossible.values()))
+            index = np.array(sorted(impossible))
 
     def _begin_episodes(
         self,
@@ -146,47 +159,35 @@ class SoftRobotVectorEnv(VectorEnv):
     ) -> None:
         """Start episodes in the sub-environments ``index``."""
         if design is not None:
-            designs = [design] * len(index) if isinstance(design, Mapping) else design
-            self.designs[index] = [self.design_space.complete(d, self._fixed_design).array for d in designs]
-            self._begin_bodies(index)
+            given = [design] * len(index) if isinstance(design, Mapping) else design
+            designs = np.array([self.design_space.complete(d, self._fixed_design).array for d in given])
+            for error in self._begin_bodies(index, designs).values():
+                raise error
             self._changed[index] = True
         elif self.sampled_variables:
-            names = self.design_space.names
-            self.designs[index] = self._fixed_design.array
-            for column, draws in enumerate(self.design_sampler(self.np_random, index).T):
-                name = self.sampled_variables[column]
-                self.designs[index, names.index(name)] = self.design_space[name].from_unit(draws)
-            self._begin_bodies(index)
+            self._draw_bodies(index)
         elif self._changed[index].any():
-            self.designs[index] = self._fixed_design.array
-            self._begin_bodies(index)
+            self._begin_bodies(index, np.tile(self._fixed_design.array, (len(index), 1)))
             self._changed[index] = False
-        self._command[index] = 0.0
-        _put(self._state, index, _rows(self._rest, index))
-        self._state.slack[index] = False
+        self.backend.rest(index)
         self._steps[index] = 0
         self._ended[index] = False
         if goal is not None:
             paths = goal
         else:
-            paths = self.task.sample(self.np_random, len(index), lambda commands: self._kinematics(index, commands))
+            paths = self.task.sample(self.np_random, len(index), partial(self.backend.effectors, index))
         missing = paths.shape[1] - self._paths.shape[1]
         if missing > 0:
             self._paths = np.pad(self._paths, ((0, 0), (0, missing), (0, 0)))
         self._paths[index, : paths.shape[1]] = paths
         self._counts[index] = paths.shape[1]
 
-    def _kinematics(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        context = self._context.rows(index)
-        found = solve_displacements(self.model, context, commands, np.zeros_like(commands), self._unilateral)
-        return np.where(found.converged[:, None], found.effector[:, :3], np.nan)
-
     # -- for controllers --------------------------------------------------------------------------------------------
 
     @property
     def command(self) -> np.ndarray:
         """Present commands, shape (num_envs, n_a)."""
-        return self._command
+        return self.backend.command
 
     @property
     def slack(self) -> np.ndarray:
@@ -221,12 +222,11 @@ class SoftRobotVectorEnv(VectorEnv):
     @property
     def condensed(self) -> CondensedModel:
         """Condensed models of the present states, evaluated at each access; leading shape (num_envs,)."""
-        batch = self.model.condensed(self._context, self._state.displacement)
-        effort, delta = batch.effort.copy(), batch.delta.array
-        # Slack cables carry no effort; the network's may differ from zero by rounding.
-        effort[:, : self.model.count] = self._state.effort
-        free = delta - np.einsum("bij,bj->bi", batch.compliance, effort)
-        return CondensedModel(batch.compliance, free, effort, batch.roles, batch.rows)
+        return self.backend.condensed
+
+    @property
+    def _state(self) -> BatchState:
+        return self.backend.state
 
     # -- Gymnasium --------------------------------------------------------------------------------------------------
 
@@ -275,6 +275,7 @@ class SoftRobotVectorEnv(VectorEnv):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any], StepGradient]:
         """As `step`; also returns the derivatives of the rewards in the actions.
 
+        In dynamics these are rewards of the equilibria where the present commands lead if they are held.
         Rows that found no equilibrium or are reset have a reward and derivatives of zero.
 
         Raises:
@@ -283,7 +284,7 @@ class SoftRobotVectorEnv(VectorEnv):
             ImportError: without torch, which differentiates the task.
         """
         actions = self._checked(actions)
-        slope, limited = self.spaces.command_slope(actions, self._command)
+        slope, limited = self.spaces.command_slope(actions, self.command)
         self._advance(actions)
         gradient = self._gradient(slope, limited)
         return *self._finish_step(), gradient
@@ -299,29 +300,19 @@ class SoftRobotVectorEnv(VectorEnv):
 
     def _advance(self, actions: np.ndarray) -> None:
         """Move commands and states by one step."""
-        command = self.spaces.command(actions, self._command)
-        present = self._state
-        state = solve_displacements(
-            self.model, self._context, command, present.displacement, self._unilateral, present.slack
-        )
-        found = state.converged.copy()
-        if found.all():
-            self._command, self._state = command, replace(state, converged=found)
-        else:  # rows without an equilibrium keep their state, and their episodes end
-            self._command = np.where(found[:, None], command, self._command)
-            self._state = replace(_choose(found, state, present), converged=found)
+        self.backend.step(self.spaces.command(actions, self.command))
         self._steps += 1
 
     def _gradient(self, slope: np.ndarray, limited: np.ndarray) -> StepGradient:
         if self._reward_gradient is None:
             self._reward_gradient = RewardGradient(self.task, self.spaces)
-        state, goals = self._state, self.goals
+        state, goals = self.backend.settled(), self.goals
         effector, effort = np.zeros_like(state.effector), state.effort
         effector[:, :3], by_effort = self._reward_gradient(state.effector[:, :3], effort, goals)
-        held, command = displacement_gradient(self.model, self._context, state, effector, by_effort)
+        held, command = self.backend.gradient(effector, by_effort)
         _, _, reward = self.task.rate(state.effector[:, :3], goals, self.spaces.effort_share(effort))
-        rated = state.converged & ~self._ended
-        found, gap = rated[:, None], state.displacement - self._command
+        rated = state.converged & self._state.converged & ~self._ended
+        found, gap = rated[:, None], state.displacement - self.command
         held, command = np.where(found, held, 0.0), np.where(found, command, 0.0)
         reward = np.where(rated, reward, 0.0)
         return StepGradient(reward, command, held, state.slack.copy(), gap, slope, limited)
@@ -352,7 +343,13 @@ class SoftRobotVectorEnv(VectorEnv):
     def _observe(self) -> np.ndarray:
         state = self._state
         return self.spaces.observe(
-            self._command, state.displacement, state.effort, state.effector[:, :3], self.goals, self._unit_design
+            self.command,
+            state.displacement,
+            state.effort,
+            state.effector[:, :3],
+            self.goals,
+            self._unit_design,
+            self.backend.velocity,
         )
 
     def _info(self) -> tuple[dict[str, Any], np.ndarray]:
@@ -366,7 +363,7 @@ class SoftRobotVectorEnv(VectorEnv):
             "distance": distance,
             "is_success": distance < self.task.success_distance,
             **{f"reward_{name}": term for name, term in terms.items()},
-            "stable": every,
+            "stable": self.backend.stable,
         }
         for name in ("displacement", "effort", "uncertainty", "trusted", "doubt", "converged"):
             info[name] = getattr(state, name).copy()
@@ -375,26 +372,3 @@ class SoftRobotVectorEnv(VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Do nothing, because there is nothing to free."""
-
-
-_FIELDS = tuple(field.name for field in fields(BatchState))
-
-
-def _repeat(state: BatchState, count: int) -> BatchState:
-    """Return ``count`` copies of the state of one row."""
-    return BatchState(*(np.repeat(getattr(state, name), count, axis=0) for name in _FIELDS))
-
-
-def _rows(state: BatchState, index: np.ndarray) -> BatchState:
-    return BatchState(*(getattr(state, name)[index] for name in _FIELDS))
-
-
-def _put(state: BatchState, index: np.ndarray, new: BatchState) -> None:
-    for name in _FIELDS:
-        getattr(state, name)[index] = getattr(new, name)
-
-
-def _choose(found: np.ndarray, new: BatchState, old: BatchState) -> BatchState:
-    """Return ``new`` in the rows that are found, ``old`` in the others."""
-    pairs = ((getattr(new, name), getattr(old, name)) for name in _FIELDS)
-    return BatchState(*(np.where(found if a.ndim == 1 else found[:, None], a, b) for a, b in pairs))

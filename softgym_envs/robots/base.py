@@ -132,6 +132,8 @@ class Robot(ABC):
         effort_scale: typical effort of each actuator of the baseline body [N, ...], shape (n_a,).
         goal_axes: which coordinates of the first effector count towards a goal, 1 or 0, shape (3,).
         goal_tolerance: distance at which a goal counts as reached [m].
+        picture_axes: coordinates that pictures show towards the viewer, to the right and up: (0, 1, 2), (1, 2, 0) or
+            (2, 0, 1).
         workspace_scale: distance over which the effector typically moves [m], by default a quarter of the size; scales
             rewards and errors.
         rest_mode: state of the actuators at rest: ``"effort"`` (no effort) or ``"displacement"`` (held at zero).
@@ -141,6 +143,8 @@ class Robot(ABC):
             actuators are driven by efforts. Surrogates rely on it; without it, they learn unstable states too.
         free_object: whether the robot holds an object that can fall. Many commands then have no static equilibrium, so
             pictures are framed by the robot at rest.
+        made_of_beams: bodies are quadratic beams and rigid parts, moved by servos or chambers; finite elements step
+            many of them at once.
         learned: how the robot is learned: one ``"potential"`` of its actuators and effectors, a ``"chain"`` of
             segments for any contacts, or a ``"hand"`` of such chains.
         non_mechanical_options: options that do not change the condensed model.
@@ -155,11 +159,13 @@ class Robot(ABC):
     effort_scale: np.ndarray
     goal_axes: np.ndarray = np.ones(3)
     goal_tolerance: float = 0.002
+    picture_axes: tuple[int, int, int] = (0, 1, 2)
     workspace_scale: float
     rest_mode: str = "effort"
     stiffness_variable: str | None = None
     convex: bool = True
     free_object: bool = False
+    made_of_beams: bool = False
     learned: str = "potential"
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")

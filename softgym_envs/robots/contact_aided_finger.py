@@ -69,6 +69,7 @@ class ContactAidedFinger(MeshedRobot):
     name = "contact_aided_finger"
     effectors: tuple[str, ...] = ("tip",)
     size = 0.1
+    picture_axes = (2, 0, 1)  # it stands along y and closes along x
     goal_axes = np.array([1.0, 1.0, 0.0])
     rest_mode = "displacement"
     convex = False

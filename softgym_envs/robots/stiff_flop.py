@@ -67,6 +67,7 @@ class StiffFlop(Robot):
     name = "trunk"
     effectors = ("tip",)
     size = 0.11
+    made_of_beams = True
     non_mechanical_options = (*Robot.non_mechanical_options, "largest_volume")
     design_boxes = {
         # 30 % about the baseline, except where chambers would leave the body.

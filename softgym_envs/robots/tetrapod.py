@@ -61,6 +61,7 @@ class Tetrapod(Robot):
     effectors = ("centre",)
     size = 0.2
     rest_mode = "displacement"
+    made_of_beams = True
 
     def __init__(
         self,

@@ -9,7 +9,7 @@ import numpy as np
 from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.robots.base import Robot
-from softgym_envs.viewer.scene import STUB, Scene, check_display
+from softgym_envs.viewer.scene import STUB, Scene, check_display, obstacle_skins
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
 MAX_DEFLECTION = 0.725
@@ -130,6 +130,7 @@ class ImageRenderer:
             lines = cable_lines(model, x, rest, stub=STUB * self.robot.size)
             pulled = [_pulled(line, self.robot.upper[row]) for row, line in lines.items()]
             seen = [BodySurface(model).points(x), *pulled, _reached(self.robot, rest)]
+            seen += [points for points, _ in obstacle_skins(model, self.robot.size)]
             self._scene = Scene(self.robot, self.size, np.concatenate(seen), window=self._window)
         return self._scene
 

@@ -111,6 +111,7 @@ class _Part:
         opacity: float = 1.0,
         line_width: float = 1.0,
         faint: float = 0.0,
+        open_surface: bool = False,
     ) -> None:
         import pyvista
 
@@ -130,7 +131,7 @@ class _Part:
                 opacity=alpha,
                 line_width=line_width,
                 # Draw only the near side of a translucent mesh, so that its far side does not shine through.
-                culling="back" if alpha < 1.0 and lit else "none",
+                culling="back" if alpha < 1.0 and lit and not open_surface else "none",
             )
             actor = pyvista.Actor(mapper=self.mapper, prop=look)
             actor.visibility = False
@@ -170,6 +171,8 @@ class Scene:
         self.robot = robot
         self._length = robot.size
         self._line = max(1.0, size[1] / 480.0)
+        self._axes = list(robot.picture_axes)
+        cloud = self._seen(cloud)
         self._open_window(size, window)
         self._place_camera(size, cloud)
         self._draw_wall(size[0] / size[1], cloud)
@@ -177,7 +180,7 @@ class Scene:
         self._shadow = _Part(self, "shadow", back=True, lit=False)
         self._ghost = _Part(self, "ghost", back=True, opacity=0.55)
         self._body = _Part(self, "body", specular=0.25)
-        self._obstacles = _Part(self, "object", back=True, opacity=0.55)
+        self._obstacles = _Part(self, "object", back=True, opacity=0.55, open_surface=True)
         self._edges = _Part(self, "edge", lit=False, opacity=0.35, line_width=1.2 * self._line)
         self._cables: dict[int, _Part] = {}
         self._trail = _Part(self, "goal", lit=False, opacity=0.8, line_width=2.5 * self._line, faint=0.3)
@@ -189,6 +192,10 @@ class Scene:
         if size[1] >= 200:  # smaller captions would be illegible
             self._text = self._caption("", size, "left")
             self._caption(f"grid {1e3 * self._spacing:g} mm", size, "right")
+
+    def _seen(self, points: np.ndarray) -> np.ndarray:
+        """Return points [m] (n, 3) in the axes of the picture: towards the camera, to the right, up."""
+        return points[:, self._axes]
 
     # -- set-up -----------------------------------------------------------------------------------------------------
 
@@ -282,6 +289,8 @@ class Scene:
 
     def set_body(self, model: MechanicalModel, x: np.ndarray) -> None:
         """Draw a body at node positions [m] (n, 3). The surface is rebuilt only if the model changes."""
+        import pyvista
+
         if model is not self._model:
             self._model = model
             self._surface = BodySurface(model)
@@ -295,8 +304,10 @@ class Scene:
             self._shadow.show(self._flat)
             self._seams = _line_mesh(np.zeros_like(self._surface.shape(x)), self._surface.edges)
             self._edges.show(self._seams)
-            self._obstacles.show(_obstacle_mesh(model, self._length))
-        points = self._surface.points(x)
+            skins = [(self._seen(points), faces) for points, faces in obstacle_skins(model, self._length)]
+            parts = [pyvista.PolyData.from_regular_faces(*skin) for skin in skins]
+            self._obstacles.show(pyvista.merge(parts) if parts else None)
+        points = self._seen(self._surface.points(x))
         _move(self._skin, points, self._surface.normals(points))
         light = -_LIGHT / _LIGHT[0]
         flat = points + (points[:, :1] - self._wall) * light
@@ -304,7 +315,7 @@ class Scene:
         flat[:, 0] = self._wall - 2e-3 * self._length
         _move(self._flat, flat)
         # Slightly in front of the skin, so that the edges stay visible.
-        _move(self._seams, self._surface.shape(x) + 2e-3 * self._length * _unit(_CAMERA))
+        _move(self._seams, self._seen(self._surface.shape(x)) + 2e-3 * self._length * _unit(_CAMERA))
 
     def set_ghost(self, model: MechanicalModel | None, x: np.ndarray | None = None) -> None:
         """Draw another body at node positions [m] (n, 3) as a pale shape in the background, or no body for None."""
@@ -313,14 +324,16 @@ class Scene:
             return
         surface = BodySurface(model)
         mesh = _surface_mesh(surface)
-        points = surface.points(x)
+        points = self._seen(surface.points(x))
         _move(mesh, points, surface.normals(points))
         self._ghost.show(mesh)
 
     def set_state(self, x: np.ndarray, state: State) -> None:
         """Draw cables and effectors of the current body at node positions [m] (n, 3) in a state."""
         assert self._model is not None
-        lines = cable_lines(self._model, x, state, stub=STUB * self._length, side=tuple(self._side))
+        side = np.zeros(3)
+        side[self._axes] = self._side
+        lines = cable_lines(self._model, x, state, stub=STUB * self._length, side=tuple(side))
         for row in self._cables.keys() - lines.keys():
             self._cables[row].show(None)
         for row, line in lines.items():
@@ -329,16 +342,17 @@ class Scene:
             slack = bool(state.slack[row])
             color = COLORS["cable slack"] if slack else tension_color(state.effort[row] / self.robot.effort_scale[row])
             radius = (0.006 if slack else 0.009) * self._length
+            line = self._seen(line)
             tube = _polyline(line).tube(radius=radius, n_sides=12, capping=True)
             tube.point_data.active_normals = tube.point_data["TubeNormals"]
             bead = self._balls(line[:1], 0.018 * self._length)
             self._cables[row].show(tube.append_polydata(bead), color)
-        self._effectors.show(self._balls(state.effector, 0.026 * self._length))
+        self._effectors.show(self._balls(self._seen(state.effector), 0.026 * self._length))
 
     def set_goal(self, goal: np.ndarray | None, path: np.ndarray | None) -> None:
         """Draw the goal [m] (3,) and, if it moves, its path [m] (p, 3); None hides them."""
-        self._goal.show(None if goal is None else self._balls(goal[None], 0.034 * self._length))
-        self._trail.show(None if path is None or len(path) < 2 else _polyline(path))
+        self._goal.show(None if goal is None else self._balls(self._seen(goal[None]), 0.034 * self._length))
+        self._trail.show(None if path is None or len(path) < 2 else _polyline(self._seen(path)))
 
     def set_text(self, text: str) -> None:
         """Write a caption in the lower left corner."""
@@ -392,13 +406,14 @@ def _surface_mesh(surface: BodySurface) -> pyvista.PolyData:
     return pyvista.PolyData.from_regular_faces(np.zeros((len(surface.nodes), 3)), surface.triangles)
 
 
-def _obstacle_mesh(model: MechanicalModel, extent: float) -> pyvista.PolyData | None:
-    """Surface of the obstacles that stand still, or None; those that move are skins of the body."""
-    import pyvista
+def obstacle_skins(model: MechanicalModel, size: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return vertices [m] and triangles of the obstacles that stand still; those that move are skins of the body.
 
-    skins = [o.skin(extent) for o in (model.contact.obstacles if model.contact else ()) if o.frame is None]
-    parts = [pyvista.PolyData.from_regular_faces(points, triangles) for points, triangles in skins]
-    return pyvista.merge(parts) if parts else None
+    Args:
+        model: body with its contacts.
+        size: of the robot [m]; an infinite obstacle is shown up to three quarters of it to each side.
+    """
+    return [o.skin(0.75 * size) for o in (model.contact.obstacles if model.contact else ()) if o.frame is None]
 
 
 def _move(mesh: pyvista.PolyData, points: np.ndarray, normals: np.ndarray | None = None) -> None:

@@ -24,6 +24,7 @@ from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import WeightsError
 from softgym_envs.testing import wait_until
+from tests.accessibility import defects
 
 TRIALS = 7
 
@@ -151,7 +152,7 @@ def test_report(finished):
     assert all(source.startswith("data:") or source in beside | sections for source in page.sources)
     assert all(f'id="{section[1:]}"' in path.read_text() for section in sections)
     assert page.downloads >= beside | {"results.json", "trials.csv", "finalists.csv"}
-    assert page.without_text == []
+    assert page.without_text == [] and defects(path.read_text()) == []
     text = " ".join(page.text)
     row = finished.results.comparison[0]
     for role in ("baseline", "winner"):

@@ -243,7 +243,7 @@ def test_same_motion_under_commanded_efforts_and_with_saturated_servos(rng):
     fast, general = both(robot)
     command, saturated = np.zeros(4), 0
     for backend in (fast, general):
-        backend._max_effort = np.full(4, 0.05)
+        backend.largest_efforts = np.full(4, 0.05)
         backend._limited = True
     for _ in range(8):
         command = np.clip(command + rng.uniform(-1, 1, 4) * robot.rates, robot.lower, robot.upper)

@@ -150,6 +150,11 @@ class Task(ABC):
         """Return the force on the first effector during a control step [N], shape (3,), or None."""
         return None
 
+    @classmethod
+    def distance_text(cls, distance: float, digits: int = 1) -> str:
+        """Return a distance to show: in millimetres, or in percent of a goal that is not a place."""
+        return f"{1e3 * distance:.{digits}f} mm" if cls.goal_unit == "m" else f"{1e2 * distance:.{digits}f} %"
+
     def measure(self, state: State) -> np.ndarray:
         """Return what is compared with the goal, shape (3,): the first effector [m] unless a task overrides it."""
         return state.effector[0]

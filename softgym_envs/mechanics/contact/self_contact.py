@@ -23,6 +23,9 @@ MAX_CCD_STEPS = 1_000
 CCD_SHARE = 0.9
 """Share of a distance that a step may use up."""
 
+LONG_WAY = 3.0
+"""Pairs along steps longer than this multiple of ``reach`` are too many to keep: they serve for one step only."""
+
 
 @cache
 def load_ipctk() -> ModuleType:
@@ -292,8 +295,12 @@ class SelfContact:
         motion = _relative(v1 - v0)
         if 2.0 * _longest(motion) <= CCD_SHARE * min(self.minimum_distance(v0), self.distance):
             return 1.0
-        candidates = self._candidates_on(v0, motion)
         v1 = np.asfortranarray(v0 + motion)
+        if _longest(motion) > LONG_WAY * self.reach:
+            candidates = self._ipctk.Candidates()
+            candidates.build(self.mesh, v0, v1, 0.0, self._broad_phase)
+        else:
+            candidates = self._candidates_on(v0, motion)
         return float(candidates.compute_collision_free_stepsize(self.mesh, v0, v1, 0.0, self._ccd))
 
     def intersects(self, v: np.ndarray) -> bool:

@@ -2,8 +2,7 @@
 
 The solutions are those of `Statics` and `Dynamics`, to their tolerance; only what surrounds the arithmetic is saved.
 Newton's method keeps its factor while it converges fast, and takes whole steps only. Anything unusual (no convergence,
-a tangent that is not positive definite, an effort beyond its limit) ends the compiled call before that step, and the
-general solver takes over.
+a tangent that is not positive definite) ends the compiled call before that step, and the general solver takes over.
 """
 
 from __future__ import annotations
@@ -29,6 +28,7 @@ from softgym_envs.mechanics.solvers.beam_equations import (
 )
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, factorise, solve_lower, solve_upper
 from softgym_envs.mechanics.solvers.complementarity import solve_row
+from softgym_envs.mechanics.solvers.equilibrium import SATURATED
 
 MAX_ITERATIONS = 20
 """Newton iterations of a time step after which the general solver takes over."""
@@ -61,6 +61,18 @@ class Factor(NamedTuple):
     step: np.ndarray
     efforts: np.ndarray
     turned: np.ndarray
+
+
+def make_factor(blocks: int, size: int) -> Factor:
+    """Return arrays for a body with ``blocks`` movable frames and ``size`` constraint rows."""
+    return Factor(
+        half=np.zeros((size, blocks, SIZE)),
+        compliance=np.zeros((size, size)),
+        driven=np.zeros((size, size)),
+        step=np.zeros((blocks, SIZE)),
+        efforts=np.zeros(size),
+        turned=np.zeros((3, 3)),
+    )
 
 
 class MarchedSteps(NamedTuple):
@@ -243,10 +255,12 @@ def _march(
     beta,
     tolerance,
     totals,
+    finish,
 ):
     """Take time steps in place until one fails or exceeds a limit, which is undone; the number of steps taken.
 
-    ``totals`` (5,) receives kinetic and elastic energy, work, dissipation and the iterations of the last step.
+    ``totals`` (5,) receives kinetic and elastic energy, work, dissipation and the iterations of the last step. If
+    ``finish``, the compliances are those at the end of the last step.
     """
     size = effort.shape[0]
     everything = np.arange(size)
@@ -271,7 +285,7 @@ def _march(
             good = good and abs(effort[i]) <= limit[i]
         if good:
             # At the end of the step: all compliances where they are asked for, else values and energies alone.
-            last = k == targets.shape[0] - 1
+            last = finish and k == targets.shape[0] - 1
             if last:
                 assemble(body, x, effort, step, equations, True)
                 good = _factorise(body, equations, factor, everything)
@@ -304,6 +318,142 @@ def _march(
     return taken
 
 
+@njit(cache=True, error_model="numpy")
+def drive(
+    body,
+    equations,
+    factor,
+    start,
+    x,
+    velocity,
+    effort,
+    delta,
+    targets,
+    is_driven,
+    unilateral,
+    limit,
+    loads,
+    h,
+    alpha,
+    beta,
+    tolerance,
+    totals,
+):
+    """Take time steps as `_march`, in which driven actuators stop at their largest effort ``limit`` (l,).
+
+    An actuator that would exceed its limit is driven by that effort instead, until its command asks for less than it
+    has reached. Returns the number of steps taken.
+    """
+    count, steps = limit.shape[0], targets.shape[0]
+    driven, forced = np.flatnonzero(is_driven), np.flatnonzero(~is_driven)
+    one_way = np.zeros(driven.shape[0], dtype=np.bool_)
+    for i in range(driven.shape[0]):
+        one_way[i] = unilateral[driven[i]]
+    bound = np.full(count, np.inf)
+    for i in range(count):
+        if is_driven[i]:
+            bound[i] = limit[i]
+    free, sign = is_driven.copy(), np.zeros(count)
+    kept, kept_velocity, kept_effort, kept_totals = x.copy(), velocity.copy(), effort.copy(), totals.copy()
+    taken = 0
+    while taken < steps:
+        saturated = False
+        for i in range(count):
+            sign[i] = np.sign(effort[i])
+            free[i] = is_driven[i] and abs(effort[i]) < SATURATED * bound[i]
+            saturated = saturated or free[i] != is_driven[i]
+        if not saturated:
+            done = _march(
+                body,
+                equations,
+                factor,
+                start,
+                x,
+                velocity,
+                effort,
+                delta,
+                targets[taken:],
+                driven,
+                forced,
+                one_way,
+                bound,
+                loads,
+                h,
+                alpha,
+                beta,
+                tolerance,
+                totals,
+                True,
+            )
+            taken += done
+            if done or count == 0:
+                if done == 0:
+                    return taken
+                continue
+        # One step, with the set of saturated actuators that is consistent.
+        kept[:] = x
+        kept_velocity[:] = velocity
+        kept_effort[:] = effort
+        kept_totals[:] = totals
+        consistent = False
+        for attempt in range(2 * count + 2):
+            target = targets[taken : taken + 1].copy()
+            for i in range(count):
+                if is_driven[i] and not free[i]:
+                    target[0, i] = sign[i] * bound[i]
+            among = np.flatnonzero(free)
+            way = np.zeros(among.shape[0], dtype=np.bool_)
+            for i in range(among.shape[0]):
+                way[i] = unilateral[among[i]]
+            done = _march(
+                body,
+                equations,
+                factor,
+                start,
+                x,
+                velocity,
+                effort,
+                delta,
+                target,
+                among,
+                np.flatnonzero(~free),
+                way,
+                np.zeros(0),
+                loads,
+                h,
+                alpha,
+                beta,
+                tolerance,
+                totals,
+                taken == steps - 1,
+            )
+            if not done:
+                break
+            consistent = True
+            for i in range(count):
+                if free[i] and abs(effort[i]) > bound[i]:
+                    free[i], sign[i], consistent = False, np.sign(effort[i]), False
+                elif is_driven[i] and not free[i]:
+                    # Stop releasing actuators after a while, so that the loop terminates.
+                    behind = sign[i] * (targets[taken, i] - equations.delta[i]) < 0.0
+                    if behind and attempt <= count:
+                        free[i], consistent = True, False
+            if consistent:
+                break
+            x[:] = kept
+            velocity[:] = kept_velocity
+            effort[:] = kept_effort
+            totals[:] = kept_totals
+        if not consistent:
+            x[:] = kept
+            velocity[:] = kept_velocity
+            effort[:] = kept_effort
+            totals[:] = kept_totals
+            return taken
+        taken += 1
+    return taken
+
+
 class BeamMotion:
     """Time steps and equilibria of a body of beams.
 
@@ -317,14 +467,7 @@ class BeamMotion:
         self.elasticity_version = model.elasticity_version
         size, count = model.assembly.size, len(self.body.components.free)
         self.equations = make_equations(self.body, size)
-        self._factor = Factor(
-            half=np.zeros((size, count, SIZE)),
-            compliance=np.zeros((size, size)),
-            driven=np.zeros((size, size)),
-            step=np.zeros((count, SIZE)),
-            efforts=np.zeros(size),
-            turned=np.zeros((3, 3)),
-        )
+        self._factor = make_factor(count, size)
         self._strains = np.zeros((len(self.body.elements.frames), 2, 6))
 
     @classmethod
@@ -348,7 +491,7 @@ class BeamMotion:
         stiffness_damping: float,
         tolerance: float,
     ) -> MarchedSteps:
-        """Take time steps until one cannot be solved or exceeds a limit of effort.
+        """Take time steps until one cannot be solved; driven actuators stop at their largest effort.
 
         Args:
             x: rows at the start [m], shape (n, 3).
@@ -357,7 +500,7 @@ class BeamMotion:
             targets: values of driven rows and efforts of all others at the end of each step, shape (k, size).
             is_driven: rows whose values are commanded, mask of shape (size,).
             unilateral: first rows, of the actuators, that cannot push, mask of shape (n_a,).
-            limit: largest efforts of the first rows, shape (l,).
+            limit: largest efforts of the first rows where their values are commanded, shape (l,).
             loads: dead loads [N], shape (n, 3).
             step: duration of one time step [s].
             mass_damping: Rayleigh's alpha [1/s].
@@ -366,8 +509,7 @@ class BeamMotion:
         """
         x, velocity, effort, delta = x.copy(), velocity.copy(), effort.copy(), np.empty(len(effort))
         totals = np.zeros(5)
-        driven = np.flatnonzero(is_driven)
-        count = _march(
+        count = drive(
             self.body,
             self.equations,
             self._factor,
@@ -377,9 +519,8 @@ class BeamMotion:
             effort,
             delta,
             targets,
-            driven,
-            np.flatnonzero(~is_driven),
-            unilateral[driven],
+            is_driven,
+            unilateral,
             limit,
             loads,
             step,

@@ -255,13 +255,14 @@ class Dynamics(Statics):
         Args:
             targets: arguments of `advance` for each time step, shape (k, n_a).
             mode: as for `advance`.
-            largest_effort: of each actuator, shape (n_a,): a time step that exceeds one is not taken. Default none.
+            largest_effort: of each actuator, shape (n_a,): one whose commanded displacement needs more is driven by
+                that effort, until the command asks for less. Default none.
             **applied: as for `advance`.
 
         Returns:
             How many of the time steps were taken, and the last one if all were.
         """
-        beams, load = self._beam_solver(), applied.get("effector_force")
+        beams, load = self.beam_solver(), applied.get("effector_force")
         modes = [mode] * self._actuators if isinstance(mode, str) else list(mode)
         known = len(modes) == self._actuators and all(m in ("displacement", "effort") for m in modes)
         if beams is None or not known or applied.get("contact") is not None or targets.shape[1] != self._actuators:

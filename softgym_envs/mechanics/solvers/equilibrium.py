@@ -12,6 +12,9 @@ from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row
 from softgym_envs.mechanics.contact.contact import ContactMemory, Contacts
 from softgym_envs.mechanics.model import MechanicalModel
 
+SATURATED = 1.0 - 1e-9
+"""Part of its largest effort from which an actuator counts as saturated: round-off."""
+
 
 @dataclass(frozen=True)
 class Equilibrium:

@@ -575,7 +575,7 @@ class Statics:
 
     # -- bodies of beams --------------------------------------------------------------------------------------------
 
-    def _beam_solver(self) -> BeamMotion | None:
+    def beam_solver(self) -> BeamMotion | None:
         """Return the compiled solver of the body, or None if it needs the general one."""
         if not self._compiled or self.model.assembly is not self._assembly:
             return None
@@ -586,7 +586,7 @@ class Statics:
 
     def _balance(self, goal: np.ndarray, driven: np.ndarray) -> Equilibrium | None:
         """Find the equilibrium for commanded rows (size,) in compiled code; None where the general solver is needed."""
-        beams, loads = self._beam_solver(), self.model.loads
+        beams, loads = self.beam_solver(), self.model.loads
         ramped = bool((loads != self._current_loads).any())
         if beams is None or ramped or self.linearisation.inertia is not None or (driven >= self._actuators).any():
             return None

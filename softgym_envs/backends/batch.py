@@ -1,0 +1,140 @@
+"""The interface between the physics of many bodies at once and the batched environment."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.robots.base import Robot
+
+
+@dataclass(frozen=True)
+class BatchState:
+    """States of a batch of B bodies.
+
+    Attributes:
+        displacement: reached actuator displacements, shape (B, n_a).
+        effort: actuator efforts, shape (B, n_a).
+        effector: effector coordinates [m], shape (B, n_e).
+        slack: which actuators are slack, shape (B, n_a).
+        converged: whether the state was found, shape (B,); rows without a state must not be used.
+        uncertainty: uncertainty of the effector [m], shape (B,).
+        doubt: why the model is not trusted, 0 where it is (`softgym_envs.surrogate.domain.DOUBTS`), shape (B,).
+    """
+
+    displacement: np.ndarray
+    effort: np.ndarray
+    effector: np.ndarray
+    slack: np.ndarray
+    converged: np.ndarray
+    uncertainty: np.ndarray
+    doubt: np.ndarray
+
+    @property
+    def trusted(self) -> np.ndarray:
+        """Whether the model may be trusted, shape (B,)."""
+        return self.doubt == 0
+
+    def repeat(self, count: int) -> BatchState:
+        """Return ``count`` copies of the state of one row."""
+        return BatchState(*(np.repeat(getattr(self, name), count, axis=0) for name in _FIELDS))
+
+    def rows(self, index: np.ndarray) -> BatchState:
+        """Return copies of the states of some rows."""
+        return BatchState(*(getattr(self, name)[index] for name in _FIELDS))
+
+    def put(self, index: np.ndarray, new: BatchState) -> None:
+        """Replace the states of some rows."""
+        for name in _FIELDS:
+            getattr(self, name)[index] = getattr(new, name)
+
+    def where(self, found: np.ndarray, old: BatchState) -> BatchState:
+        """Return the states of this batch in the rows that are found, those of ``old`` in the others."""
+        pairs = ((getattr(self, name), getattr(old, name)) for name in _FIELDS)
+        return BatchState(*(np.where(found if a.ndim == 1 else found[:, None], a, b) for a, b in pairs))
+
+
+_FIELDS = tuple(field.name for field in fields(BatchState))
+
+
+class BatchBackend(ABC):
+    """Physics of B bodies of one robot, which go from state to state under commanded displacements.
+
+    Attributes:
+        robot: the robot.
+        state: the present states.
+        command: the commands that led to them, shape (B, n_a).
+        moving: states have velocities.
+    """
+
+    moving: bool = False
+    robot: Robot
+    state: BatchState
+    command: np.ndarray
+
+    @abstractmethod
+    def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
+        """Give rows other bodies, at rest.
+
+        Args:
+            index: the rows.
+            designs: their bodies, shape (len(index), number of design variables).
+
+        Returns:
+            Why the bodies of rows cannot exist; these rows keep the bodies that they had.
+
+        Raises:
+            ConvergenceError: if a body has no state at rest.
+        """
+
+    @abstractmethod
+    def rest(self, index: np.ndarray) -> None:
+        """Put rows at rest, without a command."""
+
+    @abstractmethod
+    def step(self, command: np.ndarray) -> None:
+        """Go to the states under commands (B, n_a). Rows whose state is not found keep theirs and are not converged."""
+
+    @abstractmethod
+    def effectors(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        """Return the first effectors [m] (len(index), 3) of equilibria under commands; NaN where there is none."""
+
+    @property
+    def velocity(self) -> np.ndarray | None:
+        """Velocities of the first effector [m/s], shape (B, 3); None without dynamics."""
+        return None
+
+    @property
+    @abstractmethod
+    def stable(self) -> np.ndarray:
+        """Whether each state is stable, as in `State`, shape (B,)."""
+
+    @property
+    @abstractmethod
+    def condensed(self) -> CondensedModel:
+        """Condensed models of the present states, evaluated at each access; leading shape (B,)."""
+
+    @abstractmethod
+    def settled(self) -> BatchState:
+        """Return the equilibria under the present commands, whose derivatives `gradient` takes.
+
+        Without dynamics they are the present states. In dynamics a body goes there if its command is held.
+        """
+
+    @abstractmethod
+    def gradient(self, effector: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the gradient of a function of the last `settled` states in displacements, and in commands.
+
+        Args:
+            effector: derivative of the function in the effector coordinates, shape (B, n_e).
+            effort: derivative in the efforts, shape (B, n_a).
+
+        Returns:
+            Two gradients, each (B, n_a): with all displacements held, as if no actuator were slack; and in the
+            commands, zero for actuators that do not follow theirs.
+        """

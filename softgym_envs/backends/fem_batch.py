@@ -1,0 +1,251 @@
+"""Finite elements of many bodies of beams at once: one compiled call for each control step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.backends.batch import BatchBackend, BatchState
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.designs import Design
+from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.solvers.beam_batch import BeamBatch, BeamStates
+from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
+from softgym_envs.robots.base import Robot
+
+
+class FEMBatch(BatchBackend):
+    """The states of `FEMBackend` for many bodies made of beams.
+
+    Rows with the same body share its model. A step that the compiled solver cannot take is taken by the general one,
+    row by row.
+
+    Args:
+        robot: a robot with ``made_of_beams`` that touches nothing.
+        designs: bodies, shape (B, number of design variables).
+        **options: those of `FEMBackend`.
+
+    Raises:
+        InfeasibleDesign: if a body cannot exist.
+        ValueError: for an option of another kind.
+    """
+
+    def __init__(self, robot: Robot, designs: np.ndarray, **options: Any) -> None:
+        self.robot = robot
+        self._options = options
+        self._owners: dict[Design, FEMBackend] = {}
+        self._designs = [self._design(values) for values in designs]
+        for design in dict.fromkeys(self._designs):
+            self._owners[design] = FEMBackend(robot, design, **options)
+        first = self._owners[self._designs[0]]
+        self._first = first
+        self.moving = first.moving
+        count, size = len(designs), len(_rest(first)[1])
+        self._slices = first.state.condensed.slices
+        self._is_driven = np.arange(size) < len(robot.actuators)
+        self._present = _empty(count, len(first.model.nodes), size)
+        self._balanced = _empty(count, len(first.model.nodes), size) if self.moving else self._present
+        self._is_balanced = np.ones(count, dtype=bool)
+        self.command = np.zeros((count, len(robot.actuators)))
+        self._converged = np.ones(count, dtype=bool)
+        self._stable = np.ones(count, dtype=bool)
+        self._stack()
+        self.rest(np.arange(count))
+
+    def _design(self, values: np.ndarray) -> Design:
+        return self.robot.design_space.complete(dict(zip(self.robot.design_space.names, values, strict=True)))
+
+    def _stack(self) -> None:
+        """Put the arrays of all bodies in use beside each other."""
+        used = list(dict.fromkeys(self._designs))
+        self._owners = {design: self._owners[design] for design in used}
+        numbers = {design: k for k, design in enumerate(used)}
+        self._numbers = np.array([numbers[design] for design in self._designs])
+        solvers = [_beams(owner) for owner in self._owners.values()]
+        self._beams = BeamBatch([s.body for s in solvers], [owner.model.loads for owner in self._owners.values()])
+
+    def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
+        impossible: dict[int, InfeasibleDesign] = {}
+        for i, values in zip(index.tolist(), designs, strict=True):
+            design = self._design(values)
+            try:
+                if design not in self._owners:
+                    self._owners[design] = FEMBackend(self.robot, design, **self._options)
+            except InfeasibleDesign as error:
+                impossible[i] = error
+            else:
+                self._designs[i] = design
+        self._stack()
+        self.rest(index)
+        return impossible
+
+    def rest(self, index: np.ndarray) -> None:
+        self.command[index] = 0.0
+        self._converged[index] = True
+        for i in index.tolist():
+            x, effort, delta, compliance = _rest(self._owners[self._designs[i]])
+            for states in (self._present, self._balanced):
+                states.x[i], states.effort[i], states.delta[i], states.compliance[i] = x, effort, delta, compliance
+                states.velocity[i] = 0.0
+        self._stable[index] = True
+        self._is_balanced[index] = True
+
+    def step(self, command: np.ndarray) -> None:
+        first, present = self._first, self._present
+        step = first.step_options
+        if self.moving:
+            parts = np.arange(1, first.substeps + 1)[:, None] / first.substeps
+            targets = self._targets(self.command[:, None] + parts * (command - self.command)[:, None])
+            targets[:, -1, : command.shape[1]] = command
+        else:
+            targets = self._targets(command[:, None])
+        solved = self._beams.march(
+            self._numbers,
+            present,
+            targets,
+            self._is_driven,
+            self.robot.unilateral,
+            limit=first.largest_efforts,
+            step=step["step"] if self.moving else np.inf,
+            mass_damping=step["mass_damping"] if self.moving else 0.0,
+            stiffness_damping=step["stiffness_damping"] if self.moving else 0.0,
+            tolerance=first.tolerance,
+        )
+        self._stable[:] = True
+        self._converged = solved.copy()
+        for i in np.flatnonzero(~solved).tolist():
+            self._converged[i] = self._step_alone(i, command[i])
+        self.command = np.where(self._converged[:, None], command, self.command)
+
+    def _targets(self, commands: np.ndarray) -> np.ndarray:
+        """Values of driven rows and efforts of all others, shape (B, k, size), for commands (B, k, n_a)."""
+        targets = np.zeros((*commands.shape[:2], len(self._is_driven)))
+        targets[:, :, : commands.shape[2]] = commands
+        return targets
+
+    def _step_alone(self, i: int, command: np.ndarray) -> bool:
+        """Step one row with the general solver; whether that finds the state."""
+        owner, present = self._owners[self._designs[i]], self._present
+        owner.go_to(present.x[i], present.effort[i], present.delta[i], present.velocity[i], self.command[i])
+        try:
+            state = owner.step(command)
+        except ConvergenceError:
+            return False
+        assert state.nodes is not None
+        present.x[i], present.effort[i] = state.nodes, state.condensed.effort
+        present.velocity[i] = 0.0 if state.motion is None else state.motion.velocity
+        present.delta[i], present.compliance[i] = state.condensed.delta.array, state.condensed.compliance
+        self._stable[i] = state.stable
+        return True
+
+    def effectors(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        found = np.full((len(index), 3), np.nan)
+        for k, i in enumerate(index.tolist()):
+            owner = self._owners[self._designs[i]]
+            owner.reset()
+            try:
+                found[k] = owner.probe(commands[k]).effector[0]
+            except ConvergenceError:
+                pass
+        return found
+
+    @property
+    def state(self) -> BatchState:  # type: ignore[override]
+        return self._state_of(self._present, self._converged)
+
+    def _state_of(self, states: BeamStates, converged: np.ndarray) -> BatchState:
+        a, e = self._slices["a"], self._slices["e"]
+        displacement, effort = states.delta[:, a], states.effort[:, a]
+        # The sign of the effort alone does not suffice: at rest it is round-off.
+        slack = self.robot.unilateral & (effort <= 0.0) & (displacement > self.command + 1e-9)
+        count = len(effort)
+        return BatchState(
+            displacement.copy(),
+            effort.copy(),
+            states.delta[:, e].copy(),
+            slack,
+            converged,
+            np.zeros(count),
+            np.zeros(count, dtype=np.int64),
+        )
+
+    @property
+    def velocity(self) -> np.ndarray | None:
+        if not self.moving:
+            return None
+        points = _beams(self._first).body.points
+        return np.einsum("k,bkd->bd", points.weights[0], self._present.velocity[:, points.rows[0]])
+
+    @property
+    def stable(self) -> np.ndarray:
+        return self._stable.copy()
+
+    @property
+    def condensed(self) -> CondensedModel:
+        present, like = self._present, self._first.state.condensed
+        free = present.delta - np.einsum("bij,bj->bi", present.compliance, present.effort)
+        return CondensedModel(present.compliance.copy(), free, present.effort.copy(), like.roles, like.rows)
+
+    def settled(self) -> BatchState:
+        if self.moving:
+            # From the equilibria under the last commands, or from the present shapes where these were not found.
+            states = self._balanced
+            for name in ("x", "effort"):
+                getattr(states, name)[~self._is_balanced] = getattr(self._present, name)[~self._is_balanced]
+            self._is_balanced = self._beams.march(
+                self._numbers,
+                states,
+                self._targets(self.command[:, None]),
+                self._is_driven,
+                self.robot.unilateral,
+                limit=self._first.largest_efforts,
+                step=np.inf,
+                mass_damping=0.0,
+                stiffness_damping=0.0,
+                tolerance=self._first.tolerance,
+            )
+            return self._state_of(states, self._is_balanced.copy())
+        return self.state
+
+    def gradient(self, effector: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        states, a, e = self._balanced, self._slices["a"], self._slices["e"]
+        W, size = states.compliance[:, a, a], self.command.shape[1]
+        pulled = np.einsum("bea,be->ba", states.compliance[:, e, a], effector) + effort
+        held = np.linalg.solve(W, pulled[:, :, None])[:, :, 0]
+        # Actuators that are slack or saturated do not follow their commands; their efforts stay what they are.
+        follows = np.abs(states.delta[:, a] - self.command) < 1e-6 * self.robot.rates
+        both = follows[:, :, None] & follows[:, None, :]
+        driven = np.linalg.solve(np.where(both, W, np.eye(size)), np.where(follows, pulled, 0.0)[:, :, None])[:, :, 0]
+        return held, np.where(follows, driven, 0.0)
+
+
+def _beams(owner: FEMBackend) -> BeamMotion:
+    """Return the compiled solver of a body.
+
+    Raises:
+        ValueError: for a body that has none.
+    """
+    found = owner.beams
+    if found is None:
+        raise ValueError(f"bodies of robot '{owner.robot.name}' cannot be stepped together: they are not beams alone")
+    return found
+
+
+def _rest(owner: FEMBackend) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows, efforts, values of the constraints and ``W`` of a body at rest."""
+    state = owner.reset()
+    assert state.nodes is not None
+    return state.nodes, state.condensed.effort, state.condensed.delta.array, state.condensed.compliance
+
+
+def _empty(count: int, rows: int, size: int) -> BeamStates:
+    return BeamStates(
+        x=np.zeros((count, rows, 3)),
+        velocity=np.zeros((count, rows, 3)),
+        effort=np.zeros((count, size)),
+        delta=np.zeros((count, size)),
+        compliance=np.zeros((count, size, size)),
+    )
