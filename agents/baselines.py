@@ -45,7 +45,7 @@ class InverseQPAgent:
         """
         if env.task.needs_state:
             return self._forces(observation, env)
-        present = env.state.command
+        present = env.command
         if env not in self._controllers or not present.any():
             self._begin(env)
         try:
@@ -109,7 +109,7 @@ class ModelQPAgent(InverseQPAgent):
             return controller.solve(expected.condensed, env.goal, present, expected.slack)
         axes, correction = env.task.axes, self._corrections[env]
         # The effector follows the previous goal; the motion of the goal since then is not an error of the model.
-        error = axes * (self._previous_goals[env] - env.state.effector[0])
+        error = axes * (self._previous_goals[env] - env.sensed.effector)
         self._previous_goals[env] = env.goal
         aim = correction.correct(env.goal, env.goal - error)
         command = controller.solve(expected.condensed, aim, present, expected.slack)

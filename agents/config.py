@@ -42,6 +42,7 @@ class EnvironmentConfig(Config):
         robot_options: options of the robot.
         task_options: options of the task.
         backend_options: options of the backend.
+        plant: how the robot differs from its model, fixed or drawn at each reset (`softgym_envs.envs.plant`).
         residual_scale: factor of the agent's action when it is added to that of the QP; 0 for no QP.
     """
 
@@ -57,6 +58,7 @@ class EnvironmentConfig(Config):
     robot_options: Annotated[dict[str, Any], BesideConfig()] = {}
     task_options: Annotated[dict[str, Any], BesideConfig()] = {}
     backend_options: Annotated[dict[str, Any], BesideConfig()] = {}
+    plant: dict[str, float | tuple[float, float]] | None = None
     residual_scale: float = Field(default=0.0, ge=0, le=2)
 
     @model_validator(mode="before")

@@ -94,7 +94,7 @@ class BenchmarkProblem(StudyProblem):
     @property
     def judges(self) -> tuple[Judge, ...]:
         """The judges that are available for this problem."""
-        trains = self.environment.batched
+        trains = self.environment.batched and self.environment.backend == "surrogate"  # within seconds
         return tuple(
             judge
             for judge in JUDGES

@@ -148,7 +148,8 @@ def tabulate(name: str, bodies: int, qp_bodies: int, folder: Path, output: Path 
     require("benchmark")
     problem = load_problem(name)
     definition = problem.definition
-    if definition.objective != "mean_distance" or not definition.environment.batched:
+    learned = definition.environment.batched and definition.environment.backend == "surrogate"
+    if definition.objective != "mean_distance" or not learned:
         raise ValueError(f"problem '{name}' cannot be tabulated: it needs the objective mean_distance on a surrogate")
     points = _points(len(problem.variables), bodies)
     values: dict[str, np.ndarray] = {}

@@ -106,10 +106,12 @@ class Backend(ABC):
         state: the current state.
         moving: states have velocities.
         takes_force: `step` takes a force on the effector.
+        cable_friction: coefficient of friction of cables on their guides, 0 where they are not computed.
     """
 
     moving: bool = False
     takes_force: bool = False
+    cable_friction: float = 0.0
     robot: Robot
     design: Design
     state: State

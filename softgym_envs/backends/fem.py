@@ -11,6 +11,7 @@ import numpy as np
 from softgym_envs.backends.backend import Backend, Snapshot, State
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
@@ -45,6 +46,7 @@ class FEMBackend(Backend):
         scheme: time integration, see `Dynamics`.
         mass_damping: Rayleigh's alpha [1/s].
         stiffness_damping: Rayleigh's beta [s].
+        cable_friction: coefficient of friction of cables on their guides; in statics only.
 
     Attributes:
         model: the present body.
@@ -67,6 +69,7 @@ class FEMBackend(Backend):
         scheme: str = "euler",
         mass_damping: float = 0.0,
         stiffness_damping: float = 0.01,
+        cable_friction: float = 0.0,
     ) -> None:
         if not isinstance(dynamics, bool):
             raise ValueError(f"dynamics = {dynamics!r} is unknown; allowed: True, False")
@@ -86,6 +89,7 @@ class FEMBackend(Backend):
         }
         self.largest_efforts = np.array([actuator.max_effort for actuator in robot.actuators])
         self._limited = bool(np.isfinite(self.largest_efforts).any())
+        self._friction = self._checked_friction(cable_friction)
         self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
@@ -98,6 +102,7 @@ class FEMBackend(Backend):
         complete = self.design if design is None else self.robot.design_space.complete(design)
         if complete != self.design:
             model = self.robot.build(complete)
+            self._rub(model)
             statics = Statics(model)
             zero = np.zeros(len(self.robot.actuators))
             try:
@@ -113,6 +118,36 @@ class FEMBackend(Backend):
         self.restore(self._rest)
         self._mode = "displacement"  # mode of the current state's command
         return self.state
+
+    @property
+    def cable_friction(self) -> float:
+        """Coefficient of friction of cables on their guides; a new one applies from the state at rest."""
+        return self._friction
+
+    @cable_friction.setter
+    def cable_friction(self, friction: float) -> None:
+        friction = self._checked_friction(friction)
+        if friction != self._friction:
+            self._friction = friction
+            self._rub(self.model)
+            self._statics = Statics(self.model)
+            self._rest = replace(self._rest, memory=self._statics.memory)
+            self.restore(self._rest)
+
+    def _checked_friction(self, friction: float) -> float:
+        if not (np.isfinite(friction) and friction >= 0.0):
+            raise ValueError(f"cable_friction = {friction} must be finite and not negative")
+        if friction and self.moving:
+            raise ValueError(f"cable_friction = {friction} is computed in statics only; allowed in dynamics: 0")
+        return float(friction)
+
+    def _rub(self, model: MechanicalModel) -> None:
+        """Set the friction of the model's cables."""
+        cables = [constraint for constraint in model.constraints["a"] if isinstance(constraint, Cable)]
+        if self._friction and not cables:
+            raise ValueError(f"cable_friction = {self._friction}: robot '{self.robot.name}' has no cables")
+        for cable in cables:
+            cable.friction = self._friction
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
         command = self._checked("command", command, len(self.largest_efforts))

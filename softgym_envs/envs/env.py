@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import prod
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from softgym_envs.backends.backend import Backend, Snapshot, State
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.designs import Design
 from softgym_envs.envs.options import EnvironmentOptions, check_reset_options, set_up
+from softgym_envs.envs.plant import Plant, Plants, Sensed, sensed, stiffened
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 if TYPE_CHECKING:
@@ -37,6 +38,9 @@ class EpisodeState:
         step: control steps so far.
         progress: attributes of the task, which may change in an episode.
         random: state of the random numbers; None if none have been drawn.
+        plant: how the robot differs from its model.
+        sent: commands that have not arrived at the drives yet, the oldest first, shape (delay, n_a).
+        sensed: what the sensors show.
     """
 
     robot: str
@@ -46,6 +50,9 @@ class EpisodeState:
     step: int
     progress: dict[str, Any]
     random: Mapping[str, Any] | None
+    plant: Plant
+    sent: np.ndarray
+    sensed: Sensed | None
 
 
 class SoftRobotEnv(gymnasium.Env, EzPickle):
@@ -109,6 +116,9 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.spaces = setup.spaces(moving=self.backend.moving)
         self.action_space = self.spaces.action_space
         self.observation_space = self.spaces.observation_space
+        self._plants, self.plant = setup.plants, Plant()
+        self._sent = np.zeros((0, len(self.robot.actuators)))
+        self._sensed: Sensed | None = None
         self._renderer: Any = None
         self._path = np.zeros((1, 3))
         self._unit_design = np.zeros(len(setup.shown))
@@ -121,8 +131,19 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
 
     @property
     def state(self) -> State:
-        """The present mechanical state."""
-        return self.backend.state
+        """The present mechanical state of the plant, without noise of sensors."""
+        return stiffened(self.backend.state, self.plant.stiffness)
+
+    @property
+    def command(self) -> np.ndarray:
+        """The command that was sent last, shape (n_a,); with a delay it has not arrived yet."""
+        return self._sent[-1] if len(self._sent) else self.backend.state.command
+
+    @property
+    def sensed(self) -> Sensed:
+        """What the sensors show of the present state."""
+        state = self.state
+        return self._sensed or Sensed(state.displacement, state.effort, self.task.measure(state))
 
     @property
     def goal(self) -> np.ndarray:
@@ -155,6 +176,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         else:
             design = self._fixed_design if given is None else self.design_space.complete(given, self._fixed_design)
             self.backend.reset(design)
+        if self._plants is not None:
+            self._begin_plant(self._plants)
         self._show(design)
         if goal is None:
             self._path = self.task.sample(self.np_random, 1, self._kinematics)[0]
@@ -166,6 +189,13 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             self.render()
         observation, _, info = self._observe()
         return observation, info
+
+    def _begin_plant(self, plants: Plants) -> None:
+        """Draw the plant of an episode, at rest."""
+        self.plant = plants.sample(self.np_random)
+        self._sent = np.zeros((self.plant.delay, len(self.robot.actuators)))
+        self._sensed = None
+        self.backend.cable_friction = self.plant.cable_friction
 
     def _show(self, design: Design) -> None:
         names = self.spaces.design_names
@@ -184,6 +214,9 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             step=self._step,
             progress=copy.deepcopy({name: value for name, value in vars(self.task).items() if name != "robot"}),
             random=None if self._np_random is None else self._np_random.bit_generator.state,
+            plant=self.plant,
+            sent=self._sent.copy(),
+            sensed=self._sensed,
         )
 
     def set_state(self, state: EpisodeState) -> tuple[np.ndarray, dict[str, Any]]:
@@ -198,13 +231,15 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         for kind, name, own in (("robot", state.robot, self.robot.name), ("task", state.task, self.task.name)):
             if name != own:
                 raise ValueError(f"the state belongs to {kind} '{name}', but the environment has {kind} '{own}'")
+        self.backend.cable_friction = state.plant.cable_friction
         self.backend.go_on_from(state.physics)
+        self.plant, self._sent, self._sensed = state.plant, state.sent.copy(), state.sensed
         self._show(self.backend.design)
         vars(self.task).update(copy.deepcopy(state.progress))
         self._path, self._step = state.path.copy(), state.step
         if state.random is not None:
             self.np_random.bit_generator.state = state.random
-        observation, _, info = self._observe()
+        observation, _, info = self._observe(sense=False)
         return observation, info
 
     def __getstate__(self) -> dict[str, Any]:
@@ -245,7 +280,10 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         action = self.spaces.check_action(action)
         if action.ndim != 1:
             raise ValueError(f"action must have shape {self.action_space.shape}, got {action.shape}")
-        command = self.spaces.command(action, self.backend.state.command)
+        command = self.spaces.command(action, self.command)
+        if len(self._sent):
+            waiting = np.vstack([self._sent, command])
+            command, self._sent = waiting[0], waiting[1:]
         converged = True
         try:
             self.backend.step(command, force=self.task.push(self._step))
@@ -257,10 +295,13 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         observation, reward, info = self._observe(converged)
         return observation, reward, bool(info["lost"]), not converged, info
 
-    def _observe(self, converged: bool = True) -> tuple[np.ndarray, float, dict[str, Any]]:
-        """Return observation, reward and info of the present state."""
-        state, goal = self.backend.state, self.goal
+    def _observe(self, converged: bool = True, *, sense: bool = True) -> tuple[np.ndarray, float, dict[str, Any]]:
+        """Return observation, reward and info of the present state; with ``sense``, the sensors are read anew."""
+        state, goal = self.state, self.goal
         measured = self.task.measure(state)
+        if sense and self.plant.noise:
+            true = Sensed(state.displacement, state.effort, measured)
+            self._sensed = sensed(self.robot, true, self.plant.noise, self.np_random)
         distance, terms, _ = self.task.rate(measured, goal, self.spaces.effort_share(state.effort))
         terms |= self.task.state_terms(state)
         reward = float(prod(terms.values())) if converged else 0.0
@@ -287,9 +328,12 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
                 "smallest_gap": contacts.smallest_gap,
                 "sliding": contacts.sliding.mean() if contacts.count else 0.0,
             }
+        if self._plants is not None:
+            info |= {f"plant_{name}": value for name, value in asdict(self.plant).items()}
         velocity = state.velocity[0] if self.spaces.moving else None
+        shown = self._sensed or Sensed(state.displacement, state.effort, measured)
         observation = self.spaces.observe(
-            state.command, state.displacement, state.effort, measured, goal, self._unit_design, velocity
+            self.command, shown.displacement, shown.effort, shown.effector, goal, self._unit_design, velocity
         )
         return observation, reward, {name: _with_dtype(value) for name, value in info.items()}
 

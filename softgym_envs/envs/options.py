@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from softgym_envs.backends.registry import batches, check_backend
 from softgym_envs.designs import Design, DesignSpace
+from softgym_envs.envs.plant import Plants
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.envs.tasks.registry import make_task
@@ -34,6 +35,8 @@ class EnvironmentOptions:
         robot_options: options of the robot.
         task_options: options of the task.
         backend_options: options of the backend; in batched environments ``weights`` and ``members``.
+        plant: how the robot differs from its model: a number, or a range that each reset draws from, for attributes of
+            `Plant`; None for no difference.
         defaults: options of the environment's ID, which those above override one by one; its ``backend_options``
             and ``backend_mesh`` (options of the robot) apply to its ``backend`` only.
     """
@@ -45,6 +48,7 @@ class EnvironmentOptions:
     robot_options: Mapping[str, Any] | None = None
     task_options: Mapping[str, Any] | None = None
     backend_options: Mapping[str, Any] | None = None
+    plant: Mapping[str, float | Sequence[float]] | None = None
     defaults: Mapping[str, Any] | None = None
 
     @classmethod
@@ -74,6 +78,7 @@ class Setup:
         sampled: variables that are drawn at each reset.
         shown: variables in the observation.
         action_mode: see `AgentSpaces`.
+        plants: plants to draw from; None for the model itself.
     """
 
     robot: Robot
@@ -84,6 +89,7 @@ class Setup:
     sampled: tuple[str, ...]
     shown: tuple[str, ...]
     action_mode: str
+    plants: Plants | None = None
 
     @property
     def together(self) -> bool:
@@ -140,6 +146,7 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
         sampled=design_names(space, options.sample_design),
         shown=design_names(space, options.design_in_observation),
         action_mode=options.action_mode,
+        plants=Plants.check(options.plant, made, backend),
     )
 
 

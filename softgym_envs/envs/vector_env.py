@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ from softgym_envs.envs.options import (
     set_up,
     take_reset_mask,
 )
+from softgym_envs.envs.plant import Sensed, sensed
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
 
@@ -104,6 +106,13 @@ class SoftRobotVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
+        self._plants = setup.plants
+        if setup.plants is not None and setup.plants.high.cable_friction:
+            raise ValueError("plant cable_friction is not available together for many bodies; allowed: 0")
+        self._stiffness, self._noise = np.ones((num_envs, 1)), np.zeros(num_envs)
+        self._delay = np.zeros(num_envs, dtype=np.int64)
+        longest = 0 if setup.plants is None else setup.plants.longest_delay
+        self._sent = np.zeros((longest + 1, num_envs, len(self.robot.actuators)))  # the newest command first
         self._reward_gradient: RewardGradient | None = None  # made when it is first needed, because it loads torch
         self._unit_design = np.zeros((num_envs, len(setup.shown)))
         self._paths = np.zeros((num_envs, 1, 3))
@@ -169,6 +178,11 @@ class SoftRobotVectorEnv(VectorEnv):
         elif self._changed[index].any():
             self._begin_bodies(index, np.tile(self._fixed_design.array, (len(index), 1)))
             self._changed[index] = False
+        if self._plants is not None:
+            for i in index:
+                plant = self._plants.sample(self.np_random)
+                self._stiffness[i], self._noise[i], self._delay[i] = plant.stiffness, plant.noise, plant.delay
+            self._sent[:, index] = 0.0
         self.backend.rest(index)
         self._steps[index] = 0
         self._ended[index] = False
@@ -186,8 +200,8 @@ class SoftRobotVectorEnv(VectorEnv):
 
     @property
     def command(self) -> np.ndarray:
-        """Present commands, shape (num_envs, n_a)."""
-        return self.backend.command
+        """Commands that were sent last, shape (num_envs, n_a); with a delay some have not arrived yet."""
+        return self._sent[0] if len(self._sent) > 1 else self.backend.command
 
     @property
     def slack(self) -> np.ndarray:
@@ -222,11 +236,16 @@ class SoftRobotVectorEnv(VectorEnv):
     @property
     def condensed(self) -> CondensedModel:
         """Condensed models of the present states, evaluated at each access; leading shape (num_envs,)."""
-        return self.backend.condensed
+        found = self.backend.condensed
+        if self._plants is None:
+            return found
+        stiffness = self._stiffness
+        return replace(found, compliance=found.compliance / stiffness[:, :, None], effort=stiffness * found.effort)
 
     @property
     def _state(self) -> BatchState:
-        return self.backend.state
+        state = self.backend.state
+        return state if self._plants is None else replace(state, effort=self._stiffness * state.effort)
 
     # -- Gymnasium --------------------------------------------------------------------------------------------------
 
@@ -283,6 +302,8 @@ class SoftRobotVectorEnv(VectorEnv):
             ResetNeeded: without autoreset, if an episode is over.
             ImportError: without torch, which differentiates the task.
         """
+        if len(self._sent) > 1:
+            raise ValueError("plant delay: rewards of delayed commands have no derivatives in the actions of one step")
         actions = self._checked(actions)
         slope, limited = self.spaces.command_slope(actions, self.command)
         self._advance(actions)
@@ -300,16 +321,20 @@ class SoftRobotVectorEnv(VectorEnv):
 
     def _advance(self, actions: np.ndarray) -> None:
         """Move commands and states by one step."""
-        self.backend.step(self.spaces.command(actions, self.command))
+        command = arriving = self.spaces.command(actions, self.command)
+        if len(self._sent) > 1:
+            self._sent = np.concatenate([command[None], self._sent[:-1]])
+            arriving = self._sent[self._delay, np.arange(self.num_envs)]
+        self.backend.step(arriving)
         self._steps += 1
 
     def _gradient(self, slope: np.ndarray, limited: np.ndarray) -> StepGradient:
         if self._reward_gradient is None:
             self._reward_gradient = RewardGradient(self.task, self.spaces)
         state, goals = self.backend.settled(), self.goals
-        effector, effort = np.zeros_like(state.effector), state.effort
+        effector, effort = np.zeros_like(state.effector), self._stiffness * state.effort
         effector[:, :3], by_effort = self._reward_gradient(state.effector[:, :3], effort, goals)
-        held, command = self.backend.gradient(effector, by_effort)
+        held, command = self.backend.gradient(effector, self._stiffness * by_effort)
         _, _, reward = self.task.rate(state.effector[:, :3], goals, self.spaces.effort_share(effort))
         rated = state.converged & self._state.converged & ~self._ended
         found, gap = rated[:, None], state.displacement - self.command
@@ -342,11 +367,13 @@ class SoftRobotVectorEnv(VectorEnv):
 
     def _observe(self) -> np.ndarray:
         state = self._state
+        shown = Sensed(state.displacement, state.effort, state.effector[:, :3])
+        shown = sensed(self.robot, shown, self._noise, self.np_random)
         return self.spaces.observe(
             self.command,
-            state.displacement,
-            state.effort,
-            state.effector[:, :3],
+            shown.displacement,
+            shown.effort,
+            shown.effector,
             self.goals,
             self._unit_design,
             self.backend.velocity,
@@ -367,6 +394,10 @@ class SoftRobotVectorEnv(VectorEnv):
         }
         for name in ("displacement", "effort", "uncertainty", "trusted", "doubt", "converged"):
             info[name] = getattr(state, name).copy()
+        if self._plants is not None:
+            zero = np.zeros(self.num_envs)
+            info |= {"plant_stiffness": self._stiffness[:, 0].copy(), "plant_cable_friction": zero}
+            info |= {"plant_delay": self._delay.copy(), "plant_noise": self._noise.copy()}
         info |= {f"_{name}": every for name in tuple(info)}
         return info, reward
 

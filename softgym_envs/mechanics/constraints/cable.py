@@ -75,9 +75,13 @@ def _cable_hessian(x, ids, weights, pull, points, scale, out):
 
 
 class Cable(Constraint):
-    """Frictionless cable from a fixed pull point through embedded points; the last point is its anchor.
+    """Cable from a fixed pull point through embedded points; the last point is its anchor.
 
-    delta [m] is the shortening, rest length minus length; effort [N] is the tension.
+    delta [m] is the shortening, rest length minus length; effort [N] is the tension at the pull point.
+
+    Attributes:
+        friction: coefficient of friction on the guides between pull point and anchor, by the capstan law; `Statics`
+            reads it when it is made (see `softgym_envs.mechanics.solvers.cable_friction`).
 
     Args:
         name: identifier.
@@ -98,6 +102,7 @@ class Cable(Constraint):
         self.embedding = embedding
         self.pull_point = np.asarray(pull_point, dtype=float)
         self.unilateral = unilateral
+        self.friction = 0.0
         nodes, slot = np.unique(embedding.node_ids, return_inverse=True)
         self._slot = slot.reshape(embedding.node_ids.shape)
         self.dofs = (3 * nodes[:, None] + np.arange(3)).ravel()

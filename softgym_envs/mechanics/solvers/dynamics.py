@@ -26,6 +26,7 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.cable_friction import CableFriction, CableMemory
 from softgym_envs.mechanics.solvers.equilibrium import AppliedLoads, Equilibrium, slack_rows
 from softgym_envs.mechanics.solvers.schemes import SCHEMES, GeneralisedAlpha, ImplicitEuler, StartingAcceleration
 from softgym_envs.mechanics.solvers.statics import NewtonFailure, Statics
@@ -114,6 +115,8 @@ class Dynamics(Statics):
                 f"scheme = {scheme!r} does not damp the fast motions that barriers of contact cause, which grow; with "
                 "contact use 'euler'"
             )
+        if CableFriction.of(model) is not None:
+            raise ValueError("cables with friction are computed in statics only; allowed: dynamics with friction = 0")
         self.step = float(step)
         if not 0.0 <= spectral_radius <= 1.0:
             raise ValueError(f"spectral_radius = {spectral_radius} is out of bounds; allowed: [0, 1]")
@@ -150,7 +153,7 @@ class Dynamics(Statics):
         effort: np.ndarray,
         velocity: np.ndarray | None = None,
         *,
-        memory: ContactMemory | None = None,
+        memory: ContactMemory | CableMemory | None = None,
     ) -> None:
         """Start from rows ``x`` (n, 3), efforts (size,) and velocities (n, 3), by default at rest; see `Statics`."""
         super().restore(x, effort, memory=memory)

@@ -11,6 +11,7 @@ import numpy as np
 from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row
 from softgym_envs.mechanics.contact.contact import ContactMemory, Contacts
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.cable_friction import CableMemory
 
 SATURATED = 1.0 - 1e-9
 """Part of its largest effort from which an actuator counts as saturated: round-off."""
@@ -43,7 +44,7 @@ class Equilibrium:
     iterations: int
     increments: int
     contacts: Contacts | None = None
-    memory: ContactMemory | None = None
+    memory: ContactMemory | CableMemory | None = None
 
 
 class AppliedLoads(TypedDict, total=False):
@@ -91,7 +92,7 @@ class RowLayout:
         increments: int = 1,
         symmetric: bool = True,
         contacts: Contacts | None = None,
-        memory: ContactMemory | None = None,
+        memory: ContactMemory | CableMemory | None = None,
     ) -> Equilibrium:
         """Return an equilibrium with its condensed model, from which bonds are eliminated.
 

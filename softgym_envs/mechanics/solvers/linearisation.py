@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import hstack
+from scipy.sparse import csc_matrix, hstack
 
 from softgym_envs.mechanics.assembly import Assembled, Inertia
-from softgym_envs.mechanics.contact.contact import ContactState, ContactTerms
+from softgym_envs.mechanics.contact.contact import ContactMemory, ContactState, ContactTerms
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.cable_friction import CableFriction, CableMemory, FrictionTerms
 from softgym_envs.mechanics.solvers.tangent import Tangent
 
 
 class Linearisation:
     """Assembles the equations of a model and keeps the factorised tangent with the compliance of its constraints.
 
-    While points slide with friction, the tangent is ``S + U V^T`` with a symmetric ``S``: ``S`` is factorised, and the
-    formula of Woodbury does the rest.
+    While points or cables slide with friction, the tangent is ``S + U V^T`` with a symmetric ``S``: ``S`` is
+    factorised, and the formula of Woodbury does the rest.
 
     Args:
         model: the body. Its constraints must not change afterwards.
@@ -24,6 +25,7 @@ class Linearisation:
         loads: dead loads that act [N], shape (n, 3); a solver may apply them in steps.
         inertia: what a time step adds to the equilibrium; None in statics.
         contact: the contacts of the body, or None.
+        cable_friction: the frictional cables of the body, or None.
         current: whether this is the linearisation at the solver's current state; the solver resets it.
         exact: whether the factorised tangent is exact. Away from an equilibrium, terms of contact that make it
             indefinite are left out.
@@ -32,7 +34,8 @@ class Linearisation:
         H: gradients of the constraints, shape (N, size).
         delta: values of the constraints, shape (size,).
         elastic: elastic energy [J].
-        W: their compliance ``H^T A^-1 H``, shape (size, size); symmetric unless points slide.
+        W: their compliance ``H^T A^-1 H``, shape (size, size); symmetric unless points or cables slide. Cables with
+            friction act along another gradient than ``H``.
     """
 
     residual: np.ndarray
@@ -47,9 +50,11 @@ class Linearisation:
         self.loads = np.zeros_like(model.nodes)
         self.inertia: Inertia | None = None
         self.contact = None if model.contact is None else ContactState(model.contact, model.kinematics, model.nodes)
+        self.cable_friction = CableFriction.of(model)
         self.current = False
         self.exact = True
         self._model = model
+        self._friction_terms: FrictionTerms | None = None
         self._terms: ContactTerms | None = None
         self._tangent = Tangent(self.assembly.indptr, self.assembly.indices, model.solver)
 
@@ -57,6 +62,21 @@ class Linearisation:
     def sliding(self) -> bool:
         """Whether points slide, so that ``W`` is not symmetric."""
         return self._slips > 0
+
+    @property
+    def memory(self) -> ContactMemory | CableMemory | None:
+        """What friction remembers; None without contact and friction of cables."""
+        rubbing = self.contact or self.cable_friction
+        return None if rubbing is None else rubbing.memory
+
+    def remember(self, x: np.ndarray, memory: ContactMemory | CableMemory | None) -> None:
+        """Set the memory of friction; without one, friction starts anew at rows ``x`` (n, 3)."""
+        for rubbing, kind in ((self.contact, ContactMemory), (self.cable_friction, CableMemory)):
+            if rubbing is not None and isinstance(memory, kind):
+                rubbing.memory = memory
+            elif rubbing is not None:
+                rubbing.begin(x)
+        self.current = False
 
     @property
     def positive_definite(self) -> bool:
@@ -69,7 +89,11 @@ class Linearisation:
         if self.contact is not None:
             self._terms = self.contact.evaluate(x)
             loads = loads - self._terms.gradient
-        return self.assembly.evaluate(x, effort, loads, self.inertia)
+        assembled = self.assembly.evaluate(x, effort, loads, self.inertia)
+        if assembled is None or self.cable_friction is None:
+            return assembled
+        self._friction_terms = self.cable_friction.evaluate(x, effort)
+        return assembled._replace(residual=assembled.residual - self._friction_terms.gradients @ effort)
 
     def update(self, x: np.ndarray, effort: np.ndarray, *, exact: bool = False) -> bool:
         """Linearise at a state. False if elements are inverted or the tangent is singular."""
@@ -86,8 +110,10 @@ class Linearisation:
             definite: without contact, return False for an indefinite tangent too, which takes far longer to factorise.
         """
         self.residual, tangent, self.H, self.delta, self.elastic = assembled
-        terms = self._terms
+        terms, friction = self._terms, self._friction_terms
         extra = None if terms is None else terms.tangent
+        if friction is not None:
+            extra = friction.tangent
         self.exact = self._tangent.factorise(tangent, extra, fallback=exact or (terms is None and not definite))
         if not self.exact:
             if terms is None or exact:
@@ -106,19 +132,26 @@ class Linearisation:
                 extra = hstack([terms.directions, terms.loading], format="csc")
         columns = np.empty((len(self.residual), count + 1), order="F")
         columns[:, :count], columns[:, count] = self.H, self.residual
+        if friction is not None:
+            # Efforts act along G, and H measures what they move.
+            columns[:, :count] += friction.gradients
+            self._slips, self._loading = friction.directions.shape[1], friction.loading
+            extra = hstack([friction.directions, friction.loading, csc_matrix(self.H)], format="csc")
         gram, self._half = self._tangent.solver.condense(columns, extra)
         if not np.isfinite(gram).all():
             return False
         known = slice(0, count + 1)  # columns of the constraints and of the residual
-        response = gram[known, known]
+        measured = known if friction is None else slice(len(gram) - count, None)
+        response = gram[measured, known]
         if self._slips:
-            slide, load = slice(count + 1, count + 1 + self._slips), slice(count + 1 + self._slips, None)
+            slide = self._slide
+            load = slice(slide.stop, slide.stop + self._slips)
             self._core = np.eye(self._slips) + gram[load, slide]
             try:
                 self._slip = np.linalg.solve(self._core, gram[load, known])
             except np.linalg.LinAlgError:
                 return False
-            response = response - gram[known, slide] @ self._slip
+            response = response - gram[measured, slide] @ self._slip
         W = response[:count, :count]
         self.W = W if self._slips else 0.5 * (W + W.T)
         self.shift = response[:count, count]

@@ -25,6 +25,7 @@ from softgym_envs.mechanics.condensation import CondensedModel, Row
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
+from softgym_envs.mechanics.solvers.cable_friction import CableMemory
 from softgym_envs.mechanics.solvers.complementarity import complementary_step
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium, RowLayout, checked, checked_modes, slack_rows
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
@@ -102,7 +103,7 @@ class Statics:
         self._current_loads = np.zeros_like(self.x)  # dead loads that the current state carries
         self._remember(None)
 
-    def restore(self, x: np.ndarray, effort: np.ndarray, *, memory: ContactMemory | None = None) -> None:
+    def restore(self, x: np.ndarray, effort: np.ndarray, *, memory: ContactMemory | CableMemory | None = None) -> None:
         """Start the next solve from node positions ``x`` (n, 3) and efforts (size,) of all rows.
 
         Args:
@@ -116,20 +117,14 @@ class Statics:
         self._remember(memory)
 
     @property
-    def memory(self) -> ContactMemory | None:
-        """What friction remembers at the current state; None without contact."""
-        contact = self.linearisation.contact
-        return None if contact is None else contact.memory
+    def memory(self) -> ContactMemory | CableMemory | None:
+        """What friction remembers at the current state; None without contact and friction of cables."""
+        return self.linearisation.memory
 
-    def _remember(self, memory: ContactMemory | None) -> None:
+    def _remember(self, memory: ContactMemory | CableMemory | None) -> None:
         """Set the memory of friction; without one, friction starts anew at the current state."""
         self._bend: Bend | None = None
-        contact = self.linearisation.contact
-        if contact is not None and memory is not None:
-            contact.memory = memory
-        elif contact is not None:
-            contact.begin(self.x)
-        self.linearisation.current = False
+        self.linearisation.remember(self.x, memory)
 
     # -- Newton -----------------------------------------------------------------------------------------------------
 
@@ -486,6 +481,9 @@ class Statics:
             done, self._current_loads = level, linear.loads
             size *= 1.5
             found = self._state(target, driven, iterations, increments)
+            if linear.cable_friction is not None:
+                linear.cable_friction.commit(self.x)
+                found = replace(found, memory=self.memory)
             if linear.contact is not None and linear.contact.rubs:
                 found = replace(found, memory=self._accept())
         return found

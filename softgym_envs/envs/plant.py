@@ -1,0 +1,140 @@
+"""A plant that differs from the model: options of every environment, fixed or drawn at each reset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.backends.backend import State
+from softgym_envs.errors import unknown_name
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.robots.base import Robot
+
+
+@dataclass(frozen=True)
+class Plant:
+    """How a robot differs from its model.
+
+    Attributes:
+        stiffness: factor of the elastic stiffness of the whole body. It multiplies all efforts and divides ``W``.
+        cable_friction: coefficient of friction of cables on their guides, by the capstan law; finite elements only.
+        delay: control steps between sending a command and its arrival at the drives.
+        noise: standard deviation of all sensors: of displacements over their range, of efforts over their scale, of
+            effectors over the robot's size.
+    """
+
+    stiffness: float = 1.0
+    cable_friction: float = 0.0
+    delay: int = 0
+    noise: float = 0.0
+
+
+LIMITS = {"stiffness": (0.1, 10.0), "cable_friction": (0.0, 5.0), "delay": (0, 100), "noise": (0.0, 1.0)}
+"""Smallest and largest value of each attribute of a plant."""
+
+
+@dataclass(frozen=True)
+class Plants:
+    """Plants between two.
+
+    Attributes:
+        low: smallest value of each attribute.
+        high: largest value of each attribute.
+    """
+
+    low: Plant
+    high: Plant
+
+    @classmethod
+    def check(cls, option: Mapping[str, float | Sequence[float]] | None, robot: Robot, backend: str) -> Plants | None:
+        """Return the plants of the option ``plant``: a number or a range for each attribute. None without the option.
+
+        Raises:
+            ValueError: for an unknown name, a value out of bounds, or a plant that the robot or its backend cannot be.
+        """
+        if option is None:
+            return None
+        names = [field.name for field in fields(Plant)]
+        low: dict[str, Any] = {}
+        high: dict[str, Any] = {}
+        for name, given in option.items():
+            if name not in names:
+                raise ValueError(unknown_name("plant option", name, names))
+            ends = np.atleast_1d(np.asarray(given, dtype=float))
+            least, most = LIMITS[name]
+            whole = name != "delay" or (ends == np.round(ends)).all()
+            inside = ends.shape in ((1,), (2,)) and least <= ends[0] <= ends[-1] <= most
+            if not (inside and whole):
+                word = "integers" if name == "delay" else "numbers"
+                raise ValueError(f"plant {name} = {given!r}; allowed: one or two {word} from {least} to {most}, rising")
+            typed = int if name == "delay" else float
+            low[name], high[name] = typed(ends[0]), typed(ends[-1])
+        found = cls(replace(Plant(), **low), replace(Plant(), **high))
+        if found.high.cable_friction and backend != "fem":
+            raise ValueError(f"plant cable_friction needs backend 'fem': '{backend}' has no friction of cables")
+        stiff = found.low.stiffness == found.high.stiffness == 1.0
+        limited = any(np.isfinite(actuator.max_effort) for actuator in robot.actuators)
+        if not stiff and (any(robot.gravity) or robot.touches or limited):
+            raise ValueError(
+                f"plant stiffness: robot '{robot.name}' has weight, contacts or limited efforts, which do not scale "
+                "with its stiffness; change its design instead"
+            )
+        return found
+
+    @property
+    def longest_delay(self) -> int:
+        """Largest number of control steps that a command may take."""
+        return self.high.delay
+
+    def sample(self, rng: np.random.Generator) -> Plant:
+        """Draw a plant: every attribute uniformly, and no random number for one that is fixed."""
+        values: dict[str, Any] = {}
+        for name, low in asdict(self.low).items():
+            high = getattr(self.high, name)
+            if low == high:
+                values[name] = low
+            else:
+                values[name] = int(rng.integers(low, high + 1)) if name == "delay" else float(rng.uniform(low, high))
+        return Plant(**values)
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """What the sensors of a robot show.
+
+    Attributes:
+        displacement: of the actuators [m, ...], shape (..., n_a).
+        effort: of the actuators [N, ...], shape (..., n_a).
+        effector: the first effector, or what the task measures in its place, shape (..., 3).
+    """
+
+    displacement: np.ndarray
+    effort: np.ndarray
+    effector: np.ndarray
+
+
+def sensed(robot: Robot, true: Sensed, noise: np.ndarray | float, rng: np.random.Generator) -> Sensed:
+    """Return true values with Gaussian noise of a standard deviation (...), see `Plant`."""
+    if not np.any(noise):
+        return true
+    level = np.asarray(noise)[..., None]
+    return Sensed(
+        true.displacement + level * (robot.upper - robot.lower) * rng.normal(size=true.displacement.shape),
+        true.effort + level * robot.effort_scale * rng.normal(size=true.effort.shape),
+        true.effector + level * robot.size * rng.normal(size=true.effector.shape),
+    )
+
+
+def stiffened(state: State, factor: float) -> State:
+    """Return the state of a body whose elastic stiffness is larger by a factor, under the same displacements."""
+    if factor == 1.0:
+        return state
+
+    def condensed() -> CondensedModel:
+        model = state.condensed
+        return replace(model, compliance=model.compliance / factor, effort=factor * model.effort)
+
+    return replace(state, effort=factor * state.effort, bonds=factor * state.bonds, condensed=condensed)
