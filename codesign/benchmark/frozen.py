@@ -121,7 +121,7 @@ def frozen_parts(definition: BenchmarkProblem, goals: Mapping[str, np.ndarray]) 
         "actuators": [[a.name, a.low, a.high, a.rate, a.unit] for a in robot.actuators],
     }
     parts = {
-        "definition": _hash(definition.model_dump(mode="json", exclude={"title"})),
+        "definition": _hash(definition.model_dump(mode="json", exclude={"title"}, exclude_unset=True)),
         "physics": _hash(physics),
         "goals": _hash({key: [goal_key(goal) for goal in values] for key, values in goals.items()}),
     }
