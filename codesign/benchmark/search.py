@@ -149,7 +149,7 @@ def _optuna(name: str, **options: Any) -> Callable[[FrozenProblem, int], Optimis
 
 METHODS: dict[str, Callable[[FrozenProblem, int], Optimiser]] = {
     "random": _optuna("random"),
-    "sobol": _optuna("qmc"),
+    "sobol": _optuna("qmc", scramble=True),
     "tpe": _optuna("tpe", n_startup_trials=8),
     "gp": _optuna("gp", n_startup_trials=8),
     "cmaes": _optuna("cmaes"),
