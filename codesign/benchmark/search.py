@@ -142,6 +142,9 @@ class OptunaOptimiser:
 
 def _optuna(name: str, **options: Any) -> Callable[[FrozenProblem, int], Optimiser]:
     def make(problem: FrozenProblem, seed: int) -> Optimiser:
+        import optuna
+
+        optuna.logging.set_verbosity(optuna.logging.ERROR)  # checking the options of qmc warns of a missing seed
         return OptunaOptimiser(problem, SamplerConfig(name=name, seed=seed, options=options))  # type: ignore[arg-type]
 
     return make
