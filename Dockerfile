@@ -1,5 +1,5 @@
 # softgym-envs with all extras and the versions of requirements.lock, on the CPU. No image has been built from this file
-# yet: its commands ran one by one in a virtual environment.
+# yet.
 #
 #   docker build -t softgym-envs .
 #   docker run --rm -v "$PWD/results:/work/results" softgym-envs codesign --config finger_reach

@@ -20,9 +20,9 @@ from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.mechanics.contact.obstacles import Plane, RoundedPrism
 from softgym_envs.mechanics.contact.surface import surface_of
 from softgym_envs.mechanics.skins import box_skin
+from softgym_envs.robots.carried_objects import ROUNDING
 from softgym_envs.robots.grasping_hands import (
     ON_TABLE,
-    ROUNDING,
     TABLE_MASS,
     TABLE_STIFFNESS,
     ContactAidedGripper,
@@ -347,6 +347,8 @@ class ChainHandBackend(Backend):
             raise ValueError(f"control_step = {control_step} s must be positive and finite")
         if robot.obstacles:
             raise ValueError(f"robot '{robot.name}' touches further obstacles, which needs backend='fem'")
+        if robot.object != "box":
+            raise ValueError(f"object = {robot.object!r}: a learned hand can hold a box only; use backend='fem'")
         if robot.gravity[0] != 0.0 or robot.gravity[1] != 0.0:
             raise ValueError(f"gravity = {robot.gravity} m/s2 must be along z on a learned hand; or use backend='fem'")
         self.robot, self.control_step = robot, control_step

@@ -71,3 +71,27 @@ def box_skin(row: int, half_extents: Sequence[float], nodes: np.ndarray, *, divi
     signs, places = np.unique(np.concatenate(corners), axis=0, return_inverse=True)
     points = EmbeddedPoints.in_frame(row, signs * np.asarray(half_extents), nodes)
     return Skin(points, places.ravel()[np.concatenate(triangles)], rigid=True)
+
+
+def revolved_skin(row: int, profile: Sequence[tuple[float, float]], nodes: np.ndarray, *, sides: int) -> Skin:
+    """Return a polygon that is swept upwards about the third director of a frame, with flat ends.
+
+    Args:
+        row: first row of the frame.
+        profile: distance of the corners from the axis and height [m], from below, shape (k, 2).
+        nodes: rest rows [m], shape (n, 3).
+        sides: number of corners of the polygon; two of its sides are across the first director if it is a multiple of 2
+            but not of 4.
+    """
+    angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
+    rings = [[(r * np.cos(t), r * np.sin(t), z) for t in angles] for r, z in profile]
+    ends = [[(0.0, 0.0, profile[0][1]), (0.0, 0.0, profile[-1][1])]]
+    corners = np.array(sum(rings + ends, []))
+    a = (sides * np.arange(len(profile) - 1)[:, None] + np.arange(sides)).ravel()
+    b = (sides * np.arange(len(profile) - 1)[:, None] + (np.arange(sides) + 1) % sides).ravel()
+    triangles = [np.column_stack([a, b, b + sides]), np.column_stack([a, b + sides, a + sides])]
+    around, top = np.arange(sides), sides * (len(profile) - 1)
+    after = (around + 1) % sides
+    triangles.append(np.column_stack([np.full(sides, len(corners) - 2), after, around]))
+    triangles.append(np.column_stack([np.full(sides, len(corners) - 1), top + around, top + after]))
+    return Skin(EmbeddedPoints.in_frame(row, corners, nodes), np.concatenate(triangles), rigid=True)

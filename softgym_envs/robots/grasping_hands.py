@@ -13,22 +13,19 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.constraints.slide import Slide
-from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane, RoundedPrism
+from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane
 from softgym_envs.mechanics.elements.beams import Section
-from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.carried_objects import CARRIED, ROUNDING
 from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
 from softgym_envs.robots.grasping import KINDS, GraspObject
-
-ROUNDING = 1.0e-3
-"""Radius of the edges of prisms [m]."""
 
 CLOSING_RATE = math.radians(2.0)
 """Largest change of a servo's angle in a control step [rad]."""
@@ -106,7 +103,9 @@ class ContactAidedGripper(Robot):
 
     Args:
         clearance: height of the finger tips at rest above the table [m].
-        box: width (x), depth (y) and height (z) of the box [m].
+        object: what is lifted, a name of `CARRIED`: ``"box"``, ``"hexagon"`` (an upright prism) or ``"ball"``.
+        box: width (x), depth (y) and height (z) of the object [m]; a hexagon has no depth of its own, a ball only a
+            width.
         control_points: as for `ContactAidedFinger`.
         mesh: as for `ContactAidedFinger`.
         mesh_size: target edge length [m], instead of that of the mesh.
@@ -131,6 +130,7 @@ class ContactAidedGripper(Robot):
         self,
         *,
         clearance: float = 0.010,
+        object: str = "box",
         box: tuple[float, float, float] = (0.040, 0.030, 0.050),
         control_points: int = 12,
         mesh: str = "accurate",
@@ -148,7 +148,10 @@ class ContactAidedGripper(Robot):
             if not 2.0 * ROUNDING < value < 0.2:
                 raise ValueError(f"robot '{self.name}': {name} = {value} m must be inside (0.002, 0.2)")
         self.finger = ContactAidedFinger(control_points=control_points, mesh=mesh, mesh_size=mesh_size, element=element)
-        self.clearance, self.box = clearance, box
+        if object not in CARRIED:
+            raise ValueError(f"robot '{self.name}': " + unknown_name("object", object, CARRIED))
+        self.clearance, self.object, self.box = clearance, object, box
+        self._shape = CARRIED[object](box)
         self.design_space = DesignSpace(
             *self.finger.design_space,
             DesignVariable("object_gap", 0.005, 0.030, 0.015, "m", "distance of each finger from the box, along x"),
@@ -164,7 +167,7 @@ class ContactAidedGripper(Robot):
             Actuator("lift", 0.0, 0.020, 0.001, "m", unilateral=False),
         )
         self.effort_scale = np.array([0.3, 0.3, 1.0])
-        self.effector_rest = np.array([0.0, 0.0, 0.5 * box[2]])
+        self.effector_rest = np.array([0.0, 0.0, self._shape.half_height])
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Place both fingers, the table and the box, which rests on it.
@@ -175,16 +178,16 @@ class ContactAidedGripper(Robot):
         own = {name: design[name] for name in self.finger.design_space.names}
         mesh = self.finger.body(own)
         builder = ModelBuilder(gravity=self.gravity, floating=True)
-        reach = self.finger.width + design["object_gap"] + 0.5 * self.box[0]
+        shape = self._shape
+        reach = self.finger.width + design["object_gap"] + shape.half_width
         height = self.clearance + self.finger.length
         servos = []
         for turn in (np.eye(3), np.diag([-1.0, -1.0, 1.0])):
             shift = turn @ np.array([-reach, 0.0, height])
             servos.append((self.finger.add_to(builder, mesh, own, turn=turn @ UPRIGHT, shift=shift), turn @ UPRIGHT))
         table = _add_table(builder)
-        half = 0.5 * np.array(self.box)
-        frame = builder.add_frame([0.0, 0.0, half[2] + ON_TABLE])
-        builder.add_mass(frame, design["object_mass"], box_inertia(design["object_mass"], half))
+        frame = builder.add_frame([0.0, 0.0, shape.half_height + ON_TABLE])
+        builder.add_mass(frame, design["object_mass"], design["object_mass"] * shape.inertia)
         model = builder.build()
         for actuator, (servo, turn) in zip(self.actuators, servos, strict=False):
             axis = turn @ np.array([0.0, 0.0, -1.0])
@@ -192,17 +195,17 @@ class ContactAidedGripper(Robot):
         model.add("a", Slide("lift", table, np.array([0.0, 0.0, -1.0]), model.nodes))
         above_table = EmbeddedPoints.from_weights(np.array([[frame, table]]), np.array([[1.0, -1.0]]), model.nodes)
         model.add("e", Point("box", above_table))
-        # The table acts on this skin; for the fingers, the prism of `own_obstacles` stands for it.
-        model.skins.append(box_skin(frame, half.tolist(), model.nodes))
+        # The table acts on this skin; for the fingers, the obstacle of `own_obstacles` stands for it.
+        model.skins.append(shape.skin(frame, model.nodes))
         return model
 
     def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> tuple[Obstacle, ...]:
-        """Return the table and the box."""
+        """Return the table and the object, whose contact is called ``"box"`` whatever its shape."""
         box = len(model.nodes) - 4  # frames of four rows each: that of the table comes before that of the box
-        half, friction = [0.5 * length for length in self.box], design["friction"]
+        friction = design["friction"]
         return (
             Plane((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), name="table", friction=friction, frame=box - 4),
-            RoundedPrism.box(half, ROUNDING, name="box", friction=friction, frame=box),
+            self._shape.obstacle("box", friction, box),
         )
 
 

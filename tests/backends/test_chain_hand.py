@@ -154,6 +154,8 @@ def test_wrong_input(robot):
         backend.step(np.array([0.0, np.nan, 0.0]))
     with pytest.raises(ValueError, match="control_step = 0.0 s must be positive"):
         ChainHandBackend(robot, control_step=0.0)
+    with pytest.raises(ValueError, match="object = 'ball': a learned hand can hold a box only"):
+        make_backend("hybrid", make_robot("contact_aided_gripper", object="ball"))
     with pytest.raises(ValueError, match="must be along z"):
         ChainHandBackend(make_robot("contact_aided_gripper", gravity=(1.0, 0.0, -9.81)))
     with pytest.raises(InfeasibleDesign):

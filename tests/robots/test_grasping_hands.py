@@ -7,7 +7,9 @@ from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.contact.obstacles import Plane, RoundedPrism, Sphere
+from softgym_envs.robots.carried_objects import CARRIED
 from softgym_envs.robots.grasping import KINDS
+from softgym_envs.robots.grasping_hands import ON_TABLE
 
 COARSE = {"element": "linear", "mesh_size": 0.015}
 
@@ -52,8 +54,8 @@ def test_an_object_inside_the_finger_is_infeasible():
         make_robot("grasping_finger", **COARSE).build(wide)
 
 
-def hand(**design):
-    robot = make_robot("contact_aided_gripper", **COARSE)
+def hand(object="box", **design):
+    robot = make_robot("contact_aided_gripper", object=object, **COARSE)
     return robot, FEMBackend(robot, design, dynamics=True, time_step=0.05)
 
 
@@ -63,6 +65,32 @@ def grip_and_lift(backend, angle, height):
     for lift in np.linspace(0.2 * height, height, 5):
         state = backend.step([angle, angle, lift])
     return state
+
+
+@pytest.mark.parametrize("kind", [kind for kind in CARRIED if kind != "box"])
+def test_other_objects_stand_and_are_lifted(kind):
+    robot, backend = hand(kind)
+    skin = backend.model.skins[-1]
+    corners = skin.points.positions(backend.model.nodes)[skin.triangles]
+    assert np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0.0  # seen from outside
+    assert corners[..., 2].min() == pytest.approx(ON_TABLE)
+    rest, weight = backend.state, 9.81 * 0.020
+    np.testing.assert_allclose(rest.contacts.total, [[0.0, 0.0, weight], [0.0, 0.0, 0.0]], atol=1e-5)
+    state = grip_and_lift(backend, np.radians(26.0), 0.010)
+    assert state.effector[0, 2] - rest.effector[0, 2] > 0.009
+    np.testing.assert_allclose(state.contacts.total, [[0.0, 0.0, 0.0], [0.0, 0.0, -weight]], atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", CARRIED)
+def test_surfaces_of_objects_are_those_that_the_fingers_touch(kind):
+    """Points of the skin lie on the obstacle, but for rounded edges and the flat ends of the ball."""
+    shape, nodes = CARRIED[kind]((0.04, 0.03, 0.05)), np.vstack([np.zeros(3), np.eye(3)])
+    points = shape.skin(0, nodes).points.positions(nodes)
+    sides = points[points[:, 2] > 1e-3 - shape.half_height]
+    gaps = shape.obstacle("object", 0.5, None).gap(sides if len(sides) else points)
+    assert np.abs(gaps).max() < 2e-3
+    assert points[:, 0].max() == pytest.approx(shape.half_width, rel=0.02)
+    assert points[:, 2].min() == pytest.approx(-shape.half_height)
 
 
 def test_a_box_is_lifted_by_friction_and_falls_when_the_fingers_open():

@@ -7,8 +7,8 @@ still shortens the cable along ``H = -sum_k grad(length_k)``: the tangent is not
 which stays the exact derivative.
 
 ``sigma`` follows the slip since the last equilibrium, like bristles that bend before they slide: from one direction to
-the other over `PRESLIDING` of the cable's length. Angles below `SMALLEST_ANGLE` count less, which removes the kink of
-a straight cable.
+the other over twice `PRESLIDING` of the cable's length. Angles below `SMALLEST_ANGLE` count less, which removes the
+kink of a straight cable.
 """
 
 from __future__ import annotations
