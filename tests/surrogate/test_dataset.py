@@ -679,3 +679,11 @@ def test_a_solve_that_began_at_rest_is_not_repeated_from_rest():
     statics.calls, statics.fails = 0, False
     assert [found is None for _, found in solve_path(robot, statics, rest, commands)] == [False, True, True]
     assert statics.calls == 4  # only the second command began elsewhere
+    statics.calls, again = 0, np.array([[0.018], [0.005], [0.018], [0.018]])
+    assert {k: found is None for k, found in solve_path(robot, statics, rest, again)} == {
+        0: True,
+        1: False,
+        2: True,
+        3: True,
+    }
+    assert statics.calls == 3  # the same command is tried from the first state and from rest, and not again

@@ -177,12 +177,17 @@ def solve_path(
         except ConvergenceError:
             return None
 
+    lost: set[bytes] = set()  # repeated commands without an equilibrium: each takes seconds
     for k in path_order((commands - robot.lower) / span, -robot.lower / span):
+        if commands[k].tobytes() in lost:
+            yield int(k), None
+            continue
         found = solve(commands[k])
         if found is None and not at_rest:
             statics.restore(rest.x, rest.effort)
             found = solve(commands[k])
         if found is None:
+            lost.add(commands[k].tobytes())
             statics.restore(rest.x, rest.effort)
         at_rest = found is None or not commands[k].any()
         yield int(k), found
