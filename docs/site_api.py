@@ -21,6 +21,7 @@ PACKAGES = {
     "softgym_envs.surrogate": "Surrogates",
     "softgym_envs.backends": "Backends",
     "softgym_envs.control": "Control",
+    "softgym_envs.estimation": "Estimation",
     "softgym_envs.viewer": "Pictures",
     "softgym_envs.agents": "Agents",
     "softgym_envs.codesign": "Co-design",

@@ -1,0 +1,109 @@
+"""Accuracy of the estimator on finite elements: touches at random places of the sensorized finger's grid.
+
+``python -m benchmarks.estimation [--cavities 2] [--touches 100] [--readings 10]`` prints a line of JSON.
+
+Each touch is one body with a random pull, an error of the cable, a force and a place in a cell, constant over a number
+of readings with new noise of the volumes. Its place is one point, which is not a corner of the estimator's cell: the
+plant is another model than the estimator's. The force is that of the prior, cut off below 0.2 N.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+
+import numpy as np
+from scipy.stats import chi2
+
+from softgym_envs.estimation import Estimator, Noise, Readings, Touch, finger_grid
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.registry import make_robot
+
+LENGTH, LARGEST_PULL, FORCE = 0.120, 0.010, 2.0
+
+
+def measure(
+    cavities: int, touches: int, readings: int, pitch: float, noise_share: float, seed: int
+) -> dict[str, float | None]:
+    """Return errors, coverage and speed; the noise of the volumes is a share of their change under the full pull."""
+    rng = np.random.default_rng(seed)
+    robot = make_robot("sensorized_finger", cavities=cavities)
+    change = Statics(robot.build()).solve([LARGEST_PULL]).condensed.delta.s
+    noise = Noise(displacement=1e-4, volume=noise_share * float(np.abs(change).mean()))
+    grid = finger_grid(pitch)
+    tip, force, inside, forces_inside, misfits, certain = [], [], [], [], [], []
+    cpu, alone, steps, solved = 0.0, 0.0, 0, 0
+    for _ in range(touches):
+        cell = (int(rng.integers(grid.cells[0])), int(rng.integers(grid.cells[1])))
+        corners = grid.corners(cell)
+        point = corners[0] + rng.random() * (corners[1] - corners[0]) + rng.random() * (corners[2] - corners[0])
+        command = np.array([rng.uniform(0.001, LARGEST_PULL)])
+        pull = command + noise.displacement * rng.standard_normal(1)
+        true_force = 0.0
+        while true_force < 0.2:
+            true_force = abs(FORCE * rng.standard_normal())
+        estimator = Estimator(robot, load=Touch(grid, cell, FORCE), noise=noise)
+        body = robot.build()
+        body.add_contact("touch", point, radius=estimator.radius)
+        state = Statics(body).solve(pull, contact=true_force * np.array(grid.normal))
+        volumes = estimator.rest_volumes + state.condensed.delta.s
+        begin, found_equilibria = time.process_time(), 0
+        for _ in range(readings):
+            measured = volumes + noise.volume * rng.standard_normal(cavities)
+            found = estimator.update(Readings(command, measured))
+            misfits.append(found.misfit)
+            found_equilibria += found.equilibria
+        cpu += time.process_time() - begin
+        steps += readings
+        solved += found_equilibria
+        begin = time.process_time()
+        for _ in range(20):
+            estimator.explain(found.near, Readings(command, measured))
+        alone += (time.process_time() - begin) / 20
+        error = found.effector - state.condensed.delta.e
+        tip.append(float(np.linalg.norm(error)))
+        force.append(float(found.load[0] - true_force) / true_force)
+        # Three coordinates of the tip, of which only those that the parameters move have an uncertainty.
+        values, axes = np.linalg.eigh(found.effector_covariance)
+        known = values > 1e-6 * values[-1]
+        inside.append(float(((axes.T @ error)[known] ** 2 / values[known]).sum()) <= chi2.ppf(0.95, known.sum()))
+        spread = float(np.sqrt(found.parameters.covariance[1, 1]))
+        certain.append(spread <= 0.1 * found.load[0])
+        forces_inside.append(abs(found.load[0] - true_force) <= 1.96 * spread)
+    size = np.abs(force)
+    return {
+        "cavities": cavities,
+        "touches": touches,
+        "readings": readings,
+        "volume noise [mm3]": noise.volume * 1e9,
+        "tip error mean [% of length]": 100 * float(np.mean(tip)) / LENGTH,
+        "tip error 95th [% of length]": 100 * float(np.percentile(tip, 95)) / LENGTH,
+        "tip error worst [% of length]": 100 * float(np.max(tip)) / LENGTH,
+        "force error median [%]": 100 * float(np.median(size)),
+        "force error mean [%]": 100 * float(size.mean()),
+        "force error 95th [%]": 100 * float(np.percentile(size, 95)),
+        "force within 10 % [%]": 100 * float((size <= 0.1).mean()),
+        "force told to 10 % [% of touches]": 100 * float(np.mean(certain)),
+        "force error of those, median [%]": 100 * float(np.median(size[certain])) if any(certain) else None,
+        "force error of those, mean [%]": 100 * float(np.mean(size[certain])) if any(certain) else None,
+        "coverage tip [%]": 100 * float(np.mean(inside)),
+        "coverage force [%]": 100 * float(np.mean(forces_inside)),
+        "misfit mean": float(np.mean(misfits)),
+        "updates on finite elements per CPU s": steps / cpu,
+        "equilibria per update": solved / steps,
+        "updates per CPU s, the condensed model given": touches / alone,
+    }
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cavities", type=int, default=2)
+    parser.add_argument("--touches", type=int, default=100)
+    parser.add_argument("--readings", type=int, default=10)
+    parser.add_argument("--pitch", type=float, default=5e-3)
+    parser.add_argument("--noise", type=float, default=0.01, help="of the volumes' change under the full pull")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    result = measure(given.cavities, given.touches, given.readings, given.pitch, given.noise, given.seed)
+    print(json.dumps({name: round(value, 4) for name, value in result.items() if value is not None}))

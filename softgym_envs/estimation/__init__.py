@@ -1,0 +1,22 @@
+"""Estimation of the shape of a soft robot, and of the loads on it, from its sensors (thesis, sec. 3.3.6)."""
+
+from typing import TYPE_CHECKING
+
+from softgym_envs._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from softgym_envs.estimation.estimator import Estimator as Estimator
+    from softgym_envs.estimation.estimator import Noise as Noise
+    from softgym_envs.estimation.estimator import Readings as Readings
+    from softgym_envs.estimation.loads import Payload as Payload
+    from softgym_envs.estimation.loads import Touch as Touch
+    from softgym_envs.estimation.loads import TouchGrid as TouchGrid
+    from softgym_envs.estimation.loads import finger_grid as finger_grid
+
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "estimator": ["Estimator", "Noise", "Readings"],
+        "loads": ["Payload", "Touch", "TouchGrid", "finger_grid"],
+    },
+)

@@ -1,0 +1,294 @@
+"""Where a body is and what acts on it, from its sensors: a recursive maximum a posteriori estimate (thesis 3.3.6).
+
+Unknown are the true displacements of the actuators, which differ from the commanded ones, and the parameters of a load.
+With the actuators held, ``W`` gives the exact derivative of every row by both (`held_response`), so the
+condensed model of one equilibrium explains all readings near it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from softgym_envs.estimation.loads import Load
+from softgym_envs.estimation.posterior import Gaussian, Posterior, most_probable
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.base import Robot
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of sensors, and of changes from one reading to the next.
+
+    Attributes:
+        displacement: of the true displacement of an actuator around its command [m].
+        volume: of the measured volume of a cavity [m3].
+        effort: of the measured effort of an actuator [N]; None if it is not measured.
+        drift: of each parameter of the load from one reading to the next, as a part of its spread before any reading.
+    """
+
+    displacement: float = 1e-4
+    volume: float = 1e-9
+    effort: float | None = None
+    drift: float = 0.0
+
+
+@dataclass(frozen=True)
+class Readings:
+    """One reading of all sensors.
+
+    Attributes:
+        command: commanded displacements of the actuators, shape (n_a,).
+        volumes: of the cavities [m3], shape (n_s,).
+        efforts: of the actuators, shape (n_a,), if they are measured.
+    """
+
+    command: np.ndarray
+    volumes: np.ndarray
+    efforts: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Where the body is and what acts on it.
+
+    Attributes:
+        displacement: of the actuators [m], shape (n_a,).
+        load: parameters of the load, shape (m,).
+        effector: positions [m], shape (n_e,).
+        effector_covariance: [m2], shape (n_e, n_e).
+        parameters: distribution of the errors of the actuators and of the load, shape (n_a + m,).
+        misfit: sum of the squared residuals of the readings in standard deviations; about the number of readings or
+            less while the model explains them.
+        converged: whether Gauss-Newton converged, within the accuracy of its last equilibrium.
+        equilibria: how many were computed for this reading.
+        near: the equilibrium near which the estimate lies, with its condensed model.
+    """
+
+    displacement: np.ndarray
+    load: np.ndarray
+    effector: np.ndarray
+    effector_covariance: np.ndarray
+    parameters: Gaussian
+    misfit: float
+    converged: bool
+    equilibria: int
+    near: Linearised
+
+
+def held_response(condensed: CondensedModel, slack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of all displacements and of the actuators' efforts with held actuators.
+
+    Args:
+        condensed: model of n rows, n_a of them actuators, n_f effectors and contacts.
+        slack: which actuators hang slack, shape (n_a,).
+
+    Returns:
+        Derivatives of the displacements (n, n_a + n_f) and efforts (n_a, n_a + n_f) by the displacements of the
+        actuators and the forces on effectors and contacts.
+    """
+    W, sizes = condensed.compliance, dict(condensed.roles)
+    n_a, n_f = sizes.get("a", 0), sizes.get("e", 0) + sizes.get("c", 0)
+    held = np.flatnonzero(~slack)
+    forces = np.arange(n_a, n_a + n_f)
+    efforts = np.zeros((n_a, n_a + n_f))
+    if len(held):
+        change = np.hstack([np.eye(n_a)[held], -W[np.ix_(held, forces)]])
+        efforts[held] = np.linalg.solve(W[np.ix_(held, held)], change)
+    displacements = W[:, :n_a] @ efforts
+    displacements[:, n_a:] += W[:, forces]
+    return displacements, efforts
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """A body near one equilibrium: its condensed model, at which displacements and forces."""
+
+    displacement: np.ndarray
+    forces: np.ndarray
+    state: Equilibrium
+
+    def rows(self, displacement: np.ndarray, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return all displacements (n,) and the actuators' efforts (n_a,) for other commands and forces nearby."""
+        by_displacement, by_effort = self.response
+        change = np.concatenate([displacement - self.displacement, forces - self.forces])
+        n_a = len(displacement)
+        return self.state.condensed.delta.array + by_displacement @ change, self.state.effort[:n_a] + by_effort @ change
+
+    @cached_property
+    def response(self) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of displacements and efforts, see `held_response`."""
+        return held_response(self.state.condensed, self.state.slack)
+
+
+class Estimator:
+    """Finds the shape of a body and the load on it from a stream of readings.
+
+    Each reading is explained by the condensed model near the last equilibrium. Where the explanation moves away from
+    that equilibrium by more than `accuracy`, a new one is computed there and the reading is explained again.
+
+    Args:
+        robot: the body; its cavities are sensors.
+        design: missing variables take their baseline.
+        load: what may act on the body, e.g. `Touch` or `Payload`; None for a body without load.
+        noise: of sensors and actuators.
+        radius: over which a touch acts around each corner of its cell [m].
+        equilibria: largest number of equilibria per reading.
+        accuracy: distance from an equilibrium at which a new one is computed, in standard deviations of the estimate.
+
+    Raises:
+        DesignError: for a malformed design.
+        InfeasibleDesign: if the body cannot exist.
+        ValueError: if a touched point lies outside the body.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        design: Mapping[str, float] | None = None,
+        load: Load | None = None,
+        noise: Noise | None = None,
+        radius: float = 2.5e-3,
+        equilibria: int = 10,
+        accuracy: float = 0.1,
+    ) -> None:
+        self.robot, self.design, self.radius = robot, design, radius
+        self.noise = noise or Noise()
+        self.equilibria, self.accuracy = equilibria, accuracy
+        self.belief: Gaussian | None = None
+        self.touch(load)
+
+    def touch(self, load: Load | None) -> None:
+        """Replace the load, e.g. when another cell of the grid is touched; the errors of actuators stay known."""
+        model = self.robot.build(self.design)
+        for number, point in enumerate(np.empty((0, 3)) if load is None else load.points):
+            model.add_contact(f"touch_{number}", point, radius=self.radius)
+        self._statics = Statics(model)
+        self._near: Linearised | None = None
+        sizes = dict(model.roles)
+        self._counts = sizes.get("a", 0), sizes.get("e", 0), sizes.get("c", 0)
+        n_a = self._counts[0]
+        self.rest_volumes = np.array([c.rest_volume for c in model.constraints["s"] if isinstance(c, Cavity)])
+        unlimited = np.full(n_a, np.inf)
+        actuators = Gaussian(np.zeros(n_a), self.noise.displacement**2 * np.eye(n_a), -unlimited, unlimited)
+        if self.belief is not None:
+            covariance = self.belief.covariance[:n_a, :n_a]
+            actuators = replace(actuators, mean=self.belief.mean[:n_a], covariance=covariance)
+        self.load = load
+        self.belief = actuators if load is None else actuators.beside(load.prior)
+        self._drift = np.zeros(len(self.belief.mean))
+        self._drift[n_a:] = self.noise.drift * np.sqrt(np.diag(self.belief.covariance))[n_a:]
+
+    def forces(self, load: np.ndarray) -> np.ndarray:
+        """Return the forces on effectors and touched points for parameters of the load (m,) [N]."""
+        _, n_e, n_c = self._counts
+        return np.zeros(n_e + n_c) if self.load is None else self.load.forces(load, n_e)
+
+    def linearise(self, displacement: np.ndarray, load: np.ndarray) -> Linearised:
+        """Return the body near the equilibrium for displacements (n_a,) and parameters of the load (m,).
+
+        Raises:
+            ConvergenceError: if there is no equilibrium.
+        """
+        n_e, forces = self._counts[1], self.forces(load)
+        state = self._statics.solve(displacement, effector_force=forces[:n_e], contact=forces[n_e:])
+        return Linearised(displacement, forces, state)
+
+    def predict(self, near: Linearised, displacement: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the readings without noise (k,) that a condensed model predicts, and their derivative (k, n_a + m)."""
+        delta, effort = near.rows(displacement, self.forces(load))
+        by_displacement, by_effort = near.response
+        cavities = near.state.condensed.slices.get("s", slice(0, 0))
+        values, slope = self.rest_volumes + delta[cavities], by_displacement[cavities]
+        if self.noise.effort is not None:
+            values, slope = np.concatenate([values, effort]), np.vstack([slope, by_effort])
+        return values, slope @ self._parameters_to_rows(load)
+
+    def _parameters_to_rows(self, load: np.ndarray) -> np.ndarray:
+        """Derivative of the displacements and forces (n_a + n_f,) by the parameters (n_a + m,)."""
+        n_a, n_e, n_c = self._counts
+        forces = np.zeros((n_e + n_c, 0)) if self.load is None else self.load.jacobian(load, n_e)
+        combined = np.zeros((n_a + n_e + n_c, n_a + forces.shape[1]))
+        combined[:n_a, :n_a], combined[n_a:, n_a:] = np.eye(n_a), forces
+        return combined
+
+    def explain(self, near: Linearised, readings: Readings, start: np.ndarray | None = None) -> Posterior:
+        """Return what one reading tells beyond all before, with a given condensed model; `update` calls it.
+
+        Raises:
+            ValueError: if readings have a wrong shape or are not finite, as with a lost sensor.
+        """
+        n_a = self._counts[0]
+        assert self.belief is not None
+        command = _checked("command", readings.command, n_a)
+        measured = [_checked("volumes", readings.volumes, len(self.rest_volumes))]
+        spread = [np.full(len(self.rest_volumes), self.noise.volume)]
+        if self.noise.effort is not None:
+            measured.append(_checked("efforts", readings.efforts, n_a))
+            spread.append(np.full(n_a, self.noise.effort))
+        return most_probable(
+            lambda parameters: self.predict(near, command + parameters[:n_a], parameters[n_a:]),
+            np.concatenate(measured),
+            np.concatenate(spread),
+            replace(self.belief, covariance=self.belief.covariance + np.diag(self._drift**2)),
+            start=start,
+        )
+
+    def update(self, readings: Readings) -> Estimate:
+        """Return the estimate after one more reading.
+
+        Raises:
+            ValueError: if readings have a wrong shape or are not finite, as with a lost sensor.
+            ConvergenceError: if the body has no equilibrium at parameters that were tried.
+        """
+        n_a = self._counts[0]
+        assert self.belief is not None
+        command = _checked("command", readings.command, n_a)
+        near, solved = self._near, 0
+        if near is None:
+            near, solved = self.linearise(command + self.belief.mean[:n_a], self.belief.mean[n_a:]), 1
+        start = None
+        while True:
+            posterior = self.explain(near, readings, start)
+            start = posterior.parameters.mean
+            displacement, load = command + start[:n_a], start[n_a:]
+            close = self._close(near, displacement, load, posterior.parameters)
+            if close or solved == self.equilibria:
+                break
+            near, solved = self.linearise(displacement, load), solved + 1
+        self._near, self.belief = near, posterior.parameters
+        effectors = near.state.condensed.slices["e"]
+        slope = (near.response[0] @ self._parameters_to_rows(load))[effectors]
+        return Estimate(
+            displacement=displacement,
+            load=load,
+            effector=near.rows(displacement, self.forces(load))[0][effectors],
+            effector_covariance=slope @ posterior.parameters.covariance @ slope.T,
+            parameters=posterior.parameters,
+            misfit=posterior.misfit,
+            converged=posterior.converged and close,
+            equilibria=solved,
+            near=near,
+        )
+
+    def _close(self, near: Linearised, displacement: np.ndarray, load: np.ndarray, found: Gaussian) -> bool:
+        """Whether an estimate is within the accuracy of the equilibrium near which it was found."""
+        spread = self._parameters_to_rows(load) @ np.linalg.cholesky(found.covariance)
+        allowed = self.accuracy * np.linalg.norm(spread, axis=1)
+        moved = np.concatenate([displacement - near.displacement, self.forces(load) - near.forces])
+        return bool((np.abs(moved) <= allowed + 1e-9).all())
+
+
+def _checked(name: str, values: np.ndarray | None, count: int) -> np.ndarray:
+    """Return values of one kind of reading as an array (count,), or a ValueError."""
+    array = np.asarray([] if values is None else values, dtype=float)
+    if array.shape != (count,) or not np.isfinite(array).all():
+        raise ValueError(f"readings '{name}' must be {count} finite values, got {array.tolist()}")
+    return array

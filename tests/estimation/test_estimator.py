@@ -1,0 +1,129 @@
+"""The estimator on finite elements: derivatives, recovery without noise, memory, and messages."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softgym_envs import make_robot
+from softgym_envs.estimation import Estimator, Noise, Payload, Readings, Touch, finger_grid
+from softgym_envs.mechanics.solvers.statics import Statics
+
+GRID = finger_grid()
+TOUCH = np.array([1.3, 0.4, -0.6])  # N, and the place in the cell
+
+
+def finger_estimator(cavities):
+    robot = make_robot("sensorized_finger", cavities=cavities)
+    return Estimator(robot, load=Touch(GRID, (0, 14)), noise=Noise(volume=1e-11))
+
+
+def diamond_estimator():
+    return Estimator(make_robot("diamond"), load=Payload(), noise=Noise(effort=0.01))
+
+
+CASES = {
+    "finger, 2 cavities": (lambda: finger_estimator(2), np.array([0.006]), TOUCH),
+    "finger, 4 cavities": (lambda: finger_estimator(4), np.array([0.006]), TOUCH),
+    "finger, slack cable": (lambda: finger_estimator(2), np.array([0.0]), TOUCH),
+    "diamond": (diamond_estimator, np.array([0.004, 0.002, 0.006, 0.003]), np.array([0.05])),
+}
+
+
+@pytest.fixture(scope="module", params=CASES.values(), ids=CASES)
+def case(request):
+    make, command, load = request.param
+    return make(), command, load
+
+
+def test_derivatives_of_readings_are_exact(case):
+    estimator, command, load = case
+    n_a = len(command)
+
+    def readings(parameters):
+        near = estimator.linearise(parameters[:n_a], parameters[n_a:])
+        return estimator.predict(near, parameters[:n_a], parameters[n_a:])
+
+    at = np.concatenate([command, load])
+    slope = readings(at)[1]
+    for k, step in enumerate([1e-5] * n_a + [1e-3] * len(load)):
+        change = step * np.eye(len(at))[k]
+        difference = (readings(at + change)[0] - readings(at - change)[0]) / (2 * step)
+        # A slack cable has no effect at all, so its column is compared with the others.
+        largest = 1e-3 * np.abs(slope).max() if k < n_a else np.abs(slope[:, k]).max()
+        np.testing.assert_allclose(slope[:, k], difference, rtol=0, atol=2e-3 * largest)
+
+
+def test_readings_without_noise_lead_to_the_truth(case):
+    """The touch lies in the middle of its cell; the prior draws the estimate a little towards no load."""
+    estimator, command, load = case
+    load = load.copy()
+    load[1:] = 0.0  # the middle of the cell, which is the most probable place
+    near = estimator.linearise(command, load)
+    readings, _ = estimator.predict(near, command, load)
+    count = len(estimator.rest_volumes)
+    estimator.touch(estimator.load)
+    efforts = readings[count:] if len(readings) > count else None
+    found = estimator.update(Readings(command, readings[:count], efforts))
+    assert found.converged
+    if command.any():
+        assert found.load[0] == pytest.approx(load[0], rel=0.03)
+        truth = near.state.condensed.delta.e
+        assert np.abs(found.effector - truth).max() < 2e-4
+    assert found.misfit < 1.0
+
+
+def test_a_steady_body_needs_no_new_equilibrium_and_becomes_more_certain():
+    estimator = finger_estimator(2)
+    command, load = np.array([0.006]), TOUCH * [1, 0, 0]
+    volumes, _ = estimator.predict(estimator.linearise(command, load), command, load)
+    first = estimator.update(Readings(command, volumes))
+    second = estimator.update(Readings(command, volumes))
+    assert first.equilibria > 0
+    assert second.equilibria == 0
+    assert (np.diag(second.parameters.covariance) < np.diag(first.parameters.covariance)).all()
+
+
+def test_another_cell_forgets_the_force_and_keeps_the_error_of_the_cable():
+    estimator = finger_estimator(2)
+    command = np.array([0.006])
+    volumes, _ = estimator.predict(estimator.linearise(command + 1e-4, TOUCH), command + 1e-4, TOUCH)
+    found = estimator.update(Readings(command, volumes)).parameters
+    load = Touch(GRID, (1, 10))
+    estimator.touch(load)
+    assert estimator.belief.mean[0] == found.mean[0]
+    assert estimator.belief.covariance[0, 0] == found.covariance[0, 0]
+    np.testing.assert_array_equal(estimator.belief.mean[1:], load.prior.mean)
+
+
+def test_touched_force_is_that_of_a_point():
+    """The corners of a cell share a force as a point within the cell does: the tip differs by less than 0.3 mm."""
+    estimator = finger_estimator(2)
+    near = estimator.linearise(np.array([0.006]), TOUCH)
+    body = make_robot("sensorized_finger").build()
+    body.add_contact("touch", estimator.load.place(TOUCH), radius=estimator.radius)
+    state = Statics(body).solve([0.006], contact=TOUCH[0] * np.array(GRID.normal))
+    unloaded = Statics(body).solve([0.006])
+    moved = np.linalg.norm(state.condensed.delta.e - unloaded.condensed.delta.e)
+    assert np.linalg.norm(near.state.condensed.delta.e - state.condensed.delta.e) < min(3e-4, 0.1 * moved)
+
+
+def test_touches_outside_the_grid_are_told():
+    with pytest.raises(ValueError, match=r"touch in cell \(3, 0\) is outside the model: the grid has 3 x 20 cells"):
+        GRID.corners((3, 0))
+    with pytest.raises(ValueError, match="outside the model"):
+        GRID.cell(np.array([0.0, 0.0, -0.005]))
+    assert GRID.cell(np.array([0.0, 0.0, -0.016])) == (1, 0)
+
+
+@pytest.mark.parametrize("volumes", [[1e-7], [np.nan, 1e-7]], ids=["one of two", "not a number"])
+def test_lost_sensors_are_told(volumes):
+    with pytest.raises(ValueError, match="readings 'volumes' must be 2 finite values"):
+        finger_estimator(2).update(Readings(np.array([0.0]), np.array(volumes)))
+
+
+def test_axes_of_a_grid_are_perpendicular():
+    from softgym_envs.estimation import TouchGrid
+
+    with pytest.raises(ValueError, match="perpendicular unit vectors"):
+        TouchGrid((0, 0, 0), (1, 0, 0), (1, 0, 0), (0, 0, 1), (2, 2))
