@@ -30,6 +30,7 @@ from benchmarks import (
     morphing,
     networks,
     robots,
+    robustness,
     sensor_accuracy,
     sensor_finger,
     sensor_fronts,
@@ -92,6 +93,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "codesign_kills": codesign_scale.kills,
     "codesign_profile": codesign_scale.profile,
     **convergence.BENCHMARKS,
+    **robustness.BENCHMARKS,
 }
 """Registry of benchmarks."""
 
