@@ -58,7 +58,7 @@ class InverseQPAgent:
         self._controllers[env] = make_controller(env.robot, env.task)
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
-        return controller.solve(env.state.condensed, env.goal, present, env.state.slack)
+        return controller.solve(env.state.condensed, env.aim, present, env.state.slack)
 
 
 class StaticQPAgent(InverseQPAgent):
@@ -66,7 +66,7 @@ class StaticQPAgent(InverseQPAgent):
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
         still = env.backend.probe(present) if env.backend.moving else env.state
-        return controller.solve(still.condensed, env.goal, present, still.slack)
+        return controller.solve(still.condensed, env.aim, present, still.slack)
 
 
 class ModelQPAgent(InverseQPAgent):
@@ -84,12 +84,12 @@ class ModelQPAgent(InverseQPAgent):
         self._closed = closed
         self._models: WeakKeyDictionary[Any, Backend | None] = WeakKeyDictionary()
         self._corrections: WeakKeyDictionary[Any, PICorrection] = WeakKeyDictionary()
-        self._previous_goals: WeakKeyDictionary[Any, np.ndarray] = WeakKeyDictionary()
+        self._previous_aims: WeakKeyDictionary[Any, np.ndarray] = WeakKeyDictionary()
 
     def _begin(self, env: Any) -> None:
         super()._begin(env)
         self._corrections[env] = PICorrection(*PI_GAINS)
-        self._previous_goals[env] = env.goal
+        self._previous_aims[env] = env.aim
         if env not in self._models:
             try:
                 self._models[env] = SurrogateBackend(env.robot, env.design)
@@ -106,12 +106,12 @@ class ModelQPAgent(InverseQPAgent):
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
         expected = self._predict(env, present)
         if not self._closed:
-            return controller.solve(expected.condensed, env.goal, present, expected.slack)
+            return controller.solve(expected.condensed, env.aim, present, expected.slack)
         axes, correction = env.task.axes, self._corrections[env]
-        # The effector follows the previous goal; the motion of the goal since then is not an error of the model.
-        error = axes * (self._previous_goals[env] - env.sensed.effector)
-        self._previous_goals[env] = env.goal
-        aim = correction.correct(env.goal, env.goal - error)
+        # The effector follows the previous aim; the motion of the aim since then is not an error of the model.
+        error = axes * (self._previous_aims[env] - env.sensed.effector)
+        self._previous_aims[env] = env.aim
+        aim = correction.correct(env.aim, env.aim - error)
         command = controller.solve(expected.condensed, aim, present, expected.slack)
         model = expected.condensed
         reached = model.delta.e + model.W.ea @ (controller.effort - model.lambda_.a)

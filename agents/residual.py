@@ -47,7 +47,7 @@ class BatchQP:
     def __call__(self) -> np.ndarray:
         """Return actions for the present states, shape (num_envs, n_a); rows without a solution hold the command."""
         env = self._env
-        models, goals, previous = env.condensed, env.goals, env.command
+        models, goals, previous = env.condensed, env.aims, env.command
         commands = previous.copy()
         for i, controller in enumerate(self._controllers):
             if not previous[i].any():  # an episode begins

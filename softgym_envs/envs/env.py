@@ -147,8 +147,16 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
 
     @property
     def goal(self) -> np.ndarray:
-        """The present goal [m, or the unit of the task's goals], shape (3,)."""
-        return self.task.goals(self._path[None], np.array([len(self._path)]), np.array([self._step]))[0]
+        """The goal that the present state is rated by [m, or the unit of the task's goals], shape (3,)."""
+        return self._goal_at(self._step)
+
+    @property
+    def aim(self) -> np.ndarray:
+        """The goal that the observation shows, ``task.lookahead`` steps ahead of `goal`, shape (3,)."""
+        return self._goal_at(self._step + self.task.lookahead)
+
+    def _goal_at(self, step: int) -> np.ndarray:
+        return self.task.goals(self._path[None], np.array([len(self._path)]), np.array([step]))[0]
 
     @property
     def path(self) -> np.ndarray:
@@ -333,7 +341,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         velocity = state.velocity[0] if self.spaces.moving else None
         shown = self._sensed or Sensed(state.displacement, state.effort, measured)
         observation = self.spaces.observe(
-            self.command, shown.displacement, shown.effort, shown.effector, goal, self._unit_design, velocity
+            self.command, shown.displacement, shown.effort, shown.effector, self.aim, self._unit_design, velocity
         )
         return observation, reward, {name: _with_dtype(value) for name, value in info.items()}
 

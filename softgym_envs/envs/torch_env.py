@@ -437,6 +437,7 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         command, effort, effector = state["command"], state["effort"], state["effector"]
         displacement = self._model.middle + self._model.half_range * state["u"]
         goal = self._task.goals(state["paths"], state["counts"], state["steps"])
+        aim = self._task.goals(state["paths"], state["counts"], state["steps"] + self._task.lookahead)
         distance, terms, reward = self._task.rate(effector, goal, self._spaces.effort_share(effort))
         unit_design = bodies["unit"].expand(self.num_envs, -1)
         info = {
@@ -452,7 +453,7 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
             "trusted": state["trusted"].clone(),
             "converged": state["converged"].clone(),
         }
-        observation = self._spaces.observe(command, displacement, effort, effector, goal, unit_design)
+        observation = self._spaces.observe(command, displacement, effort, effector, aim, unit_design)
         return {"observation": observation, "reward": reward, "info": info}
 
 

@@ -210,8 +210,13 @@ class SoftRobotVectorEnv(VectorEnv):
 
     @property
     def goals(self) -> np.ndarray:
-        """Present goals [m], shape (num_envs, 3)."""
+        """Goals that the present states are rated by [m], shape (num_envs, 3)."""
         return self.task.goals(self._paths, self._counts, self._steps)
+
+    @property
+    def aims(self) -> np.ndarray:
+        """Goals that the observations show, ``task.lookahead`` steps ahead of `goals`, shape (num_envs, 3)."""
+        return self.task.goals(self._paths, self._counts, self._steps + self.task.lookahead)
 
     @property
     def paths(self) -> np.ndarray:
@@ -374,7 +379,7 @@ class SoftRobotVectorEnv(VectorEnv):
             shown.displacement,
             shown.effort,
             shown.effector,
-            self.goals,
+            self.aims,
             self._unit_design,
             self.backend.velocity,
         )

@@ -33,6 +33,14 @@ def test_the_batched_qp_agrees_with_the_single_one(identifier):
             assert np.abs((env.unwrapped.state.command - states[k][i]) / span).max() < 1e-5
 
 
+def test_the_qp_follows_a_path_closer_when_it_sees_the_next_goal():
+    last, following = (on("DiamondTrack", task_options={"lookahead": steps}) for steps in (0, 1))
+    path = sample_goals(last, 1, seed=0)
+    late, ahead = (evaluate("qp", config, path) for config in (last, following))
+    assert ahead.mean_tracking_distance < 0.6 * late.mean_tracking_distance
+    assert ahead.mean_return > late.mean_return + 10.0
+
+
 def test_the_executed_action_is_the_clipped_sum():
     config = on("FingerReach", residual_scale=0.5)
     env = config.make()

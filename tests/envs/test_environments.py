@@ -207,6 +207,39 @@ def test_track_follows_the_reference_path_of_its_robot(identifier):
     assert (np.abs(env.path) < 1.25 * env.robot.size).all()  # observations do not clip the goals
 
 
+@pytest.mark.parametrize("kind", ["single", "batched", "torch"])
+@pytest.mark.parametrize("lookahead", [0, 1, 3])
+def test_a_track_shows_the_goal_that_a_later_step_is_rated_by(kind, lookahead):
+    identifier, options = "SoftGym/DiamondTrack-v0", {"lookahead": lookahead}
+    if kind == "single":
+        env = gymnasium.make(identifier, task_options=options)
+        spaces = env.unwrapped.spaces
+    elif kind == "batched":
+        env = gymnasium.make_vec(identifier, num_envs=1, task_options=options)
+        spaces = env.unwrapped.spaces
+    else:
+        pytest.importorskip("torch")
+        from softgym_envs.envs.torch_env import TorchVectorEnv
+
+        env = TorchVectorEnv(identifier, 1, device="cpu", task_options=options)
+        spaces = gymnasium.make(identifier).unwrapped.spaces
+    shown, rated = [], []
+    observation, info = env.reset(seed=0)
+    for _ in range(13):
+        shown.append(spaces.observed_goal(np.asarray(observation).reshape(-1)))
+        rated.append(np.asarray(info["goal"]).reshape(3))
+        action = 0.0 * env.action_space.sample()
+        observation, *_, info = env.step(action if kind != "torch" else np.asarray(action))
+    np.testing.assert_allclose(shown[: len(shown) - lookahead], rated[lookahead:], atol=1e-7)
+    assert np.ptp(rated, axis=0).max() > 1e-3  # the goal moves
+
+
+@pytest.mark.parametrize("lookahead", [-1, 0.5, True, "1"])
+def test_a_track_refuses_a_wrong_lookahead(lookahead):
+    with pytest.raises(ValueError, match="lookahead = .* must be a whole number of control steps, 0 or more"):
+        make_task("track", make_robot("diamond"), lookahead=lookahead)
+
+
 def test_track_needs_a_path_or_a_reference_path(monkeypatch):
     robot = make_robot("finger")
     monkeypatch.setattr(type(robot), "reference_path", Robot.reference_path)

@@ -88,6 +88,7 @@ class Task(ABC):
         name: registry name; default the name of the class in lower case.
         horizon: control steps that a path of goals covers; afterwards the last goal holds. 1 for a single goal.
         max_episode_steps: time limit of an episode if none is given.
+        lookahead: control steps by which the observed goal is ahead of the rated one.
         robot: the robot.
         axes: coordinates of the effector that count, 1 or 0, shape (3,).
         success_distance: distance below which a goal counts as reached [m].
@@ -105,6 +106,7 @@ class Task(ABC):
     name: str
     horizon: int = 1
     max_episode_steps: int = 100
+    lookahead: int = 0
 
     def __init__(self, robot: Robot) -> None:
         if not hasattr(self, "name"):
