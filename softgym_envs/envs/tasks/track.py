@@ -32,8 +32,8 @@ class Track(Task):
         super().__init__(robot)
         self.path: Array = robot.reference_path() if path is None else check_goals(path, "path", robot)
         self.jitter = check_length(jitter, "jitter", robot)
-        if isinstance(lookahead, bool) or not isinstance(lookahead, int) or lookahead < 0:
-            raise ValueError(f"lookahead = {lookahead!r} must be a whole number of control steps, 0 or more")
+        if lookahead < 0:
+            raise ValueError(f"lookahead = {lookahead} control steps must be 0 or more")
         self.lookahead = lookahead
 
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
