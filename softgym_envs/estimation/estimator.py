@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import chi2
 
 from softgym_envs.estimation.loads import Load
 from softgym_envs.estimation.posterior import Gaussian, Posterior, most_probable
@@ -20,6 +21,9 @@ from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
+
+IMPROBABLE = 0.999
+"""Probability of a smaller misfit from which on an estimate is also sought with slack cables."""
 
 
 @dataclass(frozen=True)
@@ -127,11 +131,22 @@ class Linearised:
         return held_response(self.state.condensed, self.state.slack)
 
 
+@dataclass(frozen=True)
+class _Found:
+    """An explanation of a reading: the equilibrium near which it lies, whether near enough, and how many were tried."""
+
+    near: Linearised
+    posterior: Posterior
+    close: bool
+    solved: int
+
+
 class Estimator:
     """Finds the shape of a body and the load on it from a stream of readings.
 
     Each reading is explained by the condensed model near the last equilibrium. Where the explanation moves away from
-    that equilibrium by more than `accuracy`, a new one is computed there and the reading is explained again.
+    that equilibrium by more than `accuracy`, a new one is computed there and the reading is explained again. A reading
+    that is improbable with tight cables is also explained with slack ones, and the more probable explanation counts.
 
     Args:
         robot: the body; its cavities are sensors.
@@ -253,16 +268,20 @@ class Estimator:
         command = _checked("command", readings.command, n_a)
         near, solved = self._near, 0
         if near is None:
-            near, solved = self.linearise(command + self.belief.mean[:n_a], self.belief.mean[n_a:]), 1
-        start = None
-        while True:
-            posterior = self.explain(near, readings, start)
-            start = posterior.parameters.mean
-            displacement, load = command + start[:n_a], start[n_a:]
-            close = self._close(near, displacement, load, posterior.parameters)
-            if close or solved == self.equilibria:
-                break
-            near, solved = self.linearise(displacement, load), solved + 1
+            likely = np.clip(self.belief.mean, self.belief.low, self.belief.high)
+            near, solved = self.linearise(command + likely[:n_a], likely[n_a:]), 1
+        found = self._search(near, readings, solved)
+        tight = self._statics.unilateral & ~found.near.state.slack
+        if tight.any() and found.posterior.misfit > chi2.ppf(IMPROBABLE, len(found.posterior.residuals)):
+            # The load may have slackened cables: readings have a most probable explanation with them and one without.
+            released = self._released(command, found.posterior.mode)
+            slack = self._search(released, readings, found.solved + 1)
+            if slack.posterior.cost < found.posterior.cost:
+                found = slack
+            else:
+                found = replace(found, solved=slack.solved)
+        near, posterior = found.near, found.posterior
+        displacement, load = command + posterior.mode[:n_a], posterior.mode[n_a:]
         self._near, self.belief = near, posterior.parameters
         effectors = near.state.condensed.slices["e"]
         slope = (near.response[0] @ self._parameters_to_rows(load))[effectors]
@@ -273,10 +292,32 @@ class Estimator:
             effector_covariance=slope @ posterior.parameters.covariance @ slope.T,
             parameters=posterior.parameters,
             misfit=posterior.misfit,
-            converged=posterior.converged and close,
-            equilibria=solved,
+            converged=posterior.converged and found.close,
+            equilibria=found.solved,
             near=near,
         )
+
+    def _search(self, near: Linearised, readings: Readings, solved: int) -> _Found:
+        """Explain a reading by the body near an equilibrium, and near those that follow, until they hardly change."""
+        n_a, most, start = self._counts[0], solved + self.equilibria - 1, None
+        while True:
+            posterior = self.explain(near, readings, start)
+            start = posterior.mode
+            displacement, load = readings.command + start[:n_a], start[n_a:]
+            close = self._close(near, displacement, load, posterior.parameters)
+            if close or solved >= most:
+                return _Found(near, posterior, close, solved)
+            near, solved = self.linearise(displacement, load), solved + 1
+
+    def _released(self, command: np.ndarray, parameters: np.ndarray) -> Linearised:
+        """Return the body near the equilibrium for parameters (n_a + m,) with all of its cables slack."""
+        n_a, n_e, _ = self._counts
+        displacement, forces = command + parameters[:n_a], self.forces(parameters[n_a:])
+        loose = self._statics.unilateral
+        modes = ["effort" if free else "displacement" for free in loose]
+        target = np.where(loose, 0.0, displacement)
+        state = self._statics.solve(target, modes, effector_force=forces[:n_e], contact=forces[n_e:])
+        return Linearised(displacement, forces, replace(state, slack=loose))
 
     def _close(self, near: Linearised, displacement: np.ndarray, load: np.ndarray, found: Gaussian) -> bool:
         """Whether an estimate is within the accuracy of the equilibrium near which it was found."""

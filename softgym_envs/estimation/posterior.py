@@ -16,8 +16,8 @@ class Gaussian:
     """A normal distribution of parameters, cut off at limits.
 
     Attributes:
-        mean: shape (m,); of a posterior the most probable parameters.
-        covariance: shape (m, m); of a posterior the inverse of the Gauss-Newton Hessian, in which limits do not count.
+        mean: of the distribution before it is cut off, shape (m,); it may lie beyond the limits.
+        covariance: likewise, shape (m, m).
         low: lower limits, shape (m,).
         high: upper limits, shape (m,).
     """
@@ -45,16 +45,26 @@ class Posterior:
     """What readings tell about parameters.
 
     Attributes:
-        parameters: their distribution.
-        misfit: sum of the squared residuals of the readings, in standard deviations of their noise.
+        mode: the most probable parameters within their limits, shape (m,).
+        parameters: their distribution, from the Gauss-Newton Hessian at the mode. Where limits are active, its mean
+            lies beyond them, so that further readings find what all readings at once would.
+        residuals: of the readings, in standard deviations of their noise, shape (k,).
+        cost: sum of their squares and of that of the distance from the prior; least at the mode.
         iterations: Gauss-Newton steps.
         converged: whether the last step was short.
     """
 
+    mode: np.ndarray
     parameters: Gaussian
-    misfit: float
+    residuals: np.ndarray
+    cost: float
     iterations: int
     converged: bool
+
+    @property
+    def misfit(self) -> float:
+        """Sum of the squared residuals of the readings."""
+        return float(self.residuals @ self.residuals)
 
 
 def limited_step(matrix: np.ndarray, right: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -125,9 +135,12 @@ def most_probable(
             break
         parameters, (residual, matrix, cost) = moved, trial
     covariance = np.linalg.inv(matrix.T @ matrix)
+    mean = parameters + np.linalg.lstsq(matrix, residual, rcond=None)[0]
     return Posterior(
-        parameters=Gaussian(parameters, 0.5 * (covariance + covariance.T), prior.low, prior.high),
-        misfit=float(residual[: len(readings)] @ residual[: len(readings)]),
+        mode=parameters,
+        parameters=Gaussian(mean, 0.5 * (covariance + covariance.T), prior.low, prior.high),
+        residuals=residual[: len(readings)],
+        cost=cost,
         iterations=taken,
         converged=converged,
     )

@@ -127,3 +127,19 @@ def test_axes_of_a_grid_are_perpendicular():
 
     with pytest.raises(ValueError, match="perpendicular unit vectors"):
         TouchGrid((0, 0, 0), (1, 0, 0), (1, 0, 0), (0, 0, 1), (2, 2))
+
+
+def test_a_push_that_slackens_the_cable_is_not_taken_for_a_long_cable():
+    """A second explanation of the same volumes, with a tight cable that is 1.7 mm longer, has a far larger cost."""
+    robot, noise = make_robot("sensorized_finger", cavities=2), Noise(displacement=1e-4, volume=5.74e-10)
+    estimator = Estimator(robot, load=Touch(finger_grid(5e-3), (0, 17), 2.0), noise=noise)
+    command, load = np.array([0.00269]), np.array([2.48, 0.2, 0.58])
+    truth = estimator.linearise(command - 1.4e-4, load)
+    assert truth.state.slack.all()
+    volumes = estimator.rest_volumes + truth.state.condensed.delta.s
+    estimator = Estimator(robot, load=Touch(finger_grid(5e-3), (0, 17), 2.0), noise=noise)
+    for _ in range(3):
+        found = estimator.update(Readings(command, volumes))
+    assert found.misfit < 1.0 and found.near.state.slack.all()
+    assert found.load[0] == pytest.approx(load[0], rel=0.05)
+    assert abs(found.displacement[0] - command[0]) < 3e-4

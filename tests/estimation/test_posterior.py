@@ -56,9 +56,25 @@ def test_limits_hold_and_the_others_adapt():
     """A reading of -1 of the sum of both: the first stays at zero, the second takes the whole reading."""
     prior = Gaussian(np.zeros(2), np.eye(2), np.array([0.0, -np.inf]), np.full(2, np.inf))
     matrix = np.array([[1.0, 1.0]])
-    found = most_probable(lambda p: (matrix @ p, matrix), np.array([-1.0]), np.array([0.1]), prior).parameters.mean
-    assert found[0] == 0.0
-    assert found[1] == pytest.approx(-1.0 / 1.01)
+    found = most_probable(lambda p: (matrix @ p, matrix), np.array([-1.0]), np.array([0.1]), prior)
+    assert found.mode[0] == 0.0
+    assert found.mode[1] == pytest.approx(-1.0 / 1.01)
+    np.testing.assert_allclose(found.parameters.mean, np.full(2, -1.0 / 2.01))  # as if there were no limits
+
+
+def test_readings_one_by_one_give_the_same_as_all_at_once_at_a_limit(linear):
+    matrix, readings, noise, free = linear
+    unlimited = most_probable(lambda p: (matrix @ p, matrix), readings, noise, free).mode
+    low = unlimited + np.array([0.5, -np.inf, -np.inf])
+    prior = Gaussian(free.mean, free.covariance, low, UNLIMITED)
+    whole = most_probable(lambda p: (matrix @ p, matrix), readings, noise, prior)
+    assert whole.mode[0] == pytest.approx(low[0])
+    belief = prior
+    for k in range(5):
+        row = matrix[k : k + 1]
+        found = most_probable(lambda p, row=row: (row @ p, row), readings[k : k + 1], noise[k : k + 1], belief)
+        belief = found.parameters
+    np.testing.assert_allclose(found.mode, whole.mode, rtol=1e-8)
 
 
 def test_noise_and_prior_must_be_positive():
