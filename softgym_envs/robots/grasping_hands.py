@@ -23,7 +23,7 @@ from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Robot
-from softgym_envs.robots.carried_objects import CARRIED, ROUNDING
+from softgym_envs.robots.carried_objects import CARRIED, ROUNDING, Shape
 from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
 from softgym_envs.robots.grasping import KINDS, GraspObject
 
@@ -151,7 +151,6 @@ class ContactAidedGripper(Robot):
         if object not in CARRIED:
             raise ValueError(f"robot '{self.name}': " + unknown_name("object", object, CARRIED))
         self.clearance, self.object, self.box = clearance, object, box
-        self._shape = CARRIED[object](box)
         self.design_space = DesignSpace(
             *self.finger.design_space,
             DesignVariable("object_gap", 0.005, 0.030, 0.015, "m", "distance of each finger from the box, along x"),
@@ -168,6 +167,11 @@ class ContactAidedGripper(Robot):
         )
         self.effort_scale = np.array([0.3, 0.3, 1.0])
         self.effector_rest = np.array([0.0, 0.0, self._shape.half_height])
+
+    @property
+    def _shape(self) -> Shape:
+        """The object; not kept, because its functions cannot be pickled."""
+        return CARRIED[self.object](self.box)
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Place both fingers, the table and the box, which rests on it.
