@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -61,7 +62,8 @@ def show(name: str) -> None:
     click.echo("hashes: " + ", ".join(f"{key} {value[:12]}" for key, value in problem.parts.items()))
     known = reference(problem)
     if known is not None:
-        click.echo(f"on finite elements, test goals: baseline {known.baseline}, best known {known.best or 'none'}")
+        baseline, best = _scores([known.baseline]), _scores(known.best)
+        click.echo(f"on finite elements, test goals: baseline {baseline}, best known {best}")
 
 
 @benchmark.command()
@@ -102,7 +104,7 @@ def run(
                     found = runs.run(folder, name, method, judge, level, seed, listed)  # type: ignore[arg-type]
                     click.echo(
                         f"{name} {method} {found.judge} seed {seed}: {found.bodies} bodies, "
-                        f"{found.spent['cpu_seconds']:.1f} CPU s, best {found.search_scores[:1]}"
+                        f"{found.spent['cpu_seconds']:.1f} CPU s, best {_scores(found.search_scores[:1])}"
                     )
                     if fem:
                         runs.check_winners(folder, [found])
@@ -137,7 +139,7 @@ def verify(path: Path, record: bool, as_json: bool) -> None:
         click.echo(json.dumps(asdict(verdict)))
         return
     shown = "unknown" if verdict.normalised is None else f"{verdict.normalised:.4f}"
-    click.echo(f"accepted: normalised score {shown}; scores on finite elements {verdict.scores}")
+    click.echo(f"accepted: normalised score {shown}; scores on finite elements {_scores(verdict.scores)}")
     if verdict.record:
         click.echo("this is the best known")
 
@@ -188,3 +190,8 @@ def tabulate(name: str, bodies: int, qp_bodies: int, output: Path | None, folder
 
     with options.resumable():
         click.echo(f"wrote {run(name, bodies, qp_bodies, folder, output)}")
+
+
+def _scores(bodies: Sequence[Sequence[float]]) -> str:
+    """Return the scores of bodies for display."""
+    return "; ".join(", ".join(f"{score:.4g}" for score in scores) for scores in bodies) or "none"
