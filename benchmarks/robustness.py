@@ -20,6 +20,8 @@ PLANTS: dict[str, dict[str, Any]] = {
 }
 """Plants by name; a control step lasts 50 ms. Robots without cables leave out their friction."""
 
+CONTROLLERS = ("inverse QP, open loop", "inverse QP with PI", "policy")
+
 POLICIES = {
     "finger": "finger_reach",
     "diamond": "diamond_reach_designs",
@@ -36,7 +38,7 @@ def robustness(robot: str) -> dict[str, object]:
     policy = Policy(POLICIES[robot])
     nominal = policy.environment.model_copy(update={"sample_design": False})
     goals = sample_goals(nominal, GOALS, SEED)
-    agents = {"inverse QP, open loop": "qp_model", "inverse QP with PI": "qp_pi", "policy": POLICIES[robot]}
+    agents = dict(zip(CONTROLLERS, ("qp_model", "qp_pi", POLICIES[robot]), strict=True))
     pneumatic = robot == "trunk"
     result: dict[str, object] = {}
     for plant, given in PLANTS.items():

@@ -341,6 +341,27 @@ def _path_errors(benchmark: str, head: str) -> str:
     return markdown([head, "largest error [mm]", "mean [mm]"], rows, "lrr")
 
 
+def robustness() -> str:
+    """Controllers of the finger on plants unlike their model: goals reached and mean final distance."""
+    from benchmarks.robustness import CONTROLLERS, PLANTS
+
+    group = "robustness_finger"
+    rows = [
+        [
+            plant,
+            *(
+                figure(group, f"{name}, {plant}: goals reached [%]", ".0f")
+                + " %, "
+                + figure(group, f"{name}, {plant}: mean distance [mm]", ".2f")
+                + " mm"
+                for name in CONTROLLERS
+            ),
+        ]
+        for plant in PLANTS
+    ]
+    return markdown(["plant", *CONTROLLERS], rows, "lrrr")
+
+
 def side_by_side() -> str:
     """The same problems in several codes."""
     rows = []
@@ -491,7 +512,7 @@ TABLES: dict[str, Callable[[], str]] = {
         test_set, trust, buckling, predicted_tracking, trajectories, design_gradients, networks,
         design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop,
-        validation, contact, surrogate_speed, fem_speed, deployed, provenance,
+        validation, contact, surrogate_speed, fem_speed, deployed, robustness, provenance,
     )
 }  # fmt: skip
 """Tables by the name in a marked place."""
