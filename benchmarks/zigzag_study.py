@@ -113,16 +113,18 @@ def draw(path: Path, all_designs: np.ndarray, values: Sequence[Value], shapes: M
     from softgym_envs.codesign.tools.plots import figure
 
     with figure(path, 3, width=4.4, height=4.2) as axes:
-        for axis, column, words in ((axes[0], 1, "energy"), (axes[1], 2, "resistance [m]")):
+        for axis, column, words in ((axes[0], 1, "energy [N m]"), (axes[1], 2, "resistance [m]")):
             axis.scatter(all_designs[:, 0], all_designs[:, column], s=7, color=MUTED, label="search")
-            for mesh, color in (("published", BASELINE), ("accurate", WINNER)):
-                rows = [value for value in values if value.mesh == mesh]
-                y = [value.energy if column == 1 else value.resistance for value in rows]
-                axis.scatter([value.force for value in rows], y, s=26, color=color, label=f"{mesh} mesh")
-                for value, height in zip(rows, y, strict=True):
-                    axis.annotate(
-                        value.design, (value.force, height), xytext=(4, 3), textcoords="offset points", size=6
-                    )
+            ends: dict[str, list[tuple[float, float]]] = {}
+            for value in values:
+                ends.setdefault(value.design, []).append((value.force, (value.energy, value.resistance)[column - 1]))
+            # One line for each design, from the published mesh, where it has its name, to the accurate one.
+            for name, points in ends.items():
+                axis.plot(*zip(*points, strict=True), color=MUTED, lw=0.8, zorder=1)
+                axis.annotate(name, points[0], xytext=(4, 3), textcoords="offset points", size=6)
+            for k, (mesh, color) in enumerate(zip(MESHES, (BASELINE, WINNER), strict=True)):
+                places = np.array([points[k] for points in ends.values()])
+                axis.scatter(*places.T, s=26, color=color, label=f"{mesh} mesh")
             for name, (force, resistance, energy) in SIMULATED.items():
                 height = energy if column == 1 else resistance
                 axis.scatter(force, height, s=40, marker="x", color=BASELINE)
@@ -131,11 +133,14 @@ def draw(path: Path, all_designs: np.ndarray, values: Sequence[Value], shapes: M
             axis.set_ylabel(words)
         axes[0].legend(fontsize=7)
         for k, (name, corners) in enumerate(shapes.items()):
-            closed = 1e3 * np.vstack([corners, corners[:1]]) + [48.0 * k, 0.0]
+            closed = 1e3 * np.vstack([corners, corners[:1]]) + [62.0 * k, 0.0]
             axes[2].fill(*closed.T, color=WINNER, lw=0)
-            axes[2].annotate(name, closed.mean(0) * [1.0, 0.0] + [0.0, -18.0], ha="center", size=7)
+            words = name.replace(" ", "\n")
+            axes[2].annotate(
+                words, (np.ptp(closed[:, 0]) / 2 + closed[:, 0].min(), -12.0), ha="center", va="top", size=7
+            )
         axes[2].set_aspect("equal")
-        axes[2].set_ylim(-30.0, 110.0)
+        axes[2].set_ylim(-40.0, 110.0)
         axes[2].set_xlabel("[mm]")
 
 
