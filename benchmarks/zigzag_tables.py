@@ -82,6 +82,15 @@ def zigzag_front() -> str:
     return markdown(head, rows, "lrrrrrr")
 
 
+def zigzag_robust() -> str:
+    """Means of fingers over several objects and frictions."""
+    rows = [
+        [label.split(":")[0], *(f"{value:.{digits}f}" for value, digits in zip(values, (2, 2, 3), strict=True))]
+        for label, values in results("zigzag_robust").items()
+    ]
+    return markdown(["finger", "force [N]", "energy [N m]", "resistance [m]"], rows, "lrrr")
+
+
 def zigzag_sensitivity() -> str:
     """Finger B with one design variable at a time at both ends, most important variables for the force first."""
     found = results("zigzag_sensitivity")
@@ -128,6 +137,14 @@ def _value(row: dict[str, Any], key: str) -> str:
 
 ZIGZAG_TABLES = {
     table.__name__: table
-    for table in (zigzag_measured, zigzag_effects, zigzag_force, zigzag_front, zigzag_sensitivity, zigzag_step)
+    for table in (
+        zigzag_measured,
+        zigzag_effects,
+        zigzag_force,
+        zigzag_front,
+        zigzag_robust,
+        zigzag_sensitivity,
+        zigzag_step,
+    )
 }
 """Tables by the name in a marked place."""
