@@ -13,6 +13,7 @@ import numpy as np
 from softgym_envs.agents.baselines import BASELINES, Agent, make_baseline
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.agents.policy import Policy
+from softgym_envs.agents.residual import BatchQP
 from softgym_envs.errors import DataError
 
 
@@ -234,8 +235,10 @@ def _evaluate(
     goals = np.asarray(goals, dtype=float)
     goals = goals[:, None, :] if goals.ndim == 2 else goals
     if agent in BASELINES:
-        act = make_baseline(str(agent), seed)
         environment = environment.model_copy(update={"residual_scale": 0.0})
+        if agent == "qp" and environment.batched and len(goals) > 1:
+            return _evaluate_batch(None, environment, goals, design, seed)
+        act = make_baseline(str(agent), seed)
     else:
         policy = Policy(agent)
         policy.check_environment(environment)
@@ -276,22 +279,24 @@ def _evaluate(
 
 
 def _evaluate_batch(
-    policy: Policy,
+    policy: Policy | None,
     environment: EnvironmentConfig,
     goals: np.ndarray,
     design: dict[str, float] | Sequence[dict[str, float]] | None,
     seed: int,
 ) -> Evaluation:
-    """Run all episodes at once on the batched surrogate environment."""
+    """Run all episodes at once on the batched environment, with a policy or, without one, the inverse QP."""
     count = len(goals)
     env = environment.make_vec(count, sample_design=False)
+    control = None if policy is not None else BatchQP(env.unwrapped)  # type: ignore[arg-type]
     columns = {name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "length")}
     ends = np.zeros((count, 3))
     running = np.ones(count, dtype=bool)
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
         while running.any():
-            observation, reward, terminated, truncated, info = env.step(policy(observation))
+            action = policy(observation) if control is None else control()  # type: ignore[misc]
+            observation, reward, terminated, truncated, info = env.step(action)
             last = info.get("final_info", info)
             columns["distance"] = np.where(running, last["distance"], columns["distance"])
             ends = np.where(running[:, None], last["effector"], ends)

@@ -11,8 +11,6 @@ import numpy as np
 
 from softgym_envs.agents.baselines import InverseQPAgent, make_controller
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
-from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.condensation import CondensedModel
 
 
 class ResidualQP(gymnasium.ActionWrapper):
@@ -42,22 +40,13 @@ class BatchQP:
 
     def __init__(self, env: SoftRobotVectorEnv) -> None:
         self._env = env
-        self._controllers = [make_controller(env.robot, env.task) for _ in range(env.num_envs)]
+        self._controller = make_controller(env.robot, env.task)
 
     def __call__(self) -> np.ndarray:
         """Return actions for the present states, shape (num_envs, n_a); rows without a solution hold the command."""
         env = self._env
-        models, goals, previous = env.condensed, env.aims, env.command
-        commands = previous.copy()
-        for i, controller in enumerate(self._controllers):
-            if not previous[i].any():  # an episode begins
-                controller = self._controllers[i] = make_controller(env.robot, env.task)
-            model = CondensedModel(models.compliance[i], models.free[i], models.effort[i], models.roles)
-            try:
-                commands[i] = controller.solve(model, goals[i], previous[i], env.slack[i])
-            except ConvergenceError:
-                pass
-        return env.spaces.action(commands, previous)
+        commands = self._controller.solve_batch(env.condensed, env.aims, env.command, env.slack)
+        return env.spaces.action(commands, env.command)
 
 
 class VectorResidualQP(gymnasium.vector.VectorActionWrapper):

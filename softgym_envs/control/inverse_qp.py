@@ -33,6 +33,29 @@ class StepLimits(NamedTuple):
     commanded_effort: tuple[np.ndarray, np.ndarray]
 
 
+class _Program(NamedTuple):
+    """The QP of a step as ProxQP takes it, and what turns its solution into a command; leading shapes are a batch."""
+
+    arguments: tuple[np.ndarray | None, ...]
+    displacement: np.ndarray
+    effort: np.ndarray
+    scale: np.ndarray
+    to_effort: np.ndarray
+    limits: StepLimits
+
+    def row(self, index: int) -> tuple[np.ndarray | None, ...]:
+        """Return the QP of one row of a batch."""
+        return tuple(None if each is None else each[index] for each in self.arguments)
+
+
+def _transposed(matrices: np.ndarray) -> np.ndarray:
+    return np.swapaxes(matrices, -1, -2)
+
+
+def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    return (matrices @ vectors[..., None])[..., 0]
+
+
 class InverseQP:
     """Controller that finds actuator displacements or efforts to bring the effectors to a goal, step by step.
 
@@ -143,6 +166,7 @@ class InverseQP:
                 raise ValueError(f"bounds of {word} must be {count} pairs, low <= high, got {low} and {high}")
         self._proxqp = proxqp
         self._qp: Any = None
+        self._rows: list[Any] = []  # the solvers of `solve_batch`
 
     @classmethod
     def for_robot(cls, robot: Robot, **options: Any) -> Self:
@@ -274,8 +298,50 @@ class InverseQP:
                 brings an effort back below ``max_effort``.
         """
         goal, command = self.checked(condensed, goal, command)
+        program = self._program(condensed, goal, command, slack)
+        self._qp, found = self._solved(self._qp, program.arguments)
+        if found is None:
+            raise ConvergenceError(f"ProxQP does not reach its tolerance for goal {goal.tolist()} m")
+        return self._keep(program, found)
+
+    def solve_batch(
+        self, condensed: CondensedModel, goals: np.ndarray, commands: np.ndarray, slack: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the next commands of n plants, shape (n, n_a), as `solve` does for each.
+
+        The QPs are set up together. Each row warm-starts from its own last solution, unless its command is zero, with
+        which an episode begins. A row that ProxQP cannot solve holds its command.
+
+        Args:
+            condensed: models at the current states, leading shape (n,).
+            goals: desired effector coordinates [m], shape (n, n_e).
+            commands: current commands, shape (n, n_a).
+            slack: actuators that are slack, shape (n, n_a); default none.
+
+        Raises:
+            ValueError: if the models or goals are not finite.
+        """
+        if not all(np.isfinite(values).all() for values in (condensed.compliance, condensed.delta.array, goals)):
+            raise ValueError("the condensed models or goals contain values that are not finite")
+        if len(self._rows) != len(commands):
+            self._rows = [None] * len(commands)
+        program = self._program(condensed, goals, commands, slack)
+        steps, solved = np.zeros(commands.shape), np.ones(len(commands), dtype=bool)
+        for i in range(len(commands)):
+            solver = self._rows[i] if commands[i].any() else None
+            self._rows[i], found = self._solved(solver, program.row(i))
+            if found is None:
+                solved[i] = False
+            else:
+                steps[i] = found
+        return np.where(solved[:, None], self._keep(program, steps), commands)
+
+    def _program(
+        self, condensed: CondensedModel, goal: np.ndarray, command: np.ndarray, slack: np.ndarray | None
+    ) -> _Program:
+        """Return the scaled QP of a step; leading shapes of the arguments are a batch."""
         delta, effort = condensed.delta, condensed.lambda_.a
-        root = np.ones(goal.size) if self.goal_weights is None else np.sqrt(self.goal_weights)
+        root = np.ones(goal.shape[-1]) if self.goal_weights is None else np.sqrt(self.goal_weights)
         Waa, Wea = condensed.W.aa, root[:, None] * condensed.W.ea
         try:
             stiffness = np.linalg.inv(Waa)
@@ -283,57 +349,68 @@ class InverseQP:
             raise ValueError("W_aa is singular: two actuators have the same effect") from None
 
         limited = np.isfinite(self.effort_rates)
-        by_effort = np.abs(np.diag(Waa)) * np.where(limited, self.effort_rates, 0.0)
+        diagonal = np.diagonal(Waa, axis1=-2, axis2=-1)
+        by_effort = np.abs(diagonal) * np.where(limited, self.effort_rates, 0.0)
         scale = np.where(limited, np.minimum(self.rates, by_effort), self.rates)
-        unit = scale.max() / scale
-        epsilon = np.linalg.norm((Wea * unit).T @ (Wea * unit)) / np.linalg.norm(unit[:, None] * Waa * unit)
-        jacobian = Wea @ stiffness * scale  # effector motion per scaled displacement
-        to_effort = stiffness * scale
-        quadratic = to_effort.T @ Waa @ to_effort * epsilon
-        pull = to_effort.T @ (Waa @ effort)
-        energies, modes = np.linalg.eigh(0.5 * (quadratic + quadratic.T))
-        if energies[0] < 0.0:
+        unit = scale.max(axis=-1, keepdims=True) / scale
+        reach = Wea * unit[..., None, :]
+        epsilon = np.linalg.norm(_transposed(reach) @ reach, axis=(-2, -1))
+        epsilon = epsilon / np.linalg.norm(unit[..., :, None] * Waa * unit[..., None, :], axis=(-2, -1))
+        jacobian = Wea @ stiffness * scale[..., None, :]  # effector motion per scaled displacement
+        to_effort = stiffness * scale[..., None, :]
+        quadratic = _transposed(to_effort) @ Waa @ to_effort * epsilon[..., None, None]
+        pull = _times(_transposed(to_effort), _times(Waa, effort))
+        energies, modes = np.linalg.eigh(0.5 * (quadratic + _transposed(quadratic)))
+        if (unstable := energies[..., 0] < 0.0).any():
             # The state is stable only while its actuators are held: make the energy of efforts positive.
-            quadratic = (modes * np.abs(energies)) @ modes.T
-            pull = quadratic @ np.linalg.solve(to_effort, effort) / epsilon
-        hessian = jacobian.T @ jacobian + (self.effort_weight + self.step_weight) * quadratic
-        gradient = jacobian.T @ (root * (delta.e - goal)) + self.effort_weight * epsilon * pull
+            positive = (modes * np.abs(energies)[..., None, :]) @ _transposed(modes)
+            change = np.linalg.solve(to_effort, effort[..., None])[..., 0]
+            quadratic = np.where(unstable[..., None, None], positive, quadratic)
+            pull = np.where(unstable[..., None], _times(quadratic, change) / epsilon[..., None], pull)
+        hessian = _transposed(jacobian) @ jacobian + (self.effort_weight + self.step_weight) * quadratic
+        gradient = _times(_transposed(jacobian), root * (delta.e - goal))
+        gradient = gradient + self.effort_weight * epsilon[..., None] * pull
         # Scale to order one: displacements by the rate, the objective by its curvature.
-        norm = float(np.trace(hessian)) or float(scale.mean()) ** 2
+        norm = np.trace(hessian, axis1=-2, axis2=-1)
+        norm = np.where(norm == 0.0, scale.mean(axis=-1) ** 2, norm)
 
         limits = self.limits(condensed, command, slack)
         box_low = np.maximum(limits.displacement[0] / scale, -UNBOUNDED)
         box_high = np.minimum(limits.displacement[1] / scale, UNBOUNDED)
         if slack is not None:
             box_high = np.where(slack, 1e3, box_high)
-        effort_scale = np.abs(to_effort).sum(axis=1)
+        effort_scale = np.abs(to_effort).sum(axis=-1)
         effort_low = np.maximum(limits.effort[0] / effort_scale, -UNBOUNDED)
         effort_high = np.clip(limits.effort[1] / effort_scale, effort_low, UNBOUNDED)
         arguments = (
-            hessian / norm,
-            gradient / norm,
+            hessian / norm[..., None, None],
+            gradient / norm[..., None],
             None,
             None,
-            to_effort / effort_scale[:, None],
+            to_effort / effort_scale[..., :, None],
             effort_low,
             effort_high,
             box_low,
             box_high,
         )
+        return _Program(arguments, delta.a, effort, scale, to_effort, limits)
+
+    def _solved(self, solver: Any, arguments: tuple[np.ndarray | None, ...]) -> tuple[Any, np.ndarray | None]:
+        """Return a solver to warm-start from and the scaled step, shape (n_a,); both None if ProxQP fails."""
         # A warm start from a distant solution may fail where a cold one converges.
         for warm in (True, False):
-            if self._qp is None or not warm:
-                self._qp = self._make_qp()
-                self._qp.init(*arguments)
+            if solver is None or not warm:
+                solver = self._make_qp()
+                solver.init(*arguments)
             else:
-                self._qp.update(*arguments)
-            self._qp.solve()
-            results = self._qp.results
-            if results.info.status == self._proxqp.QPSolverOutput.PROXQP_SOLVED:
-                break
-        else:
-            self._qp = None
-            raise ConvergenceError(f"ProxQP stopped with {results.info.status} for goal {goal.tolist()} m")
-        self.displacement = delta.a + results.x * scale
-        self.effort = effort + to_effort @ results.x
-        return self.command(limits)
+                solver.update(*arguments)
+            solver.solve()
+            if solver.results.info.status == self._proxqp.QPSolverOutput.PROXQP_SOLVED:
+                return solver, solver.results.x
+        return None, None
+
+    def _keep(self, program: _Program, step: np.ndarray) -> np.ndarray:
+        """Keep what the model predicts for scaled steps (..., n_a), and return the commands."""
+        self.displacement = program.displacement + step * program.scale
+        self.effort = program.effort + _times(program.to_effort, step)
+        return self.command(program.limits)

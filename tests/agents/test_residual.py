@@ -5,7 +5,7 @@ import pytest
 
 from softgym_envs.agents.baselines import BASELINES, InverseQPAgent, make_baseline
 from softgym_envs.agents.config import EnvironmentConfig
-from softgym_envs.agents.evaluation import evaluate, sample_goals
+from softgym_envs.agents.evaluation import Evaluation, evaluate, sample_goals
 
 
 def on(identifier, **options):
@@ -115,3 +115,13 @@ def test_unknown_baseline():
     with pytest.raises(ValueError, match="agent = 'octopus' is unknown; allowed: qp, qp_static"):
         make_baseline("octopus")
     assert BASELINES == ("qp", "qp_static", "qp_model", "qp_pi", "close", "force", "random")
+
+
+def test_the_qp_reaches_goals_together_as_it_reaches_each_alone():
+    config = on("CableTrunkReach")
+    goals = sample_goals(config, 3, seed=4)
+    together = evaluate("qp", config, goals)
+    alone = Evaluation.merge([evaluate("qp", config, goal[None]) for goal in goals])
+    assert together.steps == alone.steps
+    np.testing.assert_allclose(together.ends, alone.ends, atol=1e-6)
+    np.testing.assert_allclose(together.efforts, alone.efforts, rtol=1e-4)

@@ -394,3 +394,21 @@ def test_finger_reaches_a_reachable_goal(cables, target):
     print(f"{cables} cables: {distance * 1e3:.1e} mm")
     assert distance < 1e-5
     np.testing.assert_allclose(state.displacement, there.displacement, atol=2e-5)
+
+
+def test_plants_in_a_batch_get_the_commands_that_they_get_alone(rng):
+    robots = [LinearRobot(rng) for _ in range(4)]
+    robots[1].go(np.array([0.004, 0.001, 0.0]))
+    robots[3].W[0, 0] -= 2.5e-3  # stable only while its actuators are held
+    robots[3].model = CondensedModel(robots[3].W, robots[3].model.free, robots[3].model.effort, (("a", 3), ("e", 3)))
+    assert np.linalg.eigvalsh(robots[3].W[:3, :3])[0] < 0.0
+    goals = LinearRobot.rest + rng.uniform(-0.01, 0.01, (4, 3))
+    models = CondensedModel(
+        *(np.stack([getattr(r.model, name) for r in robots]) for name in ("compliance", "free", "effort")),
+        (("a", 3), ("e", 3)),
+    )
+    commands, slack = np.stack([r.command for r in robots]), np.stack([r.slack for r in robots])
+    together = robots[0].controller().solve_batch(models, goals, commands, slack)
+    alone = [r.controller().solve(r.model, goal, r.command, r.slack) for r, goal in zip(robots, goals, strict=True)]
+    assert np.ptp(together, axis=0).min() > 1e-6  # the plants differ
+    np.testing.assert_allclose(together, alone, atol=1e-9 * 0.02)
