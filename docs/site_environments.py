@@ -127,7 +127,8 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
                 f"The goal is at the first of the {len(path)} points of the path, which are spread over "
                 f'{task.horizon} steps. `task_options={{"path": array}}` gives another path [m], shape (p, 3); '
                 '`task_options={"jitter": 0.005}` shifts it randomly by up to 5 mm along each axis in each episode; '
-                '`task_options={"lookahead": 1}` shows the goal that the next action is rated by in place of the last; '
+                "The observation shows the goal that the next action is rated by; "
+                '`task_options={"lookahead": 0}` shows the one before; '
                 '`reset(options={"goal": array})` gives the path of one episode.'
             )
         return rest + code(inspect.cleandoc(task_class.__doc__ or "")).partition("\nArgs:")[0]

@@ -229,6 +229,13 @@ def test_a_policy_takes_other_backends_bodies_goals_and_physics():
     carry.check_environment(carry.environment.model_copy(update={"robot_options": {"payload": 0.5}}))
 
 
+def test_a_policy_refuses_goals_that_are_shown_earlier_or_later_than_in_training():
+    policy = Policy("gripper_pinch_designs_analytic")
+    other = policy.environment.model_copy(update={"task_options": {"lookahead": 0}})
+    with pytest.raises(ConfigError, match=r"environment\.task_options\.lookahead = 0 does not fit .*trained with 1"):
+        policy.check_environment(other)
+
+
 def test_warm_start_and_early_stop(trained, tmp_path):
     seen = []
     config = CONFIG.model_copy(

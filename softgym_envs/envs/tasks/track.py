@@ -16,8 +16,8 @@ class Track(Task):
         robot: the robot.
         path: goals [m], shape (p, 3); default the robot's `reference_path`.
         jitter: largest random shift of the path along each axis per episode [m].
-        lookahead: control steps by which the observed goal is ahead of the rated one. With 1 the observation shows the
-            goal that the next action is rated by; with 0 it shows the last one, and the goal moves after the action.
+        lookahead: control steps by which the observed goal is ahead of the rated one. With 1, the default, the
+            observation shows the goal that the next action is rated by; with 0 the goal moves after the action.
 
     Raises:
         ValueError: for a malformed path, a negative jitter or lookahead, or a robot without a reference path.
@@ -27,7 +27,7 @@ class Track(Task):
     horizon = 100
 
     def __init__(
-        self, robot: Robot, *, path: np.ndarray | None = None, jitter: float = 0.0, lookahead: int = 0
+        self, robot: Robot, *, path: np.ndarray | None = None, jitter: float = 0.0, lookahead: int = 1
     ) -> None:
         super().__init__(robot)
         self.path: Array = robot.reference_path() if path is None else check_goals(path, "path", robot)
