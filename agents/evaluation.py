@@ -15,6 +15,7 @@ from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.residual import BatchQP
 from softgym_envs.errors import DataError
+from softgym_envs.executors import parallel_map
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +204,7 @@ def evaluate(
     *,
     design: dict[str, float] | Sequence[dict[str, float]] | None = None,
     seed: int = 0,
+    workers: int = 1,
 ) -> Evaluation:
     """Run one episode per goal.
 
@@ -212,17 +214,47 @@ def evaluate(
         goals: goals or paths of goals [m], shape (n, 3) or (n, p, 3).
         design: the body, or one for each goal; default the environment's.
         seed: seed of the random agent and of the environment.
+        workers: number of processes, which share the goals and give the same numbers as one. Policies in batched
+            environments run all episodes at once in this process, whatever the number.
 
     Returns:
-        The outcome, whose times include making the environment.
+        The outcome, whose times include making the environment; the CPU time is that of all processes.
 
     Raises:
+        ValueError: for fewer than one worker.
         ConfigError: if the policy was trained for another environment, see `Policy.check_environment`.
         WeightsError: if the policy cannot be read.
     """
-    began, cpu = time.perf_counter(), time.process_time()
-    outcome = _evaluate(agent, environment, goals, design, seed)
-    return replace(outcome, seconds=time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
+    if workers < 1:
+        raise ValueError(f"workers = {workers} must be 1 or more")
+    goals = np.asarray(goals, dtype=float)
+    goals = goals[:, None, :] if goals.ndim == 2 else goals
+    if agent not in BASELINES:
+        Policy(agent).check_environment(environment)
+    together = agent not in BASELINES and environment.batched
+    shares = np.array_split(np.arange(len(goals)), 1 if together else max(1, min(workers, len(goals))))
+    began = time.perf_counter()
+    parts: dict[int, Evaluation] = {}
+    calls = [(agent, environment, goals, design, seed, share) for share in shares]
+    for first, part in parallel_map(_evaluate_share, calls, len(shares)):
+        parts[first] = part
+    merged = Evaluation.merge([parts[first] for first in sorted(parts)])
+    return replace(merged, seconds=time.perf_counter() - began)
+
+
+def _evaluate_share(
+    agent: str | Path,
+    environment: EnvironmentConfig,
+    goals: np.ndarray,
+    design: dict[str, float] | Sequence[dict[str, float]] | None,
+    seed: int,
+    share: np.ndarray,
+) -> tuple[int, Evaluation]:
+    """Evaluate an agent on the goals with the numbers ``share``; return the first of these and the outcome."""
+    cpu = time.process_time()
+    outcome = _evaluate(agent, environment, goals, design, seed, share)
+    first = int(share[0]) if len(share) else 0
+    return first, replace(outcome, cpu_seconds=time.process_time() - cpu)
 
 
 def _evaluate(
@@ -231,9 +263,8 @@ def _evaluate(
     goals: np.ndarray,
     design: dict[str, float] | Sequence[dict[str, float]] | None,
     seed: int,
+    share: np.ndarray,
 ) -> Evaluation:
-    goals = np.asarray(goals, dtype=float)
-    goals = goals[:, None, :] if goals.ndim == 2 else goals
     if agent in BASELINES:
         environment = environment.model_copy(update={"residual_scale": 0.0})
         if agent == "qp" and environment.batched and len(goals) > 1:
@@ -241,7 +272,6 @@ def _evaluate(
         act = make_baseline(str(agent), seed)
     else:
         policy = Policy(agent)
-        policy.check_environment(environment)
         if environment.batched:
             return _evaluate_batch(policy, environment, goals, design, seed)
         act = _acting(policy)
@@ -249,7 +279,10 @@ def _evaluate(
     rows = []
     steps = 0
     try:
-        for index, path in enumerate(goals):
+        for index in share:
+            if agent == "random":  # each episode draws its own numbers, whichever process runs it
+                act = make_baseline("random", seed + index)
+            path = goals[index]
             body = design if design is None or isinstance(design, dict) else design[index]
             observation, info = env.reset(seed=seed, options={"design": body, "goal": path})
             total, effort, distance, count, ended = 0.0, 0.0, 0.0, 0, False

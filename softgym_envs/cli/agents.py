@@ -42,6 +42,7 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
 @options.design
 @click.option("--goals", default=200, show_default=True, help="Number of unseen goals.")
 @click.option("--seed", default=2_000_003, show_default=True, help="Seed of the goals.")
+@click.option("--workers", default=1, show_default=True, help="Number of processes, where goals run one by one.")
 @click.option("--output", type=options.PATH, help="Write all results as JSON to this file.")
 @options.as_json
 @options.overrides
@@ -52,6 +53,7 @@ def evaluate(
     design: tuple[str, ...],
     goals: int,
     seed: int,
+    workers: int,
     output: Path | None,
     as_json: bool,
     overrides: tuple[str, ...],
@@ -72,6 +74,8 @@ def evaluate(
     chosen = options.design_of(design) or None
     if goals < 1:
         raise ConfigError(f"--goals {goals} must be at least 1")
+    if workers < 1:
+        raise ConfigError(f"--workers {workers} must be at least 1")
     for agent in agents:  # reject an invalid policy before any evaluation
         options.check_agent(agent)
         if agent not in BASELINES:
@@ -83,7 +87,7 @@ def evaluate(
     say(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean':>11s} {'worst':>11s} {'return':>8s}")
     for backend in backends or (environment.backend,):
         for agent in agents:
-            outcome = run(agent, environment.on(backend), points, design=chosen, seed=seed)
+            outcome = run(agent, environment.on(backend), points, design=chosen, seed=seed, workers=workers)
             results.append({"agent": agent, "backend": backend, **outcome.to_json()})
             distances = (f"{shown(value, 3):>11s}" for value in (outcome.mean_distance, outcome.worst_distance))
             rate, total = f"{outcome.success_rate:8.1%}", f"{outcome.mean_return:8.2f}"

@@ -80,3 +80,20 @@ def test_tasks_that_read_states_run_one_environment_at_a_time():
     envs.reset()
     _, rewards, done, infos = envs.step(np.ones((1, 1), dtype=np.float32))
     assert rewards.shape == done.shape == (1,) and infos[0]["distance"] == 1.0
+
+
+@pytest.mark.parametrize("agent", ["finger_reach", "qp", "random"])
+def test_processes_share_goals_and_give_the_same_numbers(agent):
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0", backend="fem")
+    goals = sample_goals(environment, 3, seed=5)
+    one, two = (evaluate(agent, environment, goals, seed=1, workers=workers) for workers in (1, 2))
+    for name in ("distances", "mean_distances", "returns", "successes", "efforts", "ends"):
+        np.testing.assert_array_equal(getattr(two, name), getattr(one, name))
+    assert two.steps == one.steps == 150 and two.cpu_seconds > 0.0
+    assert len(set(one.returns)) == 3  # episodes differ
+
+
+def test_a_number_of_workers_must_be_positive():
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0")
+    with pytest.raises(ValueError, match="workers = 0 must be 1 or more"):
+        evaluate("qp", environment, np.zeros((1, 3)), workers=0)
