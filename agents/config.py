@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from softgym_envs.config import BesideConfig, Config
 from softgym_envs.envs.options import EnvironmentOptions, default_backend, set_up
 from softgym_envs.envs.registration import EnvironmentRow, find_row
-from softgym_envs.envs.tasks.registry import TASKS
+from softgym_envs.envs.tasks.registry import TASKS, make_task
 from softgym_envs.registry import class_path
 from softgym_envs.robots.registry import make_robot
 
@@ -134,6 +134,15 @@ class EnvironmentConfig(Config):
         if row.robot is None:
             raise ValueError(f"environment '{self.id}' needs a robot: give robot and task in place of the id")
         return make_robot(row.robot, **{**row.robot_options_on(self.backend), **self.robot_options})
+
+    def make_task(self, robot: Robot | None = None) -> Task:
+        """Return the task, for a robot that `make_robot` returned or a new one.
+
+        Raises:
+            ValueError: for an unknown task or a wrong option.
+        """
+        row = self.row
+        return make_task(row.task, robot or self.make_robot(), **{**row.task_options, **self.task_options})
 
     def _spec(self) -> EnvSpec:
         return self.row.spec(self.id or "SoftGym/Configured-v0")

@@ -10,7 +10,6 @@ import numpy as np
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.config import check_config
 from softgym_envs.envs.options import design_names
-from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.errors import ConfigError, DataError, WeightsError, unknown_name
 from softgym_envs.registry import class_path
 from softgym_envs.storage import atomic_write, read_json, write_json
@@ -155,7 +154,7 @@ def _meaning(environment: EnvironmentConfig) -> dict[str, tuple[Any, object]]:
     row, robot = environment.row, environment.make_robot()
     shown = design_names(robot.design_space, environment.design_in_observation)
     variables = [robot.design_space[name] for name in shown]
-    task = make_task(row.task, robot, **{**row.task_options, **environment.task_options})
+    lookahead = environment.make_task(robot).lookahead
     scales = (
         [(actuator.name, actuator.low, actuator.high, actuator.rate) for actuator in robot.actuators],
         (robot.size, robot.workspace_scale, robot.effort_scale.tolist()),
@@ -170,5 +169,5 @@ def _meaning(environment: EnvironmentConfig) -> dict[str, tuple[Any, object]]:
         "action_mode": (environment.action_mode, environment.action_mode),
         "design_in_observation": (shown, list(shown)),
         "robot_options": (scales, environment.robot_options),
-        "task_options.lookahead": (task.lookahead, task.lookahead),
+        "task_options.lookahead": (lookahead, lookahead),
     }

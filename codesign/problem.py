@@ -12,7 +12,6 @@ from softgym_envs.codesign.objectives import OBJECTIVES, Objective, find_objecti
 from softgym_envs.codesign.variables import OptionRange, make_variables, split_values, with_options
 from softgym_envs.config import Config
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.robots.base import Robot
 
 
@@ -120,9 +119,7 @@ class StudyProblem(Config):
     @property
     def success_distance(self) -> float:
         """Distance within which a goal counts as reached [m]."""
-        row = self.environment.row
-        options = {**row.task_options, **self.environment.task_options}
-        return make_task(row.task, self.robot, **options).success_distance
+        return self.environment.make_task(self.robot).success_distance
 
     @property
     def test_backends(self) -> tuple[str, ...]:

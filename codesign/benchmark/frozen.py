@@ -110,16 +110,20 @@ def freeze(name: str) -> Path:
 def frozen_parts(definition: BenchmarkProblem, goals: Mapping[str, np.ndarray]) -> dict[str, str]:
     """Return the hash of each part of a problem that decides a score.
 
-    ``definition`` is the YAML file, ``physics`` the robot's options, mesh, actuators and box of designs, ``weights``
-    the learned model, ``policy`` the shared policy, and ``goals`` the four sets of goals.
+    ``definition`` is the YAML file, ``physics`` the robot's options, mesh, actuators and box of designs and how far
+    ahead a moving goal is shown, ``weights`` the learned model, ``policy`` the shared policy, and ``goals`` the four
+    sets of goals.
     """
     robot = definition.robot
-    physics = {
+    physics: dict[str, object] = {
         "robot": robot.name,
         "mechanics": robot.mechanics_key,
         "box": {v.name: [v.low, v.high, v.baseline, v.unit] for v in definition.space},
         "actuators": [[a.name, a.low, a.high, a.rate, a.unit] for a in robot.actuators],
     }
+    task = definition.environment.make_task()
+    if task.horizon > 1:
+        physics["lookahead"] = task.lookahead
     parts = {
         "definition": _hash(definition.model_dump(mode="json", exclude={"title"}, exclude_unset=True)),
         "physics": _hash(physics),
