@@ -78,6 +78,7 @@ class FingerRobot(Robot):
             meshing=meshing,
             material=material,
             unilateral=unilateral,
+            self_contact=False,
         )
         self.mesh_size, self.element, self.fillet = self.finger.mesh_size, self.finger.element, self.finger.fillet
         self.meshing = self.finger.meshing

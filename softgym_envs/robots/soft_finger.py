@@ -83,6 +83,8 @@ class SoftFinger(MeshedRobot):
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the condensed-model work of the thesis has none.
         contacts: whether to add three contact points (role ``c``) to the front of the last segment (sec. 4.3.2).
+        self_contact: whether surfaces of the finger touch each other, as the faces of its notches do from about 10 mm
+            of pull on. By default they do on all meshes but the published one, whose scene has no contact.
         **options: options of `Robot`.
     """
 
@@ -105,6 +107,7 @@ class SoftFinger(MeshedRobot):
         unilateral: bool = True,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         contacts: bool = False,
+        self_contact: bool | None = None,
         **options: Any,
     ) -> None:
         if cables not in (1, 2):
@@ -120,6 +123,7 @@ class SoftFinger(MeshedRobot):
             meshing=meshing,
             material=material,
             gravity=gravity,
+            self_contact=mesh != "published" if self_contact is None else self_contact,
             **options,
         )
         self.cables = cables
