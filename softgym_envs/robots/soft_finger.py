@@ -43,6 +43,9 @@ CONTACT_RADIUS = 2.0e-3
 TIP_RADIUS = 8.0e-3
 """Part of the last segment over which the tip is averaged, unless cables act on single points [m]."""
 
+CONTACT_DISTANCE = (5.0e-4, 1.5e-4)
+"""Gap below which there are contact forces [m], on the published mesh and on the finer ones."""
+
 FINGER_MESHES = {
     "published": MeshTier(8.0e-3),
     "accurate": MeshTier(10.0e-3, "quadratic", feature_size=2.5e-3, guide_radius=1.0e-3),
@@ -85,6 +88,8 @@ class SoftFinger(MeshedRobot):
         contacts: whether to add three contact points (role ``c``) to the front of the last segment (sec. 4.3.2).
         self_contact: whether surfaces of the finger touch each other, as the faces of its notches do from about 10 mm
             of pull on. By default they do on all meshes but the published one, whose scene has no contact.
+        contact_distance: gap below which there are forces [m]; default 0.5 mm on the published mesh. On the others it
+            is 0.15 mm, so that the small elements at the edges of the joints do not touch at rest.
         **options: options of `Robot`.
     """
 
@@ -108,6 +113,7 @@ class SoftFinger(MeshedRobot):
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         contacts: bool = False,
         self_contact: bool | None = None,
+        contact_distance: float | None = None,
         **options: Any,
     ) -> None:
         if cables not in (1, 2):
@@ -124,6 +130,7 @@ class SoftFinger(MeshedRobot):
             material=material,
             gravity=gravity,
             self_contact=mesh != "published" if self_contact is None else self_contact,
+            contact_distance=CONTACT_DISTANCE[mesh != "published"] if contact_distance is None else contact_distance,
             **options,
         )
         self.cables = cables
