@@ -74,8 +74,8 @@ TRUNK_LEVELS = {
 }
 
 STUDIES = {
-    "finger": Study("finger", *scaled(10 * MM), (10 * MM, 10 * MM), {}),
-    "finger_1cable": Study("finger", *scaled(10 * MM), (10 * MM,), {"cables": 1}),
+    "finger": Study("finger", *scaled(10 * MM), (10 * MM, 10 * MM), {"self_contact": False}),
+    "finger_1cable": Study("finger", *scaled(10 * MM), (10 * MM,), {"cables": 1, "self_contact": False}),
     "diamond": Study("diamond", scaled(17 * MM)[0], None, (15 * MM, 0.0, 0.0, 0.0), {}, steps=4),
     "cable_trunk": Study(
         "cable_trunk", TRUNK_LEVELS, (1.0, 1 / 2, 1 / 3), (15 * MM, 0.0, 0.0, 0.0, 5 * MM, 0.0, 0.0, 0.0), {}, steps=3
@@ -202,7 +202,7 @@ def fillets() -> dict[str, object]:
     """Tension and tip of the two-cable finger at 10 mm against the radius of its re-entrant edges."""
     study, rows = STUDIES["finger"], []
     for radius in (0.0, 0.5 * MM, 1.0 * MM):
-        robot = make_robot("finger", mesh="accurate", fillet=radius)
+        robot = make_robot("finger", mesh="accurate", self_contact=False, fillet=radius)
         rows.append(asdict(measure(robot, robot.design_space.baseline, f"{1e3 * radius:g} mm", "accurate", study)))
         print(f"  {rows[-1]}", flush=True)
     return {"rows": rows}
@@ -216,7 +216,7 @@ def scatter() -> dict[str, object]:
     lengths = np.linspace(0.036, 0.044, 9)
     result: dict[str, object] = {"lengths [m]": lengths.tolist()}
     for meshing in ("morph", "remesh"):
-        robot = make_robot("finger", mesh="accurate", meshing=meshing)
+        robot = make_robot("finger", mesh="accurate", self_contact=False, meshing=meshing)
         variables = [
             replace(v, low=lengths[0], high=lengths[-1]) if v.name == "length" else v for v in robot.design_space
         ]
@@ -251,7 +251,7 @@ def guides() -> dict[str, object]:
     unknowns = []
     for factor in (1.0 / 0.6, 1.0, 0.6):
         for radius in (0.0, 1.0 * MM, 1.5 * MM):
-            robot = make_robot("finger", mesh="accurate", mesh_size=factor * 10 * MM)
+            robot = make_robot("finger", mesh="accurate", self_contact=False, mesh_size=factor * 10 * MM)
             robot.guide_radius = radius
             model = robot.build()
             finger.setdefault(f"{1e3 * radius:g} mm", []).append(_first_compliance(model))

@@ -152,10 +152,9 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
 
 def default_backend(robot: Robot, backend_options: Mapping[str, Any]) -> str:
     """Return ``"surrogate"`` where weights are given or ship for the robot, else ``"fem"``."""
-    from softgym_envs.surrogate.pretrained import pretrained_folder
+    from softgym_envs.surrogate.pretrained import ships_weights
 
-    shipped = pretrained_folder(robot).is_dir() and not robot.touches
-    return "surrogate" if "weights" in backend_options or shipped else "fem"
+    return "surrogate" if "weights" in backend_options or ships_weights(robot) else "fem"
 
 
 def design_names(space: DesignSpace, choice: bool | Sequence[str]) -> tuple[str, ...]:

@@ -147,6 +147,8 @@ class Robot(ABC):
             many of them at once.
         learned: how the robot is learned: one ``"potential"`` of its actuators and effectors, a ``"chain"`` of
             segments for any contacts, or a ``"hand"`` of such chains.
+        mirror: order of the actuators in the mirror image of the robot in the plane x = 0, where every mesh of it is
+            its own mirror image, and so are its effectors; None otherwise. Surrogates then also learn from the images.
         non_mechanical_options: options that do not change the condensed model.
     """
 
@@ -168,6 +170,7 @@ class Robot(ABC):
     made_of_beams: bool = False
     learned: str = "potential"
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
+    mirror: tuple[int, ...] | None = None
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")
     _options: dict[str, object]
 

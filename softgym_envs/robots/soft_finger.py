@@ -43,8 +43,8 @@ CONTACT_RADIUS = 2.0e-3
 TIP_RADIUS = 8.0e-3
 """Part of the last segment over which the tip is averaged, unless cables act on single points [m]."""
 
-CONTACT_DISTANCE = (5.0e-4, 1.5e-4)
-"""Gap below which there are contact forces [m], on the published mesh and on the finer ones."""
+CONTACT_DISTANCE = 1.5e-4
+"""Gap below which there are contact forces on the fine meshes [m]: below the gaps across the edges of the joints."""
 
 FINGER_MESHES = {
     "published": MeshTier(8.0e-3),
@@ -87,7 +87,8 @@ class SoftFinger(MeshedRobot):
         gravity: acceleration [m/s2]; the condensed-model work of the thesis has none.
         contacts: whether to add three contact points (role ``c``) to the front of the last segment (sec. 4.3.2).
         self_contact: whether surfaces of the finger touch each other, as the faces of its notches do from about 10 mm
-            of pull on. By default they do on all meshes but the published one, whose scene has no contact.
+            of pull on. By default they do on all meshes but the published one, whose scene has no contact, and without
+            fillets, whose narrow elements would touch at rest.
         contact_distance: gap below which there are forces [m]; default 0.5 mm on the published mesh. On the others it
             is 0.15 mm, so that the small elements at the edges of the joints do not touch at rest.
         **options: options of `Robot`.
@@ -121,6 +122,9 @@ class SoftFinger(MeshedRobot):
         if cables == 1:
             # The largest size at which the mesh of this shape can be moved to every design without remeshing.
             self.meshes = {**FINGER_MESHES, "published": MeshTier(7.9e-3)}
+        touching = mesh != "published" and not fillet if self_contact is None else self_contact
+        if contact_distance is None:
+            contact_distance = CONTACT_DISTANCE if touching and mesh != "published" else 5.0e-4
         super().__init__(
             mesh=mesh,
             mesh_size=mesh_size,
@@ -129,8 +133,8 @@ class SoftFinger(MeshedRobot):
             meshing=meshing,
             material=material,
             gravity=gravity,
-            self_contact=mesh != "published" if self_contact is None else self_contact,
-            contact_distance=CONTACT_DISTANCE[mesh != "published"] if contact_distance is None else contact_distance,
+            self_contact=touching,
+            contact_distance=contact_distance,
             **options,
         )
         self.cables = cables
@@ -158,6 +162,9 @@ class SoftFinger(MeshedRobot):
         self.stiffness_variable = None if any(gravity) else "young_modulus"
         self.effector_rest = self.tip(self.design_space.baseline)
         self.effort_scale = np.full(cables, 20.0)
+        self.mirror = (
+            tuple(reversed(range(cables))) if is_half(self.tier) and not (gravity[0] or self.obstacles) else None
+        )
         self.actuators = tuple(
             Actuator(f"cable_{i + 1}", 0.0, 0.020, 0.001, unilateral=unilateral) for i in range(cables)
         )

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from softgym_envs.errors import WeightsError
-from softgym_envs.robots.base import Robot
+from softgym_envs.robots.base import WITHOUT_CONTACT, Robot
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.weight_files import load_model
 
@@ -18,6 +19,26 @@ def pretrained_folder(robot: Robot) -> Path:
     """Return the folder of a robot's shipped weights; its name ends in that of the mesh unless it is the published."""
     mesh = robot.mechanics_key.get("mesh")
     return _ROOT / (robot.weights_name if mesh is None else f"{robot.weights_name}_{mesh}")
+
+
+def ships_weights(robot: Robot) -> bool:
+    """Return whether weights ship for a robot, with the contact that it has.
+
+    A robot may touch itself without friction if its weights were trained so. Obstacles are never part of them.
+    """
+    folder = pretrained_folder(robot)
+    return folder.is_dir() and _contact_of(_card(folder)["mechanics_key"]) == _contact_of(robot.mechanics_key)
+
+
+def _card(folder: Path) -> dict[str, Any]:
+    card: dict[str, Any] = json.loads((folder / "model.json").read_text())
+    return card
+
+
+def _contact_of(key: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of contact in a key; none for a robot that touches nothing, whatever its other options."""
+    found = {name: key[name] for name in WITHOUT_CONTACT if name in key}
+    return found if found.get("obstacles") or found.get("self_contact") else {}
 
 
 def pretrained_model(robot: Robot, weights: str | Path | None = None, members: int | None = None) -> SurrogateModel:
@@ -31,10 +52,11 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
     Raises:
         WeightsError: if there are no weights, or they are damaged or for another robot.
     """
-    if weights is None and robot.touches:
+    if weights is None and pretrained_folder(robot).is_dir() and not ships_weights(robot):
+        known = _contact_of(_card(pretrained_folder(robot))["mechanics_key"])
         raise WeightsError(
-            f"the shipped weights of '{robot.weights_name}' know no contact: use backend='fem' for a robot with "
-            "obstacles or self_contact"
+            f"the shipped weights of '{robot.weights_name}' know {'self_contact' if known else 'no contact'}"
+            f"{' without obstacles' if known else ''}: use backend='fem' for a robot with other contact"
         )
     folder = Path(weights) if weights is not None else pretrained_folder(robot)
     if weights is None and not folder.is_dir():

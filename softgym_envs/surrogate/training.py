@@ -22,7 +22,7 @@ from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.data.dataset import generate_dataset
 from softgym_envs.surrogate.data.sampling import SamplingPlan
-from softgym_envs.surrogate.data.states import full_compliance, stable_rows, training_states
+from softgym_envs.surrogate.data.states import full_compliance, stable_rows, training_states, with_mirror_images
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel, definite
 from softgym_envs.surrogate.networks import NETWORKS, network_module
@@ -37,12 +37,13 @@ cost."""
 
 
 class SplitConfig(Config):
-    """One dataset split."""
+    """One dataset split; without a ``boundary`` of its own, it has that of all data."""
 
     groups: int = Field(gt=0)
     states: int = Field(ge=0)
     sequence: Literal["halton", "sobol", "latin", "random"] = "random"
     seed: int = Field(default=0, ge=0)
+    boundary: float | None = Field(default=None, ge=0.0, le=1.0)
 
 
 class DataConfig(Config):
@@ -88,7 +89,8 @@ class DataConfig(Config):
 
     def plan_of(self, split: SplitConfig) -> SamplingPlan:
         """Return the plan of another split, with the margin and the design variables of this one."""
-        return SamplingPlan(**split.model_dump(), **self.model_dump(exclude={*SPLITS, "groups_per_shard"}))
+        shared = self.model_dump(exclude={*SPLITS, "groups_per_shard"})
+        return SamplingPlan(**{**shared, **split.model_dump(exclude_none=True)})
 
 
 class PretrainingConfig(Config):
@@ -330,7 +332,11 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
             return model.card["test"]
     torch.set_num_threads(1)
     features = Features(robot)
-    states = {name: training_states(robot, columns, features) for name, columns in data.items()}
+    learned = {
+        name: with_mirror_images(robot, columns) if name.endswith("train") else columns
+        for name, columns in data.items()
+    }
+    states = {name: training_states(robot, columns, features) for name, columns in learned.items()}
     key = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:12]
     trainer = Trainer(config.network, config.seed, folder / "parts", key, progress, config.workers)
     start = time.perf_counter()
@@ -351,10 +357,10 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     card = {
         **card_of(robot, config.network.kind),
         "config": config.model_dump(mode="json", exclude={"executor"}),
-        "domain": domain_of(model, data["train"], data["validation"]),
+        "domain": domain_of(model, learned["train"], data["validation"]),
         "loaded": bool(robot.build().loads.any()),
         "states": {split: len(rows) for split, rows in states.items()},
-        "unstable_states_left_out": {split: len(data[split]["rest"]) - len(rows) for split, rows in states.items()},
+        "unstable_states_left_out": {split: len(learned[split]["rest"]) - len(rows) for split, rows in states.items()},
         "data_sha256": inputs["data_sha256"],
         "training_seconds": round(seconds, 1),
         "best_validation": {part: min(row["validation"] for row in rows) for part, rows in histories.items()},

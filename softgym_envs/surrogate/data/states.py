@@ -75,6 +75,27 @@ def full_compliance(upper: np.ndarray, size: int) -> np.ndarray:
     return W
 
 
+def with_mirror_images(robot: Robot, data: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return a dataset, followed by the mirror images of its states if the robot is symmetric (`Robot.mirror`)."""
+    data = dict(data)
+    if robot.mirror is None:
+        return data
+    count, effectors = data["effort"].shape[1], data["effector"].shape[1]
+    size = count + effectors
+    order = np.array([*robot.mirror, *range(count, size)])
+    sign = np.ones(size)
+    sign[count::3] = -1.0
+    W = full_compliance(data["compliance"], size)[:, order][:, :, order] * sign[:, None] * sign
+    images = {
+        **data,
+        "displacement": data["displacement"][:, order[:count]],
+        "effort": data["effort"][:, order[:count]],
+        "effector": data["effector"] * sign[count:],
+        "compliance": W[:, *np.triu_indices(size)],
+    }
+    return {name: np.concatenate([column, images[name]]) for name, column in data.items()}
+
+
 def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return which equilibria of a dataset are stable enough to be learned, shape (N,).
 
