@@ -2,13 +2,16 @@
 
     python -m benchmarks.learners results/learners finger_reach:analytic finger_reach:sac
 
-trains the configuration of each named task and learner (default: all of them, cheapest first) with three seeds. Each
-training is a row of its own in a file of its own, and rows that exist are not computed again. The rows that this
-repository keeps are in ``benchmarks/data/learners.json``; ``softgym bench learners`` shows them.
+trains the configuration of each named task and learner (default: all that there are) with three seeds, the cheapest
+learners first. On paths, the return as a share of the inverse QP's takes the place of the share of goals. Training
+stops after `BUDGET` CPU seconds of learning. Each training is a row of its own in a file of its own, and rows that
+exist are not computed again. The rows that this repository keeps are in ``benchmarks/data/learners.json``;
+``softgym bench learners`` shows them.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 import subprocess
 import sys
@@ -22,12 +25,30 @@ from softgym_envs.storage import write_json
 
 KEPT = Path(__file__).parent / "data" / "learners.json"
 CONFIGS = Path(__file__).parent.parent / "configs" / "agents"
-TASKS = ("finger_reach", "diamond_reach", "trunk_reach", "cable_trunk_reach")
+TASKS = (
+    "finger_reach",
+    "diamond_reach",
+    "trunk_reach",
+    "cable_trunk_reach",
+    "finger_track",
+    "diamond_track",
+    "trunk_track",
+    "cable_trunk_track",
+    "finger_reach_designs",
+    "diamond_reach_designs",
+    "trunk_reach_designs",
+    "cable_trunk_reach_designs",
+)
+"""Names of the configurations of SAC; those of another learner have its name appended."""
 REPORTS = {"analytic": 6_400, "cloning": 3_200, "ppo": 12_800, "sac": 1_600}
 """Learners, and environment steps between evaluations; these do not count as learning."""
 SEEDS = (0, 1, 2)
 GOALS, FEM_GOALS = 200, 50
 """Unseen goals of each evaluation during training, and others for the policy that is kept, on FEM."""
+SCORES = {False: "goals reached on {} [%]", True: "return on {} [% of the QP's]"}
+"""What the results of a task call its score on a backend, by whether the goal moves along a path."""
+BUDGET = 150.0
+"""CPU seconds of learning after which a training is stopped."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +59,14 @@ class LearnerRow:
         task: name of the configuration of SAC.
         learner: name of the learner.
         seed: seed of the training.
-        seconds_90: CPU seconds of learning until 90 % of the goals are reached; None if they never are.
-        seconds_95: the same for 95 %.
+        seconds_90: CPU seconds of learning until the score is 0.9; None if it never is.
+        seconds_95: the same for 0.95.
         seconds: CPU seconds of learning of the whole training.
         steps: environment steps of the whole training.
-        success: share of the goals that the kept policy reaches on the surrogate.
-        fem_success: share of the other goals that it reaches on FEM.
+        score: of the kept policy on the surrogate: share of the goals that it reaches; on paths, its return as a share
+            of the inverse QP's.
+        fem_score: the same for other goals, on FEM.
+        stopped: whether the training was stopped by the budget.
         commit: of the code.
     """
 
@@ -54,39 +77,76 @@ class LearnerRow:
     seconds_95: float | None
     seconds: float
     steps: int
-    success: float
-    fem_success: float
+    score: float
+    fem_score: float
+    stopped: bool
     commit: str
+
+
+def config_path(task: str, learner: str) -> Path:
+    """Return the configuration of a task for a learner, which need not exist."""
+    return CONFIGS / f"{task if learner == 'sac' else f'{task}_{learner}'}.yaml"
 
 
 def measure(task: str, learner: str, seed: int, folder: Path) -> LearnerRow:
     """Train and evaluate one policy."""
     from softgym_envs.agents.config import TrainConfig
-    from softgym_envs.agents.evaluation import evaluate
+    from softgym_envs.agents.evaluation import Evaluation, evaluate
     from softgym_envs.agents.policy import Policy
     from softgym_envs.agents.sweep import unseen_goals
     from softgym_envs.agents.training import train
 
-    name = task if learner == "sac" else f"{task}_{learner}"
-    update = {"seed": seed, "evaluation_episodes": GOALS, "report_every": REPORTS[learner]}
-    config = load_config(CONFIGS / f"{name}.yaml", TrainConfig).model_copy(update=update)
-    policy = train(config, folder / f"{name}_{seed}", progress=False)
-    curve = Policy(policy).card["curve"]
-    _, goals = unseen_goals(config.environment, FEM_GOALS)
-    fem = evaluate(policy, config.environment.on("fem"), goals)
+    config = load_config(config_path(task, learner), TrainConfig)
+    path_task = config.environment.task_class.horizon > 1
+    goals_each = 1 if path_task else GOALS
+    update = {"seed": seed, "evaluation_episodes": goals_each, "report_every": REPORTS[learner]}
+    config = config.model_copy(update=update)
+    place = folder / f"{task}_{learner}_{seed}"
+
+    def spent(step: int, outcome: Evaluation) -> bool:
+        with (place / "curve.csv").open() as stream:
+            return float(list(csv.DictReader(stream))[-1]["learning_seconds"]) >= BUDGET
+
+    policy = train(config, place, report=spent, progress=False)
+    card = Policy(policy).card
+    curve = card["curve"]
+    designs, goals = unseen_goals(config.environment, 1 if path_task else FEM_GOALS)
+
+    def score(backend: str) -> float:
+        environment = config.environment.on(backend)
+        outcome = evaluate(policy, environment, goals, design=designs)
+        if not path_task:
+            return outcome.success_rate
+        return outcome.mean_return / evaluate("qp", environment, goals, design=designs).mean_return
+
     best = max(curve, key=lambda point: point["mean_return"])
+    if path_task:
+        scale = score("surrogate") / best["mean_return"]
+        scores = [point["mean_return"] * scale for point in curve]
+    else:
+        scores = [point["success_rate"] for point in curve]
     seconds = [
-        next((point["learning_seconds"] for point in curve if point["success_rate"] >= share), None)
+        next((point["learning_seconds"] for point, value in zip(curve, scores, strict=True) if value >= share), None)
         for share in (0.9, 0.95)
     ]
-    whole, steps = curve[-1]["learning_seconds"], curve[-1]["step"]
-    commit = provenance()["commit"]
-    return LearnerRow(task, learner, seed, *seconds, whole, steps, best["success_rate"], fem.success_rate, commit)
+    return LearnerRow(
+        task,
+        learner,
+        seed,
+        *seconds,
+        curve[-1]["learning_seconds"],
+        curve[-1]["step"],
+        scores[curve.index(best)],
+        score("fem"),
+        card["stopped_early"],
+        provenance()["commit"],
+    )
 
 
 def main(folder: Path, chosen: list[str]) -> None:
     """Compute the rows that are missing, each in a process of its own, and write them to the kept file."""
-    pairs = [name.split(":") for name in chosen] or [[task, learner] for learner in REPORTS for task in TASKS]
+    every = [[task, learner] for learner in REPORTS for task in TASKS if config_path(task, learner).exists()]
+    pairs = [name.split(":") for name in chosen] or every
     for seed in SEEDS:
         for task, learner in pairs:
             path = folder / f"{task}_{learner}_{seed}.json"
@@ -116,33 +176,47 @@ def rows() -> list[LearnerRow]:
 
 
 def learners() -> dict[str, object]:
-    """CPU seconds to 90 and 95 % of unseen goals, and success on FEM: for each task and learner, a list over seeds."""
+    """CPU seconds to 90 and 95 % of unseen goals, and success on FEM: for each task and learner, a list over seeds.
+
+    On paths it is the return as a share of the inverse QP's. A time is a number, ``"never"``, or, for a training that
+    the budget stopped, ``"> 150"``.
+    """
     kept = rows()
     result: dict[str, object] = {}
     for task in TASKS:
         for learner in REPORTS:
+            if not config_path(task, learner).exists():
+                continue
             found = [row for row in kept if (row.task, row.learner) == (task, learner)]
             if not found:
                 result[f"{task}, {learner}"] = "not run"
                 continue
+            score = SCORES["_track" in task]
             result |= {
-                f"{task}, {learner}: CPU seconds to 90 %": [row.seconds_90 for row in found],
-                f"{task}, {learner}: CPU seconds to 95 %": [row.seconds_95 for row in found],
+                f"{task}, {learner}: CPU seconds to 90 %": [_time(row, row.seconds_90) for row in found],
+                f"{task}, {learner}: CPU seconds to 95 %": [_time(row, row.seconds_95) for row in found],
                 f"{task}, {learner}: CPU seconds of the training": [row.seconds for row in found],
-                f"{task}, {learner}: goals reached on the surrogate [%]": [100 * row.success for row in found],
-                f"{task}, {learner}: goals reached on FEM [%]": [100 * row.fem_success for row in found],
+                f"{task}, {learner}: {score.format('the surrogate')}": [100 * row.score for row in found],
+                f"{task}, {learner}: {score.format('FEM')}": [100 * row.fem_score for row in found],
             }
     return result
 
 
-def spread(values: list[float | None], form: str = ".3g") -> str:
-    """Write the values of the seeds: median (smallest to largest); None stands for "never"."""
-    known = sorted(np.inf if value is None else value for value in values)
+def _time(row: LearnerRow, seconds: float | None) -> float | str:
+    if seconds is not None:
+        return seconds
+    return f"> {BUDGET:g}" if row.stopped else "never"
 
-    def text(value: float) -> str:
-        return "never" if np.isinf(value) else f"{value:{form}}"
 
-    middle = text(known[(len(known) - 1) // 2] if np.isinf(known).any() else float(np.median(known)))
+def spread(values: list[float | str], form: str = ".3g") -> str:
+    """Write the values of the seeds: median (smallest to largest); texts such as "never" count as infinite."""
+    known = sorted(values, key=lambda value: np.inf if isinstance(value, str) else value)
+
+    def text(value: float | str) -> str:
+        return value if isinstance(value, str) else f"{value:{form}}"
+
+    exact = len(known) % 2 == 1 or isinstance(known[-1], str)
+    middle = text(known[(len(known) - 1) // 2] if exact else float(np.median(known)))
     return middle if known[0] == known[-1] else f"{middle} ({text(known[0])} to {text(known[-1])})"
 
 

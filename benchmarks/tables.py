@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from benchmarks.learners import REPORTS, TASKS, spread
+from benchmarks.learners import REPORTS, SCORES, TASKS, spread
 from benchmarks.recorded import figure, number, records, results
 from softgym_envs.agents.results import LEARNERS, MODEL_BASED
 
@@ -129,15 +129,18 @@ def learners() -> str:
     """CPU seconds of the learners to 90 and 95 % of unseen goals, and their success on FEM."""
     found = results("learners")
     columns = ["CPU seconds to 90 %", "CPU seconds to 95 %", "CPU seconds of the training"]
-    columns += ["goals reached on the surrogate [%]", "goals reached on FEM [%]"]
+    head = [*columns, "score on the surrogate [%]", "score on FEM [%]"]
     rows = []
     for task in TASKS:
+        score = SCORES["_track" in task]
+        shown = [*columns, *(score.format(place) for place in ("the surrogate", "FEM"))]
         for learner in REPORTS:
             name, kind = f"{task}, {learner}", "model-based" if learner in MODEL_BASED else "model-free"
-            known = [found.get(f"{name}: {column}", []) for column in columns]
-            cells = [spread(values) if values else "not run" for values in known]
-            rows.append([task, f"{LEARNERS[learner]} ({kind})", str(len(known[0])), *cells])
-    return markdown(["task", "learner", "seeds", *columns], rows, "llrrrrrr")
+            known = [found.get(f"{name}: {column}", []) for column in shown]
+            if name in found or known[0]:
+                cells = [spread(values) if values else "not run" for values in known]
+                rows.append([task, f"{LEARNERS[learner]} ({kind})", str(len(known[0])), *cells])
+    return markdown(["task", "learner", "seeds", *head], rows, "llrrrrrr")
 
 
 def kills() -> str:
