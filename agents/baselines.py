@@ -9,12 +9,14 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.control.contact_qp import ContactQP, ForceGoal
 from softgym_envs.control.embedded import PICorrection
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.errors import ConvergenceError, WeightsError
+from softgym_envs.estimation import Estimator, Noise, Readings, Touch
 from softgym_envs.robots.base import Robot
 
 Agent = Callable[[np.ndarray, Any], np.ndarray]
@@ -77,6 +79,9 @@ class ModelQPAgent(InverseQPAgent):
 
     Args:
         closed: shift the goal by a PI controller on the measured effector (thesis, algorithm 2).
+
+    Raises:
+        ValueError: with ``closed``, for a task that hides the effector.
     """
 
     def __init__(self, closed: bool) -> None:
@@ -88,13 +93,16 @@ class ModelQPAgent(InverseQPAgent):
 
     def _begin(self, env: Any) -> None:
         super()._begin(env)
+        if self._closed and env.task.sensors:
+            raise ValueError(f"agent 'qp_pi' measures the effector, which task '{env.task.name}' hides")
         self._corrections[env] = PICorrection(*PI_GAINS)
         self._previous_aims[env] = env.aim
         if env not in self._models:
             try:
                 self._models[env] = SurrogateBackend(env.robot, env.design)
             except WeightsError:
-                self._models[env] = None
+                # The plant itself, unless something touches it that the agent does not know.
+                self._models[env] = FEMBackend(env.robot, env.design) if env.task.touches else None
         model = self._models[env]
         if model is not None:
             model.reset(env.design)
@@ -117,6 +125,34 @@ class ModelQPAgent(InverseQPAgent):
         reached = model.delta.e + model.W.ea @ (controller.effort - model.lambda_.a)
         correction.hold(axes * (aim - reached))
         return command
+
+
+class EstimatedQPAgent(InverseQPAgent):
+    """Inverse QP on the effector and the condensed model that the estimator finds from all sensors."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._estimators: WeakKeyDictionary[Any, Estimator] = WeakKeyDictionary()
+
+    def _begin(self, env: Any) -> None:
+        if not env.task.sensors:
+            raise ValueError(f"agent 'qp_estimated' needs a task that shows sensors; '{env.task.name}' does not")
+        super()._begin(env)
+        # A tenth of a percent stands for the differences between touches of the plant and of the estimator.
+        volume = max(env.plant.noise, 1e-3) * float(np.mean(env.robot.sensor_scale))
+        noise = Noise(displacement=1e-5, volume=volume)
+        self._estimators[env] = Estimator(env.robot, design=env.design, noise=noise)
+
+    def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
+        estimator, task = self._estimators[env], env.task
+        load = None if task.touched is None else Touch(task.grid, task.touched, task.largest_force)
+        if load != estimator.load:
+            estimator.touch(load)
+        volumes = estimator.rest_volumes + env.sensed.sensors * env.robot.sensor_scale
+        found = estimator.update(Readings(present, volumes))
+        state = found.near.state
+        aim = env.aim + state.condensed.delta.e[:3] - found.effector[:3]
+        return controller.solve(state.condensed, aim, present, state.slack)
 
 
 class OpenLoopGrasp:
@@ -207,6 +243,7 @@ _MAKERS: dict[str, Callable[[int], Agent]] = {
     "qp_static": lambda seed: StaticQPAgent(),
     "qp_model": lambda seed: ModelQPAgent(closed=False),
     "qp_pi": lambda seed: ModelQPAgent(closed=True),
+    "qp_estimated": lambda seed: EstimatedQPAgent(),
     "close": lambda seed: OpenLoopGrasp(),
     "force": lambda seed: ForceGrasp(),
     "random": _random,
@@ -217,7 +254,9 @@ BASELINES = tuple(_MAKERS)
 
 
 def baselines_for(task: type[Task]) -> tuple[str, ...]:
-    """Return the names of the agents that a task is compared with: those for forces, or those for positions."""
+    """Return the names of the agents that a task is compared with: those for forces, for sensors or for positions."""
+    if task.hides_effector:
+        return ("qp_model", "qp_estimated", "random")
     return ("close", "force", "random") if task.needs_state else ("qp", "qp_model", "qp_pi", "random")
 
 
@@ -229,7 +268,8 @@ def make_baseline(name: str, seed: int = 0) -> Agent:
             step, and for forces ``"force"``; ``"qp_static"``: on the static equilibrium under the present command,
             without momentum;
             ``"qp_model"``: on the surrogate, whatever the plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI
-            controller on the measured effector; ``"close"``: closing a hand without measuring anything; ``"force"``:
+            controller on the measured effector; ``"qp_estimated"``: on the estimate from sensors, for tasks that hide
+            the effector; ``"close"``: closing a hand without measuring anything; ``"force"``:
             control of the measured contact forces; ``"random"``: uniform actions.
         seed: seed of the random agent.
 

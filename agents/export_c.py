@@ -36,12 +36,15 @@ def export_policy_c(policy: Policy | str | Path, path: str | Path, *, name: str 
 
     Raises:
         WeightsError: if the policy cannot be read.
-        ValueError: for another file ending, or a prefix that is not an identifier.
+        ValueError: for another file ending, a prefix that is not an identifier, or a policy that sees sensors.
     """
     path = check_path(path, ".h")
     check_identifier(name)
     policy = policy if isinstance(policy, Policy) else Policy(policy)
-    text = _header(policy, spaces_of(policy), name)
+    spaces = spaces_of(policy)
+    if spaces.sensors:
+        raise ValueError("policies that see sensors in place of the effector cannot be exported to C")
+    text = _header(policy, spaces, name)
     with atomic_write(path, "w") as stream:
         stream.write(text)
     return path

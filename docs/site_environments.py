@@ -34,7 +34,9 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
     task_class: Any = TASKS[row.task]
     task: Task = task_class(robot, **row.task_options)
     moving = bool(row.backend_options.get("dynamics"))
-    spaces = AgentSpaces(robot, action_mode="increment", design_names=(), axes=task.axes, moving=moving)
+    spaces = AgentSpaces(
+        robot, action_mode="increment", design_names=(), axes=task.axes, moving=moving, sensors=task.sensors
+    )
     scales = observation_scales(robot) | {"position": task.goal_scale, "error": task.error_scale}
     goal_unit = task.goal_unit
     forces = goal_unit == "N"
@@ -83,7 +85,17 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
             (3, wanted, reach, goal_unit),
             (3, difference, f"x / (1 + abs(x)) of it over {error}", goal_unit),
         ]
-        if moving:
+        if task.sensors:
+            count = len(robot.sensor_scale)
+            volumes = f"x / (1 + abs(x)) of it over {quantity(float(robot.sensor_scale[0]), 'm3')}"
+            parts = [
+                parts[0],
+                (count, "change of the volume of each cavity since the body was undeformed", volumes, "m3"),
+                (1, "whether a cell of the grid is touched", "1 or -1", ""),
+                (2, "touched cell across and along the body", "grid to [-1, 1], 0 without a touch", ""),
+                parts[4],
+            ]
+        elif moving:
             speed = f"x / (1 + abs(x)) of it over {quantity(scales['speed'], 'm')}/s"
             parts.append((3, "velocity x, y, z of the effector", speed, "m/s"))
         rows, start = [], 0
@@ -120,6 +132,12 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
                 '(`task_options={"goals": "reachable"}`), or one of a fixed set of points '
                 '(`task_options={"goals": array}`), which makes bodies comparable, or '
                 '`reset(options={"goal": [x, y, z]})` in metres.'
+            )
+        if row.task == "sensed_reach":
+            return rest + (
+                f"The goal is the position of `{effector}` under a uniformly drawn command of the untouched body, or "
+                '`reset(options={"goal": [x, y, z]})` in metres. A touch begins at a random one of the first '
+                f"{task.window} steps, with a force of up to {quantity(task.largest_force, 'N')}, and stays."
             )
         path = getattr(task, "path", None)
         if row.task == "track" and path is not None:
@@ -203,7 +221,9 @@ def environment_top(identifier: str) -> str:
     robot = robot_of(row.robot, tuple(sorted(row.robot_options.items())))
     n, name = len(robot.actuators), page_name(identifier)
     moving = bool(row.backend_options.get("dynamics"))
-    size = 3 * n + 9 + 3 * moving
+    task: Any = TASKS[row.task]
+    sensors = task(robot, **row.task_options).sensors
+    size = n + sensors + 3 if sensors else 3 * n + 9 + 3 * moving
     rows = [
         ["Action space", f"`Box(-1, 1, ({n},), float32)`"],
         ["Observation space", f"`Box(-1, 1, ({size} + k,), float32)`, `k` = design variables shown"],

@@ -81,6 +81,19 @@ class State:
 
 
 @dataclass(frozen=True)
+class PointForce:
+    """A force at a point of a body, whose direction stays fixed in space.
+
+    Attributes:
+        point: of the undeformed body [m], shape (3,).
+        force: [N], shape (3,).
+    """
+
+    point: np.ndarray
+    force: np.ndarray
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """What a backend needs to go on from a state in another object of its class.
 
@@ -105,7 +118,7 @@ class Backend(ABC):
         design: the current design.
         state: the current state.
         moving: states have velocities.
-        takes_force: `step` takes a force on the effector.
+        takes_force: `step` takes a force on the effector, and `touch` one on any point of the body.
         cable_friction: coefficient of friction of cables on their guides, 0 where they are not computed.
     """
 
@@ -146,6 +159,14 @@ class Backend(ABC):
             return self.step(command, mode)
         finally:
             self.restore(kept)
+
+    def touch(self, load: PointForce | None) -> None:
+        """Touch the body at a point from the next `step` on, or no longer; `reset` ends a touch.
+
+        Raises:
+            ValueError: for a point outside the body, or if the backend takes no forces.
+        """
+        raise ValueError(f"{type(self).__name__} takes no forces")
 
     def contact_model(self) -> CondensedModel:
         """Return the condensed model at the current state, with openings of contacts as further rows ``c``.

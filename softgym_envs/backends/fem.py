@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, Snapshot, State
+from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.constraints.cable import Cable
@@ -18,6 +18,9 @@ from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
+
+TOUCH_RADIUS = 2.5e-3
+"""Radius over which a touch is spread [m]."""
 
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
@@ -115,9 +118,24 @@ class FEMBackend(Backend):
             self._dynamics = Dynamics(model, **self.step_options) if self.moving else None
             self._rest = self._state(rest, zero, still=True)
             self.model, self._statics, self.design = model, statics, complete
+            self._own_loads = model.nodal_loads.copy()
+        self.touch(None)
         self.restore(self._rest)
         self._mode = "displacement"  # mode of the current state's command
         return self.state
+
+    def touch(self, load: PointForce | None) -> None:
+        """Touch the body at a point from the next `step` on, or no longer; `reset` ends a touch.
+
+        Raises:
+            ValueError: for a point outside the body.
+        """
+        loads = self._own_loads.copy()
+        if load is not None:
+            at = self.model.embed(load.point, radius=TOUCH_RADIUS)
+            np.add.at(loads, at.node_ids[0], at.weights[0][:, None] * load.force)
+        self.model.nodal_loads[:] = loads
+        self._touch = load
 
     @property
     def cable_friction(self) -> float:
@@ -241,13 +259,14 @@ class FEMBackend(Backend):
             nodes=x.copy(),
         )
 
-    def _more(self) -> tuple[str, tuple | None]:
-        return self._mode, self._motion
+    def _more(self) -> tuple[str, tuple | None, PointForce | None]:
+        return self._mode, self._motion, self._touch
 
     def _put_back(self, kept: Snapshot) -> None:
         self.reset(kept.design)
         self.state = kept.state
-        self._mode, motion = kept.more
+        self._mode, motion, touch = kept.more
+        self.touch(touch)
         self._go_back(motion)
 
     @property

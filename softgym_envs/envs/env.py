@@ -17,6 +17,7 @@ from softgym_envs.backends.registry import make_backend
 from softgym_envs.designs import Design
 from softgym_envs.envs.options import EnvironmentOptions, check_reset_options, set_up
 from softgym_envs.envs.plant import Plant, Plants, Sensed, sensed, stiffened
+from softgym_envs.envs.spaces import squash
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 if TYPE_CHECKING:
@@ -108,9 +109,9 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.backend: Backend = make_backend(
             setup.backend, self.robot, design=self._fixed_design, **setup.backend_options
         )
-        if self.task.pushes and not self.backend.takes_force:
+        if (self.task.pushes or self.task.touches) and not self.backend.takes_force:
             raise ValueError(
-                f"task '{self.task.name}' pushes the effector, but backend '{setup.backend}' takes no forces; "
+                f"task '{self.task.name}' pushes the robot, but backend '{setup.backend}' takes no forces; "
                 "allowed: 'fem'"
             )
         self.spaces = setup.spaces(moving=self.backend.moving)
@@ -143,7 +144,9 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
     def sensed(self) -> Sensed:
         """What the sensors show of the present state."""
         state = self.state
-        return self._sensed or Sensed(state.displacement, state.effort, self.task.measure(state))
+        return self._sensed or Sensed(
+            state.displacement, state.effort, self.task.measure(state), self.task.sense(state)
+        )
 
     @property
     def goal(self) -> np.ndarray:
@@ -293,6 +296,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             waiting = np.vstack([self._sent, command])
             command, self._sent = waiting[0], waiting[1:]
         converged = True
+        if self.task.touches:
+            self.backend.touch(self.task.touch(self._step))
         try:
             self.backend.step(command, force=self.task.push(self._step))
         except ConvergenceError:
@@ -307,8 +312,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         """Return observation, reward and info of the present state; with ``sense``, the sensors are read anew."""
         state, goal = self.state, self.goal
         measured = self.task.measure(state)
+        true = Sensed(state.displacement, state.effort, measured, self.task.sense(state))
         if sense and self.plant.noise:
-            true = Sensed(state.displacement, state.effort, measured)
             self._sensed = sensed(self.robot, true, self.plant.noise, self.np_random)
         distance, terms, _ = self.task.rate(measured, goal, self.spaces.effort_share(state.effort))
         terms |= self.task.state_terms(state)
@@ -339,9 +344,17 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if self._plants is not None:
             info |= {f"plant_{name}": value for name, value in asdict(self.plant).items()}
         velocity = state.velocity[0] if self.spaces.moving else None
-        shown = self._sensed or Sensed(state.displacement, state.effort, measured)
+        shown = self._sensed or true
+        sensors = np.concatenate([squash(shown.sensors), self.task.feel()]) if self.task.sensors else None
         observation = self.spaces.observe(
-            self.command, shown.displacement, shown.effort, shown.effector, self.aim, self._unit_design, velocity
+            self.command,
+            shown.displacement,
+            shown.effort,
+            shown.effector,
+            self.aim,
+            self._unit_design,
+            velocity,
+            sensors,
         )
         return observation, reward, {name: _with_dtype(value) for name, value in info.items()}
 

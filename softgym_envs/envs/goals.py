@@ -30,7 +30,8 @@ class GoalObservation(gymnasium.Wrapper):
         self._effort = effort
         inner: Any = env.unwrapped
         self._task, self._spaces = inner.task, inner.spaces
-        if self._task.horizon != 1 or self._task.needs_state or self._task.pushes:
+        task = self._task
+        if task.horizon != 1 or task.needs_state or task.pushes or task.touches or task.sensors:
             raise ValueError(
                 f"task '{self._task.name}' has no goal-conditioned interface: its goal moves, or it rates more than "
                 "the goal and the effector; allowed: tasks such as 'reach'"

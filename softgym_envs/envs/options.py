@@ -36,7 +36,7 @@ class EnvironmentOptions:
         task_options: options of the task.
         backend_options: options of the backend; in batched environments ``weights`` and ``members``.
         plant: how the robot differs from its model: a number, or a range that each reset draws from, for attributes of
-            `Plant`; None for no difference.
+            `Plant`; ``{}`` for no difference, None for that of the environment's ID.
         defaults: options of the environment's ID, which those above override one by one; its ``backend_options``
             and ``backend_mesh`` (options of the robot) apply to its ``backend`` only.
     """
@@ -94,7 +94,7 @@ class Setup:
     @property
     def together(self) -> bool:
         """Whether `SoftRobotVectorEnv` can step many of these environments together."""
-        rated = not (self.task.pushes or self.task.needs_state)
+        rated = not (self.task.pushes or self.task.touches or self.task.sensors or self.task.needs_state)
         return rated and batches(self.backend, self.robot, self.backend_options)
 
     def spaces(self, *, moving: bool = False) -> AgentSpaces:
@@ -107,6 +107,7 @@ class Setup:
             moving=moving,
             goal_scale=self.task.goal_scale,
             error_scale=self.task.error_scale,
+            sensors=self.task.sensors,
         )
 
 
@@ -137,6 +138,7 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
         backend_options = {**defaults.get("backend_options", {}), **backend_options}
     check_backend(backend, made, backend_options)
     space = made.design_space
+    plant = defaults.get("plant") if options.plant is None else options.plant
     return Setup(
         robot=made,
         task=make_task(task, made, **{**defaults.get("task_options", {}), **(options.task_options or {})}),
@@ -146,7 +148,7 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
         sampled=design_names(space, options.sample_design),
         shown=design_names(space, options.design_in_observation),
         action_mode=options.action_mode,
-        plants=Plants.check(options.plant, made, backend),
+        plants=Plants.check(plant or None, made, backend),
     )
 
 
@@ -236,7 +238,9 @@ def check_counts(num_envs: int, max_episode_steps: int | None) -> None:
 
 def check_batchable(task: Task) -> None:
     """Raise ValueError for a task that a batched environment on the surrogate cannot rate."""
-    if task.pushes:
-        raise ValueError(f"task '{task.name}' pushes the effector, but the batched environment takes no forces")
+    if task.pushes or task.touches:
+        raise ValueError(f"task '{task.name}' pushes the robot, but the batched environment takes no forces")
+    if task.sensors:
+        raise ValueError(f"task '{task.name}' shows sensors, which the batched environment does not have")
     if task.needs_state:
         raise ValueError(f"task '{task.name}' reads forces of contacts, which the batched environment does not have")

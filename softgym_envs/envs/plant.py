@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -22,8 +22,8 @@ class Plant:
         stiffness: factor of the elastic stiffness of the whole body. It multiplies all efforts and divides ``W``.
         cable_friction: coefficient of friction of cables on their guides, by the capstan law; finite elements only.
         delay: control steps between sending a command and its arrival at the drives.
-        noise: standard deviation of all sensors: of displacements over their range, of efforts over their scale, of
-            effectors over the robot's size.
+        noise: standard deviation of all sensors: of displacements over their range, of efforts and of sensor rows over
+            their scale, of effectors over the robot's size.
     """
 
     stiffness: float = 1.0
@@ -57,7 +57,7 @@ class Plants:
         """
         if option is None:
             return None
-        names = [field.name for field in fields(Plant)]
+        names = [attribute.name for attribute in fields(Plant)]
         low: dict[str, Any] = {}
         high: dict[str, Any] = {}
         for name, given in option.items():
@@ -109,11 +109,13 @@ class Sensed:
         displacement: of the actuators [m, ...], shape (..., n_a).
         effort: of the actuators [N, ...], shape (..., n_a).
         effector: the first effector, or what the task measures in its place, shape (..., 3).
+        sensors: readings of sensor rows over their scale, shape (..., s).
     """
 
     displacement: np.ndarray
     effort: np.ndarray
     effector: np.ndarray
+    sensors: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 def sensed(robot: Robot, true: Sensed, noise: np.ndarray | float, rng: np.random.Generator) -> Sensed:
@@ -125,6 +127,7 @@ def sensed(robot: Robot, true: Sensed, noise: np.ndarray | float, rng: np.random
         true.displacement + level * (robot.upper - robot.lower) * rng.normal(size=true.displacement.shape),
         true.effort + level * robot.effort_scale * rng.normal(size=true.effort.shape),
         true.effector + level * robot.size * rng.normal(size=true.effector.shape),
+        true.sensors + level * rng.normal(size=true.sensors.shape) if true.sensors.size else true.sensors,
     )
 
 

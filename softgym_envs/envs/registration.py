@@ -31,6 +31,7 @@ class EnvironmentRow:
         task_options: options of the task.
         backend_options: options of that backend.
         backend_mesh: options of the robot on that backend only, such as a coarse mesh for finite elements.
+        plant: how the robot differs from its model, as the option of environments.
     """
 
     robot: RobotSource | None
@@ -41,6 +42,7 @@ class EnvironmentRow:
     task_options: Mapping[str, Any] = field(default_factory=dict)
     backend_options: Mapping[str, Any] = field(default_factory=dict)
     backend_mesh: Mapping[str, Any] = field(default_factory=dict)
+    plant: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def defaults(self) -> dict[str, Any]:
@@ -49,7 +51,7 @@ class EnvironmentRow:
         They are passed as one option because ``gymnasium.make`` replaces whole mappings: the user's ``robot_options``
         would otherwise replace all of these.
         """
-        options = ("robot_options", "task_options", "backend_options", "backend_mesh")
+        options = ("robot_options", "task_options", "backend_options", "backend_mesh", "plant")
         return {"defaults": {"backend": self.backend, **{name: dict(getattr(self, name)) for name in options}}}
 
     def robot_options_on(self, backend: str | None) -> dict[str, Any]:
@@ -92,6 +94,9 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/FingerPress-v0": _row("press_finger", "track", 100),
     "SoftGym/GripperPinch-v0": _row("two_finger_gripper", "track", 100),
     "SoftGym/GripperManipulate-v0": _row("three_finger_gripper", "track", 100),
+    "SoftGym/SensorizedFingerReach-v0": _row(
+        "sensorized_finger", "sensed_reach", 50, backend="fem", plant={"noise": 0.01}
+    ),
     "SoftGym/FingerGrasp-v0": _row("grasping_finger", "grasp", 25, backend="fem", backend_mesh=COARSE),
     "SoftGym/GripperLift-v0": _row(
         "contact_aided_gripper", "lift", 30, backend="fem", backend_mesh=COARSE, backend_options=SLOW

@@ -24,14 +24,16 @@ class AgentSpaces:
         moving: whether the observation contains the effector's velocity, which an agent needs in dynamics.
         goal_scale: that of the task; default 1.25 times the size of the robot.
         error_scale: that of the task; default 0.4 times the workspace scale of the robot.
+        sensors: number of sensor values that observations show in place of displacements, efforts, effector, error and
+            velocity; 0 for those.
 
     Attributes:
         action_space: of one environment, shape (n_a,).
         observation_space: of one environment, shape (d,).
         position_scale: unit of observed effectors and goals [m].
         error_scale: distance to the goal that is observed as one half [m].
-        slices: where to find the parts of an observation: command, displacement, effort, effector, goal, error,
-            velocity, design.
+        slices: where to find the parts of an observation: command, displacement, effort, effector, sensors, goal,
+            error, velocity, design; those that it does not have are empty.
     """
 
     def __init__(
@@ -44,6 +46,7 @@ class AgentSpaces:
         moving: bool = False,
         goal_scale: float | None = None,
         error_scale: float | None = None,
+        sensors: int = 0,
     ) -> None:
         if action_mode not in ("increment", "absolute"):
             raise ValueError(f"action_mode = {action_mode!r} is unknown; allowed: 'increment', 'absolute'")
@@ -52,6 +55,7 @@ class AgentSpaces:
         self.design_names = design_names
         self.axes: Array = np.ones(3) if axes is None else axes
         self.moving = moving
+        self.sensors = sensors
         self.lower: Array = robot.lower
         self.upper: Array = robot.upper
         self.rates: Array = robot.rates
@@ -61,17 +65,19 @@ class AgentSpaces:
         self.position_scale = 1.25 * robot.size if goal_scale is None else goal_scale
         self.error_scale = robot.workspace_scale / 2.5 if error_scale is None else error_scale
         n = len(robot.actuators)
+        seen = sensors == 0
         self.action_space = spaces.Box(-1.0, 1.0, (n,), np.float32)
         self.slices: dict[str, slice] = {}
         start = 0
         for name, size in (
             ("command", n),
-            ("displacement", n),
-            ("effort", n),
-            ("effector", 3),
+            ("displacement", n * seen),
+            ("effort", n * seen),
+            ("effector", 3 * seen),
+            ("sensors", sensors),
             ("goal", 3),
-            ("error", 3),
-            ("velocity", 3 * moving),
+            ("error", 3 * seen),
+            ("velocity", 3 * (moving and seen)),
             ("design", len(design_names)),
         ):
             self.slices[name] = slice(start, start + size)
@@ -137,11 +143,13 @@ class AgentSpaces:
         goal: Array,
         unit_design: Array,
         velocity: Array | None = None,
+        sensors: Array | None = None,
     ) -> Array:
         """Return the observation of a state, shape (..., d), float32 or the type of the tensors.
 
-        The parts are command, displacement, effort, effector, goal, error, velocity and design. Efforts, errors and
-        velocities are unbounded; x / (1 + abs(x)) maps them to (-1, 1) without loss.
+        The parts are command, displacement, effort, effector, goal, error, velocity and design; or command, sensors,
+        goal and design. Efforts, errors and velocities are unbounded; x / (1 + abs(x)) maps them to (-1, 1) without
+        loss.
 
         Args:
             command: commanded displacements, shape (..., n_a).
@@ -151,25 +159,36 @@ class AgentSpaces:
             goal: goal [m], shape (..., 3).
             unit_design: design variables in [-1, 1], shape (..., k).
             velocity: of the first effector [m/s], shape (..., 3); required if ``moving``.
+            sensors: values in [-1, 1], shape (..., sensors); required if there are any.
         """
         xp = namespace(effector)
-        parts = [
-            (command - self.middle) / self.half_range,
-            (displacement - self.middle) / self.half_range,
-            _squash(effort / self.effort_scale),
-            effector / self.position_scale,
-            *self._goal_parts(effector, goal),
-        ]
-        if self.moving and velocity is not None:
-            parts.append(_squash(velocity / self.robot.size))
+        parts = [(command - self.middle) / self.half_range]
+        if self.sensors:
+            assert sensors is not None
+            parts += [sensors, goal / self.position_scale]
+        else:
+            parts += [
+                (displacement - self.middle) / self.half_range,
+                squash(effort / self.effort_scale),
+                effector / self.position_scale,
+                *self._goal_parts(effector, goal),
+            ]
+            if self.moving and velocity is not None:
+                parts.append(squash(velocity / self.robot.size))
         observation = xp.concatenate((*parts, unit_design), axis=-1).clip(-1.0, 1.0)
         return observation.astype(np.float32) if xp is np else observation
 
     def _goal_parts(self, effector: Array, goal: Array) -> tuple[Array, Array]:
-        return goal / self.position_scale, _squash(self.axes * (goal - effector) / self.error_scale)
+        return goal / self.position_scale, squash(self.axes * (goal - effector) / self.error_scale)
 
     def observed_effector(self, observation: np.ndarray) -> np.ndarray:
-        """Return the first effector [m] (..., 3) in observations (..., d), in float32 precision."""
+        """Return the first effector [m] (..., 3) in observations (..., d), in float32 precision.
+
+        Raises:
+            ValueError: if observations show sensors in its place.
+        """
+        if self.sensors:
+            raise ValueError(f"observations of robot '{self.robot.name}' show sensors in place of its effector")
         return observation[..., self.slices["effector"]].astype(float) * self.position_scale
 
     def observed_goal(self, observation: np.ndarray) -> np.ndarray:
@@ -193,5 +212,6 @@ class AgentSpaces:
         return changed
 
 
-def _squash(x: Array) -> Array:
+def squash(x: Array) -> Array:
+    """Return ``x / (1 + abs(x))``, in (-1, 1)."""
     return x / (1.0 + abs(x))

@@ -165,6 +165,8 @@ class SensorizedFinger(MeshedRobot):
         self.cable_clearance = float(cable_clearance)
         self.effector_rest = np.array([0.0, self.tip_height, -3.0 * LENGTH * mm])
         self.effort_scale = np.array([20.0])
+        # What a pull of 10 mm takes from each cavity of the baseline body.
+        self.sensor_scale = np.full(cavities, 57e-9 if cavities == 2 else 23e-9)
         self.actuators = (Actuator("cable", 0.0, 0.015, 0.001, unilateral=unilateral),)
 
     @property

@@ -161,7 +161,8 @@ def check_info(info):
     flags = ("is_success", "lost", "stable", "trusted", "converged")
     assert {name for name, value in info.items() if value.dtype == bool} == set(flags)
     assert info["doubt"].dtype == np.int64
-    assert all(value.dtype == float for name, value in info.items() if name not in (*flags, "doubt"))
+    whole = ("doubt", "plant_delay")
+    assert all(value.dtype == float for name, value in info.items() if name not in (*flags, *whole))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from softgym_envs.backends.backend import State
+from softgym_envs.backends.backend import PointForce, State
 from softgym_envs.envs.arrays import Array, namespace, pick_rows
 from softgym_envs.robots.base import Robot
 
@@ -90,6 +90,7 @@ class Task(ABC):
         max_episode_steps: time limit of an episode if none is given.
         lookahead: control steps by which the observed goal is ahead of the rated one.
         robot: the robot.
+        sensors: number of sensor values in observations of a task that hides the effector, else 0.
         axes: coordinates of the effector that count, 1 or 0, shape (3,).
         success_distance: distance below which a goal counts as reached [m].
         goal_scale: unit of goals and of what is compared with them in observations [m].
@@ -98,6 +99,10 @@ class Task(ABC):
 
     #: Whether the task applies forces to the effector, which not every backend supports.
     pushes = False
+    #: Whether the task touches the body, which not every backend supports.
+    touches = False
+    #: Whether observations show sensors in place of displacements, efforts and the effector.
+    hides_effector = False
     #: Whether the task reads whole mechanical states, which batched environments do not have.
     needs_state = False
     #: Unit of goals; that of positions by default.
@@ -107,6 +112,7 @@ class Task(ABC):
     horizon: int = 1
     max_episode_steps: int = 100
     lookahead: int = 0
+    sensors: int = 0
 
     def __init__(self, robot: Robot) -> None:
         if not hasattr(self, "name"):
@@ -151,6 +157,18 @@ class Task(ABC):
     def push(self, step: int) -> np.ndarray | None:
         """Return the force on the first effector during a control step [N], shape (3,), or None."""
         return None
+
+    def touch(self, step: int) -> PointForce | None:
+        """Return the force that touches the body during a control step, or None."""
+        return None
+
+    def sense(self, state: State) -> np.ndarray:
+        """Return the readings of the sensors over their scale, without noise, shape (s,); s is at most ``sensors``."""
+        return np.zeros(0)
+
+    def feel(self) -> np.ndarray:
+        """Return what the touch sensors show of the last `touch`, in [-1, 1], shape (``sensors`` - s,)."""
+        return np.zeros(0)
 
     @classmethod
     def distance_text(cls, distance: float, digits: int = 1) -> str:
