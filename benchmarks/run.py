@@ -84,6 +84,8 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "sensor_front": sensor_fronts.sensor_front,
     "sensor_front_published": sensor_fronts.sensor_front_published,
     "sensor_pressure_front": sensor_fronts.sensor_pressure_front,
+    "sensor_four_cavities_front": sensor_fronts.sensor_four_cavities_front,
+    "sensor_information_front": sensor_fronts.sensor_information_front,
     "validation": validation.validation,
     "side_by_side": side_by_side.side_by_side,
     "contact": contact.contact,

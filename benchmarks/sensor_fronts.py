@@ -18,6 +18,8 @@ ENDS = {
     "angular_displacement": "bending",
     "relative_volume_change": "pressure",
     "cavity_volume": "volume",
+    "pressure_sensitivity": "pressure sensitivity",
+    "information": "information",
 }
 """What the end of a front is called at which a metric is best."""
 
@@ -93,3 +95,13 @@ def sensor_front_published() -> dict[str, object]:
 def sensor_pressure_front() -> dict[str, object]:
     """Bending, relative change and initial volume of the cavity (thesis, fig. 3.7): NSGA-II in the published box."""
     return front("sensorized_finger_pressure_front")
+
+
+def sensor_four_cavities_front() -> dict[str, object]:
+    """Bending, pressure sensitivity and initial volume with four cavities (thesis, fig. 3.15): 185 designs."""
+    return front("sensorized_finger_four_cavities_front")
+
+
+def sensor_information_front() -> dict[str, object]:
+    """Bending against what the volumes tell about touches: 300 designs."""
+    return front("sensorized_finger_information_front")

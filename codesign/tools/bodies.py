@@ -16,10 +16,12 @@ from softgym_envs.codesign.tools.grasps import GraspConfig
 from softgym_envs.codesign.tools.metrics import Course, Metric, find_metrics
 from softgym_envs.codesign.variables import split_values
 from softgym_envs.errors import ConfigError
+from softgym_envs.estimation.information import touch_slopes
 from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
 from softgym_envs.robots.grasping import Grasp
+from softgym_envs.robots.sensorized_finger import SensorizedFinger, SensorReadings
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import TorchModel
 from softgym_envs.surrogate.pretrained import pretrained_model
@@ -46,10 +48,14 @@ def check_metrics(robot: Robot, metrics: Sequence[str | Metric], backend: str) -
     if not found:
         raise ConfigError("name at least one metric")
     for metric in found:
-        if metric.needs in ("body", "sensors", "grasps") and backend != "fem":
+        if metric.needs in ("body", "sensors", "pushes", "touches", "grasps") and backend != "fem":
             raise ConfigError(f"metric '{metric.name}' needs backend 'fem', got '{backend}'")
         if metric.needs == "sensors" and not hasattr(robot, "cavities"):
             raise ConfigError(f"metric '{metric.name}' needs a robot with sensing cavities, got '{robot.name}'")
+        if metric.needs in ("pushes", "touches") and not isinstance(robot, SensorizedFinger):
+            raise ConfigError(f"metric '{metric.name}' needs robot 'sensorized_finger', got '{robot.name}'")
+        if metric.needs == "pushes" and robot.cavities != 4:  # type: ignore[attr-defined]
+            raise ConfigError(f"metric '{metric.name}' needs robot 'sensorized_finger' with robot_options cavities: 4")
         if metric.needs == "grasps" and not isinstance(robot, ContactAidedFinger):
             raise ConfigError(f"metric '{metric.name}' needs robot 'contact_aided_finger', got '{robot.name}'")
     return found
@@ -125,7 +131,7 @@ class Evaluator:
     def __call__(self, design: Mapping[str, float]) -> dict[str, float]:
         """Return the metrics of a complete design by name [SI]; raises as `course` and `close`."""
         needs = {metric.needs for metric in self.metrics}
-        course = self.course(design) if needs - {"design", "grasps"} else None
+        course = self.course(design) if needs & {"states", "body", "sensors"} else None
         grasps = self.close(design) if "grasps" in needs else []
         values = {}
         for metric in self.metrics:
@@ -133,9 +139,29 @@ class Evaluator:
                 values[metric.name] = float(metric(dict(design)))
             elif metric.needs == "grasps":
                 values[metric.name] = float(np.mean([metric(each) for each in grasps]))
+            elif metric.needs == "pushes":
+                values[metric.name] = float(metric(self.push(design)))
+            elif metric.needs == "touches":
+                values[metric.name] = float(metric(self.touch(design)))
             else:
                 values[metric.name] = float(metric(course)[0])
         return values
+
+    def push(self, design: Mapping[str, float]) -> SensorReadings:
+        """Return the readings of a complete design under a pull and a lateral force; raises as `course`."""
+        variables = self._choose_robot(design)
+        assert isinstance(self.robot, SensorizedFinger)
+        return self.robot.readings(variables, pull=float(self.command[0]))
+
+    def touch(self, design: Mapping[str, float]) -> np.ndarray:
+        """Return the slopes of the volumes under touches of a complete design, see `touch_slopes`; raises as `course`.
+
+        The finger is touched on its back at the centres of ten cells of 20 mm by 7.5 mm, under the full command.
+        """
+        variables = self._choose_robot(design)
+        heights = -0.015 - 0.020 * (np.arange(5) + 0.5)
+        places = np.array([[side * 3.75e-3, 0.0, height] for height in heights for side in (-1.0, 1.0)])
+        return touch_slopes(self.robot, places, np.array([0.0, 1.0, 0.0]), self.command, variables)
 
     def close(self, design: Mapping[str, float]) -> list[Grasp]:
         """Return all grasps of a complete design; raises `InfeasibleDesign` and `ConvergenceError`."""

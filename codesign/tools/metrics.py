@@ -11,15 +11,26 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from softgym_envs.errors import unknown_name
+from softgym_envs.estimation.information import sensor_information
+from softgym_envs.estimation.posterior import Gaussian
 from softgym_envs.registry import import_object
 from softgym_envs.robots.grasping import Grasp
+from softgym_envs.robots.sensorized_finger import SensorReadings
 
 Direction = Literal["maximize", "minimize"]
-Needs = Literal["states", "body", "sensors", "grasps", "design"]
+Needs = Literal["states", "body", "sensors", "pushes", "touches", "grasps", "design"]
+
+VOLUME_NOISE = 0.5e-9
+"""Standard deviation of the measured volume of a cavity, for `information` [m3]."""
+CABLE_ERROR = 1e-4
+"""Standard deviation of the displacement of an actuator around its command, for `information` [m]."""
+TOUCH_FORCE = 2.0
+"""Standard deviation of the force of a touch before any reading, for `information` [N]."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +160,27 @@ def cavity_volume(course: Course) -> Tensor:
     return course.sensor[0, :, 0]
 
 
+def pressure_sensitivity(readings: SensorReadings) -> float:
+    """Return the smaller relative volume change of the first cavity, under the pull or a lateral force (sec. 3.3.6)."""
+    assert readings.pressure_sensitivity is not None
+    return readings.pressure_sensitivity
+
+
+def information(slopes: np.ndarray) -> float:
+    """Return the information that one reading of all cavities adds on the force of a touch and the cable [nat].
+
+    It is the mean over touched places of half of ``log det(I + P J^T R^-1 J)``, where ``J`` (one of the slopes, shape
+    (p, n_s, n_a + 1)) is the derivative of the volumes by the displacements of the actuators and by the force.
+    """
+    count = slopes.shape[-1]
+    spread = np.full(count, CABLE_ERROR)
+    spread[-1] = TOUCH_FORCE
+    limits = np.full(count, np.inf)
+    prior = Gaussian(np.zeros(count), np.diag(spread**2), -limits, limits)
+    noise = np.full(slopes.shape[1], VOLUME_NOISE)
+    return float(np.mean([sensor_information(slope, noise, prior) for slope in slopes]))
+
+
 def grip_force(grasp: Grasp) -> float:
     """Return the largest force on the object along x (thesis, eq. 3.10)."""
     return grasp.contact_force
@@ -171,12 +203,14 @@ class Metric:
     Args:
         name: identifier, as in configurations and tables.
         function: ``Course -> values`` of shape (B,); with ``needs="design"``, ``{variable: value} -> value``; with
-            ``needs="grasps"``, ``Grasp -> value``, of which the mean over all grasps is taken.
+            ``needs="grasps"``, ``Grasp -> value``, of which the mean over all grasps is taken; with ``"pushes"``,
+            ``SensorReadings -> value``; with ``"touches"``, ``slopes -> value``, see `touch_slopes`.
         unit: SI unit, or ``"1"``.
         direction: what a designer usually wants: ``"maximize"`` or ``"minimize"``.
-        needs: ``"states"``: any backend; ``"body"``: a meshed body, on FEM; ``"sensors"``: sensing cavities, on
-            FEM; ``"grasps"``: a contact-aided finger that closes on objects, on FEM; ``"design"``: the values of the
-            variables alone.
+        needs: ``"states"``: any backend; ``"body"``: a meshed body, on FEM; ``"sensors"``: sensing cavities, on FEM;
+            ``"pushes"``: a sensorized finger with four cavities that is pushed sideways, on FEM; ``"touches"``: a
+            sensorized finger that is touched on its back, on FEM; ``"grasps"``: a contact-aided finger that closes on
+            objects, on FEM; ``"design"``: the values of the variables alone.
         description: one line for tables; default: the first line of the function's documentation.
     """
 
@@ -235,6 +269,8 @@ METRICS: dict[str, Metric] = {
         Metric("volume_change", volume_change, "m3", "maximize", needs="sensors"),
         Metric("relative_volume_change", relative_volume_change, "1", "maximize", needs="sensors"),
         Metric("cavity_volume", cavity_volume, "m3", "maximize", needs="sensors"),
+        Metric("pressure_sensitivity", pressure_sensitivity, "1", "maximize", needs="pushes"),
+        Metric("information", information, "nat", "maximize", needs="touches"),
         Metric("grip_force", grip_force, "N", "maximize", needs="grasps"),
         Metric("grip_resistance", grip_resistance, "m", "minimize", needs="grasps"),
         Metric("grip_energy", grip_energy, "N m", "minimize", needs="grasps"),

@@ -8,10 +8,12 @@ import torch
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.codesign.tools import metrics
 from softgym_envs.codesign.tools.bodies import Evaluator, LearnedBodies, full_command
 from softgym_envs.codesign.tools.box import Box
 from softgym_envs.codesign.tools.metrics import METRICS
 from softgym_envs.errors import ConfigError, DesignError
+from softgym_envs.mechanics.solvers.statics import Statics
 
 STATES = tuple(name for name, metric in METRICS.items() if metric.needs == "states")
 PULL = 0.01
@@ -95,16 +97,54 @@ def test_sensorized_finger_reads_what_the_robot_reads():
     assert found["angular_displacement"] == pytest.approx(readings.bending_angle)
 
 
+def test_four_cavities_have_a_pressure_sensitivity():
+    robot = make_robot("sensorized_finger", cavities=4)
+    found = Evaluator(robot, ["pressure_sensitivity"], actuation=[PULL])({})
+    assert found["pressure_sensitivity"] == robot.readings().pressure_sensitivity > 0.0
+
+
+def test_information_is_what_a_reading_takes_from_the_uncertainty():
+    """Slopes against differences of equilibria, and the metric against determinants of covariances."""
+    robot = make_robot("sensorized_finger")
+    evaluator = Evaluator(robot, ["information"], actuation=[PULL])
+    slopes = evaluator.touch({})
+    assert slopes.shape == (10, 2, 2)
+    model = robot.build()
+    model.add_contact("touch", [3.75e-3, 0.0, -0.085], radius=2.5e-3)
+    statics = Statics(model)
+
+    def volumes(pull, force):
+        return statics.solve([pull], contact=[0.0, force, 0.0]).condensed.delta.s
+
+    by_pull = (volumes(PULL + 1e-6, 0.0) - volumes(PULL - 1e-6, 0.0)) / 2e-6
+    by_force = (volumes(PULL, 1e-3) - volumes(PULL, -1e-3)) / 2e-3
+    np.testing.assert_allclose(slopes[7], np.column_stack([by_pull, by_force]), rtol=1e-3)
+    gained = []
+    for slope in slopes:
+        before = np.diag([metrics.CABLE_ERROR, metrics.TOUCH_FORCE]) ** 2
+        after = np.linalg.inv(np.linalg.inv(before) + slope.T @ slope / metrics.VOLUME_NOISE**2)
+        gained.append(0.5 * np.log(np.linalg.det(before) / np.linalg.det(after)))
+    assert evaluator({})["information"] == pytest.approx(np.mean(gained))
+    assert gained[0] < gained[8]  # near the flange a touch hardly changes a volume
+
+
 def test_unavailable_metrics_and_wrong_actuations(finger):
-    for metrics, options, words in (
+    for names, options, words in (
         (["beauty"], {}, "unknown metric 'beauty'; allowed: bending_angle"),
         (["volume_change"], {}, "needs a robot with sensing cavities, got 'finger'"),
+        (["information"], {}, "needs robot 'sensorized_finger', got 'finger'"),
+        (["information"], {"backend": "surrogate"}, "needs backend 'fem', got 'surrogate'"),
         (["material_volume"], {"backend": "surrogate"}, "needs backend 'fem', got 'surrogate'"),
         (["travel"], {"actuation": [0.03]}, "allowed: cable_1 0 to 0.02 m"),
         (["travel"], {"actuation": [0.01, 0.01]}, "allowed: cable_1 0 to 0.02 m"),
     ):
         with pytest.raises(ConfigError, match=words):
-            Evaluator(finger, metrics, **options)
+            Evaluator(finger, names, **options)
+
+
+def test_two_cavities_have_no_pressure_sensitivity():
+    with pytest.raises(ConfigError, match="robot_options cavities: 4"):
+        Evaluator(make_robot("sensorized_finger"), ["pressure_sensitivity"])
 
 
 @pytest.mark.parametrize("name", ["finger", "diamond", "tetrapod"])
