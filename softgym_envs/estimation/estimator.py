@@ -68,8 +68,8 @@ class Estimate:
         effector: positions [m], shape (n_e,).
         effector_covariance: [m2], shape (n_e, n_e).
         parameters: distribution of the errors of the actuators and of the load, shape (n_a + m,).
-        misfit: sum of the squared residuals of the readings in standard deviations; about the number of readings or
-            less while the model explains them.
+        misfit: sum of the squared residuals of the mean reading in its standard deviations; about the number of sensors
+            or less while the model explains them.
         converged: whether Gauss-Newton converged, within the accuracy of its last equilibrium.
         equilibria: how many were computed for this reading.
         near: the equilibrium near which the estimate lies, with its condensed model.
@@ -132,6 +132,17 @@ class Linearised:
 
 
 @dataclass(frozen=True)
+class _Evidence:
+    """Readings under one command: their mean, its standard deviations, their number, and what was known before them."""
+
+    command: np.ndarray
+    measured: np.ndarray
+    spread: np.ndarray
+    count: int
+    prior: Gaussian
+
+
+@dataclass(frozen=True)
 class _Found:
     """An explanation of a reading: the equilibrium near which it lies, whether near enough, and how many were tried."""
 
@@ -147,6 +158,10 @@ class Estimator:
     Each reading is explained by the condensed model near the last equilibrium. Where the explanation moves away from
     that equilibrium by more than `accuracy`, a new one is computed there and the reading is explained again. A reading
     that is improbable with tight cables is also explained with slack ones, and the more probable explanation counts.
+
+    Readings in a row under one command, of a load that does not drift, are explained together by their mean. Explained
+    one after the other, each near another equilibrium, they would seem to tell force and place of a touch apart where
+    their product alone is known.
 
     Args:
         robot: the body; its cavities are sensors.
@@ -187,6 +202,7 @@ class Estimator:
             model.add_contact(f"touch_{number}", point, radius=self.radius)
         self._statics = Statics(model)
         self._near: Linearised | None = None
+        self._evidence: _Evidence | None = None
         sizes = dict(model.roles)
         self._counts = sizes.get("a", 0), sizes.get("e", 0), sizes.get("c", 0)
         n_a = self._counts[0]
@@ -235,24 +251,38 @@ class Estimator:
         return combined
 
     def explain(self, near: Linearised, readings: Readings, start: np.ndarray | None = None) -> Posterior:
-        """Return what one reading tells beyond all before, with a given condensed model; `update` calls it.
+        """Return what all readings tell, with a given condensed model, as `update` does.
 
         Raises:
             ValueError: if readings have a wrong shape or are not finite, as with a lost sensor.
         """
+        return self._explain(near, self._joined(readings), start)
+
+    def _joined(self, readings: Readings) -> _Evidence:
+        """Return a reading together with those before it under the same command."""
         n_a = self._counts[0]
         assert self.belief is not None
         command = _checked("command", readings.command, n_a)
-        measured = [_checked("volumes", readings.volumes, len(self.rest_volumes))]
-        spread = [np.full(len(self.rest_volumes), self.noise.volume)]
+        parts = [_checked("volumes", readings.volumes, len(self.rest_volumes))]
+        noise = [np.full(len(self.rest_volumes), self.noise.volume)]
         if self.noise.effort is not None:
-            measured.append(_checked("efforts", readings.efforts, n_a))
-            spread.append(np.full(n_a, self.noise.effort))
+            parts.append(_checked("efforts", readings.efforts, n_a))
+            noise.append(np.full(n_a, self.noise.effort))
+        measured, spread, before = np.concatenate(parts), np.concatenate(noise), self._evidence
+        if before is None or self._drift.any() or (command != before.command).any():
+            prior = replace(self.belief, covariance=self.belief.covariance + np.diag(self._drift**2))
+            return _Evidence(command, measured, spread, 1, prior)
+        count = before.count + 1
+        mean = before.measured + (measured - before.measured) / count
+        return replace(before, measured=mean, spread=spread / np.sqrt(count), count=count)
+
+    def _explain(self, near: Linearised, evidence: _Evidence, start: np.ndarray | None) -> Posterior:
+        n_a = self._counts[0]
         return most_probable(
-            lambda parameters: self.predict(near, command + parameters[:n_a], parameters[n_a:]),
-            np.concatenate(measured),
-            np.concatenate(spread),
-            replace(self.belief, covariance=self.belief.covariance + np.diag(self._drift**2)),
+            lambda parameters: self.predict(near, evidence.command + parameters[:n_a], parameters[n_a:]),
+            evidence.measured,
+            evidence.spread,
+            evidence.prior,
             start=start,
         )
 
@@ -265,24 +295,25 @@ class Estimator:
         """
         n_a = self._counts[0]
         assert self.belief is not None
-        command = _checked("command", readings.command, n_a)
+        evidence = self._joined(readings)
+        command = evidence.command
         near, solved = self._near, 0
         if near is None:
             likely = np.clip(self.belief.mean, self.belief.low, self.belief.high)
             near, solved = self.linearise(command + likely[:n_a], likely[n_a:]), 1
-        found = self._search(near, readings, solved)
+        found = self._search(near, evidence, solved)
         tight = self._statics.unilateral & ~found.near.state.slack
         if tight.any() and found.posterior.misfit > chi2.ppf(IMPROBABLE, len(found.posterior.residuals)):
             # The load may have slackened cables: readings have a most probable explanation with them and one without.
             released = self._released(command, found.posterior.mode)
-            slack = self._search(released, readings, found.solved + 1)
+            slack = self._search(released, evidence, found.solved + 1)
             if slack.posterior.cost < found.posterior.cost:
                 found = slack
             else:
                 found = replace(found, solved=slack.solved)
         near, posterior = found.near, found.posterior
         displacement, load = command + posterior.mode[:n_a], posterior.mode[n_a:]
-        self._near, self.belief = near, posterior.parameters
+        self._near, self._evidence, self.belief = near, evidence, posterior.parameters
         effectors = near.state.condensed.slices["e"]
         slope = (near.response[0] @ self._parameters_to_rows(load))[effectors]
         return Estimate(
@@ -297,13 +328,13 @@ class Estimator:
             near=near,
         )
 
-    def _search(self, near: Linearised, readings: Readings, solved: int) -> _Found:
-        """Explain a reading by the body near an equilibrium, and near those that follow, until they hardly change."""
+    def _search(self, near: Linearised, evidence: _Evidence, solved: int) -> _Found:
+        """Explain readings by the body near an equilibrium, and near those that follow, until they hardly change."""
         n_a, most, start = self._counts[0], solved + self.equilibria - 1, None
         while True:
-            posterior = self.explain(near, readings, start)
+            posterior = self._explain(near, evidence, start)
             start = posterior.mode
-            displacement, load = readings.command + start[:n_a], start[n_a:]
+            displacement, load = evidence.command + start[:n_a], start[n_a:]
             close = self._close(near, displacement, load, posterior.parameters)
             if close or solved >= most:
                 return _Found(near, posterior, close, solved)

@@ -95,8 +95,8 @@ class Touch:
     """A force along the normal of a grid at an unknown place in one cell.
 
     Parameters: the force [N], at least 0, and the place in the cell, two numbers from -1 to 1. The force is shared by
-    the corners of the cell with bilinear weights, so that the condensed model knows how every place responds. It keeps
-    its direction in space while the body bends.
+    nine points of the cell (corners, middles of edges, centre) with quadratic weights, so that the condensed model
+    knows how every place responds. It keeps its direction in space while the body bends.
 
     Args:
         grid: of which a cell is touched.
@@ -110,7 +110,9 @@ class Touch:
 
     @property
     def points(self) -> np.ndarray:
-        return self.grid.corners(self.cell)
+        corner, right, up, _ = self.grid.corners(self.cell)
+        shares = np.array([[i, j] for j in (0.0, 0.5, 1.0) for i in (0.0, 0.5, 1.0)])
+        return corner + shares @ np.array([right - corner, up - corner])
 
     @property
     def prior(self) -> Gaussian:
@@ -137,10 +139,15 @@ class Touch:
 
     @staticmethod
     def _weights(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the weights of the corners and their derivatives by both places, each of shape (4,)."""
-        (u, v), sign_u, sign_v = parameters[1:], np.array([-1.0, 1, -1, 1]), np.array([-1.0, -1, 1, 1])
-        along, across = 0.5 * (1.0 + sign_u * u), 0.5 * (1.0 + sign_v * v)
-        return along * across, 0.5 * sign_u * across, 0.5 * sign_v * along
+        """Return the weights of the points and their derivatives by both places, each of shape (9,)."""
+        (along, by_u), (across, by_v) = (_quadratic(place) for place in parameters[1:])
+        return np.kron(across, along), np.kron(across, by_u), np.kron(by_v, along)
+
+
+def _quadratic(place: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of -1, 0 and 1 in quadratic interpolation at a place, and their derivatives."""
+    weights = np.array([0.5 * place * (place - 1.0), 1.0 - place**2, 0.5 * place * (place + 1.0)])
+    return weights, np.array([place - 0.5, -2.0 * place, place + 0.5])
 
 
 @dataclass(frozen=True)

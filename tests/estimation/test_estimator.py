@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -84,6 +86,22 @@ def test_a_steady_body_needs_no_new_equilibrium_and_becomes_more_certain():
     assert (np.diag(second.parameters.covariance) < np.diag(first.parameters.covariance)).all()
 
 
+def test_readings_under_one_command_count_as_their_mean():
+    """The order of their noise does not matter, and force and place are not told apart by it."""
+    command, truth = np.array([0.006]), TOUCH
+    one_by_one = finger_estimator(2)
+    volumes, _ = one_by_one.predict(one_by_one.linearise(command, truth), command, truth)
+    noise = one_by_one.noise.volume * np.random.default_rng(3).standard_normal((4, 2))
+    for row in noise:
+        found = one_by_one.update(Readings(command, volumes + row))
+    at_once = finger_estimator(2)
+    at_once.noise = replace(at_once.noise, volume=at_once.noise.volume / 2.0)
+    expected = at_once.update(Readings(command, volumes + noise.mean(axis=0)))
+    spread = np.sqrt(np.diag(expected.parameters.covariance))
+    assert (np.abs(found.load - expected.load) < 0.15 * spread[1:]).all()
+    np.testing.assert_allclose(np.diag(found.parameters.covariance), spread**2, rtol=0.1)
+
+
 def test_another_cell_forgets_the_force_and_keeps_the_error_of_the_cable():
     estimator = finger_estimator(2)
     command = np.array([0.006])
@@ -97,7 +115,7 @@ def test_another_cell_forgets_the_force_and_keeps_the_error_of_the_cable():
 
 
 def test_touched_force_is_that_of_a_point():
-    """The corners of a cell share a force as a point within the cell does: the tip differs by less than 0.3 mm."""
+    """Nine points of a cell share a force as a point within the cell does: the tip differs by less than 0.3 mm."""
     estimator = finger_estimator(2)
     near = estimator.linearise(np.array([0.006]), TOUCH)
     body = make_robot("sensorized_finger").build()
