@@ -37,12 +37,14 @@ class Search:
         level: name of the budget: small, medium or large.
         judge: who controls the bodies; default that of the problem.
         seed: added to those of trainings.
+        limit: largest number of bodies; default none besides the budget.
     """
 
     problem: FrozenProblem
     level: str = "small"
     judge: Judge | None = None
     seed: int = 0
+    limit: int | None = None
     ledger: list[Score] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -63,6 +65,8 @@ class Search:
     @property
     def open(self) -> bool:
         """Whether budget is left. The score that crosses a limit is the last one, and it counts."""
+        if self.limit is not None and len(self.ledger) >= self.limit:
+            return False
         return all(value < max(getattr(self.limits, name), 1) for name, value in self.spent.items())
 
     def evaluate(self, design: Mapping[str, float], budget: float = 1.0) -> Score:
