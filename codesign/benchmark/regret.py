@@ -149,6 +149,7 @@ def method_rows(runs: Sequence[Stored], data: Any = DATA) -> list[MethodRow]:
             scores = [normalised(known, test) for _, test in members if known is not None and test]
             known_scores = np.array([[s] for s in scores if s is not None])
             reached = np.array([_reached(curve) for curve in curves]) if curves else np.full((1, 2), np.nan)
+            steps, seconds = (float(value) for value in np.median(reached, axis=0))
             rows.append(
                 MethodRow(
                     contest.problem,
@@ -158,7 +159,8 @@ def method_rows(runs: Sequence[Stored], data: Any = DATA) -> list[MethodRow]:
                     len(members),
                     stratified_estimate(contest.regrets(method)[:, None]),
                     float(np.mean([_area(curve, contest.steps) for curve in curves])) if curves else np.nan,
-                    *(float(value) for value in np.median(reached, axis=0)),
+                    steps,
+                    seconds,
                     stratified_estimate(known_scores) if len(known_scores) == len(members) else None,
                     float(np.mean([_at_bounds(problem, run) for run, _ in members])),
                     float(np.mean([run.diversity for run, _ in members])),
