@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgym_envs.codesign.objectives import OBJECTIVES
 from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.report.units import present
 from softgym_envs.codesign.snapshot import StudySnapshot
@@ -242,7 +241,7 @@ def transfer(snapshot: StudySnapshot, results: StudyResults) -> str | None:
     roles = results.roles
     with _figure(9.4, 3.5, len(keys)) as (_, axes, out):
         for ax, key in zip(axes, keys, strict=True):
-            objective = snapshot.config.objectives.get(key) or OBJECTIVES[key]
+            objective = snapshot.config.shown_objectives[key]
             rows = [row for row in results.transfer if row.objective == key]
             everything = np.concatenate([[*row.surrogate, *row.fem] for row in rows]) * objective.scale
             margin = 0.08 * (np.ptp(everything) or 1.0)
@@ -262,8 +261,9 @@ def transfer(snapshot: StudySnapshot, results: StudyResults) -> str | None:
     return out[0]
 
 
-def reached(results: StudyResults) -> str | None:
+def reached(snapshot: StudySnapshot, results: StudyResults) -> str | None:
     """Share of the test goals reached within a distance on FEM, for baseline and winner; None without FEM."""
+    scale = snapshot.config.distance_scale
     agents = [row.agent for row in results.comparison if row.backend == "fem"]
     tests = {(*group.key, group.goals): group for group in results.tests}
     if not agents:
@@ -271,12 +271,12 @@ def reached(results: StudyResults) -> str | None:
     with _figure(9.4, 3.3, len(agents)) as (_, axes, out):
         for ax, agent in zip(axes, agents, strict=True):
             for number, role in results.roles.items():
-                distances = 1e3 * np.sort(tests[number, agent, "fem", "unseen"].mean.distances)
+                distances = scale.factor * np.sort(tests[number, agent, "fem", "unseen"].mean.distances)
                 share = 100 * np.arange(len(distances) + 1) / len(distances)
                 ax.step([0, *distances], share, where="post", color=COLOURS[role], linewidth=2.0, label=role)
-            radius = 1e3 * results.success_distance
-            ax.axvline(radius, color="#d97706", linewidth=1.0, linestyle="--", label=f"success: {radius:g} mm")
-            ax.set(xlabel="final distance to the goal on FEM [mm]", ylabel="test goals reached [%]", ylim=(0, 102))
+            radius, limit = scale.factor * results.success_distance, scale.limit_text(results.success_distance)
+            ax.axvline(radius, color="#d97706", linewidth=1.0, linestyle="--", label=f"success: {limit}")
+            ax.set(xlabel=f"final {scale.name} on FEM [{scale.unit}]", ylabel="test goals reached [%]", ylim=(0, 102))
             ax.set_title(AGENTS[agent][0], fontsize=10, color="#334155")
             ax.set_xlim(left=0)
             ax.legend(fontsize=8, loc="lower right")

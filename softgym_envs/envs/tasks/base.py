@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import reduce
 from operator import mul
 from typing import Any, Protocol
@@ -26,6 +27,33 @@ class Random(Protocol):
 
     def integers(self, low: int, *, size: int) -> Array:
         """Draw integers from 0 to ``low - 1``."""
+
+
+@dataclass(frozen=True)
+class DistanceScale:
+    """How people read the distances of a task.
+
+    Attributes:
+        name: what a distance is called: ``"distance"`` or ``"error"``.
+        unit: unit that people read.
+        factor: factor to that unit from what `Task.distance` returns.
+    """
+
+    name: str
+    unit: str
+    factor: float
+
+    def text(self, distance: float, digits: int = 1) -> str:
+        """Return a distance with its unit: ``"3.2 mm"``."""
+        return f"{self.factor * distance:.{digits}f} {self.unit}"
+
+    def limit_text(self, distance: float) -> str:
+        """Return a distance that somebody chose, without needless zeros: ``"5 mm"``."""
+        return f"{self.factor * distance:g} {self.unit}"
+
+
+LENGTHS = DistanceScale("distance", "mm", 1e3)
+SHARES = DistanceScale("error", "%", 1e2)
 
 
 def tolerance(x: Array, margin: float) -> Array:
@@ -107,6 +135,8 @@ class Task(ABC):
     needs_state = False
     #: Unit of goals; that of positions by default.
     goal_unit = "m"
+    #: How people read distances; lengths by default.
+    distance_scale = LENGTHS
 
     name: str
     horizon: int = 1
@@ -170,14 +200,18 @@ class Task(ABC):
         """Return what the touch sensors show of the last `touch`, in [-1, 1], shape (``sensors`` - s,)."""
         return np.zeros(0)
 
-    @classmethod
-    def distance_text(cls, distance: float, digits: int = 1) -> str:
-        """Return a distance to show: in millimetres, or in percent of a goal that is not a place."""
-        return f"{1e3 * distance:.{digits}f} mm" if cls.goal_unit == "m" else f"{1e2 * distance:.{digits}f} %"
-
     def measure(self, state: State) -> np.ndarray:
         """Return what is compared with the goal, shape (3,): the first effector [m] unless a task overrides it."""
         return state.effector[0]
+
+    def drawn_goals(self, state: State, path: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return path (p, 3) and goal (3,) for a picture of a state [m].
+
+        Goals that are not places are drawn where the effector is.
+        """
+        if self.goal_unit == "m":
+            return path, goal
+        return state.effector[:1], state.effector[0]
 
     def hindsight_goals(self, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the goals (B, 3) that measured values (B, 3) would have reached, and which may be goals (B,)."""
