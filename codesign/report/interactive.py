@@ -285,7 +285,7 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
     from softgym_envs.viewer.surface import BodySurface
 
     surfaces = [BodySurface(episode.model) for episode in episodes]
-    points = max(len(surface.shape(e.model.nodes)) for surface, e in zip(surfaces, episodes, strict=True))
+    points = max(len(surface.nodes) for surface in surfaces)
     count = max(2, min(MAX_FRAMES, max(len(e.states) for e in episodes), MAX_POINTS // points))
     picks = [episode.pick(count) for episode in episodes]
     figure = _figure(560, scene=_scene(), uirevision="constant")
@@ -296,7 +296,7 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
             index = pick[min(frame, len(pick) - 1)]
             nodes = episode.states[index].nodes
             assert nodes is not None, "finite elements compute nodes"
-            drawn.append(_body_trace(episode.role, surface.shape(nodes), surface.faces if whole else None))
+            drawn.append(_body_trace(episode.role, surface.points(nodes), surface.triangles if whole else None))
             drawn.append(_tip_trace(episode, index, whole))
         return drawn
 

@@ -276,7 +276,7 @@ def _poses(snapshot: StudySnapshot) -> list[tuple[str, np.ndarray | None]]:
 
 
 def _pictures(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
-    """Return pictures of baseline and winner in each pose and their overlaid side views, or why there are none."""
+    """Return pictures of baseline and winner in each pose and both over each other, or why there are none."""
     bodies = {"baseline": snapshot.config.baseline}
     if results.winner is not None:
         bodies["winner"] = results.winner.design
@@ -314,7 +314,7 @@ def _shapes(snapshot: StudySnapshot, bodies: Mapping[str, dict[str, float]]) -> 
         model = finder.load(body)
         surface = BodySurface(model)
         for (_, command), (_, drawn) in zip(poses, shapes, strict=True):
-            drawn[role] = (surface.shape(finder.at(body, command)), surface.faces, finder.state.effector)
+            drawn[role] = (surface.points(finder.at(body, command)), surface.triangles, finder.state.effector)
     return shapes
 
 
