@@ -18,7 +18,7 @@ results = click.option(
 )
 
 
-@click.group()
+@click.group(cls=options.Verbs)
 def benchmark() -> None:
     """Compare optimisers of bodies and controllers on frozen problems.
 
