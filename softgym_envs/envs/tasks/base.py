@@ -105,6 +105,10 @@ def check_length(value: float, name: str, robot: Robot) -> float:
     return value
 
 
+#: Smallest reward whose logarithm is followed; below, gradients would be without bound.
+SMALLEST_REWARD = 1e-6
+
+
 class Task(ABC):
     """What a robot has to do: a task draws goals and rates how close a state is to the present goal.
 
@@ -247,9 +251,27 @@ class Task(ABC):
             distance: effector to goal [m], shape (...).
             effort_share: mean actuator effort over its scale, shape (...).
         """
-        near = tolerance(distance, self.success_distance)
-        far = tolerance(distance, self.robot.workspace_scale)
+        near, far = self._nearness(distance)
         return {"distance": 0.5 * near + 0.5 * far, "effort": 1.0 - 0.05 * effort_share.clip(0.0, 1.0)}
+
+    def _nearness(self, distance: Array) -> tuple[Array, Array]:
+        return tolerance(distance, self.success_distance), tolerance(distance, self.robot.workspace_scale)
+
+    def log_reward(self, distance: Array, effort_share: Array) -> Array:
+        """Return what learners that follow derivatives ascend: the logarithm of the reward, with a slope everywhere.
+
+        Between the success distance and the workspace scale the reward is nearly flat. So the logarithm of a mean that
+        is arithmetic in the reward, of nearness on both scales, is replaced by that of the geometric mean. At the goal
+        the two agree up to the third order in the distance.
+
+        Args:
+            distance: effector to goal [m], shape (...).
+            effort_share: mean actuator effort over its scale, shape (...).
+        """
+        near, far = self._nearness(distance)
+        log = namespace(distance).log
+        reward = reduce(mul, self.reward_terms(distance, effort_share).values()).clip(SMALLEST_REWARD, None)
+        return log(reward) + 0.5 * log(near * far) - log(0.5 * near + 0.5 * far)
 
     def rate(self, effector: Array, goal: Array, effort_share: Array) -> tuple[Array, dict[str, Array], Array]:
         """Return distances to the goal [m], the factors of the reward, and the reward, which is their product.
