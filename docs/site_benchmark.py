@@ -13,6 +13,7 @@ PARTS = {
     "board": board.leaderboard,
     "tracks_of_methods": board.track_table,
     "regrets": board.regret_table,
+    "unseen": board.unseen_table,
     "methods": board.method_table,
 }
 """Name of a part, in ``<!-- benchmark: NAME -->`` -> the function that writes it."""

@@ -54,6 +54,7 @@ def method_table(runs: Sequence[Stored] | None = None, data: Path = DATA) -> str
         "method",
         "seeds",
         "regret at the end [%]",
+        "on unseen goals [%]",
         "area [%]",
         "steps to 1 %",
         "CPU s to 1 %",
@@ -71,6 +72,7 @@ def _method_cells(row: MethodRow) -> list[str]:
         row.method,
         str(row.seeds),
         _interval(row.regret, 100.0, 1),
+        "-" if row.unseen is None else _interval(row.unseen, 100.0, 0),
         "-" if np.isnan(row.area) else f"{100 * row.area:.1f}",
         _reached(row.steps, ",.0f"),
         _reached(row.seconds, ".1f"),
@@ -108,8 +110,8 @@ def track_table(runs: Sequence[Stored] | None = None) -> str:
     return _table([*header, "better than random with probability", "smallest regret on"], rows)
 
 
-def regret_table(runs: Sequence[Stored] | None = None) -> str:
-    """Return the regret of each method on each problem; default the stored runs."""
+def regret_table(runs: Sequence[Stored] | None = None, unseen: bool = False) -> str:
+    """Return the regret of each method on each problem, in the search or on unseen goals; default the stored runs."""
     found = contests(stored_runs() if runs is None else runs)
     if not found:
         return "No runs are stored."
@@ -120,12 +122,18 @@ def regret_table(runs: Sequence[Stored] | None = None) -> str:
         cells = [f"`{contest.problem}`", contest.judge + (", table" if contest.listed else "")]
         cells.append(str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}")
         for method in methods:
+            values = np.array([])
             if method in contest.runs:
-                cells.append(_interval(stratified_estimate(contest.regrets(method)[:, None]), 100.0, 1))
-            else:
-                cells.append("-")
-        rows.append(cells)
+                values = contest.unseen(method) if unseen else contest.regrets(method)
+            cells.append(_interval(stratified_estimate(values[:, None]), 100.0, 1) if len(values) else "-")
+        if set(cells[3:]) != {"-"}:
+            rows.append(cells)
     return _table(["problem", "judge", "seeds", *(f"{method} [%]" for method in methods)], rows)
+
+
+def unseen_table() -> str:
+    """Return the regret of the stored runs on unseen goals."""
+    return regret_table(unseen=True)
 
 
 def _interval(estimate: Estimate, scale: float, digits: int) -> str:

@@ -44,8 +44,9 @@ class Contest:
         limit: largest number of bodies, or None.
         runs: by method, ordered by seed.
         worst: merit of the baseline body.
-        best: merit of the best body that any run on the problem found by the same yardstick; with several objectives,
-            of all bodies that the runs of the contest found.
+        best: merit of the best body that any run found under the same judge, or of the best listed one; with several
+            objectives, of the winners of all runs of the contest together.
+        best_unseen: score on the validation goals of the best winner of any run on the problem, under any judge.
     """
 
     problem: str
@@ -56,10 +57,20 @@ class Contest:
     runs: dict[str, list[Stored]]
     worst: float
     best: float
+    best_unseen: float
 
     def regrets(self, method: str) -> np.ndarray:
         """Return the regret at the end of each run: 0 at ``best``, 1 at ``worst``; 0 if no run beat the baseline."""
         return np.array([self._regret(_end(run)) for run, _ in self.runs[method]])
+
+    def unseen(self, method: str) -> np.ndarray:
+        """Return the regret of each winner on the validation goals: 0 at ``best_unseen``, 1 at the baseline.
+
+        It is above 1 if the winner is worse than the baseline there. None with several objectives and on a table.
+        """
+        pairs = np.array([run.unseen for run, _ in self.runs[method] if len(run.unseen) == 2]).reshape(-1, 2)
+        spans = self.best_unseen - pairs[:, 0]
+        return np.where(spans > 0.0, (self.best_unseen - pairs[:, 1]) / np.where(spans > 0.0, spans, 1.0), 0.0)
 
     def curve(self, run: Run) -> np.ndarray:
         """Return rows of environment steps, CPU seconds and regret; none with several objectives."""
@@ -77,28 +88,25 @@ class Contest:
 def contests(runs: Sequence[Stored]) -> list[Contest]:
     """Return the stored runs by problem, judge, budget and limit."""
     groups: dict[tuple, dict[str, list[Stored]]] = defaultdict(lambda: defaultdict(list))
-    best: dict[tuple, float] = {}
+    best: dict[tuple, float] = defaultdict(lambda: -np.inf)
+    unseen: dict[str, float] = defaultdict(lambda: -np.inf)
     for run, test in sorted(runs, key=lambda row: row[0].seed):
         listed = run.optimum is not None
         groups[run.problem, run.judge, listed, run.level, run.limit][run.method].append((run, test))
         if run.curve:
-            value = run.optimum if run.optimum is not None else max(row[2] for row in run.curve)
-            best[_yardstick(run)] = max(best.get(_yardstick(run), -np.inf), value)
+            key = run.problem, run.judge, listed
+            best[key] = max(best[key], run.curve[-1][2] if run.optimum is None else run.optimum)
+        unseen[run.problem] = max([unseen[run.problem], *run.unseen])
     found = []
-    for (name, judge, listed, level, limit), members in sorted(groups.items(), key=lambda item: str(item[0])):
+    for key, members in sorted(groups.items(), key=lambda item: str(item[0])):
         every = [run for rows in members.values() for run, _ in rows]
         if every[0].curve:
-            worst, top = every[0].curve[0][2], best[_yardstick(every[0])]
+            worst, top = every[0].curve[0][2], best[key[:3]]
         else:
             worst = _merit(every[0], [every[0].baseline])
             top = _merit(every[0], [scores for run in every for scores in run.search_scores])
-        found.append(Contest(name, judge, listed, level, limit, dict(sorted(members.items())), worst, top))
+        found.append(Contest(*key, dict(sorted(members.items())), worst, top, unseen[key[0]]))
     return found
-
-
-def _yardstick(run: Run) -> tuple[str, str]:
-    """Return what the curve of a run was measured by; only equal yardsticks can be compared."""
-    return run.problem, "qp" if run.optimum is None else f"table {run.judge}"
 
 
 def _end(run: Run) -> float:
@@ -117,11 +125,12 @@ def _merit(run: Run, scores: Sequence[Sequence[float]]) -> float:
 class MethodRow:
     """A method on one problem, over its seeds.
 
-    ``regret`` is 0 for the best body that any run found and 1 for the baseline, under the inverse QP on the validation
-    goals; on a table 0 for its best body, by the table's scores; with several objectives it is that of the hypervolume
-    in the search. ``area`` is its mean over the logarithm of the environment steps, ``steps`` and ``seconds`` the
-    medians until it stays below 1 %, infinite if more than half of the runs never get there; these three are NaN with
-    several objectives. ``score`` is the normalised score on finite elements.
+    ``regret`` is 0 for the best body that any run found and 1 for the baseline, by the scores of the search; on a table
+    0 for its best body; with several objectives it is that of the hypervolume. ``unseen`` is the regret on the
+    validation goals under the inverse QP, above 1 if the winner is worse than the baseline there, or None. ``area`` is
+    the mean regret over the logarithm of the environment steps, ``steps`` and ``seconds`` the medians until it stays
+    below 1 %, infinite if more than half of the runs never get there; these three are NaN with several objectives.
+    ``score`` is the normalised score on finite elements.
     """
 
     problem: str
@@ -130,6 +139,7 @@ class MethodRow:
     method: str
     seeds: int
     regret: Estimate
+    unseen: Estimate | None
     area: float
     steps: float
     seconds: float
@@ -149,6 +159,7 @@ def method_rows(runs: Sequence[Stored], data: Any = DATA) -> list[MethodRow]:
             scores = [normalised(known, test) for _, test in members if known is not None and test]
             known_scores = np.array([[s] for s in scores if s is not None])
             reached = np.array([_reached(curve) for curve in curves]) if curves else np.full((1, 2), np.nan)
+            unseen = contest.unseen(method)
             steps, seconds = (float(value) for value in np.median(reached, axis=0))
             rows.append(
                 MethodRow(
@@ -158,6 +169,7 @@ def method_rows(runs: Sequence[Stored], data: Any = DATA) -> list[MethodRow]:
                     method,
                     len(members),
                     stratified_estimate(contest.regrets(method)[:, None]),
+                    stratified_estimate(unseen[:, None]) if len(unseen) else None,
                     float(np.mean([_area(curve, contest.steps) for curve in curves])) if curves else np.nan,
                     steps,
                     seconds,

@@ -39,15 +39,17 @@ class Run(Record):
         seed: of the optimiser and of trainings.
         designs: the winner; with several objectives, bodies of the front.
         search_scores: their scores in the search.
-        curve: for each body that became the best: environment steps and CPU seconds until then, and its score under the
-            inverse QP on the validation goals, the same yardstick for all judges. Empty with several objectives.
+        curve: for each body that became the best: environment steps and CPU seconds until then, and its score in the
+            search. Empty with several objectives.
+        unseen: scores of the baseline and of the winner under the inverse QP on the validation goals, which no search
+            sees: one yardstick for all judges. Empty with several objectives and for a search on a table.
         bodies: number of bodies scored.
         infeasible: number of these that could not be scored.
         diversity: mean distance between bodies in the unit box, divided by its diagonal.
         spent: environment steps, CPU seconds and solves on finite elements.
         optimiser_seconds: CPU time of the optimiser itself [s].
         commit: of the code.
-        optimum: best score of a listed body, for a search on a table; the curve then holds the scores of the table.
+        optimum: best score of a listed body, for a search on a table.
         baseline: scores of the baseline body in the search.
         limit: largest number of bodies, if the search had a limit besides its budget.
     """
@@ -61,6 +63,7 @@ class Run(Record):
     designs: list[dict[str, float]]
     search_scores: list[list[float]]
     curve: list[list[float]] = field(default_factory=list)
+    unseen: list[float] = field(default_factory=list)
     bodies: int = 0
     infeasible: int = 0
     diversity: float = 0.0
@@ -110,7 +113,8 @@ def run(
         seed=seed,
         designs=[row.design for row in winners],
         search_scores=[row.scores for row in winners],
-        curve=_curve(problem, search, folder, table is not None) if single else [],
+        curve=_curve(search) if single else [],
+        unseen=_unseen(problem, winners, folder) if single and table is None else [],
         bodies=len(search.ledger),
         infeasible=sum(not row.feasible for row in search.ledger),
         diversity=_diversity(problem, search.ledger),
@@ -125,15 +129,18 @@ def run(
     return found
 
 
-def _curve(problem: FrozenProblem, search: Search, folder: Path, own: bool) -> list[list[float]]:
-    """Return the curve of `Run`, by the search's own scores or by the yardstick of the validation goals."""
+def _curve(search: Search) -> list[list[float]]:
     rows = []
     for index, row in search.incumbents:
         spent = search.ledger[: index + 1]
-        value = row.score if own else tested(problem, row.design, "qp", "validation", None, folder).score
         steps, seconds = sum(r.environment_steps for r in spent), sum(r.cpu_seconds for r in spent)
-        rows.append([steps, round(seconds, 3), value])
+        rows.append([steps, round(seconds, 3), row.score])
     return rows
+
+
+def _unseen(problem: FrozenProblem, winners: Sequence[Score], folder: Path) -> list[float]:
+    designs = [problem.definition.baseline_values, *(row.design for row in winners)]
+    return [tested(problem, design, "qp", "validation", None, folder).score for design in designs]
 
 
 def _diversity(problem: FrozenProblem, rows: Sequence[Score]) -> float:
