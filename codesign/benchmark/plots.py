@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +20,8 @@ COLOURS = {
     "gp": "#0f766e",
     "cmaes": "#ea580c",
     "nsgaii": "#9333ea",
-    "cma_me": "#db2777",
     "halving": "#ca8a04",
+    "hyperband": "#db2777",
 }
 """Colour of each method in all figures."""
 
@@ -55,7 +56,7 @@ def draw_regret(runs: Sequence[Stored] | None = None, columns: int = 3) -> np.nd
         lines = -(-len(shown) // columns)
         figure = Figure(figsize=(3.3 * columns, 2.5 * lines + 0.4), layout="constrained", dpi=110)
         canvas = FigureCanvasAgg(figure)
-        handles: dict[str, object] = {}
+        handles: dict[str, Any] = {}
         for place, contest in enumerate(shown):
             axes = figure.add_subplot(lines, columns, place + 1)
             first = min(contest.curve(run)[0, 0] for rows in contest.runs.values() for run, _ in rows)
@@ -70,7 +71,7 @@ def draw_regret(runs: Sequence[Stored] | None = None, columns: int = 3) -> np.nd
             axes.set_title(f"{contest.problem} ({judge})", fontsize=9)
         figure.supxlabel("environment steps", fontsize=9.5)
         figure.supylabel("regret", fontsize=9.5)
-        figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(handles))
+        figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=len(handles))
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 

@@ -94,18 +94,19 @@ def contests(runs: Sequence[Stored]) -> list[Contest]:
         listed = run.optimum is not None
         groups[run.problem, run.judge, listed, run.level, run.limit][run.method].append((run, test))
         if run.curve:
-            key = run.problem, run.judge, listed
-            best[key] = max(best[key], run.curve[-1][2] if run.optimum is None else run.optimum)
+            kind = run.problem, run.judge, listed
+            best[kind] = max(best[kind], run.curve[-1][2] if run.optimum is None else run.optimum)
         unseen[run.problem] = max([unseen[run.problem], *run.unseen])
     found = []
-    for key, members in sorted(groups.items(), key=lambda item: str(item[0])):
+    for (name, judge, listed, level, limit), members in sorted(groups.items(), key=lambda item: str(item[0])):
         every = [run for rows in members.values() for run, _ in rows]
         if every[0].curve:
-            worst, top = every[0].curve[0][2], best[key[:3]]
+            worst, top = every[0].curve[0][2], best[name, judge, listed]
         else:
             worst = _merit(every[0], [every[0].baseline])
             top = _merit(every[0], [scores for run in every for scores in run.search_scores])
-        found.append(Contest(*key, dict(sorted(members.items())), worst, top, unseen[key[0]]))
+        ordered = dict(sorted(members.items()))
+        found.append(Contest(name, judge, listed, level, limit, ordered, worst, top, unseen[name]))
     return found
 
 
