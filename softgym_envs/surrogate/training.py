@@ -114,12 +114,14 @@ class CorrectionConfig(Config):
 
     Attributes:
         coarser: options of the coarser mesh, which replace those of the robot.
+        own: likewise for the robot's own mesh, such as no contact, if the others have none.
         finer: options of the finer mesh.
         sizes: of the elements from coarse to fine, in any unit.
         states: the same states on the coarser mesh, that of the robot, and the finer one.
     """
 
     coarser: dict[str, Any]
+    own: dict[str, Any] = {}
     finer: dict[str, Any]
     sizes: tuple[float, float, float]
     states: SplitConfig
@@ -278,7 +280,7 @@ def generate_datasets(
             plans[f"pretraining/{split}"] = options | coarse.robot_options, data.plan_of(getattr(coarse, split))
     if fine := config.correction:
         plan = replace(data.plan_of(fine.states), margin=0.0)  # efforts are compared at equal commands
-        for level, changed in (("coarser", fine.coarser), ("own", {}), ("finer", fine.finer)):
+        for level, changed in (("coarser", fine.coarser), ("own", fine.own), ("finer", fine.finer)):
             plans[f"correction/{level}"] = options | changed, plan
     found = {
         name: generate_dataset(
