@@ -74,7 +74,7 @@ TRUNK_LEVELS = {
 }
 
 STUDIES = {
-    "finger": Study("finger", *scaled(10 * MM), (10 * MM, 10 * MM), {}),
+    "finger": Study("finger", *scaled(10 * MM), (10 * MM, 10 * MM), {"self_contact": False}),
     "finger_1cable": Study("finger", *scaled(10 * MM), (10 * MM,), {"cables": 1, "self_contact": False}),
     "diamond": Study("diamond", scaled(17 * MM)[0], None, (15 * MM, 0.0, 0.0, 0.0), {}, steps=4),
     "cable_trunk": Study(

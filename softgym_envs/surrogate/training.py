@@ -37,13 +37,14 @@ cost."""
 
 
 class SplitConfig(Config):
-    """One dataset split; without a ``boundary`` of its own, it has that of all data."""
+    """One dataset split, see `SamplingPlan`; without a ``boundary`` of its own, it has that of all data."""
 
     groups: int = Field(gt=0)
     states: int = Field(ge=0)
     sequence: Literal["halton", "sobol", "latin", "random"] = "random"
     seed: int = Field(default=0, ge=0)
     boundary: float | None = Field(default=None, ge=0.0, le=1.0)
+    share: float = Field(default=1.0, gt=0.0, le=1.0)
 
 
 class DataConfig(Config):
