@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.recorded import results
+from benchmarks.tables import markdown
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.control.settling import settle
@@ -107,7 +109,9 @@ def _on_weights(design: Mapping[str, float], goals: np.ndarray) -> tuple[np.ndar
         controller, command = InverseQP.for_robot(model.robot), np.zeros(2)
         for _ in range(STEPS):
             reached, _, _ = model.search(context, command[None], command[None], model.robot.unilateral, 1e-6, 50)
-            command = controller.solve(model.condensed(context, reached)[0], goal, command, reached[0] > command + 1e-6)
+            both = model.condensed(context, reached)
+            state = replace(both, compliance=both.compliance[0], free=both.free[0], effort=both.effort[0])
+            command = controller.solve(state, goal, command, reached[0] > command + 1e-6)
         commands.append(command)
         distances.append(float(np.linalg.norm(model.effector(context, reached)[0][0, :3] - goal)))
     return np.array(commands), np.array(distances)
@@ -129,5 +133,37 @@ def _on_mesh(size: float, design: Mapping[str, float], goals: np.ndarray, starts
     seconds = time.process_time() - start
     return {"distance [mm]": distances, "tension [N]": tensions, "equilibria": count, "CPU [s]": seconds}
 
+
+def weights_table() -> str:
+    """Errors of tip and tension of both sets of weights, body by body."""
+    found = results("accurate_weights")["rows"]
+    of = {(row["weights"], row["body"]): row for row in found}
+    rows = []
+    for body in dict.fromkeys(row["body"] for row in found):
+        title = body if body == "baseline" else f"random body {body}"
+        cells = [f"{100 * of[weights, body][name]:.1f}" for weights in WEIGHTS for name in ("tip", "tension")]
+        rows.append([title, *cells])
+    head = ["body", "accurate: tip [%]", "tension [%]", "published: tip [%]", "tension [%]"]
+    return markdown(head, rows, "lrrrr")
+
+
+def study_table() -> str:
+    """Mean distance from the goals of the study's baseline and winner on the weights and on two meshes."""
+    found = results("accurate_study")
+    judges = ["surrogate", *MESHES]
+    rows = []
+    for judge in judges:
+        means, tensions = [], []
+        for body in ("baseline", "winner"):
+            key = f"{body}: surrogate [mm]" if judge == "surrogate" else f"{body}: {judge}: distance [mm]"
+            means.append(f"{np.mean(found[key]):.2f}")
+            tensions.append("" if judge == "surrogate" else f"{np.mean(found[f'{body}: {judge}: tension [N]']):.2f}")
+        rows.append([judge, *means, *tensions])
+    head = ["judge", "baseline [mm]", "winner [mm]", "largest tension, baseline [N]", "winner [N]"]
+    return markdown(head, rows, "lrrrr")
+
+
+TABLES = {"accurate_weights": weights_table, "accurate_study": study_table}
+"""Tables of pages by name."""
 
 BENCHMARKS = {"accurate_weights": accurate_weights, "accurate_study": accurate_study}

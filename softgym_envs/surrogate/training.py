@@ -230,7 +230,7 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
 def domain_of(
     model: SurrogateModel, training: dict[str, np.ndarray], validation: dict[str, np.ndarray]
 ) -> dict[str, Any]:
-    """Return where a model may be trusted: the box of its training states, and its uncertainty on validation states.
+    """Return where a model may be trusted: the box of all states that it learned, and its uncertainty on others.
 
     Returns:
         ``displacement`` and ``design`` ranges; ``inflation``: factor that turns the spread of the ensemble into a bound
@@ -357,10 +357,13 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     if config.correction is not None:
         levels = [data[f"correction/{level}"] for level in ("coarser", "own", "finer")]
         correction = asdict(fit_correction(levels, config.correction.sizes, features.design(levels[1]["design"])))
+    # Cheap states are learned, too, and few expensive ones hardly reach the bounds of the boxes.
+    parts = [learned[name] for name in ("train", "pretraining/train") if name in learned]
+    every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     card = {
         **card_of(robot, config.network.kind),
         "config": config.model_dump(mode="json", exclude={"executor"}),
-        "domain": domain_of(model, learned["train"], data["validation"]),
+        "domain": domain_of(model, every, data["validation"]),
         "loaded": bool(robot.build().loads.any()),
         "states": {split: len(rows) for split, rows in states.items()},
         "unstable_states_left_out": {split: len(learned[split]["rest"]) - len(rows) for split, rows in states.items()},
