@@ -263,9 +263,9 @@ def _distance(entry: StoredRuns, agent: str, backend: str) -> str:
     scores = entry.scores(agent, backend, "mean_distances" if entry.follows else "distances")
     if scores is None:
         return ""
-    if entry.environment.task_class.goal_unit == "m":
-        return _present(crossed_estimate(1e3 * scores))
-    return f"{_present(crossed_estimate(1e2 * scores))} %"
+    scale = entry.environment.task_class.distance_scale
+    text = _present(crossed_estimate(scale.factor * scores))
+    return text if scale.unit == "mm" else f"{text} {scale.unit}"
 
 
 def _success(entry: StoredRuns, agent: str, backend: str) -> str:

@@ -149,8 +149,9 @@ def train(
             # A proposer concentrates on bodies other than those of the evaluation, so the last policy is kept.
             if proposer is not None or curve[-1]["mean_return"] >= max(row["mean_return"] for row in curve):
                 best = learner.weights()
-            distance = config.environment.task_class.distance_text(outcome.mean_distance, 2)
-            bar.set_postfix_str(f"success {outcome.success_rate:.0%}, distance {distance}")
+            scale = config.environment.task_class.distance_scale
+            distance = f"{scale.name} {scale.text(outcome.mean_distance, 2)}"
+            bar.set_postfix_str(f"success {outcome.success_rate:.0%}, {distance}")
             shown = ("success_rate", "mean_distance", "mean_return")
             learner.record({f"evaluation/{name}": getattr(outcome, name) for name in shown})
             _write_curve(folder / "curve.csv", curve)

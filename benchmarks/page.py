@@ -21,13 +21,14 @@ import re
 import sys
 from pathlib import Path
 
+from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
 from benchmarks.recorded import figure
 from benchmarks.tables import TABLES as OTHER_TABLES
 from benchmarks.zigzag_tables import ZIGZAG_TABLES
 from softgym_envs.errors import DataError
 
-TABLES = OTHER_TABLES | ZIGZAG_TABLES | CONVERGENCE_TABLES
+TABLES = OTHER_TABLES | ZIGZAG_TABLES | CONVERGENCE_TABLES | ACCURATE_TABLES
 ROOT = Path(__file__).resolve().parents[1]
 MARKER = re.compile(r"(<!-- bench: (?P<key>.+?) -->)(?P<text>.*?)(<!-- /bench -->)", re.DOTALL)
 

@@ -14,6 +14,7 @@ import click
 
 from benchmarks import (
     accuracy,
+    accurate_finger,
     beams,
     carry,
     codesign_scale,
@@ -96,6 +97,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "strategies": strategies.strategies,
     "codesign_kills": codesign_scale.kills,
     "codesign_profile": codesign_scale.profile,
+    **accurate_finger.BENCHMARKS,
     **convergence.BENCHMARKS,
     **robustness.BENCHMARKS,
 }

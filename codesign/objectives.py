@@ -20,6 +20,7 @@ from softgym_envs.registry import import_object
 
 if TYPE_CHECKING:
     from softgym_envs.agents.evaluation import Evaluation
+    from softgym_envs.envs.tasks.base import Task
     from softgym_envs.mechanics.model import MechanicalModel
     from softgym_envs.robots.base import Robot
 
@@ -78,6 +79,11 @@ class Objective:
     of_body: bool = False
 
     @property
+    def decimals(self) -> int:
+        """Decimals that tables show in ``unit``."""
+        return 1 if self.unit == "%" else 2
+
+    @property
     def sign(self) -> int:
         """1 if larger is better, else -1."""
         return 1 if self.maximize else -1
@@ -115,7 +121,12 @@ class Objective:
         if value is None:
             return "-"
         unit = "pp" if sign and self.unit == "%" else self.unit
-        return f"{value * self.scale:{sign}.{1 if self.unit == '%' else 2}f}{' ' + unit if unit else ''}"
+        return f"{self.number(value, sign)}{' ' + unit if unit else ''}"
+
+    def number(self, value: float, sign: str = "") -> str:
+        """A value [SI] in ``unit``, without naming it."""
+        rounded = round(value * self.scale, self.decimals) + 0.0  # no negative zero
+        return f"{rounded:{sign}.{self.decimals}f}"
 
     @property
     def axis(self) -> str:
@@ -155,12 +166,13 @@ OBJECTIVES: dict[str, Objective] = {
 """Registry: name to objective."""
 
 
-def find_objective(name: str, robot: Robot) -> Objective:
-    """Return an objective, with the units that it has for a robot.
+def find_objective(name: str, robot: Robot, task: type[Task]) -> Objective:
+    """Return an objective, with the units that it has for a robot and a task.
 
     Args:
         name: name in `OBJECTIVES`, or the place of one of your own, ``module:attribute``.
         robot: decides the unit of efforts.
+        task: decides the unit of distances.
 
     Raises:
         ValueError: if there is no such objective.
@@ -174,6 +186,10 @@ def find_objective(name: str, robot: Robot) -> Objective:
         units = {EFFORT_UNITS.get(actuator.unit, (f"J/{actuator.unit}", 1.0)) for actuator in robot.actuators}
         unit, scale = units.pop() if len(units) == 1 else ("SI units", 1.0)
         objective = replace(objective, unit=unit, scale=scale)
+    if name in ("mean_distance", "mean_tracking_distance"):
+        shown = task.distance_scale
+        label = objective.label.replace("distance", shown.name)
+        objective = replace(objective, label=label, unit=shown.unit, scale=shown.factor)
     return objective
 
 

@@ -12,6 +12,7 @@ from softgym_envs.codesign.objectives import OBJECTIVES, Objective, find_objecti
 from softgym_envs.codesign.variables import OptionRange, make_variables, split_values, with_options
 from softgym_envs.config import Config
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.envs.tasks.base import DistanceScale
 from softgym_envs.robots.base import Robot
 
 
@@ -84,7 +85,15 @@ class StudyProblem(Config):
     def objectives(self) -> dict[str, Objective]:
         """All objectives that the study names, by name: objective, secondary objectives and constraints."""
         names = (self.objective, *self.secondary_objectives, *self.constraints)
-        return {name: find_objective(name, self.robot) for name in names}
+        return {name: self._find(name) for name in names}
+
+    def _find(self, name: str) -> Objective:
+        return find_objective(name, self.robot, self.environment.task_class)
+
+    @property
+    def shown_objectives(self) -> dict[str, Objective]:
+        """What every comparison of bodies shows, by name: the objective, success rate and final distance."""
+        return {name: self._find(name) for name in dict.fromkeys((self.objective, "success_rate", "mean_distance"))}
 
     @property
     def primary(self) -> Objective:
@@ -117,8 +126,18 @@ class StudyProblem(Config):
         return "; ".join(broken)
 
     @property
+    def distance(self) -> Objective:
+        """Mean final distance, in the unit that people read for the task."""
+        return self._find("mean_distance")
+
+    @property
+    def distance_scale(self) -> DistanceScale:
+        """How people read a single distance of the task."""
+        return self.environment.task_class.distance_scale
+
+    @property
     def success_distance(self) -> float:
-        """Distance within which a goal counts as reached [m]."""
+        """Distance within which a goal counts as reached, in the unit of `Task.distance`."""
         return self.environment.make_task(self.robot).success_distance
 
     @property

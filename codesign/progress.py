@@ -139,7 +139,8 @@ class Progress:
         if test.evaluation is None:
             return f"failed ({test.error})"
         found = f"success {100 * test.evaluation.success_rate:.1f} %, "
-        found += f"mean distance {1e3 * test.evaluation.mean_distance:.2f} mm"
+        measure = self.config.distance
+        found += f"{measure.label.lower()} {measure.text(test.evaluation.mean_distance)}"
         if self.objective.name not in ("mean_distance", "success_rate"):
             value = TestGroup([test]).value(self.objective.name)
             found = f"{self.objective.label.lower()} {self.objective.text(value)}, {found}"
@@ -174,12 +175,16 @@ class Progress:
                 f"{self.objective.label.lower()} {text(row.baseline.objective)} -> {text(row.winner.objective)}"
             )
         changes.append(f"success {100 * row.baseline.success_rate:.1f} -> {100 * row.winner.success_rate:.1f} %")
-        changes.append(f"distance {1e3 * row.baseline.mean_distance:.2f} -> {1e3 * row.winner.mean_distance:.2f} mm")
+        measure = self.config.distance
+        changes.append(
+            f"{self.config.distance_scale.name} {measure.number(row.baseline.mean_distance)} -> "
+            f"{measure.text(row.winner.mean_distance)}"
+        )
         interval = ""
         if row.distance_change_interval is not None:
-            low, high = (1e3 * value for value in row.distance_change_interval)
-            interval = f", 95 % interval {low:+.2f} to {high:+.2f} mm"
+            low, high = sorted(row.distance_change_interval)
+            interval = f", 95 % interval {measure.number(low, '+')} to {measure.text(high, '+')}"
         return (
             f"{row.agent} on {row.backend}, {row.goals} test goals: {', '.join(changes)} "
-            f"(change {1e3 * row.distance_change:+.2f} mm{interval})"
+            f"(change {measure.text(row.distance_change, '+')}{interval})"
         )

@@ -55,8 +55,9 @@ class Record:
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read a file; see `from_json`."""
+        data = read_json(path)
         try:
-            return cls.from_json(read_json(path))
+            return cls.from_json(data)
         except (DataError, TypeError, ValueError) as error:
             raise DataError(f"'{path}': {error}") from None
 

@@ -26,6 +26,7 @@ from benchmarks import convergence_tables
 from softgym_envs import make_robot
 from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.backends import make_backend
+from softgym_envs.codesign.benchmark import plots
 from softgym_envs.robots import ROBOTS
 from softgym_envs.viewer.image import ImageRenderer, render_bodies
 from softgym_envs.viewer.video import write_video
@@ -160,6 +161,7 @@ def main(names: list[str]) -> None:
     """Draw the named pictures, or all but the report."""
     table: dict[str, Callable[[], np.ndarray]] = {"codesign": draw_codesign, "arm": draw_arm, "grasp": draw_grasp}
     table["convergence"] = convergence_tables.draw
+    table |= {"benchmark_regret": plots.draw_regret, "benchmark_winners": plots.draw_winners}
     table |= {name: partial(draw_robot, name) for name in ROBOTS}
     table |= {name: partial(draw_environment, name) for name in environment_pages()}
     films = [f"{name}.webp" for name in environment_pages()]

@@ -11,6 +11,9 @@ PARTS = {
     "problems": board.problem_table,
     "references": board.reference_table,
     "board": board.leaderboard,
+    "tracks_of_methods": board.track_table,
+    "regrets": board.regret_table,
+    "unseen": board.unseen_table,
     "methods": board.method_table,
 }
 """Name of a part, in ``<!-- benchmark: NAME -->`` -> the function that writes it."""

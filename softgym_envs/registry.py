@@ -7,7 +7,7 @@ import numbers
 import types
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -187,7 +187,8 @@ def import_object(kind: str, path: str) -> Any:
     return getattr(module, name)
 
 
-def options_of(cls: type) -> dict[str, tuple[inspect.Parameter, Any]]:
+@cache  # looking up the types of a constructor takes milliseconds
+def options_of(cls: type) -> Mapping[str, tuple[inspect.Parameter, Any]]:
     """Return the keyword arguments of a class by name, each with its resolved type.
 
     A constructor that takes ``**options`` passes them on to the next base class with its own constructor.
@@ -207,7 +208,7 @@ def options_of(cls: type) -> dict[str, tuple[inspect.Parameter, Any]]:
                 found.setdefault(p.name, (p, types_of.get(p.name, Any)))
         if not any(p.kind is p.VAR_KEYWORD for p in parameters):
             break
-    return found
+    return types.MappingProxyType(found)
 
 
 def check_options(owner: str, cls: type, positional: int, options: Mapping[str, object]) -> None:

@@ -53,7 +53,12 @@ def read_npz(path: str | Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
                 raise DataError(f"'{path}' lacks {', '.join(missing)}")
             return {name: data[name] for name in names}
     except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"'{path}' cannot be read: {error}") from error
+        raise DataError(f"'{path}' cannot be read: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    """Return what an error says without the path, which errors of the operating system repeat."""
+    return getattr(error, "strerror", None) or str(error)
 
 
 def read_json(path: str | Path) -> Any:
@@ -65,7 +70,7 @@ def read_json(path: str | Path) -> Any:
     try:
         return json.loads(Path(path).read_text())
     except (OSError, ValueError) as error:
-        raise DataError(f"'{path}' cannot be read: {error}") from None
+        raise DataError(f"'{path}' cannot be read: {_reason(error)}") from None
 
 
 def write_json(path: str | Path, value: object) -> None:

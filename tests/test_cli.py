@@ -193,6 +193,8 @@ STRENGTH = "configs/design/finger_strength.yaml"
         (["codesign", "--config", "finger_reach", "--storage", "mysql://x"], ["allowed: journal, postgresql://user@"]),
         (["codesign", "--config", "finger_reach", "--folder", "/proc/x"], ["'/proc/x': No such file or directory"]),
         (["calibrate", "--config", "finger_calibration", "data=nowhere.csv"], ["'nowhere.csv' cannot be read"]),
+        (["benchmark", "verifi", "x.json"], ["unknown verb 'verifi'; did you mean 'verify'?"]),
+        (["benchmark", "verify", "nowhere.json"], ["error: 'nowhere.json' cannot be read: No such file"]),
         (["sensitivity", "--config", "finger_sensitivity", "method=sobl"], ["method: must be 'oat'", "'sobl'"]),
         (["export", "finger", "x.obj"], ["'x.obj' must end with .step or .stl"]),
         (["export", "finger"], ["nothing to write"]),

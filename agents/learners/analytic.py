@@ -1,11 +1,12 @@
 """Analytic policy gradient (model-based): the policy follows the derivative of each step's own reward.
 
 The policy acts in the batched environment on the surrogate. After each step the environment returns the exact
-derivative of the reward in the action (`SoftRobotVectorEnv.step_with_gradient`), and the policy ascends the mean
-logarithm of the reward. There is no critic, no exploration noise and no differentiation through time: a quasi-static
-robot reaches a goal by improving every step.
+derivative of the logarithm of the reward in the action (`SoftRobotVectorEnv.step_with_gradient`), and the policy
+ascends its mean. There is no critic, no exploration noise and no differentiation through time: a quasi-static robot
+reaches a goal by improving every step.
 
-The logarithm turns a product of reward terms into a sum, and it keeps a slope near the goal and far from it.
+The logarithm turns a product of reward terms into a sum, and `Task.log_reward` keeps a slope near the goal and far from
+it.
 """
 
 from __future__ import annotations
@@ -15,9 +16,6 @@ import numpy as np
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.gradient import GradientLearner
 from softgym_envs.envs.gradients import StepGradient
-
-#: Smallest reward whose logarithm is followed; below, gradients would be without bound.
-SMALLEST_REWARD = 1e-6
 
 
 class AnalyticLearner(GradientLearner):
@@ -31,22 +29,20 @@ class AnalyticLearner(GradientLearner):
         import torch
 
         action = self.policy(observation)
-        observation, *_, gradient = self.env.step_with_gradient(action.detach().numpy())
+        observation, *_, gradient = self.env.step_with_gradient(action.detach().numpy(), log=True)
         ascent = torch.from_numpy(self._ascent(gradient).astype(np.float32))
         self.descend(-(action * ascent).sum() / self.env.num_envs)
         return observation
 
     def _ascent(self, gradient: StepGradient) -> np.ndarray:
-        """Return the gradient of the log rewards in the actions (B, n_a), one-sided at kinks.
+        """Return the gradient of the objective in the actions (B, n_a), one-sided at kinks.
 
         The exact derivative is zero for commands that are slack or held by a limit; an actor that ended there would
         never come back. So a slack actuator is tightened if that helps, and its command follows what the cable reaches.
         A command held by a limit may move back, but not further out.
         """
         tighten = np.maximum(gradient.held, 0.0)
-        command = (
-            np.where(gradient.slack, tighten, gradient.command) / np.maximum(gradient.reward, SMALLEST_REWARD)[:, None]
-        )
+        command = np.where(gradient.slack, tighten, gradient.command)
         command += np.where(gradient.slack, self.slack_pull * gradient.gap / self._span**2, 0.0)
         outward = gradient.limited * command > 0.0
         return np.where(outward, 0.0, command * gradient.slope)

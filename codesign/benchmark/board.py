@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from softgym_envs.agents.statistics import Estimate
+from softgym_envs.agents.statistics import Estimate, stratified_estimate
 from softgym_envs.codesign.benchmark.frozen import load_definition, load_problem, problem_names
 from softgym_envs.codesign.benchmark.problem import TRACKS
-from softgym_envs.codesign.benchmark.runs import MethodRow, Run, method_rows, stored_runs
+from softgym_envs.codesign.benchmark.regret import MethodRow, Stored, contests, method_rows, track_rows
+from softgym_envs.codesign.benchmark.runs import stored_runs
 from softgym_envs.codesign.benchmark.scoring import DATA, normalised, reference
 from softgym_envs.codesign.benchmark.submission import Submission
 
@@ -43,7 +43,7 @@ def tracks() -> str:
     return "\n".join(f"* **{key}**: {text}" for key, text in TRACKS.items())
 
 
-def method_table(runs: Sequence[tuple[Run, Any]] | None = None, data: Path = DATA) -> str:
+def method_table(runs: Sequence[Stored] | None = None, data: Path = DATA) -> str:
     """Return the table of the baselines, one row per problem, judge and method; default the stored runs."""
     rows = method_rows(stored_runs(data) if runs is None else runs, data)
     if not rows:
@@ -54,6 +54,7 @@ def method_table(runs: Sequence[tuple[Run, Any]] | None = None, data: Path = DAT
         "method",
         "seeds",
         "regret at the end [%]",
+        "on unseen goals [%]",
         "area [%]",
         "steps to 1 %",
         "CPU s to 1 %",
@@ -71,13 +72,68 @@ def _method_cells(row: MethodRow) -> list[str]:
         row.method,
         str(row.seeds),
         _interval(row.regret, 100.0, 1),
-        f"{100 * row.area:.1f}",
-        f"{row.steps:,.0f}" if np.isfinite(row.steps) else "not reached",
-        f"{row.seconds:.1f}" if np.isfinite(row.seconds) else "not reached",
+        "-" if row.unseen is None else _interval(row.unseen, 100.0, 0),
+        "-" if np.isnan(row.area) else f"{100 * row.area:.1f}",
+        _reached(row.steps, ",.0f"),
+        _reached(row.seconds, ".1f"),
         "not tested" if row.score is None else _interval(row.score, 1.0, 3),
         f"{100 * row.at_bounds:.0f}",
         f"{row.diversity:.2f}",
     ]
+
+
+def _reached(value: float, form: str) -> str:
+    if np.isnan(value):
+        return "-"
+    return f"{value:{form}}" if np.isfinite(value) else "not reached"
+
+
+def track_table(runs: Sequence[Stored] | None = None) -> str:
+    """Return the baselines over the problems of each track; default the stored runs."""
+    rows = []
+    for row in track_rows(stored_runs() if runs is None else runs):
+        rows.append(
+            [
+                row.track,
+                row.judge + (", table" if row.listed else ""),
+                f"{len(row.problems)} x {row.seeds}",
+                row.method,
+                _interval(row.regret, 100.0, 1),
+                f"{row.factor:.1f}" if np.isfinite(row.factor) else "-",
+                _interval(row.improvement, 1.0, 2),
+                f"{row.wins}",
+            ]
+        )
+    if not rows:
+        return "No runs are stored."
+    header = ["track", "judge", "problems x seeds", "method", "regret at the end [%]", "random / method"]
+    return _table([*header, "better than random with probability", "smallest regret on"], rows)
+
+
+def regret_table(runs: Sequence[Stored] | None = None, unseen: bool = False) -> str:
+    """Return the regret of each method on each problem, in the search or on unseen goals; default the stored runs."""
+    found = contests(stored_runs() if runs is None else runs)
+    if not found:
+        return "No runs are stored."
+    methods = sorted({method for contest in found for method in contest.runs})
+    rows = []
+    for contest in found:
+        seeds = sorted({len(members) for members in contest.runs.values()})
+        cells = [f"`{contest.problem}`", contest.judge + (", table" if contest.listed else "")]
+        cells.append(str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}")
+        for method in methods:
+            values = np.array([])
+            if method in contest.runs:
+                values = contest.unseen(method) if unseen else contest.regrets(method)
+            cells.append(_interval(stratified_estimate(values[:, None]), 100.0, 1) if len(values) else "-")
+        if set(cells[3:]) != {"-"}:
+            rows.append(cells)
+    return _table(["problem", "judge", "seeds", *(f"{method} [%]" for method in methods)], rows)
+
+
+def unseen_table() -> str:
+    """Return the regret of the stored runs on unseen goals."""
+    return regret_table(unseen=True)
 
 
 def _interval(estimate: Estimate, scale: float, digits: int) -> str:

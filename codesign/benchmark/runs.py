@@ -1,9 +1,8 @@
-"""Runs of baselines on problems: resumable, one small JSON file each, and the tables made from them."""
+"""Runs of baselines on problems: resumable, one small JSON file each."""
 
 from __future__ import annotations
 
 import json
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -12,27 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.agents.statistics import Estimate, stratified_estimate
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem
 from softgym_envs.codesign.benchmark.problem import Judge, Score
 from softgym_envs.codesign.benchmark.scoring import (
     DATA,
     Reference,
-    bounds_share,
     front,
-    improvement,
     make_reference,
-    normalised,
-    reference,
 )
 from softgym_envs.codesign.benchmark.search import Search, make_optimiser, solve
 from softgym_envs.codesign.benchmark.table import Table, TableSearch
 from softgym_envs.codesign.records import Record
 from softgym_envs.config import provenance
 from softgym_envs.storage import atomic_write, read_json, write_json
-
-REGRET = 0.01
-"""Regret below which a search counts as finished."""
 
 
 @dataclass(eq=False)
@@ -48,15 +39,19 @@ class Run(Record):
         seed: of the optimiser and of trainings.
         designs: the winner; with several objectives, bodies of the front.
         search_scores: their scores in the search.
-        curve: for each body that became the best: environment steps and CPU seconds until then, and its score under the
-            inverse QP on the validation goals, the same yardstick for all judges. Empty with several objectives.
+        curve: for each body that became the best: environment steps and CPU seconds until then, and its score in the
+            search. Empty with several objectives.
+        unseen: scores of the baseline and of the winner under the inverse QP on the validation goals, which no search
+            sees: one yardstick for all judges. Empty with several objectives and for a search on a table.
         bodies: number of bodies scored.
         infeasible: number of these that could not be scored.
         diversity: mean distance between bodies in the unit box, divided by its diagonal.
         spent: environment steps, CPU seconds and solves on finite elements.
         optimiser_seconds: CPU time of the optimiser itself [s].
         commit: of the code.
-        optimum: best score of a listed body, for a search on a table; the curve then holds the scores of the table.
+        optimum: best score of a listed body, for a search on a table.
+        baseline: scores of the baseline body in the search.
+        limit: largest number of bodies, if the search had a limit besides its budget.
     """
 
     problem: str
@@ -68,6 +63,7 @@ class Run(Record):
     designs: list[dict[str, float]]
     search_scores: list[list[float]]
     curve: list[list[float]] = field(default_factory=list)
+    unseen: list[float] = field(default_factory=list)
     bodies: int = 0
     infeasible: int = 0
     diversity: float = 0.0
@@ -75,18 +71,32 @@ class Run(Record):
     optimiser_seconds: float = 0.0
     commit: str | None = None
     optimum: float | None = None
+    baseline: list[float] = field(default_factory=list)
+    limit: int | None = None
 
 
 def run(
-    folder: Path, name: str, method: str, judge: Judge | None, level: str, seed: int, table: Table | None = None
+    folder: Path,
+    name: str,
+    method: str,
+    judge: Judge | None,
+    level: str,
+    seed: int,
+    table: Table | None = None,
+    limit: int | None = None,
 ) -> Run:
-    """Run a baseline, on a table if one is given, or return its result if the folder has it."""
+    """Run a baseline, on a table if one is given, or return its result if the folder has it.
+
+    With a limit, the search also ends after so many bodies.
+    """
     problem = load_problem(name) if table is None else table.problem
-    search = Search(problem, level, judge, seed)
+    search = Search(problem, level, judge, seed, limit)
     if table is not None:
         search = TableSearch.on(table, level, judge or problem.definition.judge)
+        search.limit = limit
     kind = "table-" if table is not None else ""
-    path = folder / "runs" / name / f"{kind}{method}-{search.judge}-{level}-{seed}.json"
+    cap = "" if limit is None else f"-{limit}"
+    path = folder / "runs" / name / f"{kind}{method}-{search.judge}-{level}{cap}-{seed}.json"
     if path.is_file():
         stored = Run.read(path)
         if stored.hash == problem.hash:
@@ -103,7 +113,8 @@ def run(
         seed=seed,
         designs=[row.design for row in winners],
         search_scores=[row.scores for row in winners],
-        curve=_curve(problem, search, folder, table is not None) if single else [],
+        curve=_curve(search) if single else [],
+        unseen=_unseen(problem, winners, folder) if single and table is None else [],
         bodies=len(search.ledger),
         infeasible=sum(not row.feasible for row in search.ledger),
         diversity=_diversity(problem, search.ledger),
@@ -111,20 +122,25 @@ def run(
         optimiser_seconds=round(own, 3),
         commit=provenance()["commit"],
         optimum=None if table is None else table.best(str(search.judge)),
+        baseline=search.ledger[0].scores,
+        limit=limit,
     )
     found.write(path)
     return found
 
 
-def _curve(problem: FrozenProblem, search: Search, folder: Path, own: bool) -> list[list[float]]:
-    """Return the curve of `Run`, by the search's own scores or by the yardstick of the validation goals."""
+def _curve(search: Search) -> list[list[float]]:
     rows = []
     for index, row in search.incumbents:
         spent = search.ledger[: index + 1]
-        value = row.score if own else tested(problem, row.design, "qp", "validation", None, folder).score
         steps, seconds = sum(r.environment_steps for r in spent), sum(r.cpu_seconds for r in spent)
-        rows.append([steps, round(seconds, 3), value])
+        rows.append([steps, round(seconds, 3), row.score])
     return rows
+
+
+def _unseen(problem: FrozenProblem, winners: Sequence[Score], folder: Path) -> list[float]:
+    designs = [problem.definition.baseline_values, *(row.design for row in winners)]
+    return [tested(problem, design, "qp", "validation", None, folder).score for design in designs]
 
 
 def _diversity(problem: FrozenProblem, rows: Sequence[Score]) -> float:
@@ -191,6 +207,9 @@ def collect(folder: Path, data: Path = DATA) -> Path:
         problem = load_problem(each.problem)
         if each.hash != problem.hash:
             continue
+        if not each.baseline:  # a run of an earlier version
+            design = problem.definition.baseline_values
+            each.baseline = tested(problem, design, each.judge, "search", None, folder, each.seed).scores  # type: ignore[arg-type]
         rows.append({**each.to_json(), "test": _stored_test(problem, each, folder)})
     target = data / "runs.json"
     with atomic_write(target, "w") as stream:
@@ -222,113 +241,7 @@ def stored_runs(data: Path = DATA) -> list[tuple[Run, list[list[float]] | None]]
     return rows
 
 
-# -- tables -----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class MethodRow:
-    """A method on one problem, over its seeds.
-
-    ``regret`` is 0 for the best body that any run found and 1 for the baseline, under the inverse QP on the validation
-    goals; on a table 0 for its best body, by the table's scores. ``area`` is its mean over the logarithm of the
-    environment steps, ``steps`` and ``seconds`` the medians until it stays below 1 %, infinite if more than half of the
-    runs never get there; ``score`` is the normalised score on finite elements.
-    """
-
-    problem: str
-    judge: str
-    table: bool
-    method: str
-    seeds: int
-    regret: Estimate
-    area: float
-    steps: float
-    seconds: float
-    score: Estimate | None
-    at_bounds: float
-    diversity: float
-
-
-def method_rows(runs: Sequence[tuple[Run, list[list[float]] | None]], data: Path = DATA) -> list[MethodRow]:
-    """Return one row per problem, judge and method with a single objective."""
-    groups: dict[tuple[str, bool, str, str], list[tuple[Run, Any]]] = defaultdict(list)
-    best: dict[tuple[str, str], float] = {}
-    first: dict[tuple[str, str], float] = {}
-    for each, test in runs:
-        if each.curve:
-            groups[each.problem, each.optimum is not None, each.judge, each.method].append((each, test))
-            found = [row[2] for row in each.curve] if each.optimum is None else [each.optimum]
-            key = each.problem, _yardstick(each)
-            best[key] = max([best.get(key, -np.inf), *found])
-            first[key] = each.curve[0][2]
-    rows = []
-    for (name, listed, judge, method), members in sorted(groups.items()):
-        problem = load_problem(name, check=False)
-        limit = problem.definition.budgets[members[0][0].level].environment_steps  # type: ignore[index]
-        top = best[name, _yardstick(members[0][0])]
-        span = top - first[name, _yardstick(members[0][0])]
-        curves = [[(r[0], (top - r[2]) / span, r[1]) for r in each.curve] for each, _ in members]
-        ends = np.array([[curve[-1][1]] for curve in curves])
-        known = reference(problem, data)
-        scores = [normalised(known, test) for _, test in members if known is not None and test]
-        known_scores = np.array([[s] for s in scores if s is not None])
-        reached = [_reached(curve) for curve in curves]
-        rows.append(
-            MethodRow(
-                name,
-                judge,
-                listed,
-                method,
-                len(members),
-                stratified_estimate(ends),
-                float(np.mean([_area(curve, limit) for curve in curves])),
-                float(np.median([steps for steps, _ in reached])),
-                float(np.median([seconds for _, seconds in reached])),
-                stratified_estimate(known_scores) if len(known_scores) == len(members) else None,
-                float(np.mean([bounds_share(problem, each.designs[0]) for each, _ in members])),
-                float(np.mean([each.diversity for each, _ in members])),
-            )
-        )
-    return rows
-
-
-def _yardstick(each: Run) -> str:
-    """Return what the curve of a run was measured by; only equal yardsticks can be compared."""
-    return "qp" if each.optimum is None else f"table {each.judge}"
-
-
-def _reached(curve: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
-    """Return environment steps and CPU seconds from which on the regret stays below `REGRET`; infinite if never."""
-    if curve[-1][1] >= REGRET:
-        return np.inf, np.inf
-    index = max((k + 1 for k, row in enumerate(curve) if row[1] >= REGRET), default=0)
-    return curve[index][0], curve[index][2]
-
-
-def _area(curve: Sequence[tuple[float, float, float]], limit: float) -> float:
-    """Return the mean regret over the logarithm of the environment steps, from the first body to the budget."""
-    steps = np.array([row[0] for row in curve] + [max(limit, curve[-1][0] + 1)])
-    widths = np.diff(np.log(steps))
-    return float(np.dot(widths, [row[1] for row in curve]) / widths.sum())
-
-
-def improvements(
-    runs: Sequence[tuple[Run, Any]], judge: str, first: str, second: str, *, listed: bool = False
-) -> Estimate | None:
-    """Return the probability that a run of one method ends with less regret than one of another.
-
-    It is over the problems on which both ran, on tables if ``listed``; None if there are none.
-    """
-    table: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for each, _ in runs:
-        if each.judge == judge and each.curve and (each.optimum is not None) == listed:
-            table[each.problem][each.method].append(each.curve[-1][2])
-    names = [name for name, row in table.items() if row.get(first) and row.get(second)]
-    if not names:
-        return None
-    count = min(min(len(table[n][first]), len(table[n][second])) for n in names)
-    a, b = (np.array([table[n][m][:count] for n in names]).T for m in (first, second))
-    return improvement(a, b)
+# -- judges ---------------------------------------------------------------------------------------------------------
 
 
 def judges(folder: Path, name: str, bodies: int, seed: int = 0) -> dict[str, Any]:

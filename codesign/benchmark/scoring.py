@@ -78,11 +78,11 @@ def normalised(known: Reference, scores: Sequence[Sequence[float]]) -> float | N
     """
     if not known.best:
         return None
-    low, high, value = (_merit(known, each) for each in ([known.baseline], known.best, scores))
+    low, high, value = (merit(known, each) for each in ([known.baseline], known.best, scores))
     return None if high <= low else (value - low) / (high - low)
 
 
-def _merit(known: Reference, scores: Sequence[Sequence[float]]) -> float:
+def merit(known: Reference, scores: Sequence[Sequence[float]]) -> float:
     """Return the number that bodies are compared by: the score, or the hypervolume of several objectives."""
     if len(known.baseline) == 1:
         return max(each[0] for each in scores)

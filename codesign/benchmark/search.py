@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem
 from softgym_envs.codesign.benchmark.problem import LEVELS, Budget, Judge, Score
-from softgym_envs.codesign.sampling import SamplerConfig, make_sampler
+from softgym_envs.codesign.sampling import SamplerConfig, construct, make_sampler
 from softgym_envs.codesign.scheduling.optuna_study import distributions
 from softgym_envs.errors import SoftGymError, unknown_name
 
@@ -19,7 +19,11 @@ class BudgetSpent(SoftGymError):
 
 
 class Optimiser(Protocol):
-    """What `solve` needs of an optimiser."""
+    """What `solve` needs of an optimiser.
+
+    One that works with several fidelities also has ``share``: the share of the goals and of the training's steps that
+    the next body is scored with.
+    """
 
     def ask(self) -> Mapping[str, float]:
         """Return the body to score next: a value of every variable [SI]."""
@@ -37,12 +41,14 @@ class Search:
         level: name of the budget: small, medium or large.
         judge: who controls the bodies; default that of the problem.
         seed: added to those of trainings.
+        limit: largest number of bodies; default none besides the budget.
     """
 
     problem: FrozenProblem
     level: str = "small"
     judge: Judge | None = None
     seed: int = 0
+    limit: int | None = None
     ledger: list[Score] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -63,6 +69,8 @@ class Search:
     @property
     def open(self) -> bool:
         """Whether budget is left. The score that crosses a limit is the last one, and it counts."""
+        if self.limit is not None and len(self.ledger) >= self.limit:
+            return False
         return all(value < max(getattr(self.limits, name), 1) for name, value in self.spent.items())
 
     def evaluate(self, design: Mapping[str, float], budget: float = 1.0) -> Score:
@@ -104,7 +112,7 @@ def solve(search: Search, optimiser: Optimiser) -> float:
         search.evaluate(search.problem.definition.baseline_values)
     while search.open:
         design = optimiser.ask()
-        optimiser.tell(search.evaluate(design))
+        optimiser.tell(search.evaluate(design, getattr(optimiser, "share", 1.0)))
     return time.process_time() - began - search.spent["cpu_seconds"]
 
 
@@ -140,6 +148,65 @@ class OptunaOptimiser:
             self._study.tell(self._trial, state=optuna.trial.TrialState.PRUNED)
 
 
+class HalvingOptimiser:
+    """TPE with a pruner of Optuna: bodies are scored on a quarter of the goals, then half, then all.
+
+    Args:
+        problem: the problem, with one objective.
+        sampler: the sampler and its options.
+        pruner: decides after each score whether the body is scored on more goals.
+    """
+
+    SHARES = (0.25, 0.5, 1.0)
+
+    def __init__(self, problem: FrozenProblem, sampler: SamplerConfig, pruner: Any) -> None:
+        import optuna
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self._study = optuna.create_study(direction="maximize", sampler=make_sampler(sampler, 0), pruner=pruner)
+        self._ranges = distributions(problem.definition)
+        self._trial: Any = None
+        self._rung = 0
+
+    @property
+    def share(self) -> float:
+        """Share of the goals and of the training's steps for the next score."""
+        return self.SHARES[self._rung]
+
+    def ask(self) -> Mapping[str, float]:
+        """Return the body to score next: a new one, or the last one on more goals."""
+        if self._rung == 0:
+            self._trial = self._study.ask(self._ranges)
+        return self._trial.params
+
+    def tell(self, score: Score) -> None:
+        """Learn the outcome with the present share."""
+        import optuna
+
+        pruned = optuna.trial.TrialState.PRUNED
+        resource, last = round(self.share / self.SHARES[0]), self._rung == len(self.SHARES) - 1
+        self._rung = 0 if last or not score.feasible else self._rung + 1
+        if not score.feasible:
+            self._study.tell(self._trial, state=pruned)
+            return
+        self._trial.report(score.score, resource)
+        if last:
+            self._study.tell(self._trial, score.score)
+        elif self._trial.should_prune():
+            self._rung = 0
+            self._study.tell(self._trial, state=pruned)
+
+
+def _halving(pruner: str, **options: Any) -> Callable[[FrozenProblem, int], Optimiser]:
+    def make(problem: FrozenProblem, seed: int) -> Optimiser:
+        import optuna
+
+        sampler = SamplerConfig(name="tpe", seed=seed, options={"n_startup_trials": 8})
+        return HalvingOptimiser(problem, sampler, construct(getattr(optuna.pruners, pruner), options))
+
+    return make
+
+
 def _optuna(name: str, **options: Any) -> Callable[[FrozenProblem, int], Optimiser]:
     def make(problem: FrozenProblem, seed: int) -> Optimiser:
         import optuna
@@ -157,10 +224,12 @@ METHODS: dict[str, Callable[[FrozenProblem, int], Optimiser]] = {
     "gp": _optuna("gp", n_startup_trials=8),
     "cmaes": _optuna("cmaes"),
     "nsgaii": _optuna("nsgaii", population_size=8),
+    "halving": _halving("SuccessiveHalvingPruner", min_resource=1, reduction_factor=2),
+    "hyperband": _halving("HyperbandPruner", min_resource=1, max_resource=4, reduction_factor=2),
 }
 """Baselines: name -> function of problem and seed. A new one is one row."""
 
-SINGLE_OBJECTIVE = ("cmaes",)
+SINGLE_OBJECTIVE = ("cmaes", "halving", "hyperband")
 """Methods that know a single objective only."""
 
 

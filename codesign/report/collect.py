@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 
 from softgym_envs.codesign.config import StudyConfig
-from softgym_envs.codesign.objectives import OBJECTIVES, Objective
+from softgym_envs.codesign.objectives import Objective
 from softgym_envs.codesign.records import Finalist, TestGroup
 from softgym_envs.codesign.report.results import (
     BodyStatistics,
@@ -49,7 +49,11 @@ def collect(snapshot: StudySnapshot) -> StudyResults:
         few_goals=f"Only {few} test goals: the difference may be chance." if few < FEW_GOALS else "",
         comparison=comparison,
         pareto=snapshot.pareto if config.secondary_objectives else [],
-        transfer=[row for objective in _measured(snapshot) for row in _transfer(snapshot.unseen_tests, objective)],
+        transfer=[
+            row
+            for objective in snapshot.config.shown_objectives.values()
+            for row in _transfer(snapshot.unseen_tests, objective)
+        ],
         finalists=snapshot.finalists,
         trainings=snapshot.trainings,
         tests=snapshot.tests,
@@ -134,12 +138,6 @@ def _compare(baseline: TestGroup, winner: TestGroup, objective: Objective) -> Co
         goals_closer=int((change < 0.0).sum()),
         goals_farther=int((change > 0.0).sum()),
     )
-
-
-def _measured(snapshot: StudySnapshot) -> list[Objective]:
-    """Return the objective of a study, success rate and mean distance."""
-    objectives = (snapshot.objective, OBJECTIVES["success_rate"], OBJECTIVES["mean_distance"])
-    return list({objective.name: objective for objective in objectives}.values())
 
 
 def _transfer(groups: list[TestGroup], objective: Objective) -> list[Transfer]:

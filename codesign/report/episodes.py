@@ -12,7 +12,9 @@ from softgym_envs.backends.backend import State
 from softgym_envs.codesign.phases.finalists import finalist_environment, policy_file
 from softgym_envs.codesign.records import Finalist
 from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.report.units import shown_unit
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.envs.tasks.base import Task
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 
@@ -26,10 +28,11 @@ class Episode:
         robot: its family of bodies.
         design: the body [SI].
         model: its mechanical model.
-        path: the goals [m], shape (p, 3).
+        task: what the robot does.
+        path: the goals, shape (p, 3), in the unit of the task.
         states: mechanical states, that of the reset first.
-        goals: goal of each state [m].
-        distances: distance to the goal in each state [m].
+        goals: goal of each state, in the unit of the task.
+        distances: distance to the goal in each state, as the task measures it.
         rewards: reward of each step to a state; None after the reset.
     """
 
@@ -37,11 +40,31 @@ class Episode:
     robot: Robot
     design: dict[str, float]
     model: MechanicalModel
+    task: Task
     path: np.ndarray
     states: list[State]
     goals: list[np.ndarray]
     distances: list[float]
     rewards: list[float | None]
+
+    @property
+    def has_places(self) -> bool:
+        """Whether goals are positions that a picture can show."""
+        return self.task.goal_unit == "m"
+
+    @property
+    def goal_text(self) -> str:
+        """The last goal, as people read it: ``"(0.0, 30.0, -80.0) mm"``."""
+        unit, factor, _ = shown_unit(self.task.goal_unit)
+        return f"({', '.join(f'{factor * value:.{1 if factor > 1.0 else 2}f}' for value in self.path[-1])}) {unit}"
+
+    def distance_text(self, index: int) -> str:
+        """Return the distance to the goal in a state, as people read it."""
+        return self.task.distance_scale.text(self.distances[index])
+
+    def drawn_goal(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return path (p, 3) and goal (3,) for a picture of a state [m]; see `Task.drawn_goals`."""
+        return self.task.drawn_goals(self.states[index], self.path, self.goals[index])
 
     def pick(self, count: int) -> list[int]:
         """Return indices of at most ``count`` states, evenly over the episode, its first and last included."""
@@ -86,6 +109,7 @@ def _run(snapshot: StudySnapshot, role: str, body: Finalist, path: np.ndarray) -
             inner.robot,
             dict(inner.design),
             inner.backend.model,
+            inner.task,
             inner.path,
             [inner.state],
             [inner.goal],

@@ -131,9 +131,8 @@ def write_film(path: Path, episodes: Sequence[Episode]) -> None:
                     renderer.render(
                         episode.design,
                         episode.states[index],
-                        episode.path,
-                        episode.goals[index],
-                        text=f"{episode.role}: {1e3 * episode.distances[index]:.1f} mm",
+                        *episode.drawn_goal(index),
+                        text=f"{episode.role}: {episode.distance_text(index)}",
                     )
                     for index in episode.pick(FILM_FRAMES)
                 ]
@@ -148,16 +147,18 @@ def write_film(path: Path, episodes: Sequence[Episode]) -> None:
 def _record(path: Path, episodes: Sequence[Episode]) -> None:
     from softgym_envs.viewer.recording import RolloutRecorder
 
-    with RolloutRecorder(episodes[0].robot, path, roles=[episode.role for episode in episodes]) as recorder:
+    roles, scale = [episode.role for episode in episodes], episodes[0].task.distance_scale
+    with RolloutRecorder(episodes[0].robot, path, roles=roles, distance_scale=scale) as recorder:
         for episode in episodes:
             recorder.begin(episode.role)
             for step, state in enumerate(episode.states):
+                goals, goal = episode.drawn_goal(step)
                 recorder.log(
                     step,
                     episode.design,
                     state,
-                    episode.goals[step],
-                    path=episode.path,
+                    goal,
+                    path=goals,
                     reward=episode.rewards[step],
                     distance=episode.distances[step],
                 )

@@ -40,22 +40,22 @@ def findings(snapshot: StudySnapshot, results: StudyResults) -> list[Finding]:
     return [finding for finding in found if finding is not None]
 
 
-def _about_places(snapshot: StudySnapshot) -> bool:
-    """Return whether goals are positions, so that distances are lengths."""
-    return snapshot.config.environment.task_class.goal_unit == "m"
-
-
 def _goals(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     row = next((row for row in results.comparison if row.backend == "fem"), None)
-    if row is None or not _about_places(snapshot):
+    if row is None:
         return None
-    radius = f"{1e3 * results.success_distance:g} mm"
+    scale = snapshot.config.distance_scale
+    limit = scale.limit_text(results.success_distance)
     missed = round(row.goals * (1.0 - row.winner.success_rate))
     if not missed:
-        return Finding("Every test goal is reached", f"All {row.goals} goals, within {radius}, on FEM.", warns=False)
-    worst = f"The farthest is missed by {1e3 * row.winner.worst_distance:.2f} mm."
+        return Finding(
+            "Every test goal is reached",
+            f"All {row.goals} goals on FEM, with a final {scale.name} of at most {limit}.",
+            warns=False,
+        )
+    worst = f"The largest {scale.name} is {scale.text(row.winner.worst_distance, 2)}."
     title = f"{missed} of {row.goals} test goals are not reached"
-    return Finding(title, f"On FEM the winner ends more than {radius} from them. {worst}")
+    return Finding(title, f"A goal is reached with a final {scale.name} of at most {limit}. {worst}")
 
 
 def _limit(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
@@ -63,21 +63,22 @@ def _limit(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     assert results.winner is not None
     tests = {group.key: group for group in snapshot.unseen_tests}
     policy, qp = (tests.get((results.winner.trial, agent, "fem")) for agent in ("policy", "qp"))
-    if policy is None or qp is None or policy.mean.success_rate == 1.0 or not _about_places(snapshot):
+    if policy is None or qp is None or policy.mean.success_rate == 1.0:
         return None
     gain = policy.mean.mean_distance - qp.mean.mean_distance
+    measure = snapshot.config.distance
     interval = mean_interval(policy.table("distances"), qp.table("distances"))
-    trained, solved = (f"{1e3 * group.mean.mean_distance:.2f} mm" for group in (policy, qp))
-    means = f"{trained} from the goals with its policy and {solved} with the inverse QP"
+    trained, solved = (measure.text(group.mean.mean_distance) for group in (policy, qp))
+    means = f"{measure.label.lower()} is {trained} with its policy and {solved} with the inverse QP"
     if gain > NEGLIGIBLE * results.success_distance and (interval is None or interval[0] > 0.0):
         return Finding(
             "The policy limits, not the body",
-            f"The same body ends on average {means}. Train longer (finalists.steps), or let the policy correct the "
+            f"On the same body the {means}. Train longer (finalists.steps), or let the policy correct the "
             "inverse QP (environment.residual_scale).",
         )
     return Finding(
         "The body limits, not the policy",
-        f"On average it ends {means}, which knows the mechanical model and needs no training. More training will "
+        f"The {means}, which knows the mechanical model and needs no training. More training will "
         "hardly help; other variables, wider ranges or nearer goals may.",
     )
 
@@ -106,7 +107,7 @@ def _alternatives(snapshot: StudySnapshot, results: StudyResults) -> Finding | N
     agent = results.winner.agents[0]
     tests = {group.key: group.mean.mean_distance for group in snapshot.unseen_tests}
     own = tests.get((results.winner.trial, agent, "fem"))
-    if own is None or not _about_places(snapshot):
+    if own is None:
         return None
     variables = [variable for variable in results.variables if variable.optimised]
     winner = {**results.winner.design, **results.winner.options}
@@ -121,9 +122,8 @@ def _alternatives(snapshot: StudySnapshot, results: StudyResults) -> Finding | N
         steps = [abs(v.place(values[v.name]) - v.place(winner[v.name])) for v in variables]
         far = variables[int(np.argmax(steps))]
         differs = f"{far.name.replace('_', ' ')} {present(values[far.name], far.unit)}"
-        parts.append(
-            f"trial {body.trial} ({1e3 * distance:.2f} mm, {differs} instead of {present(winner[far.name], far.unit)})"
-        )
+        ends = snapshot.config.distance.text(distance)
+        parts.append(f"trial {body.trial} ({ends}, {differs} instead of {present(winner[far.name], far.unit)})")
     if not parts:
         return None
     return Finding(

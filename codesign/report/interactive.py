@@ -285,7 +285,7 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
     from softgym_envs.viewer.surface import BodySurface
 
     surfaces = [BodySurface(episode.model) for episode in episodes]
-    points = max(len(surface.shape(e.model.nodes)) for surface, e in zip(surfaces, episodes, strict=True))
+    points = max(len(surface.nodes) for surface in surfaces)
     count = max(2, min(MAX_FRAMES, max(len(e.states) for e in episodes), MAX_POINTS // points))
     picks = [episode.pick(count) for episode in episodes]
     figure = _figure(560, scene=_scene(), uirevision="constant")
@@ -296,7 +296,7 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
             index = pick[min(frame, len(pick) - 1)]
             nodes = episode.states[index].nodes
             assert nodes is not None, "finite elements compute nodes"
-            drawn.append(_body_trace(episode.role, surface.shape(nodes), surface.faces if whole else None))
+            drawn.append(_body_trace(episode.role, surface.points(nodes), surface.triangles if whole else None))
             drawn.append(_tip_trace(episode, index, whole))
         return drawn
 
@@ -321,12 +321,13 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
                     marker=marker,
                     hovertemplate="%{text}<extra></extra>",
                 )
-    x, y, z = 1e3 * episodes[0].path.T
-    goal = {"color": "#d97706", "size": 9, "symbol": "circle-open", "line": {"width": 3}}
-    mode = "markers" if len(x) == 1 else "lines"
-    figure.add_scatter3d(
-        x=x, y=y, z=z, mode=mode, name="goal of this episode", marker=goal, line={"color": "#d97706", "width": 5}
-    )
+    if episodes[0].has_places:
+        x, y, z = 1e3 * episodes[0].path.T
+        goal = {"color": "#d97706", "size": 9, "symbol": "circle-open", "line": {"width": 3}}
+        mode = "markers" if len(x) == 1 else "lines"
+        figure.add_scatter3d(
+            x=x, y=y, z=z, mode=mode, name="goal of this episode", marker=goal, line={"color": "#d97706", "width": 5}
+        )
     figure.frames = [Frame(name=str(k), data=traces(k, whole=False), traces=moving) for k in range(length)]
     _add_player(figure, episodes, picks, length)
     return figure
@@ -377,7 +378,7 @@ def _add_player(figure: Figure, episodes: Sequence[Episode], picks: Sequence[lis
 
     def label(frame: int) -> str:
         ends = ", ".join(
-            f"{e.role} {1e3 * e.distances[pick[min(frame, len(pick) - 1)]]:.1f} mm"
+            f"{e.role} {e.distance_text(pick[min(frame, len(pick) - 1)])}"
             for e, pick in zip(episodes, picks, strict=True)
         )
         longest = max(picks, key=len)
@@ -408,7 +409,11 @@ def _add_player(figure: Figure, episodes: Sequence[Episode], picks: Sequence[lis
                     "active": length - 1,
                     "ticklen": 0,
                 },
-                "currentvalue": {"prefix": "distance at ", "xanchor": "left", "font": {"size": 13, "color": "#334155"}},
+                "currentvalue": {
+                    "prefix": f"{episodes[0].task.distance_scale.name} at ",
+                    "xanchor": "left",
+                    "font": {"size": 13, "color": "#334155"},
+                },
                 "font": {"size": 12, "color": "rgba(0, 0, 0, 0)"},  # of the labels below, which would overlap
                 "steps": [{"label": label(k), "method": "animate", "args": [[str(k)], still]} for k in range(length)],
             }

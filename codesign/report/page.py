@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from markupsafe import Markup
 
-from softgym_envs.codesign.objectives import OBJECTIVES
+from softgym_envs.codesign.objectives import Objective
 from softgym_envs.codesign.report import interactive, plots, tables
 from softgym_envs.codesign.report.collect import FEW_GOALS
 from softgym_envs.codesign.report.episodes import Episode, run_episodes
@@ -19,7 +19,7 @@ from softgym_envs.codesign.report.files import write_results
 from softgym_envs.codesign.report.findings import findings
 from softgym_envs.codesign.report.results import Comparison, StudyResults
 from softgym_envs.codesign.report.statistics import MIN_GOALS, kendall_tau, rank_correlation
-from softgym_envs.codesign.report.tables import BACKENDS, SHOWN_ALWAYS, millimetres, percent
+from softgym_envs.codesign.report.tables import BACKENDS, SHOWN_ALWAYS, percent
 from softgym_envs.codesign.report.units import present
 from softgym_envs.codesign.snapshot import StudySnapshot, load_study
 from softgym_envs.errors import SoftGymError
@@ -70,17 +70,17 @@ def write_report(folder: str | Path) -> Path:
 
 
 def _context(snapshot: StudySnapshot, results: StudyResults, episodes: Sequence[Episode]) -> dict[str, Any]:
-    config, objective = snapshot.config, snapshot.objective
+    config = snapshot.config
     outcomes = interactive.goal_outcomes(snapshot, results)
     complete = any(trial.state == "complete" for trial in snapshot.trials)
-    measures = {**OBJECTIVES, **config.objectives}
     return {
         "r": results,
         "headline": _headline(snapshot, results),
         "findings": findings(snapshot, results),
         "plotly": Markup(interactive.plotly_code()),
         "comparison_goals": results.comparison[0].goals if results.comparison else 0,
-        "radius": f"{1e3 * results.success_distance:g} mm",
+        "radius": config.distance_scale.limit_text(results.success_distance),
+        "measure": config.distance.label.lower(),
         "goal_legend": outcomes.legend if outcomes else [],
         "end_legend": plots.COLOURS,
         "goal_views": []
@@ -92,20 +92,20 @@ def _context(snapshot: StudySnapshot, results: StudyResults, episodes: Sequence[
         "question": _question(snapshot, results),
         **_pictures(snapshot, results),
         "design": [tables.design_row(variable) for variable in results.variables],
-        "comparison_columns": tables.comparison_columns(objective),
-        "comparison": [tables.comparison_row(row, objective) for row in results.comparison],
+        "comparison_columns": tables.comparison_columns(config),
+        "comparison": [tables.comparison_row(row, config) for row in results.comparison],
         "goals_note": "The goals are those of the search, because the task has no others."
         if _same_goals(snapshot)
         else "These goals were used neither to train the controllers nor to choose the winner.",
         "interval_note": _interval_note(snapshot, results),
         "figures": {
-            "reached": plots.reached(results),
+            "reached": plots.reached(snapshot, results),
             "transfer": plots.transfer(snapshot, results),
         },
         "interactive": _interactive(snapshot, results) if complete else [],
         "search": _search(snapshot, results) if complete else [],
         "search_notes": _search_notes(snapshot, results),
-        "transfer": [tables.transfer_row(row, measures[row.objective]) for row in results.transfer],
+        "transfer": [tables.transfer_row(row, config.shown_objectives[row.objective]) for row in results.transfer],
         **tables.finalist_table(snapshot, results),
         **tables.trial_table(snapshot, results),
         "cost": tables.cost_rows(results.cost),
@@ -130,25 +130,26 @@ def _headline(snapshot: StudySnapshot, results: StudyResults) -> str:
         return "No body scores better than the baseline, so the baseline itself wins."
     if not results.comparison:
         return f"Trial {winner.trial} scored best. It has not been tested on FEM yet."
-    row = results.comparison[0]
-    reached = f"reaches {percent(row.winner.success_rate)} of them within {1e3 * results.success_distance:g} mm"
+    row, measure = results.comparison[0], snapshot.config.distance
+    scale = snapshot.config.distance_scale
     sentences = [
         _finding(snapshot, row),
-        f"On {BACKENDS[row.backend]}, with {'its own policy' if row.agent == 'policy' else 'the inverse QP'}, it ends "
-        f"{millimetres(row.winner.mean_distance)} from {row.goals} test goals on average instead of "
-        f"{millimetres(row.baseline.mean_distance)} (difference {millimetres(row.distance_change, '+')}"
-        f"{_interval(row.distance_change_interval, 1e3)}), and {reached} instead of "
+        f"On {BACKENDS[row.backend]}, with {'its own policy' if row.agent == 'policy' else 'the inverse QP'}, its "
+        f"{measure.label.lower()} over {row.goals} test goals is {measure.text(row.winner.mean_distance)} instead of "
+        f"{measure.text(row.baseline.mean_distance)} (difference {measure.text(row.distance_change, '+')}"
+        f"{_interval(row.distance_change_interval, measure)}). It reaches {percent(row.winner.success_rate)} of the "
+        f"goals with a final {scale.name} of at most {scale.limit_text(results.success_distance)}, the baseline "
         f"{percent(row.baseline.success_rate)}.",
         results.few_goals,
     ]
     return " ".join(sentence for sentence in sentences if sentence)
 
 
-def _interval(interval: tuple[float, float] | None, scale: float) -> str:
+def _interval(interval: tuple[float, float] | None, measure: Objective) -> str:
     if interval is None:
         return ""
-    low, high = sorted(scale * end for end in interval)
-    return f", 95 % interval {low:+.2f} to {high:+.2f}"
+    low, high = (measure.number(end, "+") for end in sorted(interval))
+    return f", 95 % interval {low} to {high}"
 
 
 def _finding(snapshot: StudySnapshot, row: Comparison) -> str:
@@ -166,7 +167,7 @@ def _finding(snapshot: StudySnapshot, row: Comparison) -> str:
     if objective.name == "mean_distance":
         return f"{finding}."
     before, after = objective.text(row.baseline.objective), objective.text(row.winner.objective)
-    change = f"change {objective.text(row.objective_change, '+')}{_interval(interval, objective.scale)}"
+    change = f"change {objective.text(row.objective_change, '+')}{_interval(interval, objective)}"
     return f"{finding}. Its {objective.label.lower()} in the test is {after} instead of {before} ({change})."
 
 
@@ -182,9 +183,13 @@ def _tiles(snapshot: StudySnapshot, results: StudyResults) -> list[dict[str, str
         where = f"on {BACKENDS[row.backend]}, baseline to winner"
         before, after = row.baseline, row.winner
         if objective.name not in SHOWN_ALWAYS:
-            number = objective.text(before.objective).removesuffix(f" {objective.unit}")
-            add(f"{number} → {objective.text(after.objective)}", f"{objective.label.lower()} {where}")
-        add(f"{1e3 * before.mean_distance:.2f} → {millimetres(after.mean_distance)}", f"mean final distance {where}")
+            add(
+                f"{objective.number(before.objective)} → {objective.text(after.objective)}",
+                f"{objective.label.lower()} {where}",
+            )
+        measure = snapshot.config.distance
+        values = f"{measure.number(before.mean_distance)} → {measure.text(after.mean_distance)}"
+        add(values, f"{measure.label.lower()} {where}")
         add(f"{100 * before.success_rate:.0f} → {100 * after.success_rate:.0f} %", f"test goals reached {where}")
     if results.constraints:
         label = f"complete trials that satisfy all constraints, of {results.trials['complete']}"
@@ -211,8 +216,10 @@ def _question(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str,
         others = "the task has only one path, so the final test uses the same"
     done = ", ".join(f"{results.trials[s]} {s}" for s in ("complete", "pruned", "infeasible"))
     backend = BACKENDS.get(config.environment.backend, config.environment.backend)
+    scale = config.distance_scale
+    reached = f"a final {scale.name} of at most {scale.limit_text(results.success_distance)}"
     rows = [
-        ("Task", f"{results.environment}, success within {1e3 * results.success_distance:g} mm at the end"),
+        ("Task", f"{results.environment}; success is {reached}"),
         ("Body", f"{len(optimised)} variables: {ranges}"),
         ("Objective", f"{objective.axis_inside} on {count} goals, {direction}"),
     ]
@@ -269,7 +276,7 @@ def _poses(snapshot: StudySnapshot) -> list[tuple[str, np.ndarray | None]]:
 
 
 def _pictures(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
-    """Return pictures of baseline and winner in each pose and their overlaid side views, or why there are none."""
+    """Return pictures of baseline and winner in each pose and both over each other, or why there are none."""
     bodies = {"baseline": snapshot.config.baseline}
     if results.winner is not None:
         bodies["winner"] = results.winner.design
@@ -307,7 +314,7 @@ def _shapes(snapshot: StudySnapshot, bodies: Mapping[str, dict[str, float]]) -> 
         model = finder.load(body)
         surface = BodySurface(model)
         for (_, command), (_, drawn) in zip(poses, shapes, strict=True):
-            drawn[role] = (surface.shape(finder.at(body, command)), surface.faces, finder.state.effector)
+            drawn[role] = (surface.points(finder.at(body, command)), surface.triangles, finder.state.effector)
     return shapes
 
 
@@ -357,11 +364,10 @@ def _episode_text(episodes: Sequence[Episode]) -> str:
     """Return what the animation shows."""
     if not episodes:
         return ""
-    goal = ", ".join(f"{1e3 * value:.1f}" for value in episodes[-1].path[-1])
-    ends = " and ".join(f"the {episode.role} {millimetres(episode.distances[-1])}" for episode in episodes)
+    ends = " and ".join(f"{episode.distance_text(-1)} for the {episode.role}" for episode in episodes)
     return (
-        f"Computed with finite elements at a typical goal, where the winner gains the median of all goals: ({goal}) "
-        f"mm. At the end, {ends} away."
+        f"Computed with finite elements at a typical goal, where the winner gains the median of all goals: "
+        f"{episodes[-1].goal_text}. The {episodes[-1].task.distance_scale.name} at the end is {ends}."
     )
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgym_envs.codesign.objectives import OBJECTIVES
 from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.report.units import present
 from softgym_envs.codesign.snapshot import StudySnapshot
@@ -161,39 +160,45 @@ def parallel(snapshot: StudySnapshot, results: StudyResults) -> str:
     return out[0]
 
 
-def _silhouette(nodes: np.ndarray, triangles: np.ndarray, extent: np.ndarray) -> np.ndarray:
-    """Return the shadow of a body on the plane of its last two coordinates, as an image (h, w) of 0 and 1.
+def _silhouette(points: np.ndarray, triangles: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """Return the shadow of a body on a plane, as an image (h, w) of 0 and 1.
 
-    The body has nodes [m] (n, 3) and boundary triangles (t, 3). ``extent`` holds two corners of the image [m], (2, 2).
+    The body has points in the plane [m] (n, 2) and triangles (t, 3). ``extent`` holds two corners of the image [m],
+    shape (2, 2).
     """
     from PIL import Image, ImageDraw
 
     scale = SILHOUETTE_HEIGHT / (extent[1, 1] - extent[0, 1])
     image = Image.new("L", (round(scale * (extent[1, 0] - extent[0, 0])), SILHOUETTE_HEIGHT))
     draw = ImageDraw.Draw(image)
-    for corners in (nodes[:, 1:][triangles] - extent[0]) * scale:
-        draw.polygon([(float(y), float(z)) for y, z in corners], fill=1)
+    for corners in (points[triangles] - extent[0]) * scale:
+        draw.polygon([(float(a), float(b)) for a, b in corners], fill=1)
     return np.asarray(image)
 
 
 def overlay(shapes: Sequence[tuple[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]]]) -> str:
-    """Overlaid side views of baseline and winner, to scale.
+    """Overlaid views of baseline and winner, to scale, along the axis along which the bodies move least.
 
-    Each pose has its caption and, by role, nodes [m] (n, 3), boundary triangles (t, 3) and effectors [m] (k, 3).
+    Each pose has its caption and, by role, points [m] (n, 3), triangles (t, 3) and effectors [m] (k, 3). The points of
+    a role have the same order in all poses.
     """
+    first, last = shapes[0][1], shapes[-1][1]
+    moved = [np.abs(last[role][0] - first[role][0]).mean(axis=0) for role in first]
+    plane = np.delete(np.arange(3), np.mean(moved, axis=0).argmin())
+    labels = [f"{'xyz'[axis]} [mm]" for axis in plane]
     with _figure(9.4, 4.4, len(shapes)) as (_, axes, out):
         for ax, (caption, bodies) in zip(axes, shapes, strict=True):
-            points = np.concatenate([nodes[:, 1:] for nodes, _, _ in bodies.values()])
+            points = np.concatenate([shape[:, plane] for shape, _, _ in bodies.values()])
             margin = 0.05 * np.ptp(points[:, 1])
             extent = np.array([points.min(axis=0) - margin, points.max(axis=0) + margin])
-            for role, (nodes, triangles, effectors) in bodies.items():
+            for role, (shape, triangles, effectors) in bodies.items():
                 colour = WINNER if role == "winner" else BASELINE
-                image = _silhouette(nodes, triangles, extent)
+                image = _silhouette(shape[:, plane], triangles, extent)
                 grid = [1e3 * np.linspace(extent[0, k], extent[1, k], n) for k, n in enumerate(reversed(image.shape))]
                 ax.contourf(*grid, image, levels=[0.5, 1.5], colors=[colour], alpha=0.16)
                 ax.contour(*grid, image, levels=[0.5], colors=[colour], linewidths=1.3)
-                ax.scatter(*(1e3 * effectors[:, 1:].T), 30, colour, zorder=4, label=f"{role}, effector")
-            ax.set(xlabel="y [mm]", ylabel="z [mm]", aspect="equal")
+                ax.scatter(*(1e3 * effectors[:, plane].T), 30, colour, zorder=4, label=f"{role}, effector")
+            ax.set(xlabel=labels[0], ylabel=labels[1], aspect="equal")
             ax.set_title(caption, fontsize=10, color="#334155")
         axes[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
     return out[0]
@@ -242,7 +247,7 @@ def transfer(snapshot: StudySnapshot, results: StudyResults) -> str | None:
     roles = results.roles
     with _figure(9.4, 3.5, len(keys)) as (_, axes, out):
         for ax, key in zip(axes, keys, strict=True):
-            objective = snapshot.config.objectives.get(key) or OBJECTIVES[key]
+            objective = snapshot.config.shown_objectives[key]
             rows = [row for row in results.transfer if row.objective == key]
             everything = np.concatenate([[*row.surrogate, *row.fem] for row in rows]) * objective.scale
             margin = 0.08 * (np.ptp(everything) or 1.0)
@@ -262,8 +267,9 @@ def transfer(snapshot: StudySnapshot, results: StudyResults) -> str | None:
     return out[0]
 
 
-def reached(results: StudyResults) -> str | None:
+def reached(snapshot: StudySnapshot, results: StudyResults) -> str | None:
     """Share of the test goals reached within a distance on FEM, for baseline and winner; None without FEM."""
+    scale = snapshot.config.distance_scale
     agents = [row.agent for row in results.comparison if row.backend == "fem"]
     tests = {(*group.key, group.goals): group for group in results.tests}
     if not agents:
@@ -271,12 +277,12 @@ def reached(results: StudyResults) -> str | None:
     with _figure(9.4, 3.3, len(agents)) as (_, axes, out):
         for ax, agent in zip(axes, agents, strict=True):
             for number, role in results.roles.items():
-                distances = 1e3 * np.sort(tests[number, agent, "fem", "unseen"].mean.distances)
+                distances = scale.factor * np.sort(tests[number, agent, "fem", "unseen"].mean.distances)
                 share = 100 * np.arange(len(distances) + 1) / len(distances)
                 ax.step([0, *distances], share, where="post", color=COLOURS[role], linewidth=2.0, label=role)
-            radius = 1e3 * results.success_distance
-            ax.axvline(radius, color="#d97706", linewidth=1.0, linestyle="--", label=f"success: {radius:g} mm")
-            ax.set(xlabel="final distance to the goal on FEM [mm]", ylabel="test goals reached [%]", ylim=(0, 102))
+            radius, limit = scale.factor * results.success_distance, scale.limit_text(results.success_distance)
+            ax.axvline(radius, color="#d97706", linewidth=1.0, linestyle="--", label=f"success: {limit}")
+            ax.set(xlabel=f"final {scale.name} on FEM [{scale.unit}]", ylabel="test goals reached [%]", ylim=(0, 102))
             ax.set_title(AGENTS[agent][0], fontsize=10, color="#334155")
             ax.set_xlim(left=0)
             ax.legend(fontsize=8, loc="lower right")

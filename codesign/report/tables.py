@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
-from softgym_envs.codesign.objectives import OBJECTIVES, Objective
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.objectives import Objective
 from softgym_envs.codesign.records import TrialResult
 from softgym_envs.codesign.report.results import Comparison, Cost, StudyResults, Transfer, VariableResult
 from softgym_envs.codesign.report.units import present, shown_unit
@@ -20,11 +22,6 @@ SHOWN_ALWAYS = ("mean_distance", "success_rate")
 def percent(value: float) -> str:
     """Return a share in percent."""
     return f"{100 * value:.1f} %"
-
-
-def millimetres(value: float, sign: str = "") -> str:
-    """Return a length in millimetres."""
-    return f"{1e3 * value:{sign}.2f} mm"
 
 
 def design_row(variable: VariableResult) -> dict[str, Any]:
@@ -58,29 +55,30 @@ def _cell(
     return {"value": value, "interval": f"{low} to {high}", "good": min(better * end for end in interval) > 0.0}
 
 
-def comparison_columns(objective: Objective) -> list[str]:
+def comparison_columns(config: StudyConfig) -> list[str]:
     """Return the columns of the comparison of baseline and winner."""
-    measures = [] if objective.name in SHOWN_ALWAYS else [objective.label]
+    measures = [] if config.objective in SHOWN_ALWAYS else [config.primary.label]
     return [
         f"{measure}, {what}"
-        for measure in (*measures, "Success", "Distance")
+        for measure in (*measures, "Success", config.distance_scale.name.capitalize())
         for what in ("baseline", "winner", "change")
     ]
 
 
-def comparison_row(row: Comparison, objective: Objective) -> dict[str, Any]:
+def comparison_row(row: Comparison, config: StudyConfig) -> dict[str, Any]:
     """Return the comparison for one controller and backend."""
+    measures = config.shown_objectives
     cells: list[dict[str, Any]] = []
     # Measure, its mean, and the prefix of its other fields in the comparison.
-    shown = [(objective, "objective", "objective")] if objective.name not in SHOWN_ALWAYS else []
-    shown += [(OBJECTIVES["success_rate"], "success_rate", "success")]
-    shown += [(OBJECTIVES["mean_distance"], "mean_distance", "distance")]
+    shown = [(config.primary, "objective", "objective")] if config.objective not in SHOWN_ALWAYS else []
+    shown += [(measures["success_rate"], "success_rate", "success")]
+    shown += [(measures["mean_distance"], "mean_distance", "distance")]
     for measure, mean, prefix in shown:
         for body in (row.baseline, row.winner):
             text, interval = measure.text(getattr(body, mean)), getattr(body, f"{prefix}_interval")
-            cells.append(_cell(text, interval, _ends(measure)))
+            cells.append(_cell(text, interval, measure.number))
         change, interval = getattr(row, f"{prefix}_change"), getattr(row, f"{prefix}_change_interval")
-        cells.append(_cell(measure.text(change, "+"), interval, _ends(measure, "+"), measure.sign))
+        cells.append(_cell(measure.text(change, "+"), interval, partial(measure.number, sign="+"), measure.sign))
     return {
         "backend": BACKENDS[row.backend],
         "agent": AGENTS[row.agent],
@@ -90,24 +88,14 @@ def comparison_row(row: Comparison, objective: Objective) -> dict[str, Any]:
     }
 
 
-def _ends(measure: Objective, sign: str = "") -> Callable[[float], str]:
-    decimals = 0 if measure.unit == "%" else 2
-    return lambda value: f"{value * measure.scale:{sign}.{decimals}f}"
-
-
 def transfer_row(row: Transfer, objective: Objective) -> dict[str, Any]:
     """Return how an objective differs between surrogate and FEM."""
-
-    def gap(value: float, sign: str) -> str:
-        rounded = round(value * objective.scale, 2) + 0.0  # no negative zero
-        return f"{rounded:{sign}.2f} {'pp' if objective.unit == '%' else objective.unit}".rstrip()
-
     return {
         "agent": AGENTS[row.agent],
         "measure": objective.label,
         "bodies": len(row.trials),
-        "mean": gap(row.mean_gap, "+"),
-        "worst": gap(row.worst_gap, ""),
+        "mean": objective.text(row.mean_gap, "+"),
+        "worst": objective.text(row.worst_gap, "-"),
         "spearman": "-" if row.spearman is None else f"{row.spearman:.2f}",
     }
 
@@ -134,7 +122,7 @@ def finalist_table(snapshot: StudySnapshot, results: StudyResults) -> dict[str, 
             if group is None or group.error is not None:
                 cells.append(("-" if group is None else "failed", ""))
                 continue
-            below = millimetres(group.mean.mean_distance)
+            below = config.distance.text(group.mean.mean_distance)
             if objective.name not in SHOWN_ALWAYS:
                 below = f"{objective.text(group.value(objective.name))}; {below}"
             broken = config.violations_text({name: group.value(name) for name in limits}, limits)

@@ -81,7 +81,7 @@ def evaluate(
         if agent not in BASELINES:
             Policy(agent).check_environment(environment)
     points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
-    shown = environment.task_class.distance_text
+    shown = environment.task_class.distance_scale.text
     results: list[dict[str, Any]] = []
     say = partial(click.echo, err=as_json)  # stdout is for the JSON
     say(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean':>11s} {'worst':>11s} {'return':>8s}")

@@ -9,8 +9,8 @@ from typing import NoReturn
 import click
 
 from softgym_envs.cli import agents, bench, benchmark, codesign, configs, environments, robots, surrogates
-from softgym_envs.cli.options import Resumable
-from softgym_envs.errors import SoftGymError, unknown_name
+from softgym_envs.cli.options import Resumable, Verbs
+from softgym_envs.errors import SoftGymError
 from softgym_envs.extras import explain
 from softgym_envs.version import __version__
 
@@ -26,21 +26,14 @@ SECTIONS = {
 }
 
 
-class _Verbs(click.Group):
-    """A group whose help lists the verbs by section, and whose errors suggest the nearest verb."""
+class _Verbs(Verbs):
+    """The group of all verbs, whose help lists them by section."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         width = max(map(len, self.commands))  # all sections share the same two columns
         for title, verbs in SECTIONS.items():
             with formatter.section(title):
                 formatter.write_dl([(f"{verb.name:{width}}", verb.get_short_help_str(80)) for verb in verbs])
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args[0] not in self.commands and not args[0].startswith("-"):
-            raise click.UsageError(unknown_name("verb", args[0], self.commands), ctx)
-        return super().resolve_command(ctx, args)
 
 
 @click.group(

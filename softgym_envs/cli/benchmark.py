@@ -18,7 +18,7 @@ results = click.option(
 )
 
 
-@click.group()
+@click.group(cls=options.Verbs)
 def benchmark() -> None:
     """Compare optimisers of bodies and controllers on frozen problems.
 
@@ -72,6 +72,7 @@ def show(name: str) -> None:
 @click.option("--judge", help="Who controls the bodies in the search (default: the problem's).")
 @click.option("--level", default="small", show_default=True, help="Budget: small, medium or large.")
 @click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Number of seeds.")
+@click.option("--bodies", type=click.IntRange(min=1), help="Largest number of bodies, besides the budget.")
 @click.option(
     "--table", type=options.PATH, help="Choose among the bodies of this Parquet file (softgym benchmark tabulate)."
 )
@@ -83,6 +84,7 @@ def run(
     judge: str | None,
     level: str,
     seeds: int,
+    bodies: int | None,
     table: Path | None,
     fem: bool,
     folder: Path,
@@ -101,7 +103,7 @@ def run(
         for seed in range(seeds):
             for name in names:
                 for method in methods:
-                    found = runs.run(folder, name, method, judge, level, seed, listed)  # type: ignore[arg-type]
+                    found = runs.run(folder, name, method, judge, level, seed, listed, bodies)  # type: ignore[arg-type]
                     click.echo(
                         f"{name} {method} {found.judge} seed {seed}: {found.bodies} bodies, "
                         f"{found.spent['cpu_seconds']:.1f} CPU s, best {_scores(found.search_scores[:1])}"

@@ -110,8 +110,8 @@ def rollout(
         if video is not None:
             frames.append(env.render())
     click.echo(f"{environment} on {config.backend}, agent {agent}: {step} steps, return {total:.2f}")
-    distance = config.task_class.distance_text(info["distance"], 3)
-    click.echo(f"final distance {distance}, success {info['is_success']}")
+    scale = config.task_class.distance_scale
+    click.echo(f"final {scale.name} {scale.text(info['distance'], 3)}, success {info['is_success']}")
     if doubted := [doubt for doubt in doubts if doubt]:
         reasons = doubt_text(functools.reduce(operator.or_, doubted))
         click.echo(f"{len(doubted)} of {len(doubts)} states are not trusted: {reasons}; compare with --backend fem")

@@ -31,6 +31,17 @@ VERBS = {
 """Folder of shipped configurations -> the verbs that read them."""
 
 
+class Verbs(click.Group):
+    """A group whose errors suggest the nearest verb."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] not in self.commands and not args[0].startswith("-"):
+            raise click.UsageError(unknown_name("verb", args[0], self.commands), ctx)
+        return super().resolve_command(ctx, args)
+
+
 def shipped_configs(folder: str) -> list[str]:
     """Return the names of the shipped configurations of one kind: ``"agents"``, ``"codesign"``, ..."""
     return sorted(path.stem for path in (CONFIGS / folder).glob("*.yaml"))

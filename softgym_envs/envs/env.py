@@ -380,12 +380,11 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             source = self.backend if isinstance(self.backend, FEMBackend) else None
             window = self.render_mode == "human"
             self._renderer = ImageRenderer(self.robot, self.render_size, window=window, source=source)
-        state, goal, path = self.backend.state, self.goal, self._path
-        distance = float(self.task.distance(self.task.measure(state), goal))
-        place = self.task.goal_unit == "m"
-        text = f"{'distance' if place else 'error'} {self.task.distance_text(distance)}"
-        if not place:
-            goal, path = state.effector[0], state.effector[:1]
+        state = self.backend.state
+        distance = float(self.task.distance(self.task.measure(state), self.goal))
+        scale = self.task.distance_scale
+        text = f"{scale.name} {scale.text(distance)}"
+        path, goal = self.task.drawn_goals(state, self._path, self.goal)
         image = self._renderer.render(self.backend.design, state, path, goal, text=text)
         return None if self.render_mode == "human" else image
 

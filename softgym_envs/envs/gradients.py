@@ -15,6 +15,8 @@ from softgym_envs.envs.tasks.base import Task
 class StepGradient:
     """Derivatives of the rewards of one step of B environments in what the agent did in this step.
 
+    Asked for with ``log=True``, they are derivatives of `Task.log_reward`.
+
     Attributes:
         reward: the rewards, shape (B,).
         command: derivative in the commands, through the equilibrium of slack actuators, shape (B, n_a). It is zero for
@@ -58,13 +60,25 @@ class RewardGradient:
         self._axes = task.axes
         self._task, self._spaces = with_tensors(task, torch.as_tensor), with_tensors(spaces, torch.as_tensor)
 
-    def __call__(self, effector: np.ndarray, effort: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives of the rewards in effectors (B, 3) and efforts (B, n_a), for goals (B, 3)."""
+    def __call__(
+        self, effector: np.ndarray, effort: np.ndarray, goal: np.ndarray, log: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of the rewards in effectors (B, 3) and efforts (B, n_a), for goals (B, 3).
+
+        Args:
+            effector: first effectors [m].
+            effort: efforts of the actuators [N, ...].
+            goal: goals [m].
+            log: return those of `Task.log_reward` instead.
+        """
         import torch
 
         x, e = (torch.from_numpy(np.ascontiguousarray(part)).requires_grad_() for part in (effector, effort))
-        _, _, reward = self._task.rate(x, torch.from_numpy(np.ascontiguousarray(goal)), self._spaces.effort_share(e))
-        by_effector, by_effort = torch.autograd.grad(reward.sum(), (x, e), allow_unused=True, materialize_grads=True)
+        share = self._spaces.effort_share(e)
+        distance, _, value = self._task.rate(x, torch.from_numpy(np.ascontiguousarray(goal)), share)
+        if log:
+            value = self._task.log_reward(distance, share)
+        by_effector, by_effort = torch.autograd.grad(value.sum(), (x, e), allow_unused=True, materialize_grads=True)
         # A distance of exactly zero has no derivative; the reward is at its peak there.
         met = (self._axes * (effector - goal) == 0.0).all(axis=1)
         return np.where(met[:, None], 0.0, by_effector.numpy()), by_effort.numpy()

@@ -46,6 +46,11 @@ class ModelBuilder:
         self.size += len(rows)
         return start
 
+    @property
+    def nodes(self) -> np.ndarray:
+        """Rest rows [m] of the parts added so far, shape (size, 3)."""
+        return np.vstack(self._rows) if self._rows else np.empty((0, 3))
+
     def add_solid(self, nodes: np.ndarray, tetrahedra: np.ndarray, *, fixed: Fixed, **options: Any) -> int:
         """Add a solid body; arguments as for `MechanicalModel.from_mesh`, without gravity and solver."""
         part = solid_part(nodes, tetrahedra, fixed=fixed, **options)
@@ -109,7 +114,7 @@ class ModelBuilder:
 
     def build(self) -> MechanicalModel:
         """Return the model, with its blocks in the order in which they were added."""
-        nodes = np.vstack(self._rows)
+        nodes = self.nodes
         blocks = [kind(nodes, topology, **options) for kind, topology, options in self._parts]  # type: ignore[call-arg]
         return MechanicalModel(
             nodes,

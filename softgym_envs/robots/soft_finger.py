@@ -43,8 +43,9 @@ CONTACT_RADIUS = 2.0e-3
 TIP_RADIUS = 8.0e-3
 """Part of the last segment over which the tip is averaged, unless cables act on single points [m]."""
 
-CONTACT_DISTANCE = 1.5e-4
-"""Gap below which there are contact forces on the fine meshes [m]: below the gaps across the edges of the joints."""
+CONTACT_DISTANCE = 0.015
+"""Gap below which there are contact forces, relative to the size of the elements. Vertices on both sides of a sharp
+edge are as far apart as the elements there are large, and must not touch at rest."""
 
 FINGER_MESHES = {
     "published": MeshTier(8.0e-3),
@@ -89,8 +90,9 @@ class SoftFinger(MeshedRobot):
         self_contact: whether surfaces of the finger touch each other, as the faces of its notches do from about 10 mm
             of pull on. By default they do on all meshes but the published one, whose scene has no contact, and without
             fillets, whose narrow elements would touch at rest.
-        contact_distance: gap below which there are forces [m]; default 0.5 mm on the published mesh. On the others it
-            is 0.15 mm, so that the small elements at the edges of the joints do not touch at rest.
+        contact_distance: gap below which there are forces [m]; default 0.5 mm on the published mesh, 0.15 mm on the
+            accurate one and in proportion to the ``mesh_size`` on finer ones, so that elements at the edges of the
+            joints do not touch at rest.
         **options: options of `Robot`.
     """
 
@@ -124,7 +126,8 @@ class SoftFinger(MeshedRobot):
             self.meshes = {**FINGER_MESHES, "published": MeshTier(7.9e-3)}
         touching = mesh != "published" and not fillet if self_contact is None else self_contact
         if contact_distance is None:
-            contact_distance = CONTACT_DISTANCE if touching and mesh != "published" else 5.0e-4
+            size = self.meshes[mesh].size if mesh_size is None and mesh in self.meshes else mesh_size
+            contact_distance = CONTACT_DISTANCE * size if touching and mesh != "published" and size else 5.0e-4
         super().__init__(
             mesh=mesh,
             mesh_size=mesh_size,

@@ -37,13 +37,14 @@ cost."""
 
 
 class SplitConfig(Config):
-    """One dataset split; without a ``boundary`` of its own, it has that of all data."""
+    """One dataset split, see `SamplingPlan`; without a ``boundary`` of its own, it has that of all data."""
 
     groups: int = Field(gt=0)
     states: int = Field(ge=0)
     sequence: Literal["halton", "sobol", "latin", "random"] = "random"
     seed: int = Field(default=0, ge=0)
     boundary: float | None = Field(default=None, ge=0.0, le=1.0)
+    share: float = Field(default=1.0, gt=0.0, le=1.0)
 
 
 class DataConfig(Config):
@@ -114,12 +115,14 @@ class CorrectionConfig(Config):
 
     Attributes:
         coarser: options of the coarser mesh, which replace those of the robot.
+        own: likewise for the robot's own mesh, such as no contact, if the others have none.
         finer: options of the finer mesh.
         sizes: of the elements from coarse to fine, in any unit.
         states: the same states on the coarser mesh, that of the robot, and the finer one.
     """
 
     coarser: dict[str, Any]
+    own: dict[str, Any] = {}
     finer: dict[str, Any]
     sizes: tuple[float, float, float]
     states: SplitConfig
@@ -227,7 +230,7 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
 def domain_of(
     model: SurrogateModel, training: dict[str, np.ndarray], validation: dict[str, np.ndarray]
 ) -> dict[str, Any]:
-    """Return where a model may be trusted: the box of its training states, and its uncertainty on validation states.
+    """Return where a model may be trusted: the box of all states that it learned, and its uncertainty on others.
 
     Returns:
         ``displacement`` and ``design`` ranges; ``inflation``: factor that turns the spread of the ensemble into a bound
@@ -278,7 +281,7 @@ def generate_datasets(
             plans[f"pretraining/{split}"] = options | coarse.robot_options, data.plan_of(getattr(coarse, split))
     if fine := config.correction:
         plan = replace(data.plan_of(fine.states), margin=0.0)  # efforts are compared at equal commands
-        for level, changed in (("coarser", fine.coarser), ("own", {}), ("finer", fine.finer)):
+        for level, changed in (("coarser", fine.coarser), ("own", fine.own), ("finer", fine.finer)):
             plans[f"correction/{level}"] = options | changed, plan
     found = {
         name: generate_dataset(
@@ -354,10 +357,13 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     if config.correction is not None:
         levels = [data[f"correction/{level}"] for level in ("coarser", "own", "finer")]
         correction = asdict(fit_correction(levels, config.correction.sizes, features.design(levels[1]["design"])))
+    # Cheap states are learned, too, and few expensive ones hardly reach the bounds of the boxes.
+    parts = [learned[name] for name in ("train", "pretraining/train") if name in learned]
+    every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     card = {
         **card_of(robot, config.network.kind),
         "config": config.model_dump(mode="json", exclude={"executor"}),
-        "domain": domain_of(model, learned["train"], data["validation"]),
+        "domain": domain_of(model, every, data["validation"]),
         "loaded": bool(robot.build().loads.any()),
         "states": {split: len(rows) for split, rows in states.items()},
         "unstable_states_left_out": {split: len(learned[split]["rest"]) - len(rows) for split, rows in states.items()},

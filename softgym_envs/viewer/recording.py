@@ -16,6 +16,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import State
 from softgym_envs.envs.env import SoftRobotEnv
+from softgym_envs.envs.tasks.base import LENGTHS, DistanceScale
 from softgym_envs.extras import require
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
@@ -39,8 +40,8 @@ class RolloutRecorder:
     Use it as a context manager: the file is complete when the block ends, and does not exist if the block fails.
 
     The recording contains ``world/body`` (mesh), ``world/cables/<actuator>``, ``world/effectors``, ``world/goal`` and
-    ``world/path`` (all in metres), ``plots/distance`` [mm], ``plots/reward``, and for each actuator
-    ``plots/displacement/<actuator>`` and ``plots/effort/<actuator>`` (mm and N for cables).
+    ``world/path`` (all in metres), ``plots/distance`` (mm, or the unit of the task), ``plots/reward``, and for each
+    actuator ``plots/displacement/<actuator>`` and ``plots/effort/<actuator>`` (mm and N for cables).
 
     Args:
         robot: the family of bodies.
@@ -48,12 +49,20 @@ class RolloutRecorder:
         name: name of the recording in the viewer.
         roles: names of several rollouts to show side by side. The entities of a rollout lie under its name, and `log`
             writes to the rollout selected by the last `begin`.
+        distance_scale: unit of ``plots/distance``.
     """
 
     def __init__(
-        self, robot: Robot, path: str | Path, *, name: str | None = None, roles: Sequence[str] = ("",)
+        self,
+        robot: Robot,
+        path: str | Path,
+        *,
+        name: str | None = None,
+        roles: Sequence[str] = ("",),
+        distance_scale: DistanceScale = LENGTHS,
     ) -> None:
         self.robot = robot
+        self.distance_scale = distance_scale
         self.path = Path(path)
         self.name = name or self.path.stem
         self.roles = tuple(roles)
@@ -159,7 +168,7 @@ class RolloutRecorder:
 
         if distance is None:
             distance = float(np.linalg.norm(state.effector[0] - goal))
-        self._plot("distance", 1e3 * distance)
+        self._plot("distance", self.distance_scale.factor * distance)
         if reward is not None:
             self._plot("reward", reward)
         for row, actuator in enumerate(self.robot.actuators):
@@ -171,7 +180,8 @@ class RolloutRecorder:
         import rerun
 
         self._stream.log(f"{self._root}world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        names = {"distance": "distance [mm]", "reward": "reward"}
+        scale = self.distance_scale
+        names = {"distance": f"{scale.name} [{scale.unit}]", "reward": "reward"}
         for actuator in self.robot.actuators:
             unit, _, effort = _PLOTTED.get(actuator.unit, (actuator.unit, 1.0, "SI"))
             names[f"displacement/{actuator.name}"] = f"{actuator.name} [{unit}]"
@@ -229,13 +239,15 @@ def record_rollout(
         steps: largest number of steps; default: the time limit of the environment.
 
     Returns:
-        ``return`` (sum of rewards), ``final_distance`` [m], ``success`` at the last step, and ``steps``.
+        ``return`` (sum of rewards), ``final_distance`` (as `Task.distance` returns it: [m] for positions), ``success``
+        at the last step, and ``steps``.
 
     Raises:
         ValueError: if the environment is not a `SoftRobotEnv`, or has no time limit while ``steps`` is None.
     """
     name = Path(path).stem if env.spec is None else env.spec.id
-    with RolloutRecorder(_body_of(env).robot, path, name=name) as recorder:
+    body = _body_of(env)
+    with RolloutRecorder(body.robot, path, name=name, distance_scale=body.task.distance_scale) as recorder:
         return _roll_out(recorder, env, agent, seed, options, _limit(env, steps))
 
 
@@ -264,7 +276,8 @@ def record_comparison(
     """
     if not rollouts:
         raise ValueError("rollouts is empty; pass at least one agent by name")
-    with RolloutRecorder(_body_of(env).robot, path, roles=tuple(rollouts)) as recorder:
+    scale, roles = _body_of(env).task.distance_scale, tuple(rollouts)
+    with RolloutRecorder(_body_of(env).robot, path, roles=roles, distance_scale=scale) as recorder:
         found = {}
         for role, (agent, options) in rollouts.items():
             recorder.begin(role)
@@ -297,20 +310,18 @@ def _roll_out(
     """Run one episode into an open recording."""
     body = _body_of(env)
     observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
-    recorder.log(0, body.design, body.state, body.goal, path=body.path, distance=float(info["distance"]))
+
+    def log(step: int, reward: float | None) -> None:
+        path, goal = body.task.drawn_goals(body.state, body.path, body.goal)
+        distance = float(info["distance"])
+        recorder.log(step, body.design, body.state, goal, path=path, reward=reward, distance=distance)
+
+    log(0, None)
     total, step, over = 0.0, 0, False
     while step < steps and not over:
         observation, reward, terminated, truncated, info = env.step(agent(observation, body))
         step, total, over = step + 1, total + float(reward), terminated or truncated
-        recorder.log(
-            step,
-            body.design,
-            body.state,
-            body.goal,
-            path=body.path,
-            reward=float(reward),
-            distance=float(info["distance"]),
-        )
+        log(step, float(reward))
     return {
         "return": total,
         "final_distance": float(info["distance"]),

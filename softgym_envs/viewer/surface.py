@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -13,13 +12,9 @@ from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.extras import require
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
-
-if TYPE_CHECKING:
-    import pyvista
 
 
 class BodySurface:
@@ -32,7 +27,6 @@ class BodySurface:
         feature_angle: an edge is sharp if the normals of its two faces at rest differ by more [rad].
 
     Attributes:
-        faces: points of the triangles, shape (t, 3).
         nodes: point of each surface vertex, shape (v,); a point on a sharp edge has several vertices.
         triangles: corner vertices, shape (t, 3).
         edges: point pairs of the sharp edges, shape (s, 2).
@@ -51,7 +45,7 @@ class BodySurface:
             parts.append(skin.triangles + start)
             held.append(model.fixed[skin.points.node_ids[:, 0]])
             start += len(skin.points.node_ids)
-        corners = self.faces = np.concatenate(parts)
+        corners = np.concatenate(parts)
         self.clamped = np.concatenate(held)[corners].all(axis=1)
         solid = len(corners) - sum(len(skin.triangles) for skin in model.skins)
         flags = [np.full(len(skin.triangles), skin.rigid) for skin in model.skins]
@@ -103,28 +97,6 @@ def surface_kinds(surface: BodySurface) -> np.ndarray:
 def _face_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     corners = points[triangles]
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def body_surface(model: MechanicalModel, x: np.ndarray | None = None) -> pyvista.PolyData:
-    """Return the boundary surface of a body as a mesh [m], for pictures and for export (``.save("body.stl")``).
-
-    Args:
-        model: the body.
-        x: node positions [m], shape (n, 3); default: at rest.
-
-    Returns:
-        A mesh with point normals, the point array ``node`` and the cell array ``clamped``.
-    """
-    require("viewer")
-    import pyvista
-
-    surface = BodySurface(model)
-    points = surface.points(model.nodes if x is None else x)
-    mesh = pyvista.PolyData.from_regular_faces(points, surface.triangles)
-    mesh.point_data["node"] = surface.nodes
-    mesh.point_data.active_normals = surface.normals(points)
-    mesh.cell_data["clamped"] = surface.clamped
-    return mesh
 
 
 def cable_lines(

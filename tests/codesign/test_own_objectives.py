@@ -9,6 +9,8 @@ from softgym_envs import make_robot
 from softgym_envs.agents.evaluation import Evaluation
 from softgym_envs.codesign import Objective, StudyConfig, load_study, run_study, write_report
 from softgym_envs.codesign.objectives import OBJECTIVES, Outcome, find_objective, objective_name
+from softgym_envs.envs.tasks.grasp import Grasp
+from softgym_envs.envs.tasks.reach import Reach
 from softgym_envs.robots.soft_finger import SoftFinger
 from softgym_envs.robots.tetrapod import Tetrapod
 
@@ -49,17 +51,24 @@ def test_names_of_objectives():
 
 
 def test_units_of_efforts_are_those_of_the_robot():
-    assert find_objective("mean_effort", ROBOT).text(2.0) == "2.00 N"
-    assert find_objective("mean_effort", make_robot("trunk")).text(2e3) == "2.00 kPa"
-    assert find_objective("mean_effort", Tetrapod()).text(2.0) == "2.00 N m"
+    assert find_objective("mean_effort", ROBOT, Reach).text(2.0) == "2.00 N"
+    assert find_objective("mean_effort", make_robot("trunk"), Reach).text(2e3) == "2.00 kPa"
+    assert find_objective("mean_effort", Tetrapod(), Reach).text(2.0) == "2.00 N m"
+
+
+@pytest.mark.parametrize("name, label", [("mean_distance", "Mean final"), ("mean_tracking_distance", "Mean tracking")])
+def test_units_of_distances_are_those_of_the_task(name, label):
+    lengths, errors = (find_objective(name, ROBOT, task) for task in (Reach, Grasp))
+    assert (lengths.text(0.002), lengths.label) == ("2.00 mm", f"{label} distance")
+    assert (errors.text(0.05), errors.text(-0.01, "+"), errors.label) == ("5.0 %", "-1.0 pp", f"{label} error")
 
 
 def test_measurements():
-    found = find_objective(f"{__name__}:effort_per_reach", ROBOT)
+    found = find_objective(f"{__name__}:effort_per_reach", ROBOT, Reach)
     assert (found.label, found.sign) == ("Effort per reach", -1)
     measured = found.measure(outcome([0.0, 1e-3], [1.0, 2.0]))
     assert (measured.value, measured.per_goal) == (2.5, [1.0, 4.0])
-    body = find_objective(f"{__name__}:lightness", ROBOT).measure(outcome([0.0], [1.0]))
+    body = find_objective(f"{__name__}:lightness", ROBOT, Reach).measure(outcome([0.0], [1.0]))
     assert body.per_goal is None and body.value == pytest.approx(1.0 / ROBOT.build().volume)
 
 

@@ -66,6 +66,47 @@ def test_gradients_agree_with_differences(name, action_mode):
     env.close()
 
 
+@pytest.mark.parametrize("name", ["SoftGym/TrunkReach-v0", "SoftGym/GripperPinch-v0"])
+def test_the_logarithm_of_the_reward_has_the_slope_of_its_differences_everywhere(name):
+    from softgym_envs.envs.gradients import RewardGradient
+
+    env: Any = gym.make_vec(name, num_envs=60).unwrapped
+    env.reset(seed=0)
+    task, rng = env.task, np.random.default_rng(1)
+    distances = np.geomspace(0.01 * task.success_distance, task.robot.workspace_scale, 60)
+    direction = task.axes * rng.normal(size=(60, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    goal = np.zeros((60, 3))
+    effector = distances[:, None] * direction
+    effort = rng.uniform(0.1, 0.5, (60, env.action_space.shape[1])) * task.robot.effort_scale
+
+    def value(effector, effort):
+        share = env.spaces.effort_share(effort)
+        return task.log_reward(task.distance(effector, goal), share)
+
+    by_effector, by_effort = RewardGradient(task, env.spaces)(effector, effort, goal, log=True)
+    for i in range(3):
+        shift = np.zeros((60, 3))
+        shift[:, i] = 1e-4 * distances
+        difference = (value(effector + shift, effort) - value(effector - shift, effort)) / (2.0 * shift[:, i])
+        np.testing.assert_allclose(by_effector[:, i], difference, rtol=1e-5, atol=1e-5 * np.abs(by_effector).max())
+    h = 1e-5 * task.robot.effort_scale
+    for i in range(effort.shape[1]):
+        shift = np.eye(effort.shape[1])[i] * h
+        difference = (value(effector, effort + shift) - value(effector, effort - shift)) / (2.0 * shift[i])
+        np.testing.assert_allclose(by_effort[:, i], difference, rtol=1e-5)
+    # The slope falls as 1 / distance; that of the plain logarithm falls with its cube.
+    slope = -(by_effector * direction).sum(axis=1)
+    outside = distances > 2.0 * task.success_distance
+    assert (slope[outside] * distances[outside] > 0.4).all()
+    # At the goal it is the logarithm of the reward.
+    near = distances < 0.03 * task.success_distance
+    share = env.spaces.effort_share(effort)
+    reward = np.prod(list(task.reward_terms(task.distance(effector, goal), share).values()), axis=0)
+    np.testing.assert_allclose(value(effector, effort)[near], np.log(reward)[near], atol=1e-5)
+    env.close()
+
+
 def test_derivatives_are_finite_at_the_goal():
     env: Any = gym.make_vec("SoftGym/FingerReach-v0", num_envs=2)
     _, info = env.reset(seed=0)

@@ -10,9 +10,11 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends.registry import make_backend
+from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.errors import InfeasibleDesign, WeightsError
 from softgym_envs.mechanics.contact.obstacles import Plane, Sphere
 from softgym_envs.robots import ROBOTS
+from softgym_envs.surrogate.pretrained import ships_weights
 
 WALL = Plane((0.0, 0.0, 0.1263), (0.0, 0.0, -1.0), friction=0.3, name="ceiling")
 """0.3 mm above the top of the Diamond: so near that it presses at rest."""
@@ -75,6 +77,24 @@ def test_wrong_options_are_named(options, message):
 def test_shipped_weights_refuse_contact(options):
     with pytest.raises(WeightsError, match="weights of 'diamond' know no contact: use backend='fem'"):
         make_backend("surrogate", make_robot("diamond", **options))
+
+
+@pytest.mark.parametrize("options", [{"obstacles": [WALL]}, {"self_contact": False}, {"self_friction": 0.3}])
+def test_weights_of_a_robot_that_touches_itself_refuse_other_contact(options):
+    assert ships_weights(make_robot("finger", mesh="accurate"))
+    robot = make_robot("finger", mesh="accurate", **options)
+    assert not ships_weights(robot)
+    with pytest.raises(WeightsError, match="know self_contact without obstacles: use backend='fem'"):
+        make_backend("surrogate", robot)
+
+
+def test_the_accurate_finger_runs_on_weights_that_know_its_contact():
+    env = gymnasium.make("SoftGym/FingerReach-v0", robot_options={"mesh": "accurate"})
+    assert isinstance(env.get_wrapper_attr("backend"), SurrogateBackend)
+    env.reset(seed=0, options={"design": {"length": 0.041, "joint_height": 0.0055}})
+    for _ in range(6):
+        *_, info = env.step(np.ones(2, dtype=np.float32))
+    assert info["converged"] and info["trusted"] and (info["effort"] > 0.0).all()
 
 
 def test_contact_in_environments():

@@ -174,6 +174,16 @@ def test_a_share_of_the_training_bodies_lies_on_the_boundary():
         SamplingPlan(1, 1, boundary=1.5)
 
 
+def test_commands_may_come_from_a_part_of_their_ranges():
+    robot = make_robot("finger")
+    whole, part = (SamplingPlan(9, 3, seed=1, share=share) for share in (1.0, 0.25))
+    for group in range(9):
+        assert part.designs(robot, group, 1) == whole.designs(robot, group, 1)
+        assert part.commands(robot, group) == pytest.approx(0.25 * whole.commands(robot, group))
+    with pytest.raises(ValueError, match=r"share = 2.0 is out of bounds; allowed: \[0, 1\]"):
+        SamplingPlan(1, 1, share=2.0)
+
+
 def test_a_dataset_without_the_option_is_continued(tmp_path):
     plan = SamplingPlan(2, 1, "halton", 3)
     generate_dataset(tmp_path, "trunk", plan, groups_per_shard=1, progress=False)

@@ -13,7 +13,7 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.viewer.image import ImageRenderer, render_bodies, render_body
 from softgym_envs.viewer.recording import record_comparison, record_rollout
 from softgym_envs.viewer.scene import COLORS, tension_color
-from softgym_envs.viewer.surface import BodySurface, ShapeFinder, body_surface, cable_lines, slacken
+from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines, slacken
 
 SIZE = (160, 120)
 GOAL = np.array([0.0, 0.06, -0.095])
@@ -175,11 +175,6 @@ class TestShape:
         side = np.isclose(corners[:, :, 0], corners[:, :, 0].max()).all(axis=1)
         normals = surface.normals(points)[surface.triangles[side]]
         np.testing.assert_allclose(normals, np.broadcast_to([1.0, 0.0, 0.0], normals.shape), atol=0.3)
-
-    def test_body_surface_mesh(self, backend, states):
-        mesh = body_surface(backend.model, states["bent"].nodes)
-        assert mesh.n_cells == len(mesh.cell_data["clamped"])
-        np.testing.assert_allclose(mesh.points, states["bent"].nodes[mesh.point_data["node"]], atol=1e-7)
 
     def test_cables(self, backend, states):
         state = states["slack"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import reduce
 from operator import mul
 from typing import Any, Protocol
@@ -26,6 +27,33 @@ class Random(Protocol):
 
     def integers(self, low: int, *, size: int) -> Array:
         """Draw integers from 0 to ``low - 1``."""
+
+
+@dataclass(frozen=True)
+class DistanceScale:
+    """How people read the distances of a task.
+
+    Attributes:
+        name: what a distance is called: ``"distance"`` or ``"error"``.
+        unit: unit that people read.
+        factor: factor to that unit from what `Task.distance` returns.
+    """
+
+    name: str
+    unit: str
+    factor: float
+
+    def text(self, distance: float, digits: int = 1) -> str:
+        """Return a distance with its unit: ``"3.2 mm"``."""
+        return f"{self.factor * distance:.{digits}f} {self.unit}"
+
+    def limit_text(self, distance: float) -> str:
+        """Return a distance that somebody chose, without needless zeros: ``"5 mm"``."""
+        return f"{self.factor * distance:g} {self.unit}"
+
+
+LENGTHS = DistanceScale("distance", "mm", 1e3)
+SHARES = DistanceScale("error", "%", 1e2)
 
 
 def tolerance(x: Array, margin: float) -> Array:
@@ -77,6 +105,10 @@ def check_length(value: float, name: str, robot: Robot) -> float:
     return value
 
 
+#: Smallest reward whose logarithm is followed; below, gradients would be without bound.
+SMALLEST_REWARD = 1e-6
+
+
 class Task(ABC):
     """What a robot has to do: a task draws goals and rates how close a state is to the present goal.
 
@@ -107,6 +139,8 @@ class Task(ABC):
     needs_state = False
     #: Unit of goals; that of positions by default.
     goal_unit = "m"
+    #: How people read distances; lengths by default.
+    distance_scale = LENGTHS
 
     name: str
     horizon: int = 1
@@ -170,14 +204,18 @@ class Task(ABC):
         """Return what the touch sensors show of the last `touch`, in [-1, 1], shape (``sensors`` - s,)."""
         return np.zeros(0)
 
-    @classmethod
-    def distance_text(cls, distance: float, digits: int = 1) -> str:
-        """Return a distance to show: in millimetres, or in percent of a goal that is not a place."""
-        return f"{1e3 * distance:.{digits}f} mm" if cls.goal_unit == "m" else f"{1e2 * distance:.{digits}f} %"
-
     def measure(self, state: State) -> np.ndarray:
         """Return what is compared with the goal, shape (3,): the first effector [m] unless a task overrides it."""
         return state.effector[0]
+
+    def drawn_goals(self, state: State, path: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return path (p, 3) and goal (3,) for a picture of a state [m].
+
+        Goals that are not places are drawn where the effector is.
+        """
+        if self.goal_unit == "m":
+            return path, goal
+        return state.effector[:1], state.effector[0]
 
     def hindsight_goals(self, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the goals (B, 3) that measured values (B, 3) would have reached, and which may be goals (B,)."""
@@ -213,9 +251,27 @@ class Task(ABC):
             distance: effector to goal [m], shape (...).
             effort_share: mean actuator effort over its scale, shape (...).
         """
-        near = tolerance(distance, self.success_distance)
-        far = tolerance(distance, self.robot.workspace_scale)
+        near, far = self._nearness(distance)
         return {"distance": 0.5 * near + 0.5 * far, "effort": 1.0 - 0.05 * effort_share.clip(0.0, 1.0)}
+
+    def _nearness(self, distance: Array) -> tuple[Array, Array]:
+        return tolerance(distance, self.success_distance), tolerance(distance, self.robot.workspace_scale)
+
+    def log_reward(self, distance: Array, effort_share: Array) -> Array:
+        """Return what learners that follow derivatives ascend: the logarithm of the reward, with a slope everywhere.
+
+        Between the success distance and the workspace scale the reward is nearly flat. So the logarithm of a mean that
+        is arithmetic in the reward, of nearness on both scales, is replaced by that of the geometric mean. At the goal
+        the two agree up to the third order in the distance.
+
+        Args:
+            distance: effector to goal [m], shape (...).
+            effort_share: mean actuator effort over its scale, shape (...).
+        """
+        near, far = self._nearness(distance)
+        log = namespace(distance).log
+        reward = reduce(mul, self.reward_terms(distance, effort_share).values()).clip(SMALLEST_REWARD, None)
+        return log(reward) + 0.5 * log(near * far) - log(0.5 * near + 0.5 * far)
 
     def rate(self, effector: Array, goal: Array, effort_share: Array) -> tuple[Array, dict[str, Array], Array]:
         """Return distances to the goal [m], the factors of the reward, and the reward, which is their product.

@@ -6,7 +6,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import State
 from softgym_envs.envs.arrays import Array
-from softgym_envs.envs.tasks.base import Kinematics, Random, Task, tolerance
+from softgym_envs.envs.tasks.base import SHARES, Kinematics, Random, Task, tolerance
 from softgym_envs.robots.base import Robot
 
 
@@ -34,6 +34,7 @@ class Grasp(Task):
     max_episode_steps = 25
     needs_state = True
     goal_unit = "N"
+    distance_scale = SHARES
 
     def __init__(
         self,

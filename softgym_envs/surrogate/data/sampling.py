@@ -43,6 +43,7 @@ class SamplingPlan:
             towards the first of them by a part that it draws, from not at all to altogether.
         boundary: share of the groups whose designs and commands lie on faces, edges and vertices of their boxes, where
             optimisers end; commands at a vertex leave cables slack (see `pushed`).
+        share: part of the ranges of the commands, from their lower ends, that is drawn from.
     """
 
     groups: int
@@ -55,6 +56,7 @@ class SamplingPlan:
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     alike: tuple[str, ...] = ()
     boundary: float = 0.0
+    share: float = 1.0
 
     def __post_init__(self) -> None:
         if self.sequence not in SEQUENCES:
@@ -65,7 +67,7 @@ class SamplingPlan:
                 raise ValueError(f"{name} = {value!r} must be an integer of at least {least}")
         if self.vary is not None and len(set(self.vary)) < len(self.vary):
             raise ValueError(f"vary = {list(self.vary)} names a variable twice")
-        for name in ("margin", "boundary"):
+        for name in ("margin", "boundary", "share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} = {getattr(self, name)} is out of bounds; allowed: [0, 1]")
 
@@ -132,7 +134,7 @@ class SamplingPlan:
         points = self.unit_points(len(robot.actuators), group * self.states, self.states, self.groups * self.states, 1)
         if self._on_boundary(group):
             points = pushed(points, np.random.default_rng([self.seed, 5, group]))
-        return robot.displacements(points)
+        return robot.displacements(self.share * points)
 
     def _on_boundary(self, group: int) -> bool:
         return self.boundary > 0.0 and np.random.default_rng([self.seed, 3, group]).random() < self.boundary

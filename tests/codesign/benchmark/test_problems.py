@@ -1,12 +1,14 @@
 """Frozen problems: nothing that decides a score may change unnoticed, and searches keep to their budget."""
 
+import itertools
+
 import numpy as np
 import pytest
 import yaml
 
 from softgym_envs.codesign.benchmark import Search, load_problem, problem_names
 from softgym_envs.codesign.benchmark.frozen import freeze, load_definition
-from softgym_envs.codesign.benchmark.problem import GOAL_SETS, TRACKS, goal_key
+from softgym_envs.codesign.benchmark.problem import GOAL_SETS, TRACKS, Score, goal_key
 from softgym_envs.codesign.benchmark.search import METHODS, BudgetSpent, make_optimiser, solve
 from softgym_envs.errors import ConfigError, DataError, DesignError
 from tests.codesign.benchmark.conftest import tiny_definition
@@ -109,9 +111,10 @@ def test_each_baseline_solves_and_repeats_itself(tiny, method):
         found.append(search)
     assert [row.design for row in found[0].ledger] == [row.design for row in found[1].ledger]
     assert found[0].ledger[0].design == tiny.definition.baseline_values
-    assert len(found[0].ledger) == 7 and found[0].spent["environment_steps"] == 700
-    assert found[0].best.score == max(row.score for row in found[0].ledger)
-    with pytest.raises(BudgetSpent, match=r"the budget 'small' is spent \(environment_steps = 700"):
+    whole = [row for row in found[0].ledger if row.share == 1.0]
+    assert 700 <= sum(max(50, 100 * row.share) for row in found[0].ledger) == found[0].spent["environment_steps"] < 800
+    assert found[0].best.score == max(row.score for row in whole)
+    with pytest.raises(BudgetSpent, match=r"the budget 'small' is spent \(environment_steps = 7"):
         found[0].evaluate(tiny.definition.baseline_values)
 
 
@@ -119,3 +122,19 @@ def test_points_of_the_unit_box(tiny):
     low, high = (tiny.design(np.full(3, sign)) for sign in (-1.0, 1.0))
     for name, variable in tiny.definition.optimised.items():
         assert (low[name], high[name]) == (pytest.approx(variable.low), pytest.approx(variable.high))
+
+
+@pytest.mark.parametrize("method", ["halving", "hyperband"])
+def test_halving_scores_only_promising_bodies_on_all_goals(method):
+    problem = load_problem("finger-zone-v1")
+    optimiser, told = make_optimiser(method, problem, 0), []
+    for _ in range(60):
+        share, design = optimiser.share, dict(optimiser.ask())
+        told.append(Score(design, "qp", share, scores=[-design["length"]]))
+        optimiser.tell(told[-1])
+    shares = [row.share for row in told]
+    assert shares.count(0.25) > shares.count(0.5) > shares.count(1.0) >= 1
+    for first, second in itertools.pairwise(told):
+        assert second.share == 0.25 or (second.share == 2.0 * first.share and second.design == first.design)
+    kept, all_ = ([row.design["length"] for row in told if row.share == share] for share in (0.5, 0.25))
+    assert np.mean(kept) < np.mean(all_)  # short bodies score better here

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from softgym_envs.codesign.benchmark import board, runs
+from softgym_envs.codesign.benchmark import board, regret, runs
 from softgym_envs.codesign.benchmark.problem import Score
 from softgym_envs.codesign.benchmark.scoring import Reference, front, hypervolume, improvement, normalised
 from softgym_envs.codesign.benchmark.search import make_optimiser, solve
@@ -51,23 +51,37 @@ def test_probability_of_improvement():
     assert mixed.value == 0.5 and mixed.low == 0.0 and mixed.high == 1.0
 
 
+SPENT = {"environment_steps": 15_000}
+
+
 def make_run(method, seed, curve):
-    return runs.Run("finger-zone-v1", "0", method, "qp", "small", seed, [{"length": 0.1}], [[0.0]], curve=curve)
+    return runs.Run(
+        "finger-zone-v1",
+        "0",
+        method,
+        "qp",
+        "small",
+        seed,
+        [{"length": 0.1}],
+        [[0.0]],
+        curve=curve,
+        spent=SPENT,
+    )
 
 
 def test_regret_area_and_steps_follow_from_the_curves(monkeypatch):
-    monkeypatch.setattr(runs, "bounds_share", lambda *_: 0.0)
+    monkeypatch.setattr(regret, "bounds_share", lambda *_: 0.0)
     first = [make_run("a", seed, [[600, 1.0, -4.0], [6000, 2.0, -2.0]]) for seed in (0, 1)]
     second = [make_run("b", seed, [[600, 1.0, -4.0], [1200, 2.0, -3.0]]) for seed in (0, 1)]
-    a, b = runs.method_rows([(each, None) for each in (*first, *second)])
+    a, b = regret.method_rows([(each, None) for each in (*first, *second)])
     assert (a.regret.value, b.regret.value) == (0.0, 0.5)
     assert (a.steps, a.seconds) == (6000, 2.0) and np.isinf(b.steps)
-    limit = 15_000
+    limit = SPENT["environment_steps"]
     assert a.area == pytest.approx(np.log(10) / np.log(limit / 600))
     assert b.area == pytest.approx((np.log(2) + 0.5 * np.log(limit / 1200)) / np.log(limit / 600))
-    found = runs.improvements([(each, None) for each in (*first, *second)], "qp", "a", "b")
+    found = regret.improvements([(each, None) for each in (*first, *second)], "qp", "a", "b")
     assert found.value == 1.0
-    assert runs.improvements([(first[0], None)], "qp", "a", "b") is None
+    assert regret.improvements([(first[0], None)], "qp", "a", "b") is None
 
 
 def test_runs_resume_and_become_a_table(tiny, tmp_path):
@@ -103,7 +117,50 @@ def test_tables(tiny, tmp_path):
     found = runs.run(tmp_path, "tiny-v1", "random", "shared", "small", 1, table)
     assert found.optimum == pytest.approx(-table.values["shared"][:, 0].min())
     assert found.curve[-1][2] == max(score[0] for score in found.search_scores) <= found.optimum
-    (row,) = runs.method_rows([(found, None)])
+    (row,) = regret.method_rows([(found, None)])
     assert row.table and 0.0 <= row.regret.value <= 1.0
     with pytest.raises(DataError, match="cannot be read"):
         Table.read("tiny-v1", tmp_path / "absent.parquet")
+
+
+def make_front(method, seed, scores):
+    designs = [{"length": 0.1}] * len(scores)
+    return runs.Run(
+        "finger-front-v1", "0", method, "qp", "small", seed, designs, scores, spent=SPENT, baseline=[-1.0, -2.0]
+    )
+
+
+def test_regret_of_fronts_is_that_of_their_hypervolume():
+    first, second = make_front("a", 0, [[-1.0, -2.0]]), make_front("b", 0, [[-0.5, -2.0], [-1.0, -1.0]])
+    third = make_front("c", 0, [[-0.5, -2.0]])
+    (contest,) = regret.contests([(first, None), (second, None), (third, None)])
+    # In units of the baseline, up to twice its values: 1 for the baseline, 1.5 for one body, 2 for both.
+    assert [float(contest.regrets(m)[0]) for m in "abc"] == [1.0, 0.0, pytest.approx(0.5)]
+    assert "| 50.0 |" in board.regret_table([(each, None) for each in (first, second, third)])
+
+
+def test_tracks_compare_with_random_search():
+    def rows(method, ends):
+        return [(make_run(method, seed, [[600, 1.0, -4.0], [6000, 2.0, end]]), None) for seed, end in enumerate(ends)]
+
+    stored = [*rows("random", [-3.0, -3.0, -3.0]), *rows("tpe", [-2.0, -2.5, -2.5]), *rows("cmaes", [-3.0] * 3)]
+    found = {row.method: row for row in regret.track_rows(stored)}
+    assert found["tpe"].regret.value == pytest.approx(0.5 / 3 + 1e-9, abs=0.1)
+    assert (found["tpe"].improvement.value, found["cmaes"].improvement.value) == (1.0, 0.5)
+    assert (found["tpe"].wins, found["random"].wins, found["cmaes"].wins) == (1, 0, 0)
+    assert found["tpe"].track == "A" and found["tpe"].seeds == 3
+    assert found["tpe"].factor == pytest.approx(found["random"].regret.value / found["tpe"].regret.value)
+    assert "| A | qp | 1 x 3 | tpe |" in board.track_table(stored)
+    assert regret.track_rows(rows("tpe", [-2.0])) == []
+
+
+def test_regret_on_unseen_goals_tells_winners_that_fit_the_search_goals_only():
+    stored = []
+    for seed, (method, unseen) in enumerate((("a", [-4.0, -2.0]), ("b", [-4.0, -5.0]))):
+        run = make_run(method, seed, [[600, 1.0, -4.0], [6000, 2.0, -1.0]])
+        run.unseen = unseen
+        stored.append((run, None))
+    (contest,) = regret.contests(stored)
+    assert [float(contest.regrets(m)[0]) for m in "ab"] == [0.0, 0.0]
+    assert [float(contest.unseen(m)[0]) for m in "ab"] == [0.0, 1.5]
+    assert "| 0.0 | 150.0 |" in board.regret_table(stored, unseen=True)

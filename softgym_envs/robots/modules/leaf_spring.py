@@ -1,0 +1,45 @@
+"""A single leaf spring: soft in bending about y and in torsion about z, stiff otherwise (thesis, fig. 5.5 B)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.robots.base import Drawing
+from softgym_envs.robots.modules.base import MATERIAL, Module
+from softgym_envs.robots.modules.plates import PLATE, add_plates
+
+
+def draw_leaf(*, depth: float, width: float, thickness: float, length: float, plate: float) -> None:
+    """Draw two plates and the leaf between them, in mm."""
+    import gmsh
+
+    occ = gmsh.model.occ
+    leaf = occ.addBox(-thickness / 2, -width / 2, plate, thickness, width, length - 2.0 * plate)
+    first, last = add_plates(depth, width, length, plate)
+    occ.fuse([first], [(3, leaf), last])
+
+
+class LeafSpring(Module):
+    """A leaf between two plates; it bends about y."""
+
+    name = "leaf_spring"
+    design_space = DesignSpace(
+        DesignVariable("leaf_length", 0.010, 0.040, 0.020, "m", "free length of the leaf"),
+        DesignVariable("width", 0.005, 0.030, 0.020, "m", "along y"),
+        DesignVariable("thickness", 0.0008, 0.004, 0.0015, "m", "of the leaf, along x"),
+        *MATERIAL,
+    )
+    #: Size of the plates along x [m].
+    depth = 0.010
+
+    def drawing(self, design: Mapping[str, float]) -> Drawing:
+        lengths = {"depth": self.depth, "length": self.length(design), "plate": PLATE}
+        lengths |= {name: design[name] for name in ("width", "thickness")}
+        return draw_leaf, {name: 1e3 * value for name, value in lengths.items()}
+
+    def length(self, design: Mapping[str, float]) -> float:
+        return design["leaf_length"] + 2.0 * PLATE
+
+    def thinnest(self, design: Mapping[str, float]) -> float:
+        return design["thickness"]
