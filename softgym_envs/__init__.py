@@ -2,9 +2,9 @@
 
 Importing this package registers every environment ID and imports nothing heavy.
 
-Public is what the packages `softgym_envs`, `softgym_envs.envs`, `.robots`, `.mechanics`, `.surrogate`, `.backends`,
-`.control` and `.viewer`, `agents` and `codesign` export, and the exceptions in `softgym_envs.errors`. Every other
-module and name may change without notice.
+Public is what `softgym_envs` and its packages `mechanics`, `robots`, `surrogate`, `backends`, `control`, `estimation`,
+`envs`, `agents`, `codesign` and `viewer` export, and the exceptions in `softgym_envs.errors`. Every other module and
+name may change without notice. docs/architecture.md says what each package does.
 """
 
 from typing import TYPE_CHECKING

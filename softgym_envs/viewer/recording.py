@@ -251,40 +251,6 @@ def record_rollout(
         return _roll_out(recorder, env, agent, seed, options, _limit(env, steps))
 
 
-def record_comparison(
-    env: gymnasium.Env,
-    rollouts: Mapping[str, tuple[Agent, Mapping[str, Any] | None]],
-    path: str | Path,
-    *,
-    seed: int | None = 0,
-    steps: int | None = None,
-) -> dict[str, dict[str, Any]]:
-    """Run episodes of several agents, bodies or goals and write them side by side to one ``.rrd`` file.
-
-    Args:
-        env: as for `record_rollout`.
-        rollouts: agent and options of the reset, by the name to show.
-        path: file to write.
-        seed: seed of every reset.
-        steps: largest number of steps; default: the time limit of the environment.
-
-    Returns:
-        Results of `record_rollout`, by name.
-
-    Raises:
-        ValueError: as `record_rollout`, and if there are no rollouts.
-    """
-    if not rollouts:
-        raise ValueError("rollouts is empty; pass at least one agent by name")
-    scale, roles = _body_of(env).task.distance_scale, tuple(rollouts)
-    with RolloutRecorder(_body_of(env).robot, path, roles=roles, distance_scale=scale) as recorder:
-        found = {}
-        for role, (agent, options) in rollouts.items():
-            recorder.begin(role)
-            found[role] = _roll_out(recorder, env, agent, seed, options, _limit(env, steps))
-        return found
-
-
 def _body_of(env: gymnasium.Env) -> SoftRobotEnv:
     body = env.unwrapped
     if not isinstance(body, SoftRobotEnv):

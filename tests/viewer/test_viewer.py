@@ -11,7 +11,7 @@ from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.viewer.image import ImageRenderer, render_bodies, render_body
-from softgym_envs.viewer.recording import record_comparison, record_rollout
+from softgym_envs.viewer.recording import RolloutRecorder, record_rollout
 from softgym_envs.viewer.scene import COLORS, tension_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines, slacken
 
@@ -239,28 +239,20 @@ class TestRecording:
         columns = {name for part in rows["/world/body"] for name in part.to_record_batch().schema.names}
         assert {"Mesh3D:vertex_positions", "Mesh3D:triangle_indices", "Mesh3D:vertex_normals"} <= columns
 
-    def test_two_rollouts_side_by_side(self, tmp_path):
+    def test_two_rollouts_side_by_side(self, tmp_path, backend, states):
         path = tmp_path / "both.rrd"
-        env = gymnasium.make("SoftGym/FingerReach-v0")
-        designs = {"short": {"length": 0.0385}, "long": {"length": 0.0415}}
-        goal = [0.0, 0.05, -0.07]
-        rollouts = {
-            role: (lambda observation, body: np.array([1.0, 0.0]), {"design": design, "goal": goal})
-            for role, design in designs.items()
-        }
-        found = record_comparison(env, rollouts, path, steps=3)
-        assert {role: row["steps"] for role, row in found.items()} == {"short": 3, "long": 3}
-        assert found["short"]["final_distance"] != found["long"]["final_distance"]
+        with RolloutRecorder(backend.robot, path, roles=("short", "long")) as recorder:
+            for role in recorder.roles:
+                recorder.begin(role)
+                for step, name in enumerate(("rest", "bent")):
+                    recorder.log(step, backend.design, states[name], np.zeros(3))
         chunk = pytest.importorskip("rerun.chunk")
         rows = {}
         for part in chunk.RrdReader(path).stream():
             rows[part.entity_path] = rows.get(part.entity_path, 0) + part.num_rows * ("step" in part.timeline_names)
-        for role in designs:
-            assert rows[f"/{role}/world/body"] == rows[f"/{role}/plots/distance"] == 4
+        for role in ("short", "long"):
+            assert rows[f"/{role}/world/body"] == rows[f"/{role}/plots/distance"] == 2
         assert "/world/body" not in rows
-        with pytest.raises(ValueError, match="at least one"):
-            record_comparison(env, {}, path)
-        env.close()
 
     def test_nothing_is_left_by_an_error(self, tmp_path):
         env = gymnasium.make("SoftGym/FingerReach-v0", backend="fem")
