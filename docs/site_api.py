@@ -17,6 +17,7 @@ PACKAGES = {
     "softgym_envs.errors": "Errors",
     "softgym_envs.envs": "Environments",
     "softgym_envs.robots": "Robots",
+    "softgym_envs.robots.modules": "Compliant modules",
     "softgym_envs.mechanics": "Mechanics",
     "softgym_envs.surrogate": "Surrogates",
     "softgym_envs.backends": "Backends",

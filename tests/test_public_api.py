@@ -22,12 +22,13 @@ PACKAGES = [
     "softgym_envs.estimation",
     "softgym_envs.mechanics",
     "softgym_envs.robots",
+    "softgym_envs.robots.modules",
     "softgym_envs.surrogate",
     "softgym_envs.viewer",
 ]
 ERRORS = "softgym_envs.errors"
 """The one public module that is not a package: its exceptions."""
-MAX_NAMES = 102
+MAX_NAMES = 106
 ROOMS = ("benchmarks", "softgym_envs")
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -75,7 +76,10 @@ def test_all_packages_with_public_names_are_listed():
     found = [
         ".".join(path.parent.relative_to(ROOT).parts)
         for path in [ROOT / "softgym_envs" / "__init__.py", *(ROOT / "softgym_envs").glob("*/__init__.py")]
-        + [*(ROOT / "softgym_envs").glob("*/benchmark/__init__.py")]
+        + [
+            *(ROOT / "softgym_envs").glob("*/benchmark/__init__.py"),
+            *(ROOT / "softgym_envs").glob("*/modules/__init__.py"),
+        ]
         if "lazy_exports(" in path.read_text() or re.search(r"^__all__ = \[", path.read_text(), flags=re.MULTILINE)
     ]
     assert sorted(found) == PACKAGES

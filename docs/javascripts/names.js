@@ -1,4 +1,9 @@
-// Names for screen readers, and the keyboard for tables that scroll: the theme leaves them out.
-document.querySelectorAll(".md-search").forEach((search) => search.setAttribute("aria-label", "Search"))
-document.querySelectorAll(".md-code__nav").forEach((nav, index) => nav.setAttribute("aria-label", `Code block ${index + 1}`))
-document.querySelectorAll(".md-typeset__scrollwrap").forEach((wrap) => { wrap.tabIndex = 0 })
+// Names for screen readers, and the keyboard for tables that scroll: the theme leaves them out, and adds some of these
+// elements only when they come into view.
+function complete() {
+  document.querySelectorAll(".md-search").forEach((search) => search.setAttribute("aria-label", "Search"))
+  document.querySelectorAll(".md-code__nav").forEach((nav, index) => nav.setAttribute("aria-label", `Code block ${index + 1}`))
+  document.querySelectorAll(".md-typeset__scrollwrap").forEach((wrap) => { wrap.tabIndex = 0 })
+}
+complete()
+new MutationObserver(complete).observe(document.body, { childList: true, subtree: true })

@@ -211,3 +211,10 @@ def test_modules_are_written_for_printing(tmp_path):
     for ending in ("step", "stl"):
         drawing = module.drawing(module.design_space.complete())
         assert write_drawing(drawing, tmp_path / f"leaf.{ending}").stat().st_size > 1000
+
+
+def test_the_exact_shape_is_written(tmp_path):
+    leaf = MODULES["leaf_spring"]()
+    assert leaf.write(tmp_path / "leaf.step").read_text().startswith("ISO-10303-21")
+    with pytest.raises(ValueError, match=r"must end with \.step or \.stl"):
+        leaf.write(tmp_path / "leaf.obj")

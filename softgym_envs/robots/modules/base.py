@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Drawing
+from softgym_envs.robots.geometry.export import write_drawing
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 
 POSE = ("x", "y", "z", "rx", "ry", "rz")
@@ -123,6 +125,16 @@ class Module(ABC):
         for component, name in enumerate(POSE):
             model.add("a", Pose(name, far, component, model.nodes))
         return model
+
+    def write(self, path: str | Path, design: Mapping[str, float] | None = None) -> Path:
+        """Write the exact shape as ``.step`` or ``.stl`` [mm] and return the path.
+
+        Raises:
+            DesignError: for a malformed design.
+            InfeasibleDesign: if the body cannot be drawn.
+            ValueError: for another ending.
+        """
+        return write_drawing(self.drawing(self.design_space.complete(design)), path)
 
     def compliance(self, design: Mapping[str, float] | None = None, *, refine: float = 1.0) -> np.ndarray:
         """Return the motion of the far port by a wrench on it, near port clamped, small motions: shape (6, 6), `POSE`.
