@@ -33,6 +33,10 @@ LIGHT = {
     "grasping_finger": {"element": "linear", "mesh_size": 0.015},
     "contact_aided_gripper": {"element": "linear", "mesh_size": 0.015},
 }
+# Some bodies of a large space have no equilibrium under large pulls, which ends the episode.
+SAMPLED = {
+    "SoftGym/SensorizedFingerReach-v0": ["outer_radius", "joint_height", "bellow_height", "wall_thickness"],
+}
 
 
 def make(identifier, **options):
@@ -123,7 +127,7 @@ def test_bounds_time_limit_and_info(identifier, options, episodes, action_mode):
         action_mode=action_mode,
         robot_options=options,
         design_in_observation=True,
-        sample_design=True,
+        sample_design=SAMPLED.get(identifier, True),
     )
     limit = softgym_envs.ENVIRONMENTS[identifier].max_episode_steps
     env.action_space.seed(3)
