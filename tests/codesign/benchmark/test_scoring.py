@@ -92,6 +92,8 @@ def test_runs_resume_and_become_a_table(tiny, tmp_path):
     assert path.stat().st_mtime_ns == stamp
     runs.collect(tmp_path, tmp_path)
     assert runs.stored_runs(tmp_path) == [(found, None)]
+    runs.collect(tmp_path / "absent", tmp_path)  # adds nothing, and keeps what is stored
+    assert runs.stored_runs(tmp_path) == [(found, None)]
     text = board.method_table(runs.stored_runs(tmp_path), tmp_path)
     assert "| `tiny-v1` | shared | random | 1 |" in text and "not tested" in text
 
