@@ -123,7 +123,7 @@ class MethodRow:
     """A method on one problem, over its seeds.
 
     ``regret`` is 0 for the best body that any run found and 1 for the baseline, by the scores of the search; on a table
-    0 for its best body; with several objectives it is that of the hypervolume. ``unseen`` is that of `Contest`, or None.
+    0 for its best body; with several objectives it is that of the hypervolume. ``unseen`` is that of `Contest` or None.
     ``area`` is the mean regret over the logarithm of the environment steps, ``steps`` and ``seconds`` the medians until
     it stays below 1 %, infinite if more than half of the runs never get there; these three are NaN with several
     objectives. ``score`` is the normalised score on finite elements.
