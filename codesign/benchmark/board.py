@@ -54,7 +54,7 @@ def method_table(runs: Sequence[Stored] | None = None, data: Path = DATA) -> str
         "method",
         "seeds",
         "regret at the end [%]",
-        "on unseen goals [%]",
+        "on unseen goals [% of the baseline]",
         "area [%]",
         "steps to 1 %",
         "CPU s to 1 %",
@@ -111,7 +111,7 @@ def track_table(runs: Sequence[Stored] | None = None) -> str:
 
 
 def regret_table(runs: Sequence[Stored] | None = None, unseen: bool = False) -> str:
-    """Return the regret of each method on each problem, in the search or on unseen goals; default the stored runs."""
+    """Return the regret of each method on each problem, or `Contest.unseen`; default the stored runs."""
     found = contests(stored_runs() if runs is None else runs)
     if not found:
         return "No runs are stored."
@@ -132,7 +132,7 @@ def regret_table(runs: Sequence[Stored] | None = None, unseen: bool = False) -> 
 
 
 def unseen_table() -> str:
-    """Return the regret of the stored runs on unseen goals."""
+    """Return how far winners of the stored runs end from unseen goals, in percent of the baseline."""
     return regret_table(unseen=True)
 
 

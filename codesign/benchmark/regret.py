@@ -46,7 +46,6 @@ class Contest:
         worst: merit of the baseline body.
         best: merit of the best body that any run found under the same judge, or of the best listed one; with several
             objectives, of the winners of all runs of the contest together.
-        best_unseen: score on the validation goals of the best winner of any run on the problem, under any judge.
     """
 
     problem: str
@@ -57,20 +56,19 @@ class Contest:
     runs: dict[str, list[Stored]]
     worst: float
     best: float
-    best_unseen: float
 
     def regrets(self, method: str) -> np.ndarray:
         """Return the regret at the end of each run: 0 at ``best``, 1 at ``worst``; 0 if no run beat the baseline."""
         return np.array([self._regret(_end(run)) for run, _ in self.runs[method]])
 
     def unseen(self, method: str) -> np.ndarray:
-        """Return the regret of each winner on the validation goals: 0 at ``best_unseen``, 1 at the baseline.
+        """Return the score of each winner on the validation goals divided by that of the baseline.
 
-        It is above 1 if the winner is worse than the baseline there. None with several objectives and on a table.
+        Scores are negative distances: below 1 the winner is better than the baseline, above 1 worse. None with several
+        objectives, on a table, and for problems with a single path.
         """
         pairs = np.array([run.unseen for run, _ in self.runs[method] if len(run.unseen) == 2]).reshape(-1, 2)
-        spans = self.best_unseen - pairs[:, 0]
-        return np.where(spans > 0.0, (self.best_unseen - pairs[:, 1]) / np.where(spans > 0.0, spans, 1.0), 0.0)
+        return pairs[:, 1] / pairs[:, 0]
 
     def curve(self, run: Run) -> np.ndarray:
         """Return rows of environment steps, CPU seconds and regret; none with several objectives."""
@@ -89,14 +87,12 @@ def contests(runs: Sequence[Stored]) -> list[Contest]:
     """Return the stored runs by problem, judge, budget and limit."""
     groups: dict[tuple, dict[str, list[Stored]]] = defaultdict(lambda: defaultdict(list))
     best: dict[tuple, float] = defaultdict(lambda: -np.inf)
-    unseen: dict[str, float] = defaultdict(lambda: -np.inf)
     for run, test in sorted(runs, key=lambda row: row[0].seed):
         listed = run.optimum is not None
         groups[run.problem, run.judge, listed, run.level, run.limit][run.method].append((run, test))
         if run.curve:
             kind = run.problem, run.judge, listed
             best[kind] = max(best[kind], run.curve[-1][2] if run.optimum is None else run.optimum)
-        unseen[run.problem] = max([unseen[run.problem], *run.unseen])
     found = []
     for (name, judge, listed, level, limit), members in sorted(groups.items(), key=lambda item: str(item[0])):
         every = [run for rows in members.values() for run, _ in rows]
@@ -106,7 +102,7 @@ def contests(runs: Sequence[Stored]) -> list[Contest]:
             worst = _merit(every[0], [every[0].baseline])
             top = _merit(every[0], [scores for run in every for scores in run.search_scores])
         ordered = dict(sorted(members.items()))
-        found.append(Contest(name, judge, listed, level, limit, ordered, worst, top, unseen[name]))
+        found.append(Contest(name, judge, listed, level, limit, ordered, worst, top))
     return found
 
 
@@ -127,11 +123,10 @@ class MethodRow:
     """A method on one problem, over its seeds.
 
     ``regret`` is 0 for the best body that any run found and 1 for the baseline, by the scores of the search; on a table
-    0 for its best body; with several objectives it is that of the hypervolume. ``unseen`` is the regret on the
-    validation goals under the inverse QP, above 1 if the winner is worse than the baseline there, or None. ``area`` is
-    the mean regret over the logarithm of the environment steps, ``steps`` and ``seconds`` the medians until it stays
-    below 1 %, infinite if more than half of the runs never get there; these three are NaN with several objectives.
-    ``score`` is the normalised score on finite elements.
+    0 for its best body; with several objectives it is that of the hypervolume. ``unseen`` is that of `Contest` or None.
+    ``area`` is the mean regret over the logarithm of the environment steps, ``steps`` and ``seconds`` the medians until
+    it stays below 1 %, infinite if more than half of the runs never get there; these three are NaN with several
+    objectives. ``score`` is the normalised score on finite elements.
     """
 
     problem: str

@@ -42,7 +42,8 @@ class Run(Record):
         curve: for each body that became the best: environment steps and CPU seconds until then, and its score in the
             search. Empty with several objectives.
         unseen: scores of the baseline and of the winner under the inverse QP on the validation goals, which no search
-            sees: one yardstick for all judges. Empty with several objectives and for a search on a table.
+            sees: one yardstick for all judges. Empty with several objectives, on a table, and for a problem with a
+            single path.
         bodies: number of bodies scored.
         infeasible: number of these that could not be scored.
         diversity: mean distance between bodies in the unit box, divided by its diagonal.
@@ -114,7 +115,7 @@ def run(
         designs=[row.design for row in winners],
         search_scores=[row.scores for row in winners],
         curve=_curve(search) if single else [],
-        unseen=_unseen(problem, winners, folder) if single and table is None else [],
+        unseen=_unseen(problem, winners, folder) if single and table is None and not problem.single_path else [],
         bodies=len(search.ledger),
         infeasible=sum(not row.feasible for row in search.ledger),
         diversity=_diversity(problem, search.ledger),
@@ -200,21 +201,30 @@ def check_winners(folder: Path, runs: Iterable[Run], data: Path = DATA) -> None:
 
 
 def collect(folder: Path, data: Path = DATA) -> Path:
-    """Write all runs of a folder and the tests of their winners into one small file of the package."""
-    rows = []
+    """Add all runs of a folder, with the tests of their winners, to one small file; runs of older versions are dropped.
+
+    A run replaces the stored one with the same problem, method, judge, budget and seed.
+    """
+    rows = {_key(each): (each, test) for each, test in stored_runs(data)}
+    problems: dict[str, FrozenProblem] = {}
     for path in sorted(folder.glob("runs/*/*.json")):
         each = Run.read(path)
-        problem = load_problem(each.problem)
-        if each.hash != problem.hash:
-            continue
-        if not each.baseline:  # a run of an earlier version
-            design = problem.definition.baseline_values
-            each.baseline = tested(problem, design, each.judge, "search", None, folder, each.seed).scores  # type: ignore[arg-type]
-        rows.append({**each.to_json(), "test": _stored_test(problem, each, folder)})
+        problem = problems.setdefault(each.problem, load_problem(each.problem))
+        if each.hash == problem.hash:
+            rows[_key(each)] = each, _stored_test(problem, each, folder)
+    current = [
+        {**each.to_json(), "test": test}
+        for _, (each, test) in sorted(rows.items(), key=lambda item: str(item[0]))
+        if each.hash == problems.setdefault(each.problem, load_problem(each.problem)).hash
+    ]
     target = data / "runs.json"
     with atomic_write(target, "w") as stream:
-        stream.write("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
+        stream.write("[\n" + ",\n".join(json.dumps(row) for row in current) + "\n]\n")
     return target
+
+
+def _key(each: Run) -> tuple:
+    return each.problem, each.optimum is not None, each.judge, each.level, each.limit, each.method, each.seed
 
 
 def _stored_test(problem: FrozenProblem, each: Run, folder: Path) -> list[list[float]] | None:

@@ -147,11 +147,14 @@ def verify(path: Path, record: bool, as_json: bool) -> None:
 
 
 @benchmark.command(name="table")
+@click.option("--store", is_flag=True, help="Add the runs of the folder to the stored ones (source checkout).")
 @results
-def table_(folder: Path) -> None:
+def table_(folder: Path, store: bool) -> None:
     """Show the stored runs, or those of a folder, one row per problem, judge and method."""
     from softgym_envs.codesign.benchmark import board, runs
 
+    if store:
+        click.echo(f"wrote {runs.collect(folder)}")
     if (folder / "runs").is_dir():
         runs.collect(folder, folder)
         click.echo(board.method_table(runs.stored_runs(folder)))
