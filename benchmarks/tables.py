@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from benchmarks.learners import REPORTS, SCORES, TASKS, spread
 from benchmarks.recorded import figure, number, records, results
 from softgym_envs.agents.results import LEARNERS, MODEL_BASED
@@ -50,13 +52,17 @@ def short(value: float) -> str:
 
 
 def headlines() -> str:
-    """Five studies: mean distance to the test goals on FEM, from the baseline to the winner."""
+    """Studies: mean distance to the test goals on FEM, from the baseline to the winner."""
     rows = []
     for key in HEADLINES:
         study = results("codesign")[key]
         row = study["rows"][0]
         name = f"{study['title']}; {row['controller'].partition(',')[0]}"
         rows.append([name, *_ends(row), f"`{study['command']}`"])
+    accurate = results("accurate_study")
+    means = {f"{body} [mm]": np.mean(accurate[f"{body}: accurate: distance [mm]"]) for body in ("baseline", "winner")}
+    command = "`softgym codesign --config finger_reach_accurate`"
+    rows.insert(1, ["Soft Finger, accurate mesh; inverse QP", *_ends(means), command])
     return markdown(["robot; controller", "baseline", "winner", "command"], rows, "lrrl")
 
 
