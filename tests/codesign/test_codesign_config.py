@@ -203,7 +203,8 @@ def test_shipped_configs_and_their_policies(path):
 @pytest.mark.parametrize("path", sorted((ROOT / "configs" / "codesign").glob("*.yaml")), ids=lambda path: path.stem)
 def test_shipped_studies_train_a_policy_for_each_body(path):
     config = load_config(path, StudyConfig)
-    if config.name in ("finger_grasp", "tetrapod_reach"):  # FEM at every step; their headers say so
+    # FEM at every step, or a question about the mesh that training would blur; their headers say so.
+    if config.name in ("finger_grasp", "tetrapod_reach", "finger_reach_accurate"):
         assert config.strategy == "qp"
     else:
         assert config.plan.trains
