@@ -27,7 +27,9 @@ from softgym_envs import make_robot
 from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.backends import make_backend
 from softgym_envs.codesign.benchmark import plots
+from softgym_envs.mechanics import Statics
 from softgym_envs.robots import ROBOTS
+from softgym_envs.robots.modules import MODULES
 from softgym_envs.viewer.image import ImageRenderer, render_bodies
 from softgym_envs.viewer.video import write_video
 
@@ -45,6 +47,15 @@ COMMANDS: dict[str, tuple[float, ...]] = {
     "two_finger_friction_gripper": (0.6, 0.6, 0.6, 0.6),
     "three_finger_friction_gripper": (0.5, 0.5, 0.3, 0.3, 0.3, 0.3),
 }
+MODULE_MOTIONS = {
+    "solid_block": (2, -0.003),
+    "leaf_spring": (4, 0.5),
+    "crossed_leaves": (4, 0.4),
+    "notch_hinge": (4, 0.4),
+    "torsion_tube": (5, 0.8),
+    "accordion": (2, 0.008),
+}
+"""Component of `softgym_envs.robots.modules.base.POSE` and value, for the picture of each module."""
 WIDTH, HEIGHT = 800, 520
 SHOWN = ("finger_reach", "trunk_track", "gripper_lift")
 """Environments of the animation of the home page."""
@@ -136,6 +147,32 @@ def draw_grasp() -> np.ndarray:
     return np.concatenate(pictures, axis=1)
 
 
+def draw_modules() -> np.ndarray:
+    """Draw all compliant modules at rest and with their far port moved the way in which they are soft."""
+    import pyvista
+
+    plotter = pyvista.Plotter(shape=(1, len(MODULE_MOTIONS)), off_screen=True, window_size=(1200, 360), border=False)
+    for column, (name, (component, motion)) in enumerate(MODULE_MOTIONS.items()):
+        module = MODULES[name]()
+        model, triangles = module.model(), module.body().surface()
+        modes = ["displacement" if k == component else "effort" for k in range(6)]
+        moved = Statics(model).solve(np.where(np.arange(6) == component, motion, 0.0), modes).x
+        faces = np.column_stack([np.full(len(triangles), 3), triangles]).ravel()
+        plotter.subplot(0, column)
+        plotter.set_background("white")
+        corners = int(triangles.max()) + 1
+        plotter.add_mesh(pyvista.PolyData(model.nodes[:corners], faces), color="#c9d3de", opacity=0.25)
+        plotter.add_mesh(
+            pyvista.PolyData(moved[:corners], faces), color="#10776d", show_edges=True, edge_color="#0b5750"
+        )
+        plotter.add_text(name, position="lower_edge", font_size=9, color="black")
+        plotter.view_vector((1.0, -1.6, 0.5), viewup=(0.0, 0.0, 1.0))
+        plotter.camera.zoom(1.15)
+    image = plotter.screenshot(return_img=True)
+    plotter.close()
+    return np.asarray(image)
+
+
 def draw_arm() -> np.ndarray:
     """Return the picture that the tutorial on a robot of your own draws."""
     with tempfile.TemporaryDirectory() as folder:
@@ -160,7 +197,7 @@ def draw_report() -> np.ndarray:
 def main(names: list[str]) -> None:
     """Draw the named pictures, or all but the report."""
     table: dict[str, Callable[[], np.ndarray]] = {"codesign": draw_codesign, "arm": draw_arm, "grasp": draw_grasp}
-    table["convergence"] = convergence_tables.draw
+    table |= {"convergence": convergence_tables.draw, "modules": draw_modules}
     table |= {"benchmark_regret": plots.draw_regret, "benchmark_winners": plots.draw_winners}
     table |= {name: partial(draw_robot, name) for name in ROBOTS}
     table |= {name: partial(draw_environment, name) for name in environment_pages()}
