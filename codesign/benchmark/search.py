@@ -163,7 +163,10 @@ class HalvingOptimiser:
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self._study = optuna.create_study(direction="maximize", sampler=make_sampler(sampler, 0), pruner=pruner)
+        # Hyperband draws a trial's bracket from the name of the study, which is random unless it is given.
+        self._study = optuna.create_study(
+            study_name=f"seed {sampler.seed}", direction="maximize", sampler=make_sampler(sampler, 0), pruner=pruner
+        )
         self._ranges = distributions(problem.definition)
         self._trial: Any = None
         self._rung = 0
