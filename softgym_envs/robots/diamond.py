@@ -74,14 +74,10 @@ class Diamond(MeshedRobot):
 
     Args:
         mesh: ``"published"`` (1529 nodes and 5272 linear tetrahedra), ``"accurate"`` or ``"reference"``.
-        mesh_size: target edge length [m], instead of that of the mesh. Edges of the outline may be shorter.
-        element: name of the solid element, instead of that of the mesh.
-        meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` creates a new mesh for every design.
-        material: name of a material of `softgym_envs.mechanics.materials`.
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
-        gravity: acceleration [m/s2]; the condensed-model work of the thesis has none. Its reinforcement-learning scene
-            is ``gravity=(0, 0, -9.81)`` with the design ``{"young_modulus": 1.8e5}``; the baseline body weighs 0.5 kg.
-        **options: options of `Robot`.
+        **options: options of `MeshedRobot`. The condensed-model work of the thesis has no gravity; its
+            reinforcement-learning scene is ``gravity=(0, 0, -9.81)`` with the design ``{"young_modulus": 1.8e5}``; the
+            baseline body weighs 0.5 kg.
     """
 
     name = "diamond"
@@ -108,23 +104,10 @@ class Diamond(MeshedRobot):
         self,
         *,
         mesh: str = "published",
-        mesh_size: float | None = None,
-        element: str | None = None,
-        meshing: str = "morph",
-        material: str = "corotational",
         unilateral: bool = True,
-        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         **options: Any,
     ) -> None:
-        super().__init__(
-            mesh=mesh,
-            mesh_size=mesh_size,
-            element=element,
-            meshing=meshing,
-            material=material,
-            gravity=gravity,
-            **options,
-        )
+        super().__init__(mesh=mesh, **options)
         self.design_space = DesignSpace(
             DesignVariable("leg_width", 0.8, 1.2, 1.0, "1", "width of the legs over that of the published body"),
             DesignVariable("top_height", 0.115, 0.140, 0.126, "m", "height of the top above the origin"),
@@ -133,7 +116,7 @@ class Diamond(MeshedRobot):
             DesignVariable("young_modulus", 1.0e5, 1.0e7, 3.0e6, "Pa", "stiffness of the silicone", log=True),
             DesignVariable("poisson_ratio", 0.40, 0.499, 0.45, "1", "0.5 is incompressible"),
         )
-        self.stiffness_variable = None if any(gravity) else "young_modulus"
+        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.effector_rest = self._top(self.design_space.baseline)
         self.effort_scale = np.full(4, 40.0)
         self.actuators = tuple(

@@ -85,17 +85,12 @@ class SensorizedFinger(MeshedRobot):
         cavities: 2 (one in each bellow) or 4 (two in each, with a wall between; its thickness is then a variable).
         mesh: ``"published"``, ``"local"`` (linear elements, small at the cavities; thesis, fig. 3.10), ``"accurate"``
             or ``"reference"``. Volume changes and Poisson's ratios above 0.45 need an accurate mesh: see the page.
-        mesh_size: target edge length [m], instead of that of the mesh.
-        element: name of the solid element, instead of that of the mesh.
-        fillet: radius of the re-entrant edges at the joints [m]; see `SoftFinger`.
         meshing: ``"remesh"`` (default) creates a new mesh for every design, as in the published study. ``"morph"``
             moves the baseline mesh if its elements stay good, which holds in about a quarter of this large space.
-        material: name of a material of `softgym_envs.mechanics.materials`.
         unilateral: whether the cable cannot push (default).
-        gravity: acceleration [m/s2].
         tip_height: height of the effector over the bottom [m]: 0 as published, 10 mm as in the `SoftFinger`.
         cable_clearance: height of the cable over the bellows [m]: 0.8 mm in the published study, 1 mm as built.
-        **options: options of `Robot`.
+        **options: options of `MeshedRobot`.
     """
 
     name = "sensorized_finger"
@@ -114,29 +109,15 @@ class SensorizedFinger(MeshedRobot):
         *,
         cavities: int = 2,
         mesh: str = "published",
-        mesh_size: float | None = None,
-        element: str | None = None,
-        fillet: float | None = None,
         meshing: str = "remesh",
-        material: str = "corotational",
         unilateral: bool = True,
-        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         tip_height: float = 0.0,
         cable_clearance: float = 0.8e-3,
         **options: Any,
     ) -> None:
         if cavities not in (2, 4):
             raise ValueError(f"cavities = {cavities!r} is unknown; allowed: 2, 4")
-        super().__init__(
-            mesh=mesh,
-            mesh_size=mesh_size,
-            element=element,
-            fillet=fillet,
-            meshing=meshing,
-            material=material,
-            gravity=gravity,
-            **options,
-        )
+        super().__init__(mesh=mesh, meshing=meshing, **options)
         self.cavities = cavities
         mm = 1e-3
         shape = [
@@ -160,7 +141,7 @@ class SensorizedFinger(MeshedRobot):
             DesignVariable("young_modulus", 1.0e6, 1.0e7, 3.0e6, "Pa", "stiffness of the silicone", log=True),
             DesignVariable("poisson_ratio", 0.30, 0.499, 0.30, "1", "0.5 is incompressible"),
         )
-        self.stiffness_variable = None if any(gravity) else "young_modulus"
+        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.tip_height = float(tip_height)
         self.cable_clearance = float(cable_clearance)
         self.effector_rest = np.array([0.0, self.tip_height, -3.0 * LENGTH * mm])

@@ -78,14 +78,9 @@ class SoftFinger(MeshedRobot):
         mesh: ``"published"``, ``"accurate"`` or ``"reference"``; the published one has 485 nodes and 1572 linear
             tetrahedra with two cables, 520 and 1721 with one.
         mesh_size: target edge length [m], instead of that of the mesh.
-        element: name of the solid element, instead of that of the mesh.
         fillet: radius of the re-entrant edges at the joints [m], which no source states; by default they are sharp, as
             drawn. A fillet makes the finger stiffer, see its page.
-        meshing: ``"morph"`` moves the baseline mesh, ``"remesh"`` creates a new mesh for every design, as is always
-            done with a fillet.
-        material: name of a material of `softgym_envs.mechanics.materials`.
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
-        gravity: acceleration [m/s2]; the condensed-model work of the thesis has none.
         contacts: whether to add three contact points (role ``c``) to the front of the last segment (sec. 4.3.2).
         self_contact: whether surfaces of the finger touch each other, as the faces of its notches do from about 10 mm
             of pull on. By default they do on all meshes but the published one, whose scene has no contact, and without
@@ -93,7 +88,7 @@ class SoftFinger(MeshedRobot):
         contact_distance: gap below which there are forces [m]; default 0.5 mm on the published mesh, 0.15 mm on the
             accurate one and in proportion to the ``mesh_size`` on finer ones, so that elements at the edges of the
             joints do not touch at rest.
-        **options: options of `Robot`.
+        **options: options of `MeshedRobot`.
     """
 
     name = "finger"
@@ -108,12 +103,8 @@ class SoftFinger(MeshedRobot):
         cables: int = 2,
         mesh: str = "published",
         mesh_size: float | None = None,
-        element: str | None = None,
         fillet: float | None = None,
-        meshing: str = "morph",
-        material: str = "corotational",
         unilateral: bool = True,
-        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         contacts: bool = False,
         self_contact: bool | None = None,
         contact_distance: float | None = None,
@@ -131,11 +122,7 @@ class SoftFinger(MeshedRobot):
         super().__init__(
             mesh=mesh,
             mesh_size=mesh_size,
-            element=element,
             fillet=fillet,
-            meshing=meshing,
-            material=material,
-            gravity=gravity,
             self_contact=touching,
             contact_distance=contact_distance,
             **options,
@@ -162,11 +149,11 @@ class SoftFinger(MeshedRobot):
         self.design_boxes = {"wide": WIDE_BOXES[cables]}
         # The mesh of a design does not depend on the design box.
         self._middle = {v.name: 0.5 * (v.low + v.high) for v in self.design_space if v.unit == "m"}
-        self.stiffness_variable = None if any(gravity) else "young_modulus"
+        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.effector_rest = self.tip(self.design_space.baseline)
         self.effort_scale = np.full(cables, 20.0)
         self.mirror = (
-            tuple(reversed(range(cables))) if is_half(self.tier) and not (gravity[0] or self.obstacles) else None
+            tuple(reversed(range(cables))) if is_half(self.tier) and not (self.gravity[0] or self.obstacles) else None
         )
         self.actuators = tuple(
             Actuator(f"cable_{i + 1}", 0.0, 0.020, 0.001, unilateral=unilateral) for i in range(cables)
