@@ -68,7 +68,7 @@ def measure(
         values, axes = np.linalg.eigh(found.effector_covariance)
         known = values > 1e-6 * values[-1]
         inside.append(float(((axes.T @ error)[known] ** 2 / values[known]).sum()) <= chi2.ppf(0.95, known.sum()))
-        spread = float(np.sqrt(found.parameters.covariance[1, 1]))
+        spread = float(np.sqrt(found.load_covariance[0, 0]))
         certain.append(spread <= 0.1 * found.load[0])
         forces_inside.append(abs(found.load[0] - true_force) <= 1.96 * spread)
     size = np.abs(force)

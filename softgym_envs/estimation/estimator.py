@@ -2,7 +2,8 @@
 
 Unknown are the true displacements of the actuators, which differ from the commanded ones, and the parameters of a load.
 With the actuators held, ``W`` gives the exact derivative of every row by both (`held_response`), so the
-condensed model of one equilibrium explains all readings near it.
+condensed model of one equilibrium explains all readings near it. The equilibrium is sought at the most probable
+parameters; near it, the estimate is the mean over all sizes and places of the load (`Mixture`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from softgym_envs.estimation.loads import Load
+from softgym_envs.estimation.places import Mixture
 from softgym_envs.estimation.posterior import Gaussian, Posterior, most_probable
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.constraints.cavity import Cavity
@@ -62,12 +64,16 @@ class Readings:
 class Estimate:
     """Where the body is and what acts on it.
 
+    All values are means over what explains the readings; for a load that drifts, they are the most probable ones.
+
     Attributes:
         displacement: of the actuators [m], shape (n_a,).
         load: parameters of the load, shape (m,).
+        load_covariance: shape (m, m).
         effector: positions [m], shape (n_e,).
         effector_covariance: [m2], shape (n_e, n_e).
-        parameters: distribution of the errors of the actuators and of the load, shape (n_a + m,).
+        parameters: normal distribution of the errors of the actuators and of the load near the most probable ones,
+            shape (n_a + m,).
         misfit: sum of the squared residuals of the mean reading in its standard deviations; about the number of sensors
             or less while the model explains them.
         converged: whether Gauss-Newton converged, within the accuracy of its last equilibrium.
@@ -77,6 +83,7 @@ class Estimate:
 
     displacement: np.ndarray
     load: np.ndarray
+    load_covariance: np.ndarray
     effector: np.ndarray
     effector_covariance: np.ndarray
     parameters: Gaussian
@@ -140,6 +147,7 @@ class _Evidence:
     spread: np.ndarray
     count: int
     prior: Gaussian
+    mixture: Mixture | None
 
 
 @dataclass(frozen=True)
@@ -216,6 +224,10 @@ class Estimator:
         self.belief = actuators if load is None else actuators.beside(load.prior)
         self._drift = np.zeros(len(self.belief.mean))
         self._drift[n_a:] = self.noise.drift * np.sqrt(np.diag(self.belief.covariance))[n_a:]
+        self._mixture: Mixture | None = None
+        if load is not None and not self._drift.any():
+            size = float(np.sqrt(load.prior.covariance[0, 0]))
+            self._mixture = Mixture.before_readings(load.places(self._counts[1]), actuators, size)
 
     def forces(self, load: np.ndarray) -> np.ndarray:
         """Return the forces on effectors and touched points for parameters of the load (m,) [N]."""
@@ -271,7 +283,7 @@ class Estimator:
         measured, spread, before = np.concatenate(parts), np.concatenate(noise), self._evidence
         if before is None or self._drift.any() or (command != before.command).any():
             prior = replace(self.belief, covariance=self.belief.covariance + np.diag(self._drift**2))
-            return _Evidence(command, measured, spread, 1, prior)
+            return _Evidence(command, measured, spread, 1, prior, self._mixture)
         count = before.count + 1
         mean = before.measured + (measured - before.measured) / count
         return replace(before, measured=mean, spread=spread / np.sqrt(count), count=count)
@@ -311,21 +323,52 @@ class Estimator:
                 found = slack
             else:
                 found = replace(found, solved=slack.solved)
-        near, posterior = found.near, found.posterior
-        displacement, load = command + posterior.mode[:n_a], posterior.mode[n_a:]
-        self._near, self._evidence, self.belief = near, evidence, posterior.parameters
-        effectors = near.state.condensed.slices["e"]
-        slope = (near.response[0] @ self._parameters_to_rows(load))[effectors]
-        return Estimate(
+        self._near, self._evidence, self.belief = found.near, evidence, found.posterior.parameters
+        displacement, load = command + found.posterior.mode[:n_a], found.posterior.mode[n_a:]
+        effectors = found.near.state.condensed.slices["e"]
+        covariance = self.belief.covariance
+        slope = (found.near.response[0] @ self._parameters_to_rows(load))[effectors]
+        estimate = Estimate(
             displacement=displacement,
             load=load,
-            effector=near.rows(displacement, self.forces(load))[0][effectors],
-            effector_covariance=slope @ posterior.parameters.covariance @ slope.T,
-            parameters=posterior.parameters,
-            misfit=posterior.misfit,
-            converged=posterior.converged and found.close,
+            load_covariance=covariance[n_a:, n_a:],
+            effector=found.near.rows(displacement, self.forces(load))[0][effectors],
+            effector_covariance=slope @ covariance @ slope.T,
+            parameters=self.belief,
+            misfit=found.posterior.misfit,
+            converged=found.posterior.converged and found.close,
             equilibria=found.solved,
-            near=near,
+            near=found.near,
+        )
+        return estimate if evidence.mixture is None else self._mean(estimate, evidence.mixture, evidence)
+
+    def _mean(self, estimate: Estimate, before: Mixture, evidence: _Evidence) -> Estimate:
+        """Replace the most probable values of an estimate by means over all sizes and places of the load."""
+        n_a, near = self._counts[0], estimate.near
+        unloaded = np.zeros(len(near.forces))
+        delta, effort = near.rows(evidence.command, unloaded)
+        by_displacement, by_effort = near.response
+        directions = before.places.directions.T
+
+        def at_places(response: np.ndarray) -> np.ndarray:
+            """Derivatives by the errors of actuators and the size of the load at each place, (q, rows, n_a + 1)."""
+            by_size = (response[:, n_a:] @ directions).T[:, :, None]
+            return np.concatenate([np.tile(response[:, :n_a], (len(by_size), 1, 1)), by_size], axis=2)
+
+        slices = near.state.condensed.slices
+        cavities, effectors = slices.get("s", slice(0, 0)), slices["e"]
+        base, response = self.rest_volumes + delta[cavities], by_displacement[cavities]
+        if self.noise.effort is not None:
+            base, response = np.concatenate([base, effort]), np.vstack([response, by_effort])
+        self._mixture = before.after(evidence.measured, evidence.spread, base, at_places(response))
+        moments = self._mixture.moments(delta[effectors], at_places(by_displacement[effectors]))
+        return replace(
+            estimate,
+            displacement=evidence.command + moments.displacement,
+            load=moments.load,
+            load_covariance=moments.load_covariance,
+            effector=moments.outputs,
+            effector_covariance=moments.output_covariance,
         )
 
     def _search(self, near: Linearised, evidence: _Evidence, solved: int) -> _Found:

@@ -7,13 +7,20 @@ from typing import Protocol
 
 import numpy as np
 
+from softgym_envs.estimation.places import Places
 from softgym_envs.estimation.posterior import Gaussian
 
 Cell = tuple[int, int]
 
+PLACES = 9
+"""Places along each edge of a cell that estimates are summed over."""
+
 
 class Load(Protocol):
-    """Forces on a body as a function of a few unknown parameters."""
+    """Forces on a body, proportional to a size of at least 0 and dependent on a place.
+
+    The parameters are the size, then the coordinates of the place.
+    """
 
     @property
     def prior(self) -> Gaussian:
@@ -22,6 +29,9 @@ class Load(Protocol):
     @property
     def points(self) -> np.ndarray:
         """Points of the undeformed body on which the load acts besides the effectors [m], shape (p, 3)."""
+
+    def places(self, effectors: int) -> Places:
+        """Places that stand for all at which the load may act."""
 
     def forces(self, parameters: np.ndarray, effectors: int) -> np.ndarray:
         """Forces on the coordinates of the effectors, then of the points [N], shape (effectors + 3 p,)."""
@@ -124,6 +134,14 @@ class Touch:
             high=np.array([np.inf, 1.0, 1.0]),
         )
 
+    def places(self, effectors: int) -> Places:
+        """Return the nodes of a Gauss quadrature over the cell: before any reading, all its places are alike."""
+        nodes, weights = np.polynomial.legendre.leggauss(PLACES)
+        coordinates = np.array([[u, v] for v in nodes for u in nodes])
+        sizes = np.column_stack([np.ones(len(coordinates)), coordinates])
+        directions = np.array([self.forces(parameters, effectors) for parameters in sizes])
+        return Places(coordinates, directions, np.kron(weights, weights) / 4.0)
+
     def place(self, parameters: np.ndarray) -> np.ndarray:
         """Return the touched point of the undeformed body [m], shape (3,)."""
         return self._weights(parameters)[0] @ self.points
@@ -169,6 +187,10 @@ class Payload:
     @property
     def prior(self) -> Gaussian:
         return Gaussian(np.zeros(1), np.array([[self.expected_mass**2]]), low=np.zeros(1), high=np.array([np.inf]))
+
+    def places(self, effectors: int) -> Places:
+        """Return the only place."""
+        return Places(np.empty((1, 0)), self.jacobian(np.ones(1), effectors).T, np.ones(1))
 
     def forces(self, parameters: np.ndarray, effectors: int) -> np.ndarray:
         return self.jacobian(parameters, effectors) @ parameters
