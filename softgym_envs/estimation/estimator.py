@@ -262,14 +262,6 @@ class Estimator:
         combined[:n_a, :n_a], combined[n_a:, n_a:] = np.eye(n_a), forces
         return combined
 
-    def explain(self, near: Linearised, readings: Readings, start: np.ndarray | None = None) -> Posterior:
-        """Return what all readings tell, with a given condensed model, as `update` does.
-
-        Raises:
-            ValueError: if readings have a wrong shape or are not finite, as with a lost sensor.
-        """
-        return self._explain(near, self._joined(readings), start)
-
     def _joined(self, readings: Readings) -> _Evidence:
         """Return a reading together with those before it under the same command."""
         n_a = self._counts[0]
