@@ -287,6 +287,12 @@ class AnalyticConfig(GradientConfig):
     slack_pull: float = Field(
         default=0.3, ge=0, description="how strongly commands of slack cables follow the displacement that is reached"
     )
+    effort_weight: float = Field(
+        default=1.0,
+        ge=0,
+        description="factor of the effort's share in the derivatives; above 1 for redundant actuators, which otherwise "
+        "end up working against each other",
+    )
 
 
 class CloningConfig(GradientConfig):

@@ -23,13 +23,15 @@ class AnalyticLearner(GradientLearner):
 
     def __init__(self, config: TrainConfig) -> None:
         super().__init__(config, config.analytic)
-        self.slack_pull = config.analytic.slack_pull
+        self.slack_pull, self.effort_weight = config.analytic.slack_pull, config.analytic.effort_weight
 
     def advance(self, observation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         import torch
 
         action = self.policy(observation)
-        observation, *_, gradient = self.env.step_with_gradient(action.detach().numpy(), log=True)
+        observation, *_, gradient = self.env.step_with_gradient(
+            action.detach().numpy(), log=True, effort_weight=self.effort_weight
+        )
         ascent = torch.from_numpy(self._ascent(gradient).astype(np.float32))
         self.descend(-(action * ascent).sum() / self.env.num_envs)
         return observation

@@ -295,10 +295,11 @@ class SoftRobotVectorEnv(VectorEnv):
         return self._finish_step()
 
     def step_with_gradient(
-        self, actions: np.ndarray, *, log: bool = False
+        self, actions: np.ndarray, *, log: bool = False, effort_weight: float = 1.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any], StepGradient]:
         """As `step`; also returns the derivatives of the rewards in the actions, or with ``log`` of `Task.log_reward`.
 
+        The part of the derivatives that comes through the efforts is multiplied by ``effort_weight``.
         In dynamics these are rewards of the equilibria where the present commands lead if they are held.
         Rows that found no equilibrium or are reset have a reward and derivatives of zero.
 
@@ -312,7 +313,7 @@ class SoftRobotVectorEnv(VectorEnv):
         actions = self._checked(actions)
         slope, limited = self.spaces.command_slope(actions, self.command)
         self._advance(actions)
-        gradient = self._gradient(slope, limited, log)
+        gradient = self._gradient(slope, limited, log, effort_weight)
         return *self._finish_step(), gradient
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
@@ -333,13 +334,13 @@ class SoftRobotVectorEnv(VectorEnv):
         self.backend.step(arriving)
         self._steps += 1
 
-    def _gradient(self, slope: np.ndarray, limited: np.ndarray, log: bool) -> StepGradient:
+    def _gradient(self, slope: np.ndarray, limited: np.ndarray, log: bool, effort_weight: float) -> StepGradient:
         if self._reward_gradient is None:
             self._reward_gradient = RewardGradient(self.task, self.spaces)
         state, goals = self.backend.settled(), self.goals
         effector, effort = np.zeros_like(state.effector), self._stiffness * state.effort
         effector[:, :3], by_effort = self._reward_gradient(state.effector[:, :3], effort, goals, log)
-        held, command = self.backend.gradient(effector, self._stiffness * by_effort)
+        held, command = self.backend.gradient(effector, effort_weight * self._stiffness * by_effort)
         _, _, reward = self.task.rate(state.effector[:, :3], goals, self.spaces.effort_share(effort))
         rated = state.converged & self._state.converged & ~self._ended
         found, gap = rated[:, None], state.displacement - self.command

@@ -107,6 +107,22 @@ def test_the_logarithm_of_the_reward_has_the_slope_of_its_differences_everywhere
     env.close()
 
 
+def test_the_weight_of_the_effort_changes_only_its_own_part_of_the_derivatives():
+    env: Any = gym.make_vec("SoftGym/GripperPinch-v0", num_envs=4)
+    actions = np.full(env.action_space.shape, 0.8)
+
+    def derivatives(weight):
+        env.reset(seed=0)
+        for _ in range(8):  # all cables are taut
+            env.step(actions)
+        return env.step_with_gradient(actions, log=True, effort_weight=weight)[-1].action
+
+    without, once, tenfold = derivatives(0.0), derivatives(1.0), derivatives(10.0)
+    assert (once < without).all(), "pulling more raises the efforts"
+    np.testing.assert_allclose(tenfold - without, 10.0 * (once - without), rtol=1e-6)
+    env.close()
+
+
 def test_derivatives_are_finite_at_the_goal():
     env: Any = gym.make_vec("SoftGym/FingerReach-v0", num_envs=2)
     _, info = env.reset(seed=0)
