@@ -336,7 +336,8 @@ class TrainConfig(LearnerConfig):
         steps: environment steps, over all sub-environments.
         initial: initial policy: a file or the name of a shipped one.
         evaluation_episodes: number of episodes of each evaluation.
-        report_every: environment steps between evaluations.
+        report_every: environment steps between evaluations. Learners begin new episodes after each, so all
+            sub-environments should make several episodes in between.
     """
 
     environment: EnvironmentConfig

@@ -41,7 +41,11 @@ TASKS = (
 )
 """Names of the configurations of SAC; those of another learner have its name appended."""
 REPORTS = {"analytic": 6_400, "cloning": 3_200, "ppo": 12_800, "sac": 1_600}
-"""Learners, and environment steps between evaluations; these do not count as learning."""
+"""Learners, and environment steps between evaluations on single goals; these do not count as learning.
+
+Learners begin new episodes after each evaluation, and an episode on a path is longer than these steps allow. There the
+configuration's own number holds.
+"""
 SEEDS = (0, 1, 2)
 GOALS, FEM_GOALS = 200, 50
 """Unseen goals of each evaluation during training, and others for the policy that is kept, on FEM."""
@@ -99,7 +103,8 @@ def measure(task: str, learner: str, seed: int, folder: Path) -> LearnerRow:
     config = load_config(config_path(task, learner), TrainConfig)
     path_task = config.environment.task_class.horizon > 1
     goals_each = 1 if path_task else GOALS
-    update = {"seed": seed, "evaluation_episodes": goals_each, "report_every": REPORTS[learner]}
+    report_every = config.report_every if path_task else REPORTS[learner]
+    update = {"seed": seed, "evaluation_episodes": goals_each, "report_every": report_every}
     config = config.model_copy(update=update)
     place = folder / f"{task}_{learner}_{seed}"
 
