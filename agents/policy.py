@@ -115,16 +115,20 @@ class Policy:
         """Widths of the hidden layers."""
         return [weight.shape[1] for weight, _ in self.hidden]
 
-    def check_environment(self, environment: EnvironmentConfig) -> None:
+    def check_environment(self, environment: EnvironmentConfig, *, any_task: bool = False) -> None:
         """Refuse an environment in which observations or actions have another meaning than in training.
 
         Backend, body, goals and ID may differ if robot and task are the same.
 
+        Args:
+            environment: the environment.
+            any_task: allow another task with goals and sensors of the same kind, as the start of a training does.
+
         Raises:
             ConfigError: with the key, its value and the policy's value.
         """
-        own = _meaning(self.environment)
-        for key, (meaning, shown) in _meaning(environment).items():
+        own = _meaning(self.environment, any_task)
+        for key, (meaning, shown) in _meaning(environment, any_task).items():
             if meaning != own[key][0]:
                 name = "robot" if key == "id" and environment.id is None else key
                 raise ConfigError(
@@ -149,12 +153,15 @@ class Policy:
         return np.tanh(x @ self.mean[0] + self.mean[1])
 
 
-def _meaning(environment: EnvironmentConfig) -> dict[str, tuple[Any, object]]:
+def _meaning(environment: EnvironmentConfig, any_task: bool) -> dict[str, tuple[Any, object]]:
     """Return what defines observations and actions: for each key, the value to compare and the text for a message."""
     row, robot = environment.row, environment.make_robot()
     shown = design_names(robot.design_space, environment.design_in_observation)
     variables = [robot.design_space[name] for name in shown]
-    lookahead = environment.make_task(robot).lookahead
+    task = environment.make_task(robot)
+    # Goals of other tasks are read alike if they have the same unit and scales.
+    kind: object = (task.goal_unit, task.sensors, task.hides_effector, task.goal_scale, task.error_scale)
+    lookahead = 0 if any_task else task.lookahead
     scales = (
         [(actuator.name, actuator.low, actuator.high, actuator.rate) for actuator in robot.actuators],
         (robot.size, robot.workspace_scale, robot.effort_scale.tolist()),
@@ -162,7 +169,7 @@ def _meaning(environment: EnvironmentConfig) -> dict[str, tuple[Any, object]]:
     )
     return {
         "id": (
-            (class_path(type(robot)), class_path(environment.task_class)),
+            (class_path(type(robot)), kind if any_task else class_path(environment.task_class)),
             f"{environment.title} (robot {row.robot}, task {row.task})",
         ),
         "residual_scale": (environment.residual_scale, environment.residual_scale),

@@ -111,7 +111,7 @@ def train(
         began -= spent
     elif config.initial is not None:
         start_from = Policy(config.initial)
-        start_from.check_environment(config.environment)
+        start_from.check_environment(config.environment, any_task=True)
         learner.load_weights(read_tensors(start_from.path), start_from.path)
     if proposer is not None:
         proposer.attach(_model(learner), config, folder)
