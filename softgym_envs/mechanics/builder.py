@@ -10,6 +10,7 @@ import numpy as np
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.rigid import RigidBody
+from softgym_envs.mechanics.elements.superelement import PortEnergy, Superelement
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solids import Fixed, solid_part
@@ -107,6 +108,13 @@ class ModelBuilder:
                 f"row {unknown[0]} of the beam is not a frame's first row; frames start at rows {sorted(known)}"
             )
         self._parts.append((Beam, np.asarray(frames, dtype=np.int64), {"section": section, **options}))
+
+    def add_superelement(self, near: int, far: int, energy: PortEnergy, **options: Any) -> None:
+        """Add an elastic part between two frames, known by its energy alone; options as for `Superelement`."""
+        for row in (near, far):
+            if row not in self._frames:
+                raise ValueError(f"row {row} is not the first row of a frame; frames start at rows {self._frames}")
+        self._parts.append((Superelement, np.array([near, far]), {"energy": energy, **options}))
 
     def add_mass(self, frame: int, mass: float, inertia: np.ndarray) -> None:
         """Assign a mass [kg] and an inertia along the directors [kg m2] (3, 3) to the rigid part at a frame."""

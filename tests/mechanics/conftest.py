@@ -6,11 +6,12 @@ import pytest
 
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.solids import SOLIDS
-from softgym_envs.testing import clamped_beam, clamped_solid, dense_tangent, derivative_errors
+from softgym_envs.testing import clamped_beam, clamped_solid, clamped_superelements, dense_tangent, derivative_errors
 
 BODIES = [f"{element}-{material}" for element in SOLIDS for material in MATERIALS] + [
     f"beam-{order}-{shape}" for order in (1, 2) for shape in ("straight", "curved")
 ]
+BODIES.append("superelement")
 
 
 @pytest.fixture(scope="session")
@@ -41,4 +42,6 @@ def make_beam():
 def body(request):
     """The model of a small clamped body of every element block and material."""
     kind = request.param.split("-")
+    if kind[0] == "superelement":
+        return clamped_superelements()
     return clamped_beam(int(kind[1]), kind[2]) if kind[0] == "beam" else clamped_solid(*kind)

@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements import averaged, beams, quadratic, tetrahedra
+from softgym_envs.mechanics.elements import averaged, beams, quadratic, superelement, tetrahedra
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, add_midside_nodes, split_triangles
+from softgym_envs.mechanics.elements.superelement import Superelement
 from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.materials import MATERIALS
@@ -26,7 +27,7 @@ from softgym_envs.mechanics.solvers.statics import Statics
 
 KINDS = {
     cls
-    for module in (averaged, beams, quadratic, tetrahedra)
+    for module in (averaged, beams, quadratic, superelement, tetrahedra)
     for cls in vars(module).values()
     if inspect.isclass(cls) and issubclass(cls, ElementBlock) and not inspect.isabstract(cls)
 }
@@ -83,7 +84,7 @@ def damping(block, x, start):
 
 
 def test_every_block_is_tested():
-    assert set(SOLIDS.values()) | {Beam} == KINDS
+    assert set(SOLIDS.values()) | {Beam, Superelement} == KINDS
 
 
 # -- derivatives ----------------------------------------------------------------------------------------------------
@@ -204,8 +205,11 @@ def test_masses(body):
     for block in body.blocks:
         masses = block.nodal_masses(len(body.nodes))
         assert masses.shape == (len(body.nodes),)
-        assert masses.sum() == pytest.approx(block.mass, rel=1e-12)
-        assert block.mass == pytest.approx(block.density * block.volume, rel=1e-12)
+        if isinstance(block, Superelement):  # its inertia is given; axes of ports have first moments
+            assert masses[block.nodes_used[[0, 4]]].sum() == pytest.approx(block.mass, rel=1e-12)
+        else:
+            assert masses.sum() == pytest.approx(block.mass, rel=1e-12)
+            assert block.mass == pytest.approx(block.density * block.volume, rel=1e-12)
         assert not masses[np.setdiff1d(np.arange(len(body.nodes)), block.nodes_used)].any()
     assert body.mass == pytest.approx(sum(block.mass for block in body.blocks))
 
@@ -543,7 +547,7 @@ def test_averaging_has_no_effect_without_lame_or_in_uniform_strain(box, rng):
 
 
 def test_inverted_elements_are_counted(body, rng):
-    if any(isinstance(block, Beam) for block in body.blocks):
+    if any(isinstance(block, Beam | Superelement) for block in body.blocks):
         x = body.nodes.copy()
         x[0] = np.nan
     else:

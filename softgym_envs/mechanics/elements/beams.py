@@ -200,7 +200,7 @@ def _cross(a, b, factor, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _add_warped(x, step, rows, shape, slope, weights, out):
+def warp_lines(x, step, rows, shape, slope, weights, out):
     """Rotate the tangent by the exponential of the spin, and strain it by the remainder of the step."""
     spin = np.empty(3)
     tangent = np.empty(3)
@@ -398,7 +398,7 @@ class Beam(ElementBlock):
         return float(energy)
 
     def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
-        _add_warped(x, step, self.rows, self.shape, self.slope, self.weights, out)
+        warp_lines(x, step, self.rows, self.shape, self.slope, self.weights, out)
 
     def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         k = self.order + 1
