@@ -24,7 +24,7 @@ WEIGHTS = {
 }
 """Readable names of the robots, by name of the shipped weights."""
 
-HEADLINES = ("finger", "diamond", "trunk", "two_finger_gripper", "tetrapod")
+HEADLINES = ("finger", "diamond", "trunk", "cable_trunk", "tetrapod")
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "") -> str:
@@ -76,9 +76,10 @@ def codesign() -> str:
     rows = []
     for study in results("codesign").values():
         for index, row in enumerate(study["rows"]):
-            low, high = row["change, 95% interval [mm]"]
+            interval = row.get("change, 95% interval [mm]")  # None for a single path
             name = "" if index else study["title"]
-            rows.append([name, row["controller"], *_ends(row), f"{low:.1f} to {high:.1f} mm"])
+            change = "" if interval is None else "{:.1f} to {:.1f} mm".format(*interval)
+            rows.append([name, row["controller"], *_ends(row), change])
     return markdown(["robot", "controller", "baseline", "winner", "95% interval of the change"], rows, "llrrr")
 
 
