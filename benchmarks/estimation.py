@@ -1,6 +1,6 @@
 """Accuracy of the estimator on finite elements: touches at random places of the sensorized finger's grid.
 
-``python -m benchmarks.estimation [--cavities 2] [--touches 100] [--readings 10]`` prints a line of JSON.
+``python -m benchmarks.estimation [--cavities 2] [--touches 100] [--readings 10] [--design JSON]`` prints a line of JSON.
 
 Each touch is one body with a random pull, an error of the cable, a force and a place in a cell, constant over a number
 of readings with new noise of the volumes. Its place is one point, which is not a corner of the estimator's cell: the
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.stats import chi2
@@ -24,9 +25,18 @@ LENGTH, LARGEST_PULL, FORCE = 0.120, 0.010, 2.0
 
 
 def measure(
-    cavities: int, touches: int, readings: int, pitch: float, noise_share: float, seed: int
+    cavities: int,
+    touches: int,
+    readings: int,
+    pitch: float,
+    noise_share: float,
+    seed: int,
+    design: Mapping[str, float],
 ) -> dict[str, float | None]:
-    """Return errors, coverage and speed; the noise of the volumes is a share of their change under the full pull."""
+    """Return errors, coverage and speed of a body whose missing variables take their baseline.
+
+    The noise of the volumes is a share of their change under the full pull in the baseline: that of one sensor.
+    """
     rng = np.random.default_rng(seed)
     robot = make_robot("sensorized_finger", cavities=cavities)
     change = Statics(robot.build()).solve([LARGEST_PULL]).condensed.delta.s
@@ -43,8 +53,8 @@ def measure(
         true_force = 0.0
         while true_force < 0.2:
             true_force = abs(FORCE * rng.standard_normal())
-        estimator = Estimator(robot, load=Touch(grid, cell, FORCE), noise=noise)
-        body = robot.build()
+        estimator = Estimator(robot, design=design, load=Touch(grid, cell, FORCE), noise=noise)
+        body = robot.build(design)
         body.add_contact("touch", point, radius=estimator.radius)
         state = Statics(body).solve(pull, contact=true_force * np.array(grid.normal))
         volumes = estimator.rest_volumes + state.condensed.delta.s
@@ -104,6 +114,7 @@ if __name__ == "__main__":
     parser.add_argument("--pitch", type=float, default=5e-3)
     parser.add_argument("--noise", type=float, default=0.01, help="of the volumes' change under the full pull")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--design", type=json.loads, default={}, help="JSON object of design variables, SI units")
     given = parser.parse_args()
-    result = measure(given.cavities, given.touches, given.readings, given.pitch, given.noise, given.seed)
+    result = measure(given.cavities, given.touches, given.readings, given.pitch, given.noise, given.seed, given.design)
     print(json.dumps({name: round(value, 4) for name, value in result.items() if value is not None}))
