@@ -1,6 +1,6 @@
 """Accuracy of the estimator on finite elements: touches at random places of the sensorized finger's grid.
 
-``python -m benchmarks.estimation [--cavities 2] [--touches 100] [--readings 10] [--design JSON]`` prints a line of JSON.
+``python -m benchmarks.estimation [--cavities 2] [--touches 100] [--readings 10]`` prints a line of JSON.
 
 Each touch is one body with a random pull, an error of the cable, a force and a place in a cell, constant over a number
 of readings with new noise of the volumes. Its place is one point, which is not a corner of the estimator's cell: the
