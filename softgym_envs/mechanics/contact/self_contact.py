@@ -26,6 +26,9 @@ CCD_SHARE = 0.9
 LONG_WAY = 3.0
 """Pairs along steps longer than this multiple of ``reach`` are too many to keep: they serve for one step only."""
 
+PIECE = 8.0
+"""Length of the pieces of such steps, relative to ``reach``."""
+
 
 @cache
 def load_ipctk() -> ModuleType:
@@ -297,11 +300,22 @@ class SelfContact:
             return 1.0
         v1 = np.asfortranarray(v0 + motion)
         if _longest(motion) > LONG_WAY * self.reach:
-            candidates = self._ipctk.Candidates()
-            candidates.build(self.mesh, v0, v1, 0.0, self._broad_phase)
-        else:
-            candidates = self._candidates_on(v0, motion)
+            return self._long_step(v0, motion)
+        candidates = self._candidates_on(v0, motion)
         return float(candidates.compute_collision_free_stepsize(self.mesh, v0, v1, 0.0, self._ccd))
+
+    def _long_step(self, v0: np.ndarray, motion: np.ndarray) -> float:
+        """Part of a long motion that can be taken, found piece by piece: pieces have few pairs whose ways overlap."""
+        pieces = int(np.ceil(_longest(motion) / (PIECE * self.reach)))
+        for k in range(pieces):
+            start, end = (np.asfortranarray(v0 + motion * (part / pieces)) for part in (k, k + 1))
+            candidates = self._ipctk.Candidates()
+            candidates.build(self.mesh, start, end, 0.0, self._broad_phase)
+            part = float(candidates.compute_collision_free_stepsize(self.mesh, start, end, 0.0, self._ccd))
+            if part < 1.0:
+                # The share refers to the distances at the start of this piece, which may already be small.
+                return (k + part) / pieces * (CCD_SHARE if k else 1.0)
+        return 1.0
 
     def intersects(self, v: np.ndarray) -> bool:
         """Whether any edge passes through a face that it may touch."""

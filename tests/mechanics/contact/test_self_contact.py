@@ -143,6 +143,10 @@ def test_a_step_ends_before_the_surfaces_meet():
     for length in (2.0 * GAP, 0.002, 0.05):  # within the reach of the kept pairs, beyond it, through the other block
         step = surfaces.max_step(rest, rest + length * down)
         assert 0.8 * GAP < step * length < GAP
+    # They meet in one of the later pieces of a long way, also just after such a piece has begun.
+    for gap in (0.0101, 0.0124, 0.0151):
+        apart = rest - (gap - GAP) * down
+        assert 0.8 * gap < surfaces.max_step(apart, apart + 0.05 * down) * 0.05 < gap
     assert surfaces.max_step(rest, rest - 0.05 * down) == 1.0
     assert surfaces.max_step(rest, rest + np.array([0.05, 0.0, 0.0])) == 1.0  # all together
 
