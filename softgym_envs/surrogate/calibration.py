@@ -43,6 +43,10 @@ FACTOR_OF = {
 }
 """Entry of `Calibration` that is fitted to a stratum."""
 
+TOUCHING = "touching"
+"""Name of all states in which surfaces are in contact, wherever they were drawn. They count in their strata as well: a
+model does not know which states touch."""
+
 ROUNDS = 4
 POOL = 8
 """Bodies and commands from which an adversary chooses each of its own."""
@@ -113,21 +117,26 @@ def predict(model: SurrogateModel, states: JudgedStates) -> Predictions:
 
 
 def report(model: SurrogateModel, states: JudgedStates) -> dict[str, StratumReport]:
-    """Return how a model does in each stratum of judged states."""
-    every, result = predict(model, states), {}
-    for stratum in dict.fromkeys(states.stratum.tolist()):
-        rows = (states.stratum == stratum) & every.found
-        trusted = rows & every.trusted
-        result[str(stratum)] = StratumReport(
-            states=int(rows.sum()),
-            mean=float(every.error[rows].mean()),
-            worst=float(every.error[rows].max()),
-            coverage=float((every.error <= every.uncertainty)[rows].mean()),
-            trusted=float(every.trusted[rows].mean()),
-            worst_trusted=float(every.error[trusted].max(initial=0.0)),
-            unsolved=int((every.trusted & ~states.found & (states.stratum == stratum)).sum()),
-        )
-    return result
+    """Return how a model does in each stratum of judged states, and in all that touch, under `TOUCHING`."""
+    every = predict(model, states)
+    groups = {str(stratum): states.stratum == stratum for stratum in dict.fromkeys(states.stratum.tolist())}
+    if states.touching.any():
+        groups[TOUCHING] = states.touching
+    return {name: _report(every, states, which) for name, which in groups.items() if (which & every.found).any()}
+
+
+def _report(every: Predictions, states: JudgedStates, which: np.ndarray) -> StratumReport:
+    """Return how a model does in some of the judged states."""
+    rows = which & every.found
+    return StratumReport(
+        states=int(rows.sum()),
+        mean=float(every.error[rows].mean()),
+        worst=float(every.error[rows].max()),
+        coverage=float((every.error <= every.uncertainty)[rows].mean()),
+        trusted=float(every.trusted[rows].mean()),
+        worst_trusted=float(every.error[rows & every.trusted].max(initial=0.0)),
+        unsolved=int((every.trusted & ~states.found & which).sum()),
+    )
 
 
 # -- states --------------------------------------------------------------------------------------------------------
@@ -143,18 +152,19 @@ def judged_states(
         bodies: in each stratum.
         states: commands of each body.
         seed: of the bodies and commands.
-        folder: where each stratum is kept once it is solved; an interrupted run continues with the next one.
+        folder: where the states of each body are kept; an interrupted run continues with the next body.
     """
-    robot, parts = model.robot, []
+    robot, bounds, parts = model.robot, learned_bounds(model), []
     for stratum in strata_of(robot, buckles=model.domain.limits_growth):
-        path = None if folder is None else Path(folder) / f"{stratum.replace(' ', '_')}_{bodies}x{states}_{seed}.npz"
-        if path is not None and path.exists():
-            parts.append(JudgedStates.load(path))
-            continue
-        parts.append(solve_commands(robot, draw_commands(robot, stratum, bodies, states, seed, softness(model))))
-        if path is not None:
-            parts[-1].save(path)
+        commands = draw_commands(robot, stratum, bodies, states, seed, softness(model), bounds)
+        parts.append(solve_commands(robot, commands, folder=folder))
     return JudgedStates.join(parts)
+
+
+def learned_bounds(model: SurrogateModel) -> dict[str, tuple[float, float]]:
+    """Return the bounds of design variables whose training data have narrower ones than the robot."""
+    bounds = model.card.get("config", {}).get("data", {}).get("bounds", {})
+    return {name: (low, high) for name, (low, high) in bounds.items()}
 
 
 def softness(model: SurrogateModel) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
@@ -264,13 +274,7 @@ def calibrate(
     known = judged_states(model, bodies, states, seed, state_folder)
     calibration = fit_calibration(model, known)
     model = _calibrated(model, calibration, robot.goal_tolerance)
-    path = None if state_folder is None else Path(state_folder) / f"adversarial_{attacks}_{seed}.npz"
-    if path is not None and path.exists():
-        attacked = JudgedStates.load(path)
-    else:
-        attacked = attack(model, attacks, states, seed)
-        if path is not None:
-            attacked.save(path)
+    attacked = attack(model, attacks, states, seed, state_folder)
     everything = JudgedStates.join([known, attacked])
     limit = safe_limit(predict(model, everything), robot.goal_tolerance)
     model = _calibrated(model, calibration, limit)
@@ -290,7 +294,9 @@ def calibrate(
 # -- the worst trusted states --------------------------------------------------------------------------------------
 
 
-def attack(model: SurrogateModel, count: int, states: int, seed: int) -> JudgedStates:
+def attack(
+    model: SurrogateModel, count: int, states: int, seed: int, folder: str | Path | None = None
+) -> JudgedStates:
     """Search for trusted states with large errors; return all that were judged, in the stratum ``adversarial``.
 
     In each of `ROUNDS` rounds, gradients of the spread move bodies and commands from anywhere in their boxes to where
@@ -302,6 +308,7 @@ def attack(model: SurrogateModel, count: int, states: int, seed: int) -> JudgedS
         count: number of states.
         states: commands of each body.
         seed: of the random numbers.
+        folder: where the states of each body are kept; an interrupted search continues with the next body.
     """
     rng = np.random.default_rng([seed, 99])
     robot = model.robot
@@ -326,9 +333,9 @@ def attack(model: SurrogateModel, count: int, states: int, seed: int) -> JudgedS
                 np.concatenate([x[: bodies - half], near_x[:half]]),
                 np.concatenate([c[: bodies - half], near_c[:half]]),
             )
-        designs = _designs(robot, x)
+        designs = _designs(model, x)
         command = robot.displacements(c.reshape(-1, n)).reshape(c.shape)
-        found = solve_commands(robot, Commands(np.full(len(x), "adversarial"), designs, command))
+        found = solve_commands(robot, Commands(np.full(len(x), "adversarial"), designs, command), folder=folder)
         parts.append(found)
         judged = predict(model, found)
         error = np.where(judged.found & judged.trusted, judged.error, 0.0)
@@ -343,9 +350,9 @@ def attack(model: SurrogateModel, count: int, states: int, seed: int) -> JudgedS
     return JudgedStates.join(parts)
 
 
-def _designs(robot: Robot, x: np.ndarray) -> np.ndarray:
+def _designs(model: SurrogateModel, x: np.ndarray) -> np.ndarray:
     """Return designs (B, len(space)) of points x (B, d) of the unit cube of the learned variables."""
-    space, names = robot.design_space, learned_variables(robot)
+    space, names = model.robot.design_space.within(learned_bounds(model)), learned_variables(model.robot)
     designs = np.tile(space.complete(None).array, (len(x), 1))
     for k, name in enumerate(names):
         designs[:, space.names.index(name)] = space[name].low + x[:, k] * (space[name].high - space[name].low)
@@ -360,7 +367,7 @@ def _judge_points(model: SurrogateModel, x: np.ndarray, c: np.ndarray) -> tuple[
     """
     robot, (B, S, n) = model.robot, c.shape
     command = robot.displacements(c.reshape(-1, n))
-    context = model.context(_designs(robot, x)).rows(np.repeat(np.arange(B), S))
+    context = model.context(_designs(model, x)).rows(np.repeat(np.arange(B), S))
     displacement, found = reached(model, context, command)
     _, spread = model.effector(context, displacement)
     uncertainty, trusted = model.trust(context, displacement, spread, command)
@@ -397,7 +404,7 @@ def _climb(
     columns = [robot.design_space.names.index(name) for name in learned_variables(robot)]
     _, trusted, displacement = _judge_points(model, x, c)
     for _ in range(steps):
-        values = torch.tensor(_designs(robot, x), requires_grad=True)
+        values = torch.tensor(_designs(model, x), requires_grad=True)
         u = torch.tensor((displacement - model.middle) / model.half_range, dtype=torch.float32, requires_grad=True)
         features = model.features.design(values).to(torch.float32).repeat_interleave(S, dim=0)
         members = ensemble.effectors(ensemble.coefficients(features), u)

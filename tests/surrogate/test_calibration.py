@@ -26,6 +26,7 @@ from softgym_envs.surrogate.calibration import (
     safe_limit,
     with_domain,
 )
+from softgym_envs.surrogate.data import strata
 from softgym_envs.surrogate.data.strata import JudgedStates, draw_commands, strata_of
 from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, doubt_text
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
@@ -70,6 +71,7 @@ def predicted_states(model, stratum, bodies, states, seed, noise=None):
         effort=np.zeros_like(displacement),
         effector=effector,
         slack=displacement > command,
+        touching=np.zeros(rows, dtype=bool),
         growth=np.ones(rows),
         apart=np.zeros(rows),
         found=np.ones(rows, dtype=bool),
@@ -225,7 +227,7 @@ def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
     robot = model.robot
     columns = [robot.design_space.names.index(name) for name in ("module_length", "outer_radius")]
 
-    def solve(robot, commands):
+    def solve(robot, commands, folder):
         count, states, n = commands.command.shape
         design = np.repeat(commands.design, states, axis=0)
         command = commands.command.reshape(-1, n)
@@ -239,7 +241,7 @@ def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
         rows, found = len(design), np.ones(len(design), bool)
         return JudgedStates(
             np.repeat(commands.stratum, states), np.repeat(np.arange(count), states), design, command, displacement,
-            command, effector, ~found, np.ones(rows), np.zeros(rows), found,
+            command, effector, ~found, ~found, np.ones(rows), np.zeros(rows), found,
         )  # fmt: skip
 
     monkeypatch.setattr(module, "solve_commands", solve)
@@ -273,7 +275,7 @@ def test_calibration_of_weights_from_start_to_end(tmp_path, monkeypatch):
     assert all(getattr(model.domain.calibration, name) > 0.0 for name in FACTOR_OF.values())
     card = (folder / "model.json").read_text()
     # A second run finds all states, and the same calibration, although the weights have been calibrated.
-    monkeypatch.setattr(module, "solve_commands", None)
+    monkeypatch.setattr(strata, "_solve_body", None)
     again = calibrate(folder, robot, bodies=6, states=2, attacks=16, state_folder=tmp_path / "states")
     assert (folder / "model.json").read_text() == card
     assert again.keys() == rows.keys()
@@ -295,6 +297,7 @@ def test_shipped_weights_hold_what_trust_promises(variant):
     assert model.domain.limit <= robot.goal_tolerance
     assert max(row["worst_trusted"] for row in (worst, *strata.values())) <= robot.goal_tolerance
     assert strata.keys() == set(strata_of(robot, buckles=model.domain.limits_growth))
+    touching = strata.pop("touching", None)
     assert all(0.94 < row["coverage"] < 0.97 for row in strata.values())
 
 

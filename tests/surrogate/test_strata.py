@@ -12,7 +12,6 @@ from softgym_envs.surrogate.data import strata
 from softgym_envs.surrogate.data.dataset import generate_dataset
 from softgym_envs.surrogate.data.sampling import SamplingPlan, pushed
 from softgym_envs.surrogate.data.strata import (
-    TOUCHING,
     Commands,
     JudgedStates,
     draw_commands,
@@ -134,7 +133,44 @@ def test_commands_and_bodies_without_equilibrium_are_marked(monkeypatch):
     assert np.isnan(states.effector[1]).all() and np.isfinite(states.effector[[0, 2]]).all()
 
 
-def test_states_that_touch_have_a_stratum_of_their_own():
+def test_bodies_lie_within_narrower_bounds():
+    robot = make_robot("finger")
+    bounds = {"joint_height": (0.0055, 0.007)}
+    column = robot.design_space.names.index("joint_height")
+    for stratum in strata_of(robot, buckles=False):
+        heights = draw_commands(robot, stratum, 40, 1, bounds=bounds).design[:, column]
+        assert heights.min() >= 0.0055 and heights.max() <= 0.007
+        at_bounds = np.isin(heights, bounds["joint_height"])
+        assert at_bounds.all() if "corners" in stratum else not at_bounds.all()
+
+
+def test_an_interrupted_run_continues_with_the_next_body(tmp_path, monkeypatch):
+    robot = make_robot("trunk")
+    commands = draw_commands(robot, "inside", 3, 2)
+    solved, solve = [], strata._solve_body
+
+    def counted(robot, commands, number, second_start):
+        if len(solved) == 2:
+            raise KeyboardInterrupt
+        solved.append(number)
+        return solve(robot, commands, number, second_start)
+
+    monkeypatch.setattr(strata, "_solve_body", counted)
+    with pytest.raises(KeyboardInterrupt):
+        solve_commands(robot, commands, folder=tmp_path)
+    assert solved == [0, 1]
+    solved[:] = [None]
+    states = solve_commands(robot, commands, folder=tmp_path)
+    assert solved == [None, 2]
+    assert states.body.tolist() == [0, 0, 1, 1, 2, 2]
+    assert (states.command == commands.command.reshape(-1, 6)).all()
+    # Other commands of the same body are solved.
+    solved[:] = []
+    other = Commands(commands.stratum[:1], commands.design[:1], 0.5 * commands.command[:1])
+    assert (solve_commands(robot, other, folder=tmp_path).command == other.command[0]).all() and solved == [0]
+
+
+def test_states_that_touch_are_marked():
     wall = {"kind": "plane", "point": [0.0, 0.045, 0.0], "normal": [0.0, -1.0, 0.0]}
     robot = make_robot("finger", obstacles=[wall])
     commands = draw_commands(robot, "inside", 1, 2)
@@ -142,7 +178,8 @@ def test_states_that_touch_have_a_stratum_of_their_own():
     commands.command[:] = [[[0.0, 0.0], [0.01, 0.01]]]
     states = solve_commands(robot, commands)
     assert states.found.all()
-    assert states.stratum.tolist() == ["inside", TOUCHING]
+    assert states.touching.tolist() == [False, True]
+    assert states.stratum.tolist() == ["inside", "inside"]
 
 
 def test_pushed_points_lie_on_faces_edges_and_vertices(rng):

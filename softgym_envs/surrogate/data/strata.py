@@ -6,7 +6,9 @@ of random bodies has hardly any of the states that matter to them, so each kind 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -31,11 +33,6 @@ DRAWN = ("inside", "faces", "corners", "slack corners", "near buckling")
 * ``near buckling``: bodies and commands from any of these whose actuators are expected to be softest; only for robots
   that can buckle.
 """
-
-TOUCHING = "touching"
-"""Stratum of all states in which the body touches something, wherever they were drawn."""
-
-STRATA = (*DRAWN, TOUCHING)
 
 SLACK = 1e-6
 """Actuators that end farther beyond their commands than this are slack [range]."""
@@ -64,7 +61,7 @@ class JudgedStates:
     """Commands and the FEM equilibria they lead to, N states.
 
     Attributes:
-        stratum: one of `STRATA`, shape (N,).
+        stratum: one of `DRAWN`, or ``adversarial`` (see `softgym_envs.surrogate.calibration.attack`), shape (N,).
         body: number of the body, shape (N,).
         design: shape (N, d).
         command: commanded displacements, shape (N, n_a).
@@ -72,6 +69,7 @@ class JudgedStates:
         effort: shape (N, n_a).
         effector: [m], shape (N, n_e).
         slack: which actuators are slack, shape (N, n_a).
+        touching: whether surfaces are in contact, shape (N,).
         growth: how many times softer the actuators are than at rest, in the softest direction; infinite for states that
             are stable only while their actuators are held, shape (N,).
         apart: distance of the effector from that of the equilibrium found from another start [m], shape (N,): more than
@@ -87,6 +85,7 @@ class JudgedStates:
     effort: np.ndarray
     effector: np.ndarray
     slack: np.ndarray
+    touching: np.ndarray
     growth: np.ndarray
     apart: np.ndarray
     found: np.ndarray
@@ -144,6 +143,7 @@ def draw_commands(
     states: int,
     seed: int = 0,
     softness: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> Commands:
     """Return random bodies and commands of one stratum.
 
@@ -154,6 +154,7 @@ def draw_commands(
         states: commands of each body.
         seed: of the random numbers.
         softness: for ``near buckling``: returns the expected growth (N,) of bodies (N, d) under commands (N, n_a).
+        bounds: narrower bounds of design variables; default those of the robot.
 
     Raises:
         ValueError: for an unknown stratum, or one that needs ``softness``.
@@ -161,12 +162,15 @@ def draw_commands(
     if stratum not in DRAWN:
         raise ValueError(f"stratum = {stratum!r} is unknown; allowed: {', '.join(map(repr, DRAWN))}")
     rng = np.random.default_rng([seed, DRAWN.index(stratum)])
-    space, names, count = robot.design_space, learned_variables(robot), len(robot.actuators)
+    space, names, count = robot.design_space.within(bounds or {}), learned_variables(robot), len(robot.actuators)
     if stratum == "near buckling":
         if softness is None:
             raise ValueError("states near buckling need an estimate of the softness")
         kinds = [k for k in strata_of(robot, buckles=False)]
-        pool = [draw_commands(robot, kind, 2 * groups, CANDIDATES, int(rng.integers(2**31))) for kind in kinds]
+        pool = [
+            draw_commands(robot, kind, 2 * groups, CANDIDATES, int(rng.integers(2**31)), bounds=bounds)
+            for kind in kinds
+        ]
         design, command = (np.concatenate([getattr(p, f) for p in pool]) for f in ("design", "command"))
         growth = softness(np.repeat(design, CANDIDATES, axis=0), command.reshape(-1, count)).reshape(len(design), -1)
         # The softest states of a body first; bodies by how soft the last of its chosen states is.
@@ -203,55 +207,82 @@ def _vertices(dimension: int, count: int, rng: np.random.Generator) -> np.ndarra
     return (numbers[:, None] >> np.arange(dimension) & 1).astype(float)
 
 
-def solve_commands(robot: Robot, commands: Commands, *, second_start: bool = False) -> JudgedStates:
+def solve_commands(
+    robot: Robot, commands: Commands, *, second_start: bool = False, folder: str | Path | None = None
+) -> JudgedStates:
     """Return the FEM equilibria under commands; bodies that are infeasible or have no state at rest are left out.
 
     Each state is reached from the nearest state before it, as an environment reaches it. With ``second_start`` it is
     reached from rest, at about twice the cost, and compared with the other one: they differ if there are several
     equilibria. Cables of a robot whose energy is not convex can push, as they can in its learned model.
+
+    Args:
+        robot: the robot.
+        commands: bodies and their commands.
+        second_start: also solve each command from rest.
+        folder: where the states of each body are kept, so that an interrupted run continues with the next body.
     """
-    count, size, span = len(robot.actuators), 3 * len(robot.effectors), robot.upper - robot.lower
     parts = []
     for number in range(len(commands.design)):
-        design = dict(zip(robot.design_space.names, commands.design[number].tolist(), strict=True))
-        wanted = commands.command[number]
-        try:
-            statics = Statics(robot.build(design))
-            if not robot.convex:
-                statics.unilateral = np.zeros(count, dtype=bool)
-            rest = statics.solve(np.zeros(count), robot.rest_mode)
-            if robot.rest_mode == "effort" and statics.model.loads.any():
-                rest = statics.solve(np.zeros(count))
-        except (InfeasibleDesign, ConvergenceError):
-            continue
-        rows = len(wanted)
-        part = JudgedStates(
-            stratum=np.full(rows, commands.stratum[number], dtype=f"<U{max(map(len, STRATA))}"),
-            body=np.zeros(rows, dtype=np.int64),
-            design=np.tile(commands.design[number], (rows, 1)),
-            command=wanted,
-            displacement=np.full((rows, count), np.nan),
-            effort=np.full((rows, count), np.nan),
-            effector=np.full((rows, size), np.nan),
-            slack=np.zeros((rows, count), dtype=bool),
-            growth=np.full(rows, np.nan),
-            apart=np.full(rows, np.nan),
-            found=np.zeros(rows, dtype=bool),
-        )
-        for k, found in solve_path(robot, statics, rest, wanted):
-            if found is None:
-                continue
-            if second_start:
-                other, found = found, _from_rest(statics, rest, wanted[k], found)
-                part.apart[k] = np.abs(found.condensed.delta.e - other.condensed.delta.e).max()
-            part.displacement[k], part.effort[k] = found.condensed.delta.a, found.condensed.lambda_.a
-            part.effector[k], part.found[k] = found.condensed.delta.e, True
-            part.slack[k] = statics.unilateral & (part.displacement[k] > wanted[k] + SLACK * span)
-            part.growth[k] = growth_of(rest, found)
-            if found.contacts is not None and np.isfinite(found.contacts.smallest_gap):
-                part.stratum[k] = TOUCHING
+        path = None if folder is None else Path(folder) / f"{_key(robot, commands, number, second_start)}.npz"
+        if path is not None and path.exists():
+            part = JudgedStates.load(path)
+        else:
+            part = _solve_body(robot, commands, number, second_start)
+            if path is not None:
+                part.save(path)
         parts.append(part)
     return JudgedStates.join(parts)
+
+
+def _key(robot: Robot, commands: Commands, number: int, second_start: bool) -> str:
+    """Return a name for the states of one body, by everything that they depend on."""
+    text = json.dumps([robot.name, robot.mechanics_key, str(commands.stratum[number]), second_start])
+    values = commands.design[number].tobytes() + commands.command[number].tobytes()
+    return hashlib.sha256(text.encode() + values).hexdigest()[:16]
+
+
+def _solve_body(robot: Robot, commands: Commands, number: int, second_start: bool) -> JudgedStates:
+    """Return the states of one body; no rows if it is infeasible or has no state at rest."""
+    count, size, span = len(robot.actuators), 3 * len(robot.effectors), robot.upper - robot.lower
+    design = dict(zip(robot.design_space.names, commands.design[number].tolist(), strict=True))
+    wanted = commands.command[number]
+    rows = len(wanted)
+    part = JudgedStates(
+        stratum=np.full(rows, commands.stratum[number]),
+        body=np.zeros(rows, dtype=np.int64),
+        design=np.tile(commands.design[number], (rows, 1)),
+        command=wanted,
+        displacement=np.full((rows, count), np.nan),
+        effort=np.full((rows, count), np.nan),
+        effector=np.full((rows, size), np.nan),
+        slack=np.zeros((rows, count), dtype=bool),
+        touching=np.zeros(rows, dtype=bool),
+        growth=np.full(rows, np.nan),
+        apart=np.full(rows, np.nan),
+        found=np.zeros(rows, dtype=bool),
+    )
+    try:
+        statics = Statics(robot.build(design))
+        if not robot.convex:
+            statics.unilateral = np.zeros(count, dtype=bool)
+        rest = statics.solve(np.zeros(count), robot.rest_mode)
+        if robot.rest_mode == "effort" and statics.model.loads.any():
+            rest = statics.solve(np.zeros(count))
+    except (InfeasibleDesign, ConvergenceError):
+        return part.rows(np.zeros(0, dtype=np.int64))
+    for k, found in solve_path(robot, statics, rest, wanted):
+        if found is None:
+            continue
+        if second_start:
+            other, found = found, _from_rest(statics, rest, wanted[k], found)
+            part.apart[k] = np.abs(found.condensed.delta.e - other.condensed.delta.e).max()
+        part.displacement[k], part.effort[k] = found.condensed.delta.a, found.condensed.lambda_.a
+        part.effector[k], part.found[k] = found.condensed.delta.e, True
+        part.slack[k] = statics.unilateral & (part.displacement[k] > wanted[k] + SLACK * span)
+        part.touching[k] = found.contacts is not None and np.isfinite(found.contacts.smallest_gap)
+        part.growth[k] = growth_of(rest, found)
+    return part
 
 
 def _from_rest(statics: Statics, rest: Equilibrium, command: np.ndarray, known: Equilibrium) -> Equilibrium:
