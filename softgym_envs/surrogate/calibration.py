@@ -294,9 +294,7 @@ def calibrate(
 # -- the worst trusted states --------------------------------------------------------------------------------------
 
 
-def attack(
-    model: SurrogateModel, count: int, states: int, seed: int, folder: str | Path | None = None
-) -> JudgedStates:
+def attack(model: SurrogateModel, count: int, states: int, seed: int, folder: str | Path | None = None) -> JudgedStates:
     """Search for trusted states with large errors; return all that were judged, in the stratum ``adversarial``.
 
     In each of `ROUNDS` rounds, gradients of the spread move bodies and commands from anywhere in their boxes to where
