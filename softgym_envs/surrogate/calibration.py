@@ -14,7 +14,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +118,10 @@ def predict(model: SurrogateModel, states: JudgedStates) -> Predictions:
 
 def report(model: SurrogateModel, states: JudgedStates) -> dict[str, StratumReport]:
     """Return how a model does in each stratum of judged states, and in all that touch, under `TOUCHING`."""
-    every = predict(model, states)
+    return _by_stratum(predict(model, states), states)
+
+
+def _by_stratum(every: Predictions, states: JudgedStates) -> dict[str, StratumReport]:
     groups = {str(stratum): states.stratum == stratum for stratum in dict.fromkeys(states.stratum.tolist())}
     if states.touching.any():
         groups[TOUCHING] = states.touching
@@ -289,6 +292,29 @@ def calibrate(
     }  # fmt: skip
     write_json(card_path, card)
     return found
+
+
+def cross_validated(model: SurrogateModel, states: JudgedStates, folds: int = 16) -> dict[str, StratumReport]:
+    """Return how a model does where its calibration has not seen the body, for states too expensive to solve others.
+
+    Bodies are divided into parts. Factors and limit of trust for the states of each part are those of all other parts.
+
+    Args:
+        model: its own calibration is not used.
+        states: those of the calibration, with or without those of an attack.
+        folds: number of parts.
+    """
+    tolerance, parts, order = model.robot.goal_tolerance, [], []
+    for fold in range(folds):
+        left_out = states.body % folds == fold
+        known = states.rows(~left_out)
+        calibration = fit_calibration(model, known)
+        limit = safe_limit(predict(_calibrated(model, calibration, tolerance), known), tolerance)
+        parts.append(predict(_calibrated(model, calibration, limit), states.rows(left_out)))
+        order.append(np.flatnonzero(left_out))
+    back = np.argsort(np.concatenate(order))
+    every = Predictions(*(np.concatenate([getattr(part, f.name) for part in parts])[back] for f in fields(Predictions)))
+    return _by_stratum(every, states)
 
 
 # -- the worst trusted states --------------------------------------------------------------------------------------

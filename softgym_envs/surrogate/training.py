@@ -41,7 +41,7 @@ class SplitConfig(Config):
 
     groups: int = Field(gt=0)
     states: int = Field(ge=0)
-    sequence: Literal["halton", "sobol", "latin", "random"] = "random"
+    sequence: Literal["halton", "sobol", "latin", "random", "vertices"] = "random"
     seed: int = Field(default=0, ge=0)
     boundary: float | None = Field(default=None, ge=0.0, le=1.0)
     share: float = Field(default=1.0, gt=0.0, le=1.0)
@@ -50,6 +50,7 @@ class SplitConfig(Config):
 class DataConfig(Config):
     """Three separate datasets. The validation set chooses the best step of a training; the test set is used once.
 
+    ``more`` is a second set of training states, for example bodies at the vertices of the design box.
     Seeds default to 0, 1 and 2. An interrupted run keeps finished shards of ``groups_per_shard`` bodies; choose small
     ones where a body takes long.
     """
@@ -57,6 +58,7 @@ class DataConfig(Config):
     train: SplitConfig
     validation: SplitConfig
     test: SplitConfig
+    more: SplitConfig | None = None
     margin: float = Field(default=0.1, ge=0.0, le=1.0)
     vary: tuple[str, ...] | None = None
     design: dict[str, float] = {}
@@ -90,7 +92,7 @@ class DataConfig(Config):
 
     def plan_of(self, split: SplitConfig) -> SamplingPlan:
         """Return the plan of another split, with the margin and the design variables of this one."""
-        shared = self.model_dump(exclude={*SPLITS, "groups_per_shard"})
+        shared = self.model_dump(exclude={*SPLITS, "more", "groups_per_shard"})
         return SamplingPlan(**{**shared, **split.model_dump(exclude_none=True)})
 
 
@@ -268,14 +270,16 @@ def generate_datasets(
     """Return the datasets of a surrogate; whatever is missing is generated.
 
     Returns:
-        ``train``, ``validation`` and ``test``; with pretraining also ``pretraining/train`` and
-        ``pretraining/validation``; with a correction also ``correction/coarser``, ``correction/own`` and
-        ``correction/finer``.
+        ``train``, ``validation`` and ``test``; with more training states also ``more/train``; with pretraining also
+        ``pretraining/train`` and ``pretraining/validation``; with a correction also ``correction/coarser``,
+        ``correction/own`` and ``correction/finer``.
     """
     if not (Path(data_folder) / "config.yaml").exists():  # an existing file is kept until the data are accepted
         save_resolved(data_folder, config)
     options, data = config.robot_options, config.data
     plans = {split: (options, data.plan(split)) for split in SPLITS}
+    if data.more is not None:
+        plans["more/train"] = options, data.plan_of(data.more)
     if coarse := config.pretraining:
         for split in ("train", "validation"):
             plans[f"pretraining/{split}"] = options | coarse.robot_options, data.plan_of(getattr(coarse, split))
@@ -339,6 +343,8 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         name: with_mirror_images(robot, columns) if name.endswith("train") else columns
         for name, columns in data.items()
     }
+    if more := learned.pop("more/train", None):
+        learned["train"] = {name: np.concatenate([column, more[name]]) for name, column in learned["train"].items()}
     states = {name: training_states(robot, columns, features) for name, columns in learned.items()}
     key = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:12]
     trainer = Trainer(config.network, config.seed, folder / "parts", key, progress, config.workers)

@@ -211,6 +211,25 @@ def test_every_stratum_is_covered_on_new_states(robot, bodies, off):
     assert found.inside < found.corners < found.slack_corners
 
 
+def test_bodies_that_are_left_out_are_judged_by_the_others(trunk):
+    kinds = strata_of(trunk.robot, buckles=False)
+    states = JudgedStates.join(
+        [
+            predicted_states(trunk, kind, 10, 2, seed=k, noise=lambda spread, rng: spread * rng.uniform(0.9, 1.0))
+            for k, kind in enumerate(kinds)
+        ]
+    )
+    # With 20 states, the largest error of a stratum is the bound. One body is off by far more than all others.
+    odd = np.flatnonzero(states.body == 7)
+    states.effector[odd, :3] += 50.0 * predict(trunk, states).spread.max()
+    calibrated = module._calibrated(trunk, fit_calibration(trunk, states))
+    assert report(calibrated, states)["inside"].coverage >= 0.95
+    rows = module.cross_validated(trunk, states, folds=40)
+    assert rows.keys() == set(kinds)
+    assert all(row.states == 20 for row in rows.values())
+    assert rows["inside"].coverage <= 0.9
+
+
 def test_the_limit_is_below_all_wrong_states():
     def judged(error, uncertainty):
         values = np.array(error), np.array(uncertainty)

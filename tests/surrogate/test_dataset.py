@@ -103,6 +103,17 @@ def test_sequences_spread_evenly():
             assert len(set((column * total).astype(int))) >= share * total
 
 
+def test_designs_at_vertices():
+    plan = SamplingPlan(20, 2, "vertices", seed=3, bounds={"joint_height": (0.0055, 0.007)})
+    points = plan.unit_points(4, 0, 20, 20, 0)
+    assert len(np.unique(points[:16], axis=0)) == 16 and np.isin(points, (0.0, 1.0)).all()
+    robot = make_robot("finger")
+    designs = plan.designs(robot, 0, 20)
+    assert {design["joint_height"] for design in designs} == {0.0055, 0.007}
+    assert {design["young_modulus"] for design in designs} == {robot.design_space["young_modulus"].baseline}
+    assert not np.isin(plan.commands(robot, 0), (robot.lower[0], robot.upper[0])).any()
+
+
 def test_designs():
     robot = make_robot("finger")
     space = robot.design_space

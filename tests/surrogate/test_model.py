@@ -535,7 +535,8 @@ def test_fit_of_three_fidelities(tmp_path):
     fidelities = {
         "robot": "trunk",
         "robot_options": {"mesh": "accurate"},
-        "data": splits(train={"groups": 6}, validation={"groups": 2}, test={"groups": 1}) | {"groups_per_shard": 2},
+        "data": splits(train={"groups": 6}, validation={"groups": 2}, test={"groups": 1})
+        | {"more": {"groups": 2, "states": 1, "sequence": "vertices"}, "groups_per_shard": 2},
         "pretraining": {
             "robot_options": {"mesh": "published"},
             "train": {"groups": 20, "states": 8, "sequence": "halton"},
@@ -559,6 +560,10 @@ def test_fit_of_three_fidelities(tmp_path):
         np.testing.assert_array_equal(level["design"], levels[1]["design"])
     robot = make_robot("trunk", mesh="accurate")
     model = load_model(tmp_path / "model", robot)
+    more = load_dataset(tmp_path / "data" / "more" / "train")
+    train = load_dataset(tmp_path / "data" / "train")
+    images = 1 if robot.mirror is None else 2
+    assert model.card["states"]["train"] == images * (len(train["rest"]) + len(more["rest"]))
     assert model.card["states"]["pretraining/train"] > 150 and model.card["correction"]["states"] == 3
     features = model.features.design(levels[1]["design"])
     assert model.correction == fit_correction(levels, (4.0, 2.0, 1.0), features)

@@ -22,8 +22,9 @@ from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.features import learned_variables
 
-SEQUENCES = ("halton", "sobol", "latin", "random")
-"""Kinds of points: scrambled Halton and Sobol sequences, a Latin hypercube, independent draws."""
+SEQUENCES = ("halton", "sobol", "latin", "random", "vertices")
+"""Kinds of points: scrambled Halton and Sobol sequences, a Latin hypercube, independent draws, and for the designs the
+vertices of their box with independent draws of the commands."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,9 @@ class SamplingPlan:
         """Points ``first .. first + count`` of ``total`` in [0, 1], shape (count, dimension)."""
         if dimension == 0 or count == 0:
             return np.zeros((count, dimension))
-        if self.sequence == "random":
+        if self.sequence == "vertices" and stream == 0:
+            return vertices(dimension, total, np.random.default_rng([self.seed, stream]))[first : first + count]
+        if self.sequence in ("random", "vertices"):
             rows = range(first, first + count)
             return np.stack([np.random.default_rng([self.seed, stream, row]).random(dimension) for row in rows])
         from scipy.stats import qmc
@@ -147,6 +150,15 @@ def pushed(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """
     share = rng.random((len(points), 1))
     return np.where(rng.random(points.shape) < share, np.round(points), points)
+
+
+def vertices(dimension: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return vertices of the unit cube (count, dimension): if possible all before any twice."""
+    if dimension > 16:
+        return rng.integers(2, size=(count, dimension)).astype(float)
+    all_of_them = [rng.permutation(2**dimension) for _ in range(-(-count // 2**dimension))]
+    numbers = np.concatenate(all_of_them)[:count]
+    return (numbers[:, None] >> np.arange(dimension) & 1).astype(float)
 
 
 def path_order(points: np.ndarray, start: np.ndarray) -> np.ndarray:

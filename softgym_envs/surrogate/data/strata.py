@@ -19,7 +19,7 @@ from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write, read_npz
-from softgym_envs.surrogate.data.sampling import solve_path
+from softgym_envs.surrogate.data.sampling import solve_path, vertices
 from softgym_envs.surrogate.features import learned_variables
 
 DRAWN = ("inside", "faces", "corners", "slack corners", "near buckling")
@@ -184,7 +184,7 @@ def draw_commands(
         which = rng.integers(len(names), size=groups)
         points[np.arange(groups), which] = np.round(points[np.arange(groups), which])
     elif stratum in ("corners", "slack corners"):
-        points = _vertices(len(names), groups, rng)
+        points = vertices(len(names), groups, rng)
     fractions = rng.random((groups * states, count))
     if stratum == "slack corners":
         fractions = np.round(fractions)
@@ -196,15 +196,6 @@ def draw_commands(
         design[:, space.names.index(name)] = variable.low + points[:, k] * (variable.high - variable.low)
     command = robot.displacements(fractions).reshape(groups, states, count)
     return Commands(np.full(groups, stratum), design, command)
-
-
-def _vertices(dimension: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return vertices of the unit cube (count, dimension): if possible all before any twice."""
-    if dimension > 16:
-        return rng.integers(2, size=(count, dimension)).astype(float)
-    all_of_them = [rng.permutation(2**dimension) for _ in range(-(-count // 2**dimension))]
-    numbers = np.concatenate(all_of_them)[:count]
-    return (numbers[:, None] >> np.arange(dimension) & 1).astype(float)
 
 
 def solve_commands(
