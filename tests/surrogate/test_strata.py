@@ -133,6 +133,23 @@ def test_commands_and_bodies_without_equilibrium_are_marked(monkeypatch):
     assert np.isnan(states.effector[1]).all() and np.isfinite(states.effector[[0, 2]]).all()
 
 
+def test_mirror_images_of_commands_are_not_solved_again(monkeypatch):
+    robot = make_robot("finger", mesh="accurate", mesh_size=0.02, self_contact=False)
+    space, count = robot.design_space, []
+    command = np.array([[[0.01, 0.0], [0.002, 0.006], [0.0, 0.01], [0.01, 0.0]]])
+    commands = Commands(np.array(["inside"]), space.complete(None).array[None], command)
+    solve = Statics.solve
+    monkeypatch.setattr(Statics, "solve", lambda *args: (count.append(1), solve(*args))[1])
+    states = solve_commands(robot, commands)
+    assert states.found.all()
+    solved = len(count)
+    monkeypatch.setattr(robot, "mirror", None)
+    every = solve_commands(robot, commands)
+    assert len(count) == 2 * solved + 1
+    for name in ("displacement", "effort", "effector", "slack", "growth"):
+        np.testing.assert_allclose(getattr(states, name), getattr(every, name), rtol=1e-6, atol=1e-9)
+
+
 def test_bodies_lie_within_narrower_bounds():
     robot = make_robot("finger")
     bounds = {"joint_height": (0.0055, 0.007)}

@@ -262,7 +262,10 @@ def _solve_body(robot: Robot, commands: Commands, number: int, second_start: boo
             rest = statics.solve(np.zeros(count))
     except (InfeasibleDesign, ConvergenceError):
         return part.rows(np.zeros(0, dtype=np.int64))
-    for k, found in solve_path(robot, statics, rest, wanted):
+    source, image = _repeated(robot, wanted)
+    own = np.unique(source)
+    for row, found in solve_path(robot, statics, rest, wanted[own]):
+        k = own[row]
         if found is None:
             continue
         if second_start:
@@ -273,7 +276,33 @@ def _solve_body(robot: Robot, commands: Commands, number: int, second_start: boo
         part.slack[k] = statics.unilateral & (part.displacement[k] > wanted[k] + SLACK * span)
         part.touching[k] = found.contacts is not None and np.isfinite(found.contacts.smallest_gap)
         part.growth[k] = growth_of(rest, found)
+    for name in ("displacement", "effort", "effector", "slack", "touching", "growth", "apart", "found"):
+        getattr(part, name)[:] = getattr(part, name)[source]
+    if image.any():
+        for name in ("displacement", "effort", "slack"):
+            getattr(part, name)[image] = getattr(part, name)[image][:, list(robot.mirror or ())]
+        part.effector[image, ::3] *= -1.0
     return part
+
+
+def _repeated(robot: Robot, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which commands (n, n_a) need no solution of their own.
+
+    Returns:
+        For each command, the number of the first that is equal to it or its mirror image (`Robot.mirror`), its own if
+        there is none before; and whether it is the mirror image of that one.
+    """
+    source, image = np.arange(len(commands)), np.zeros(len(commands), dtype=bool)
+    for k, command in enumerate(commands):
+        for first in range(k):
+            if np.array_equal(command, commands[first]):
+                source[k] = first
+            elif robot.mirror is not None and np.array_equal(command, commands[first][list(robot.mirror)]):
+                source[k], image[k] = first, True
+            else:
+                continue
+            break
+    return source, image
 
 
 def _from_rest(statics: Statics, rest: Equilibrium, command: np.ndarray, known: Equilibrium) -> Equilibrium:
