@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from benchmarks.learners import REPORTS, SCORES, TASKS, spread
 from benchmarks.recorded import figure, number, records, results
@@ -218,19 +219,24 @@ def test_set() -> str:
 
 
 def trust() -> str:
-    """Errors, coverage and trust of calibrated weights, by stratum."""
+    """Errors, coverage and trust of calibrated weights, by stratum.
+
+    Intervals of the coverage are those of a share of independent states (Clopper and Pearson, 95 %).
+    """
     rows = []
-    for name, title in WEIGHTS.items():
+    for name, title in (WEIGHTS | {"finger_2cables_accurate": "finger, 2 cables, accurate mesh"}).items():
         found = {k.removeprefix(f"{name}: "): v for k, v in results("trust").items() if k.startswith(f"{name}: ")}
         for stratum, row in found.items():
             if not isinstance(row, dict):
                 continue
-            cells = [str(row["states"]), *(short(row[k]) for k in ("mean", "worst"))]
-            cells += [f"{row['coverage']:.1f}", f"{row['trusted']:.0f}", short(row["worst_trusted"])]
-            cells.append(f"{found['goal tolerance [mm]']:.3g}")
+            states = row["states"]
+            interval = binomtest(round(row["coverage"] / 100 * states), states).proportion_ci()
+            covered = f"{row['coverage']:.1f} ({100 * interval.low:.0f} to {100 * interval.high:.0f})"
+            cells = [str(states), *(short(row[k]) for k in ("mean", "worst")), covered, f"{row['trusted']:.0f}"]
+            cells += [short(row["worst_trusted"]) if row["trusted"] else "", f"{found['goal tolerance [mm]']:.3g}"]
             rows.append([title, stratum, *cells])
             title = ""
-    head = ["weights", "stratum", "states", "error, mean [mm]", "worst [mm]", "covered [%]", "trusted [%]"]
+    head = ["weights", "stratum", "states", "error, mean [mm]", "worst [mm]", "covered (95 %) [%]", "trusted [%]"]
     return markdown([*head, "worst trusted [mm]", "goal tolerance [mm]"], rows, "llrrrrrrr")
 
 

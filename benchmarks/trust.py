@@ -13,13 +13,13 @@ SEED = 12
 def trust(folder: str | Path = "results/trust") -> dict[str, object]:
     """Errors, coverage and trust under given commands by stratum, on FEM states that the calibration has not seen.
 
-    ``adversarial`` is another search for trusted states with large errors, with the limit of trust as it is. As many
-    states as the calibration of the weights used; those of a robot are kept in the folder. Weights that have not been
-    calibrated are left out.
+    As many states as the calibration of the weights used; those of a robot are kept in the folder. States of an
+    accurate mesh take many seconds, so there the states of the calibration serve again: those of each body are judged
+    by the calibration of all others. ``adversarial`` is a new search for trusted states with large errors, with the
+    limit of trust as it is. Weights that have not been calibrated are left out.
     """
     from softgym_envs.robots.registry import make_robot
-    from softgym_envs.surrogate.calibration import attack, judged_states, report
-    from softgym_envs.surrogate.data.strata import JudgedStates
+    from softgym_envs.surrogate.calibration import attack, cross_validated, judged_states, report
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
 
     result: dict[str, object] = {}
@@ -28,17 +28,17 @@ def trust(folder: str | Path = "results/trust") -> dict[str, object]:
         model = pretrained_model(robot)
         if "calibration" not in model.card:
             continue
-        sizes, start = model.card["calibration"], time.process_time()
-        states = judged_states(model, sizes["bodies"], sizes["states"], SEED, Path(folder) / variant)
-        path = Path(folder) / variant / f"adversarial_{sizes['attacks']}_{SEED}.npz"
-        if path.exists():
-            attacked = JudgedStates.load(path)
-        else:
-            attacked = attack(model, sizes["attacks"], sizes["states"], SEED)
-            attacked.save(path)
+        sizes, start, kept = model.card["calibration"], time.process_time(), Path(folder) / variant
+        expensive = "mesh" in robot.mechanics_key
+        seed = sizes["seed"] if expensive else SEED
+        states = judged_states(model, sizes["bodies"], sizes["states"], seed, kept)
+        attacked = attack(model, sizes["attacks"], sizes["states"], SEED, kept)
+        rows = cross_validated(model, states) if expensive else report(model, states)
+        rows["adversarial"] = report(model, attacked)["adversarial"]
         result[f"{variant}: goal tolerance [mm]"] = 1e3 * robot.goal_tolerance
         result[f"{variant}: trusted below an uncertainty of [mm]"] = 1e3 * model.domain.limit
-        for stratum, row in report(model, JudgedStates.join([states, attacked])).items():
+        result[f"{variant}: bodies"] = "of the calibration, each left out of it" if expensive else "new ones"
+        for stratum, row in rows.items():
             lengths = {k: 1e3 * getattr(row, k) for k in ("mean", "worst", "worst_trusted")}
             shares = {k: 100 * getattr(row, k) for k in ("coverage", "trusted")}
             result[f"{variant}: {stratum}"] = asdict(replace(row, **lengths, **shares))
