@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from benchmarks.learners import REPORTS, SCORES, TASKS, spread
-from benchmarks.recorded import figure, number, records, results
+from benchmarks.recorded import figure, number, records, records, results
 from softgym_envs.agents.results import LEARNERS, MODEL_BASED
 
 WEIGHTS = {
@@ -358,24 +358,24 @@ def _path_errors(benchmark: str, head: str) -> str:
 
 
 def robustness() -> str:
-    """Controllers of the finger on plants unlike their model: goals reached and mean final distance."""
-    from benchmarks.robustness import CONTROLLERS, PLANTS
+    """Controllers on plants unlike their model, of every robot that was run: goals reached and mean final distance."""
+    from benchmarks.robustness import BENCHMARKS, CONTROLLERS, PLANTS
 
-    group = "robustness_finger"
-    rows = [
-        [
-            plant,
-            *(
-                figure(group, f"{name}, {plant}: goals reached [%]", ".0f")
-                + " %, "
-                + figure(group, f"{name}, {plant}: mean distance [mm]", ".2f")
-                + " mm"
-                for name in CONTROLLERS
-            ),
-        ]
-        for plant in PLANTS
-    ]
-    return markdown(["plant", *CONTROLLERS], rows, "lrrr")
+    rows = []
+    for group in (name for name in BENCHMARKS if name in records()):
+        found = results(group)
+        for plant in PLANTS:
+            keys = [f"{name}, {plant}" for name in CONTROLLERS]
+            if f"{keys[0]}: goals reached [%]" in found:
+                cells = [
+                    figure(group, f"{key}: goals reached [%]", ".0f")
+                    + " %, "
+                    + figure(group, f"{key}: mean distance [mm]", ".2f")
+                    + " mm"
+                    for key in keys
+                ]
+                rows.append([group.removeprefix("robustness_").capitalize(), plant, *cells])
+    return markdown(["robot", "plant", *CONTROLLERS], rows, "llrrr")
 
 
 def side_by_side() -> str:
