@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from benchmarks.learners import REPORTS, SCORES, TASKS, spread
-from benchmarks.recorded import figure, number, records, records, results
+from benchmarks.recorded import figure, number, records, results
 from softgym_envs.agents.results import LEARNERS, MODEL_BASED
 
 WEIGHTS = {
