@@ -17,6 +17,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.stats import chi2
 
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.estimation import Estimator, Noise, Readings, Touch, finger_grid
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.registry import make_robot
@@ -43,7 +44,7 @@ def measure(
     noise = Noise(displacement=1e-4, volume=noise_share * float(np.abs(change).mean()))
     grid = finger_grid(pitch)
     tip, force, inside, forces_inside, misfits, certain = [], [], [], [], [], []
-    cpu, alone, steps, solved = 0.0, [], 0, 0
+    cpu, alone, steps, solved, buckled = 0.0, [], 0, 0, 0
     for _ in range(touches):
         cell = (int(rng.integers(grid.cells[0])), int(rng.integers(grid.cells[1])))
         corners = grid.corners(cell)
@@ -56,7 +57,11 @@ def measure(
         estimator = Estimator(robot, design=design, load=Touch(grid, cell, FORCE), noise=noise)
         body = robot.build(design)
         body.add_contact("touch", point, radius=estimator.radius)
-        state = Statics(body).solve(pull, contact=true_force * np.array(grid.normal))
+        try:
+            state = Statics(body).solve(pull, contact=true_force * np.array(grid.normal))
+        except ConvergenceError:  # the finger has buckled: there is no reading to explain
+            buckled += 1
+            continue
         volumes = estimator.rest_volumes + state.condensed.delta.s
         begin, found_equilibria = time.process_time(), 0
         for _ in range(readings):
@@ -84,7 +89,8 @@ def measure(
     size = np.abs(force)
     return {
         "cavities": cavities,
-        "touches": touches,
+        "touches": len(tip),
+        "touches without equilibrium": buckled,
         "readings": readings,
         "volume noise [mm3]": noise.volume * 1e9,
         "tip error mean [% of length]": 100 * float(np.mean(tip)) / LENGTH,
