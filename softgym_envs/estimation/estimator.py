@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.stats import chi2
 
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.estimation.loads import Load
 from softgym_envs.estimation.places import Mixture
 from softgym_envs.estimation.posterior import Gaussian, Posterior, most_probable
@@ -119,9 +120,10 @@ def held_response(condensed: CondensedModel, slack: np.ndarray) -> tuple[np.ndar
 
 @dataclass(frozen=True)
 class Linearised:
-    """A body near one equilibrium: its condensed model, at which displacements and forces."""
+    """A body near one equilibrium: its condensed model, at which displacements, load and forces."""
 
     displacement: np.ndarray
+    load: np.ndarray
     forces: np.ndarray
     state: Equilibrium
 
@@ -242,7 +244,7 @@ class Estimator:
         """
         n_e, forces = self._counts[1], self.forces(load)
         state = self._statics.solve(displacement, effector_force=forces[:n_e], contact=forces[n_e:])
-        return Linearised(displacement, forces, state)
+        return Linearised(displacement, load, forces, state)
 
     def predict(self, near: Linearised, displacement: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the readings without noise (k,) that a condensed model predicts, and their derivative (k, n_a + m)."""
@@ -295,7 +297,7 @@ class Estimator:
 
         Raises:
             ValueError: if readings have a wrong shape or are not finite, as with a lost sensor.
-            ConvergenceError: if the body has no equilibrium at parameters that were tried.
+            ConvergenceError: if the body has no equilibrium under the command, at the most probable load before it.
         """
         n_a = self._counts[0]
         assert self.belief is not None
@@ -373,7 +375,22 @@ class Estimator:
             close = self._close(near, displacement, load, posterior.parameters)
             if close or solved >= most:
                 return _Found(near, posterior, close, solved)
-            near, solved = self.linearise(displacement, load), solved + 1
+            nearer, solved = self._towards(near, displacement, load), solved + 1
+            if nearer is None:
+                return _Found(near, posterior, False, solved)
+            near = nearer
+
+    def _towards(self, near: Linearised, displacement: np.ndarray, load: np.ndarray) -> Linearised | None:
+        """Return the body at an estimate or, where it buckles before, on the way there; None if it does at once."""
+        for share in (1.0, 0.5, 0.25, 0.125):
+            try:
+                return self.linearise(
+                    near.displacement + share * (displacement - near.displacement),
+                    near.load + share * (load - near.load),
+                )
+            except ConvergenceError:
+                continue
+        return None
 
     def _released(self, command: np.ndarray, parameters: np.ndarray) -> Linearised:
         """Return the body near the equilibrium for parameters (n_a + m,) with all of its cables slack."""
@@ -383,7 +400,7 @@ class Estimator:
         modes = ["effort" if free else "displacement" for free in loose]
         target = np.where(loose, 0.0, displacement)
         state = self._statics.solve(target, modes, effector_force=forces[:n_e], contact=forces[n_e:])
-        return Linearised(displacement, forces, replace(state, slack=loose))
+        return Linearised(displacement, parameters[n_a:], forces, replace(state, slack=loose))
 
     def _close(self, near: Linearised, displacement: np.ndarray, load: np.ndarray, found: Gaussian) -> bool:
         """Whether an estimate is within the accuracy of the equilibrium near which it was found."""

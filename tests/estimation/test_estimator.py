@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.estimation import Estimator, Noise, Payload, Readings, Touch, finger_grid
 from softgym_envs.mechanics.solvers.statics import Statics
 
@@ -161,3 +162,22 @@ def test_a_push_that_slackens_the_cable_is_not_taken_for_a_long_cable():
     assert found.misfit < 1.0 and found.near.state.slack.all()
     assert found.load[0] == pytest.approx(load[0], rel=0.05)
     assert abs(found.displacement[0] - command[0]) < 3e-4
+
+
+def test_an_estimate_beyond_the_last_equilibrium_is_sought_as_far_as_the_body_stands(monkeypatch):
+    estimator = finger_estimator(2)
+    command, load = np.array([0.006]), np.array([2.0, 0.0, 0.0])
+    readings, _ = estimator.predict(estimator.linearise(command, load), command, load)
+    estimator.touch(estimator.load)
+    solve = estimator._statics.solve
+
+    def buckling(target, modes="displacement", *, contact=None, **options):
+        if np.abs(contact).sum() > 1.0:
+            raise ConvergenceError("the finger has buckled")
+        return solve(target, modes, contact=contact, **options)
+
+    monkeypatch.setattr(estimator._statics, "solve", buckling)
+    found = estimator.update(Readings(command, readings))
+    assert not found.converged
+    assert 0.2 < np.abs(found.near.forces).sum() <= 1.0
+    assert found.load[0] == pytest.approx(2.0, rel=0.3)
