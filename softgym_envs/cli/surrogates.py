@@ -55,6 +55,7 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
 @click.option("--states", type=click.IntRange(1), default=5, show_default=True, help="Commands of each body.")
 @click.option("--attacks", type=click.IntRange(1), default=500, show_default=True, help="States of the search.")
 @click.option("--seed", type=click.IntRange(0), default=11, show_default=True, help="Seed of all states.")
+@click.option("--kept-only", is_flag=True, help="Calibrate on what FOLDER holds of an interrupted run.")
 def calibrate_trust(
     robot: str,
     options_: tuple[str, ...],
@@ -64,6 +65,7 @@ def calibrate_trust(
     states: int,
     attacks: int,
     seed: int,
+    kept_only: bool,
 ) -> None:
     """Calibrate the uncertainty of a surrogate on FEM.
 
@@ -78,7 +80,7 @@ def calibrate_trust(
     body = options.robot_of(robot, options_)
     found = calibrate(
         weights or pretrained_folder(body), body, bodies=bodies, states=states, attacks=attacks, seed=seed,
-        state_folder=folder,
+        state_folder=folder, kept_only=kept_only,
     )  # fmt: skip
     click.echo(json.dumps({name: asdict(row) for name, row in found.items()}, indent=2))
 

@@ -146,7 +146,12 @@ def _report(every: Predictions, states: JudgedStates, which: np.ndarray) -> Stra
 
 
 def judged_states(
-    model: SurrogateModel, bodies: int, states: int, seed: int, folder: str | Path | None = None
+    model: SurrogateModel,
+    bodies: int,
+    states: int,
+    seed: int,
+    folder: str | Path | None = None,
+    kept_only: bool = False,
 ) -> JudgedStates:
     """Return FEM states of all strata of a model's robot.
 
@@ -156,11 +161,12 @@ def judged_states(
         states: commands of each body.
         seed: of the bodies and commands.
         folder: where the states of each body are kept; an interrupted run continues with the next body.
+        kept_only: take what the folder holds, without solving the rest.
     """
     robot, bounds, parts = model.robot, learned_bounds(model), []
     for stratum in strata_of(robot, buckles=model.domain.limits_growth):
         commands = draw_commands(robot, stratum, bodies, states, seed, softness(model), bounds)
-        parts.append(solve_commands(robot, commands, folder=folder))
+        parts.append(solve_commands(robot, commands, folder=folder, kept_only=kept_only))
     return JudgedStates.join(parts)
 
 
@@ -252,7 +258,7 @@ def safe_limit(judged: Predictions, tolerance: float) -> float:
 
 def calibrate(
     folder: str | Path, robot: Robot, *, bodies: int = 64, states: int = 5, attacks: int = 500, seed: int = 11,
-    state_folder: str | Path | None = None,
+    state_folder: str | Path | None = None, kept_only: bool = False,
 ) -> dict[str, StratumReport]:  # fmt: skip
     """Calibrate the weights of a folder and write the result to their card.
 
@@ -264,6 +270,8 @@ def calibrate(
         attacks: states of the search for the worst trusted ones.
         seed: of all random numbers.
         state_folder: where the FEM states are kept, so that an interrupted run continues.
+        kept_only: calibrate on the states that the folder holds, without solving the rest; only those of the search
+            for the worst trusted ones are solved.
 
     Returns:
         How the calibrated model does on the calibration states, by stratum; ``adversarial`` for those of the search.
@@ -274,7 +282,7 @@ def calibrate(
     model = load_model(folder, robot)
     if not model.ensemble:
         raise WeightsError(f"'{folder}': only an ensemble can be calibrated; these weights are '{model.network}'")
-    known = judged_states(model, bodies, states, seed, state_folder)
+    known = judged_states(model, bodies, states, seed, state_folder, kept_only)
     calibration = fit_calibration(model, known)
     model = _calibrated(model, calibration, robot.goal_tolerance)
     attacked = attack(model, attacks, states, seed, state_folder)
@@ -287,7 +295,7 @@ def calibrate(
     entries = {k: v for k, v in asdict(calibration).items() if np.isfinite(v)}
     card["domain"] |= {"inflation": 1.0, "limit": limit, "calibration": entries}
     card["calibration"] = {
-        "bodies": bodies, "states": states, "attacks": attacks, "seed": seed,
+        "bodies": bodies, "states": states, "attacks": attacks, "seed": seed, "kept_only": kept_only,
         "strata": {name: asdict(row) for name, row in found.items()},
     }  # fmt: skip
     write_json(card_path, card)

@@ -176,6 +176,12 @@ def test_an_interrupted_run_continues_with_the_next_body(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         solve_commands(robot, commands, folder=tmp_path)
     assert solved == [0, 1]
+    # What the interrupted run left can be used as it is.
+    kept = solve_commands(robot, commands, folder=tmp_path, kept_only=True)
+    assert kept.body.tolist() == [0, 0, 1, 1] and (kept.command == commands.command[:2].reshape(-1, 6)).all()
+    assert solved == [0, 1]
+    with pytest.raises(DataError, match="holds no states of the stratum 'inside' with these commands"):
+        solve_commands(robot, commands, folder=tmp_path / "empty", kept_only=True)
     solved[:] = [None]
     states = solve_commands(robot, commands, folder=tmp_path)
     assert solved == [None, 2]

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.errors import ConvergenceError, DataError, InfeasibleDesign
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
@@ -199,7 +199,12 @@ def draw_commands(
 
 
 def solve_commands(
-    robot: Robot, commands: Commands, *, second_start: bool = False, folder: str | Path | None = None
+    robot: Robot,
+    commands: Commands,
+    *,
+    second_start: bool = False,
+    folder: str | Path | None = None,
+    kept_only: bool = False,
 ) -> JudgedStates:
     """Return the FEM equilibria under commands; bodies that are infeasible or have no state at rest are left out.
 
@@ -212,17 +217,25 @@ def solve_commands(
         commands: bodies and their commands.
         second_start: also solve each command from rest.
         folder: where the states of each body are kept, so that an interrupted run continues with the next body.
+        kept_only: leave out bodies whose states are not in the folder, instead of solving them.
+
+    Raises:
+        DataError: if no body is left then.
     """
     parts = []
     for number in range(len(commands.design)):
         path = None if folder is None else Path(folder) / f"{_key(robot, commands, number, second_start)}.npz"
         if path is not None and path.exists():
             part = JudgedStates.load(path)
+        elif kept_only:
+            continue
         else:
             part = _solve_body(robot, commands, number, second_start)
             if path is not None:
                 part.save(path)
         parts.append(part)
+    if not parts:
+        raise DataError(f"'{folder}' holds no states of the stratum '{commands.stratum[0]}' with these commands")
     return JudgedStates.join(parts)
 
 
