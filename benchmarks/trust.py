@@ -14,12 +14,19 @@ def trust(folder: str | Path = "results/trust") -> dict[str, object]:
     """Errors, coverage and trust under given commands by stratum, on FEM states that the calibration has not seen.
 
     As many states as the calibration of the weights used; those of a robot are kept in the folder. States of an
-    accurate mesh take many seconds, so there the states of the calibration serve again: those of each body are judged
-    by the calibration of all others. ``adversarial`` is a new search for trusted states with large errors, with the
-    limit of trust as it is. Weights that have not been calibrated are left out.
+    accurate mesh take many seconds, so there the states of the calibration serve again, if the folder has them: those
+    of each body are judged by factors and a limit of trust from all others. ``adversarial`` is a search for trusted
+    states with large errors; a new one, with the limit of trust as it is, for the others. Weights that have not been
+    calibrated are left out.
     """
     from softgym_envs.robots.registry import make_robot
-    from softgym_envs.surrogate.calibration import attack, cross_validated, judged_states, report
+    from softgym_envs.surrogate.calibration import (
+        attack,
+        calibration_states,
+        cross_validated,
+        judged_states,
+        report,
+    )
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
 
     result: dict[str, object] = {}
@@ -29,13 +36,12 @@ def trust(folder: str | Path = "results/trust") -> dict[str, object]:
         if "calibration" not in model.card:
             continue
         sizes, start, kept = model.card["calibration"], time.process_time(), Path(folder) / variant
-        expensive = "mesh" in robot.mechanics_key
-        seed = sizes["seed"] if expensive else SEED
-        kept_only = expensive and sizes.get("kept_only", False)
-        states = judged_states(model, sizes["bodies"], sizes["states"], seed, kept, kept_only)
-        attacked = attack(model, sizes["attacks"], sizes["states"], SEED, kept)
-        rows = cross_validated(model, states) if expensive else report(model, states)
-        rows["adversarial"] = report(model, attacked)["adversarial"]
+        if expensive := "mesh" in robot.mechanics_key:
+            rows = cross_validated(model, calibration_states(model, kept))
+        else:
+            states = judged_states(model, sizes["bodies"], sizes["states"], SEED, kept)
+            attacked = attack(model, sizes["attacks"], sizes["states"], SEED, kept)
+            rows = report(model, states) | {"adversarial": report(model, attacked)["adversarial"]}
         result[f"{variant}: goal tolerance [mm]"] = 1e3 * robot.goal_tolerance
         result[f"{variant}: trusted below an uncertainty of [mm]"] = 1e3 * model.domain.limit
         result[f"{variant}: bodies"] = "of the calibration, each left out of it" if expensive else "new ones"

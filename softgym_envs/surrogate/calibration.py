@@ -325,6 +325,20 @@ def cross_validated(model: SurrogateModel, states: JudgedStates, folds: int = 16
     return _by_stratum(every, states)
 
 
+def calibration_states(model: SurrogateModel, folder: str | Path) -> JudgedStates:
+    """Return the states by which a calibrated model was calibrated, those of the search included.
+
+    Args:
+        model: the model.
+        folder: where `calibrate` kept them; missing ones are solved.
+    """
+    made = model.card["calibration"]
+    sizes = made["states"], made["seed"], folder
+    known = judged_states(model, made["bodies"], *sizes, made.get("kept_only", False))
+    searched = with_domain(model, limit=model.robot.goal_tolerance)
+    return JudgedStates.join([known, attack(searched, made["attacks"], *sizes)])
+
+
 # -- the worst trusted states --------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -298,6 +299,8 @@ def test_calibration_of_weights_from_start_to_end(tmp_path, monkeypatch):
     again = calibrate(folder, robot, bodies=6, states=2, attacks=16, state_folder=tmp_path / "states")
     assert (folder / "model.json").read_text() == card
     assert again.keys() == rows.keys()
+    kept = module.calibration_states(load_model(folder, robot), tmp_path / "states")
+    assert {name: asdict(row) for name, row in report(model, kept).items()} == rows
 
 
 # -- shipped weights --------------------------------------------------------------------------------------------------
