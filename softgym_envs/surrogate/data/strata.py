@@ -241,7 +241,7 @@ def solve_commands(
 
 def _key(robot: Robot, commands: Commands, number: int, second_start: bool) -> str:
     """Return a name for the states of one body, by everything that they depend on."""
-    text = json.dumps([robot.name, robot.mechanics_key, str(commands.stratum[number]), second_start])
+    text = json.dumps([robot.name, robot.mechanics_key, str(commands.stratum[number]), second_start], sort_keys=True)
     values = commands.design[number].tobytes() + commands.command[number].tobytes()
     return hashlib.sha256(text.encode() + values).hexdigest()[:16]
 
