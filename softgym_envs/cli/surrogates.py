@@ -53,7 +53,7 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
 @click.option("--folder", type=options.PATH, help="Folder of the FEM states; an interrupted run continues.")
 @click.option("--bodies", type=click.IntRange(1), default=64, show_default=True, help="Bodies of each stratum.")
 @click.option("--states", type=click.IntRange(1), default=5, show_default=True, help="Commands of each body.")
-@click.option("--attacks", type=click.IntRange(1), default=500, show_default=True, help="States of the search.")
+@click.option("--attacks", type=click.IntRange(0), default=500, show_default=True, help="States of the search.")
 @click.option("--seed", type=click.IntRange(0), default=11, show_default=True, help="Seed of all states.")
 @click.option("--kept-only", is_flag=True, help="Calibrate on what FOLDER holds of an interrupted run.")
 def calibrate_trust(

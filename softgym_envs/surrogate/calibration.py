@@ -267,7 +267,7 @@ def calibrate(
         robot: their robot.
         bodies: bodies of each stratum.
         states: commands of each body.
-        attacks: states of the search for the worst trusted ones.
+        attacks: states of the search for the worst trusted ones; 0 for no search.
         seed: of all random numbers.
         state_folder: where the FEM states are kept, so that an interrupted run continues.
         kept_only: calibrate on the states that the folder holds, without solving the rest; only those of the search
@@ -285,8 +285,8 @@ def calibrate(
     known = judged_states(model, bodies, states, seed, state_folder, kept_only)
     calibration = fit_calibration(model, known)
     model = _calibrated(model, calibration, robot.goal_tolerance)
-    attacked = attack(model, attacks, states, seed, state_folder)
-    everything = JudgedStates.join([known, attacked])
+    searched = [attack(model, attacks, states, seed, state_folder)] if attacks else []
+    everything = JudgedStates.join([known, *searched])
     limit = safe_limit(predict(model, everything), robot.goal_tolerance)
     model = _calibrated(model, calibration, limit)
     found = report(model, everything)
@@ -335,6 +335,8 @@ def calibration_states(model: SurrogateModel, folder: str | Path) -> JudgedState
     made = model.card["calibration"]
     sizes = made["states"], made["seed"], folder
     known = judged_states(model, made["bodies"], *sizes, made.get("kept_only", False))
+    if not made["attacks"]:
+        return known
     searched = with_domain(model, limit=model.robot.goal_tolerance)
     return JudgedStates.join([known, attack(searched, made["attacks"], *sizes)])
 

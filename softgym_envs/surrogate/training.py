@@ -153,13 +153,13 @@ class TrustConfig(Config):
     Attributes:
         bodies: bodies of each stratum.
         states: commands of each body.
-        attacks: states of the search for the worst trusted ones.
+        attacks: states of the search for the worst trusted ones; 0 for no search.
         seed: of all these states.
     """
 
     bodies: int = Field(default=64, gt=0)
     states: int = Field(default=5, gt=0)
-    attacks: int = Field(default=500, gt=0)
+    attacks: int = Field(default=500, ge=0)
     seed: int = Field(default=11, ge=0)
 
 

@@ -315,14 +315,15 @@ def test_shipped_weights_hold_what_trust_promises(variant):
         assert model.domain.calibration == Calibration()
         return
     rows = dict(model.card["calibration"]["strata"])
-    worst = rows.pop("adversarial")
     assert model.domain.limit <= robot.goal_tolerance
-    assert max(row["worst_trusted"] for row in (worst, *rows.values())) <= robot.goal_tolerance
+    assert max(row["worst_trusted"] for row in rows.values()) <= robot.goal_tolerance
+    assert ("adversarial" in rows) == bool(model.card["calibration"]["attacks"])
+    rows.pop("adversarial", None)
     rows.pop(module.TOUCHING, None)
     assert rows.keys() == set(strata_of(robot, buckles=model.domain.limits_growth))
     for row in rows.values():
         covered = conformal_quantile(np.arange(1.0, row["states"] + 1.0)) / row["states"]
-        assert row["coverage"] == pytest.approx(covered, abs=0.01)
+        assert row["coverage"] == pytest.approx(covered, abs=max(0.01, 1.01 / row["states"]))
 
 
 def test_the_trunk_is_right_where_it_is_trusted(trunk):
