@@ -101,6 +101,7 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/GripperLift-v0": _row(
         "contact_aided_gripper", "lift", 30, backend="fem", backend_mesh=COARSE, backend_options=SLOW
     ),
+    "SoftGym/ModularReach-v0": _row("modular_arm", "reach", 50, backend="fem"),
     "SoftGym/TetrapodReach-v0": _row("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
     "SoftGym/TetrapodTrack-v0": _row("tetrapod", "track", 100, backend="fem", backend_options=MOVING),
     "SoftGym/TetrapodCarry-v0": _row("tetrapod", "carry", 100, backend="fem", backend_options=MOVING),

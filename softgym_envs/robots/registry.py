@@ -25,6 +25,7 @@ ROBOTS = Registry(
         "two_finger_gripper": "softgym_envs.robots.grippers:TwoFingerGripper",
         "two_finger_friction_gripper": "softgym_envs.robots.friction_grippers:TwoFingerFrictionGripper",
         "three_finger_friction_gripper": "softgym_envs.robots.friction_grippers:ThreeFingerFrictionGripper",
+        "modular_arm": "softgym_envs.robots.modular_arm:ModularArm",
         "tetrapod": "softgym_envs.robots.tetrapod:Tetrapod",
         "three_finger_gripper": "softgym_envs.robots.grippers:ThreeFingerGripper",
     },

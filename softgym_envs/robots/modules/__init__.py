@@ -1,7 +1,7 @@
 """Compliant modules with two ports, and structures that are built from them (thesis, sec. 5.2.2).
 
-A module is known to the rest of a structure by the compliance between its ports alone. So a structure of any number of
-modules is solved with six unknowns for each port.
+A module is known to the rest of a structure by the compliance between its ports alone, or, for large motions, by its
+energy over their relative motion. So a structure of any number of modules is solved with six unknowns for each port.
 """
 
 from typing import TYPE_CHECKING
@@ -10,6 +10,9 @@ from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from softgym_envs.robots.modules.base import Module as Module
+    from softgym_envs.robots.modules.learned import LearnedModule as LearnedModule
+    from softgym_envs.robots.modules.learned import learned_module as learned_module
+    from softgym_envs.robots.modules.learning import learn_module as learn_module
     from softgym_envs.robots.modules.registry import MODULES as MODULES
     from softgym_envs.robots.modules.structure import Link as Link
     from softgym_envs.robots.modules.structure import Structure as Structure
@@ -18,6 +21,8 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "base": ["Module"],
+        "learned": ["LearnedModule", "learned_module"],
+        "learning": ["learn_module"],
         "registry": ["MODULES"],
         "structure": ["Link", "Structure"],
     },

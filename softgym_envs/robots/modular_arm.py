@@ -1,0 +1,158 @@
+"""The modular arm: a chain of compliant modules, bent by three cables through their ports (thesis, fig. 5.7)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.errors import unknown_name
+from softgym_envs.mechanics.builder import ModelBuilder
+from softgym_envs.mechanics.constraints.cable import Cable
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.skins import box_skin
+from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.modules.base import Module
+from softgym_envs.robots.modules.learned import learned_module
+from softgym_envs.robots.modules.registry import MODULES
+
+_QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+CELLS: dict[str, tuple[str, np.ndarray]] = {
+    "leaf_x": ("leaf_spring", np.eye(3)),
+    "leaf_y": ("leaf_spring", _QUARTER_TURN),
+    "block": ("solid_block", np.eye(3)),
+}
+"""What a cell may be: a module, and the axes in which it stands. A ``leaf_x`` bends towards x."""
+
+BODIES = ("superelements", "solid")
+
+CABLES = ("cable_0", "cable_120", "cable_240")
+"""Names of the cables, by the angle from x at which they run [degrees]."""
+
+
+class _Cell(NamedTuple):
+    """A cell of one body: its module, the module's design, its axes, and the height at which it begins [m]."""
+
+    kind: str
+    module: Module
+    design: Mapping[str, float]
+    axes: np.ndarray
+    height: float
+
+    @property
+    def length(self) -> float:
+        return self.module.length(self.module.design_space.complete(self.design))
+
+
+class ModularArm(Robot):
+    """Modules in a row on a clamped base. Cables run through guides that are fixed to the ports.
+
+    The kinds of the cells are an option, so that arms of other structures are other robots; their dimensions are the
+    design.
+
+    Args:
+        cells: what each cell is, from the base to the tip: names in `CELLS`.
+        body: ``"superelements"``, learned modules with six unknowns for each port; or ``"solid"``, finite elements of
+            the whole body, by which designs are judged.
+        stroke: largest displacement of a cable [m].
+        max_effort: largest tension of a cable [N]; small enough that three cables together do not buckle the modules.
+        **options: options of `Robot`.
+
+    Raises:
+        ValueError: for an unknown cell or body, or gravity on superelements, which have no mass.
+    """
+
+    name = "modular_arm"
+    effectors = ("tip",)
+    stiffness_variable = "young_modulus"
+    size = 0.1
+
+    def __init__(
+        self,
+        *,
+        cells: Sequence[str] = ("leaf_x", "leaf_y", "leaf_x", "leaf_y"),
+        body: str = "superelements",
+        stroke: float = 0.008,
+        max_effort: float = 0.3,
+        **options: Any,
+    ) -> None:
+        if isinstance(cells, str) or not cells:
+            raise ValueError(f"cells must be a list of names, got {cells!r}; allowed: {', '.join(CELLS)}")
+        for cell in cells:
+            if cell not in CELLS:
+                raise ValueError(unknown_name("cell", cell, CELLS))
+        if body not in BODIES:
+            raise ValueError(unknown_name("body", body, BODIES))
+        super().__init__(**options)
+        if body == "superelements" and any(self.gravity):
+            raise ValueError("superelements have no mass: use body = 'solid' with gravity")
+        if any(self.gravity):
+            self.stiffness_variable = None
+        self.cells = tuple(cells)
+        self.body = body
+        self.stroke = float(stroke)
+        self.max_effort = float(max_effort)
+        self.design_space = DesignSpace(
+            *self._dimensions(),
+            DesignVariable("cable_radius", 0.010, 0.016, 0.012, "m", "distance of the cables from the axis"),
+            DesignVariable("young_modulus", 1.0e7, 4.0e7, 2.0e7, "Pa", "stiffness of the printed material", log=True),
+        )
+        self.effector_rest = np.array([0.0, 0.0, self._height(self.design_space.baseline)])
+        self.effort_scale = np.full(3, 0.2)
+        self.actuators = tuple(
+            Actuator(name, 0.0, self.stroke, self.stroke / 20.0, max_effort=self.max_effort) for name in CABLES
+        )
+
+    def _dimensions(self) -> Iterator[DesignVariable]:
+        for number, cell in enumerate(self.cells, start=1):
+            name, _ = CELLS[cell]
+            variables = MODULES[name].design_space
+            for dimension, (low, high) in learned_module(name).box.items():
+                baseline = min(max(variables[dimension].baseline, low), high)
+                described = f"{variables[dimension].description} (cell {number})"
+                yield DesignVariable(f"{dimension}_{number}", low, high, baseline, "m", described)
+
+    def _modules(self, design: Mapping[str, float]) -> Iterator[_Cell]:
+        """Yield the cells of a complete design from the base to the tip."""
+        height = 0.0
+        for number, cell in enumerate(self.cells, start=1):
+            name, axes = CELLS[cell]
+            own = {dimension: design[f"{dimension}_{number}"] for dimension in learned_module(name).box}
+            own["young_modulus"] = design["young_modulus"]
+            part = _Cell(name, MODULES[name](), own, axes, height)
+            yield part
+            height += part.length
+
+    def _height(self, design: Mapping[str, float]) -> float:
+        *_, last = self._modules(design)
+        return last.height + last.length
+
+    def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
+        """Stack the modules on a clamped port, and thread the cables through all ports above it."""
+        builder = ModelBuilder(gravity=self.gravity)
+        ports = [builder.add_frame(np.zeros(3), fixed=True, fixed_spin=True)]
+        for part in self._modules(design):
+            origin = np.array([0.0, 0.0, part.height])
+            if self.body == "solid":
+                far = part.module.add_to(builder, part.design, near=ports[-1], origin=origin, rotation=part.axes)
+            else:
+                far = builder.add_frame(origin + [0.0, 0.0, part.length])
+                energy = learned_module(part.kind).energy(part.design)
+                builder.add_superelement(ports[-1], far, energy, length=part.length, rotation=part.axes)
+            ports.append(far)
+        model = builder.build()
+        rows = np.array(ports[1:])[:, None] + np.arange(4)
+        for actuator, angle in zip(self.actuators, np.deg2rad([0.0, 120.0, 240.0]), strict=True):
+            guide = design["cable_radius"] * np.array([np.cos(angle), np.sin(angle), 0.0])
+            points = EmbeddedPoints.from_weights(rows, np.tile([1.0, *guide], (len(rows), 1)), model.nodes)
+            model.add("a", Cable(actuator.name, points, guide, unilateral=actuator.unilateral))
+        model.add("e", Point("tip", EmbeddedPoints.in_frame(ports[-1], np.zeros(3), model.nodes)))
+        if self.body == "superelements":
+            half = design["cable_radius"]
+            model.skins += [box_skin(port, (half, half, 0.001), model.nodes) for port in ports]
+        return model

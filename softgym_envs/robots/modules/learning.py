@@ -1,0 +1,261 @@
+"""How superelements are learned: least squares on gradients and Hessians of the energy from finite elements.
+
+The residuals are what a user sees: the error of the strains under the load of a state, relative to the largest of the
+module, and the error of the stiffness relative to that of the state. Both weigh soft and stiff motions alike. The
+derivatives of the residuals are exact, and Levenberg and Marquardt's method finds the minimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import qmc
+
+from softgym_envs.robots.modules.energy import TERMS
+from softgym_envs.robots.modules.learned import LearnedModule, polynomials
+from softgym_envs.robots.modules.registry import MODULES
+from softgym_envs.robots.modules.states import ModuleStates, solve_states
+
+RIDGE = 1e-4
+"""Weight of the squares of the weights of corrections, against overfitting."""
+
+MARGIN = 1.1
+"""Bodies are drawn from a box that is wider by this factor than the one that users may use."""
+
+_ROWS, _COLUMNS = np.triu_indices(6)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is learned of a module.
+
+    Attributes:
+        box: bounds of each dimension [m].
+        rotation: defines the largest load; see `solve_states` [rad].
+        bodies: number of bodies to learn from, under loads.
+        unloaded: number of further bodies, only at rest.
+        rays: number of random directions of load for each body.
+    """
+
+    box: Mapping[str, tuple[float, float]]
+    rotation: float
+    bodies: int = 16
+    unloaded: int = 32
+    rays: int = 3
+
+
+RECIPES = {
+    "leaf_spring": Recipe({"leaf_length": (0.010, 0.025), "width": (0.008, 0.020), "thickness": (0.001, 0.0025)}, 0.6),
+    "solid_block": Recipe({"length": (0.010, 0.030), "width": (0.008, 0.020), "depth": (0.008, 0.020)}, 0.3),
+}
+"""What is learned, by the name of the module. The form of the energy needs modules that three planes mirror."""
+
+
+class _Products(NamedTuple):
+    """`TERMS` at strains: values (n, m), first (n, m, 6) and second derivatives (n, m, 6, 6)."""
+
+    value: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+
+
+def _products(strain: np.ndarray) -> _Products:
+    n, m = len(strain), len(TERMS)
+    value, first, second = np.ones((n, m)), np.zeros((n, m, 6)), np.zeros((n, m, 6, 6))
+    padded = np.column_stack([strain, np.ones(n)])
+    for t, (_, *factors) in enumerate(TERMS):
+        value[:, t] = padded[:, factors].prod(axis=1)
+        present = [p for p, f in enumerate(factors) if f >= 0]
+        for p in present:
+            others = [factors[k] for k in range(3) if k != p]
+            first[:, t, factors[p]] += padded[:, others].prod(axis=1)
+            for q in present:
+                if q != p:
+                    (left,) = (factors[k] for k in range(3) if k not in (p, q))
+                    second[:, t, factors[p], factors[q]] += padded[:, left]
+    return _Products(value, first, second)
+
+
+class _Corrected(NamedTuple):
+    """Corrected strains of states (n, 6) with derivatives (n, 6, 6) and (n, 6, 6, 6), and ``k`` (n, 6)."""
+
+    value: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    k: np.ndarray
+
+    def gradient(self) -> np.ndarray:
+        return np.einsum("ni,ni,nip->np", self.k, self.value, self.first)
+
+    def hessian(self) -> np.ndarray:
+        squares = np.einsum("ni,nip,niq->npq", self.k, self.first, self.first)
+        return squares + np.einsum("ni,ni,nipq->npq", self.k, self.value, self.second)
+
+
+def _corrected(model: LearnedModule, states: ModuleStates, products: _Products) -> _Corrected:
+    unit = model.unit(states.designs)
+    c = polynomials(unit, model.degrees[1]) @ model.corrections
+    n = len(states)
+    value, first = states.strain.copy(), np.tile(np.eye(6), (n, 1, 1))
+    second = np.zeros((n, 6, 6, 6))
+    for t, target in enumerate(TERMS[:, 0]):
+        value[:, target] += c[:, t] * products.value[:, t]
+        first[:, target] += c[:, t, None] * products.first[:, t]
+        second[:, target] += c[:, t, None, None] * products.second[:, t]
+    return _Corrected(value, first, second, np.exp(polynomials(unit, model.degrees[0]) @ model.stiffness))
+
+
+class _Weights(NamedTuple):
+    """How errors of gradient and Hessian are weighed, by state: strains per load (n, 6, 6), inverse roots (n, 6, 6)."""
+
+    compliance: np.ndarray
+    root: np.ndarray
+
+
+def _weights(states: ModuleStates, rotation: float) -> _Weights:
+    compliance = np.linalg.inv(states.hessian)
+    return _Weights(compliance / rotation, np.linalg.inv(np.linalg.cholesky(states.hessian)))
+
+
+def _residuals(gradient: np.ndarray, hessian: np.ndarray, weights: _Weights) -> np.ndarray:
+    """Weigh errors of gradient (n, ..., 6) and Hessian (n, ..., 6, 6): shape (n, ..., 27)."""
+    strain = np.einsum("nij,n...j->n...i", weights.compliance, gradient)
+    relative = np.einsum("nip,n...pq,njq->n...ij", weights.root, hessian, weights.root, optimize=True)
+    return np.concatenate([strain, 0.1 * relative[..., _ROWS, _COLUMNS]], axis=-1)
+
+
+def fit(
+    recipe: Recipe, module: str, states: ModuleStates, others: Mapping[str, float], steps: int = 30
+) -> LearnedModule:
+    """Return the superelement that fits states best.
+
+    Args:
+        recipe: what was learned.
+        module: name in `MODULES`.
+        states: to learn from.
+        others: the values of the variables that were not varied.
+        steps: largest number of steps of the search.
+    """
+    degrees = (3, 2)
+    model = LearnedModule(
+        module, dict(recipe.box), dict(others), recipe.rotation, np.empty((0, 6)), np.empty((0, 0)), {}, degrees
+    )
+    unit = model.unit(states.designs)
+    P, Q = polynomials(unit, degrees[0]), polynomials(unit, degrees[1])
+    rest = (states.strain == 0.0).all(axis=1)
+    diagonal = np.log(np.einsum("nii->ni", states.hessian[rest]))
+    start = np.linalg.lstsq(P[rest], diagonal, rcond=None)[0]
+    model = replace(model, stiffness=start, corrections=np.zeros((Q.shape[1], len(TERMS))))
+    products, weights = _products(states.strain), _weights(states, recipe.rotation)
+    target = TERMS[:, 0]
+
+    def errors_of(trial: LearnedModule) -> tuple[_Corrected, np.ndarray]:
+        found = _corrected(trial, states, products)
+        return found, _residuals(found.gradient() - states.gradient, found.hessian() - states.hessian, weights)
+
+    def cost_of(trial: LearnedModule, residual: np.ndarray) -> float:
+        return float((residual**2).sum() + RIDGE * (trial.corrections**2).sum())
+
+    state, residual = errors_of(model)
+    cost, damping = cost_of(model, residual), 1e-3
+    for _ in range(steps):
+        k, g, G = state.k, state.value, state.first
+        kt, gt, Gt, St = k[:, target], g[:, target], G[:, target], state.second[:, target]
+        by_c = kt[:, :, None] * (products.value[:, :, None] * Gt + gt[:, :, None] * products.first)
+        cross = np.einsum("ntp,ntq->ntpq", products.first, Gt)
+        curved = products.value[:, :, None, None] * St + gt[:, :, None, None] * products.second
+        by_c2 = kt[:, :, None, None] * (cross + np.swapaxes(cross, 2, 3) + curved)
+        by_k = (k * g)[:, :, None] * G
+        by_k2 = k[:, :, None, None] * (np.einsum("nip,niq->nipq", G, G) + g[:, :, None, None] * state.second)
+        slopes_k = np.swapaxes(_residuals(by_k, by_k2, weights), 1, 2)
+        slopes_c = np.swapaxes(_residuals(by_c, by_c2, weights), 1, 2)
+        jacobian = np.concatenate(
+            [
+                np.einsum("nri,np->nrpi", slopes_k, P).reshape(residual.size, -1),
+                np.einsum("nrt,nq->nrqt", slopes_c, Q).reshape(residual.size, -1),
+            ],
+            axis=1,
+        )
+        ridge = np.concatenate([np.zeros(model.stiffness.size), np.full(model.corrections.size, RIDGE)])
+        weightsof = np.concatenate([model.stiffness.ravel(), model.corrections.ravel()])
+        normal = jacobian.T @ jacobian + np.diag(ridge)
+        slope = jacobian.T @ residual.ravel() + ridge * weightsof
+        improved = False
+        for _ in range(8):
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -slope)
+            new = weightsof + step
+            trial = replace(
+                model,
+                stiffness=new[: model.stiffness.size].reshape(model.stiffness.shape),
+                corrections=new[model.stiffness.size :].reshape(model.corrections.shape),
+            )
+            trial_state, trial_residual = errors_of(trial)
+            trial_cost = cost_of(trial, trial_residual)
+            if trial_cost < cost:
+                improved = True
+                break
+            damping *= 4.0
+        if not improved:
+            break
+        gain, damping = 1.0 - trial_cost / cost, 0.25 * damping
+        model, state, residual, cost = trial, trial_state, trial_residual, trial_cost
+        if gain < 1e-4:
+            break
+    return model
+
+
+def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
+    """Return the errors on states: those of strains under load and of the stiffness.
+
+    Returns:
+        ``strain_mean`` and ``strain_max``: error of the strains under the load of a state over the largest strain of
+        the states, to first order; ``stiffness_mean`` and ``stiffness_max``: largest relative error of the stiffness
+        over all directions of motion.
+    """
+    found = _corrected(model, states, _products(states.strain))
+    weights = _weights(states, 1.0)
+    strain = np.einsum("nij,nj->ni", weights.compliance, found.gradient() - states.gradient)
+    strain = np.linalg.norm(strain, axis=1) / np.linalg.norm(states.strain, axis=1).max()
+    relative = weights.root @ (found.hessian() - states.hessian) @ np.swapaxes(weights.root, 1, 2)
+    stiffness = np.abs(np.linalg.eigvalsh(relative)).max(axis=1)
+    values = {"strain_mean": strain.mean(), "strain_max": strain.max()}
+    values |= {"stiffness_mean": stiffness.mean(), "stiffness_max": stiffness.max()}
+    return {name: float(value) for name, value in values.items()}
+
+
+def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
+    """Return the superelement of a module, learned from finite elements; this takes some minutes.
+
+    It is tested on four corners of the box and on two bodies inside, which are not learned.
+
+    Raises:
+        KeyError: for a module without a recipe, if none is given.
+        ValueError: for an unknown module.
+    """
+    recipe = RECIPES[module] if recipe is None else recipe
+    made = MODULES[module]()
+    low, high = np.log(np.array(list(recipe.box.values()))).T
+    names = tuple(recipe.box)
+
+    def bodies(unit: np.ndarray) -> np.ndarray:
+        found = np.exp(0.5 * (low + high) + 0.5 * unit * (high - low))
+        bounds = np.array([[v.low, v.high] for v in made.design_space if v.name in names])
+        return np.clip(found, bounds[:, 0], bounds[:, 1])
+
+    def solved(unit: np.ndarray, rays: int, seed: int) -> ModuleStates:
+        rng = np.random.default_rng(seed)
+        return solve_states(made, bodies(unit), names, rotation=recipe.rotation, rays=rays, rng=rng)
+
+    def drawn(number: int, seed: int) -> np.ndarray:
+        return 2.0 * qmc.Sobol(len(names), seed=seed).random(number) - 1.0
+
+    loaded = solved(MARGIN * drawn(recipe.bodies, 1), recipe.rays, 1)
+    states = loaded.joined(solved(MARGIN * drawn(recipe.unloaded, 2), 0, 2))
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=float)[:, : len(names)]
+    tests = {"corners": solved(corners, 1, 3), "inside": solved(drawn(2, 4), 1, 4)}
+    others = {v.name: v.baseline for v in made.design_space if v.name not in names and v.name != "young_modulus"}
+    model = fit(recipe, module, states, others)
+    return replace(model, errors={name: errors(model, each) for name, each in tests.items()})

@@ -1,0 +1,140 @@
+"""States of modules under load, from finite elements: what superelements learn from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.elements.superelement import QuadraticEnergy, Superelement
+from softgym_envs.mechanics.frames import frame_rows
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.modules.base import Module
+
+MODULUS = 1.0e7
+"""Young's modulus of the learned states [Pa]; the energy of a module is proportional to it."""
+
+LARGEST_SINE = 0.8
+"""Largest sine of the rotation of the far port; the strains are unique up to 90 degrees."""
+
+
+@dataclass(frozen=True)
+class ModuleStates:
+    """Equilibria of bodies of one module. Energies are divided by Young's modulus and the cube of the length.
+
+    Attributes:
+        designs: dimensions of the body of each state, without its material, shape (n, v).
+        strain: those of a superelement, the first three over the length, shape (n, 6).
+        gradient: of the energy in the strains, shape (n, 6).
+        hessian: of the energy in the strains, shape (n, 6, 6).
+    """
+
+    designs: np.ndarray
+    strain: np.ndarray
+    gradient: np.ndarray
+    hessian: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.strain)
+
+    def rows(self, index: np.ndarray) -> ModuleStates:
+        """Return some of the states."""
+        return ModuleStates(self.designs[index], self.strain[index], self.gradient[index], self.hessian[index])
+
+    def joined(self, other: ModuleStates) -> ModuleStates:
+        """Return these states and others of the same module."""
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return ModuleStates(*(np.concatenate(pair) for pair in pairs))
+
+
+def solve_states(
+    module: Module,
+    designs: np.ndarray,
+    names: tuple[str, ...],
+    *,
+    rotation: float,
+    rays: int,
+    rng: np.random.Generator,
+    more: Mapping[str, float] | None = None,
+    refine: float = 1.0,
+) -> ModuleStates:
+    """Return the states of bodies at rest, and under half and full loads in random directions.
+
+    All loads of a body have the same energy, by its compliance at rest: the energy with which its softest rotation
+    would reach the angle ``rotation``. So soft motions become large and stiff ones stay small, as in a structure. Loads
+    at which the body is unstable, turns by more than 53 degrees or is not found are left out.
+
+    Args:
+        module: the module.
+        designs: dimensions of the bodies, shape (b, v).
+        names: of the dimensions.
+        rotation: [rad].
+        rays: number of random directions for each body.
+        rng: draws the directions.
+        more: other variables of all designs.
+        refine: see `Module.body`.
+    """
+    kept: list[tuple[np.ndarray, ...]] = []
+    for row in designs:
+        design = dict(zip(names, row, strict=True)) | dict(more or {}) | {"young_modulus": MODULUS}
+        length = module.length(module.design_space.complete(design))
+        solver = Statics(module.model(design, refine=refine))
+        rest = solver.solve(np.zeros(6), "effort").condensed
+        stiffness = np.linalg.inv(rest.W.aa)
+        kept.append((row, *_in_strains(np.zeros(6), np.zeros(6), stiffness, length)))
+        root = np.linalg.cholesky(stiffness)
+        size = rotation / np.sqrt(np.diag(rest.W.aa)[3:].max())
+        for _ in range(rays):
+            direction = rng.normal(size=6)
+            load = root @ (direction * (size / np.linalg.norm(direction)))
+            for share in (0.5, 1.0):
+                try:
+                    found = solver.solve(share * load, "effort")
+                except ConvergenceError:
+                    break
+                if not found.stable:
+                    break
+                state = found.condensed
+                pose, tangent = state.delta.a, np.linalg.inv(state.W.aa)
+                if np.linalg.norm(pose[3:]) > LARGEST_SINE:
+                    break
+                kept.append((row, *_in_strains(pose, state.lambda_.a, tangent, length)))
+    return ModuleStates(*(np.array(column) for column in zip(*kept, strict=True)))
+
+
+def pose_rows(pose: np.ndarray, length: float) -> np.ndarray:
+    """Return the rows (8, 3) of two frames: the near one at rest, and the far one in a pose (6,); see `Pose`."""
+    axial = pose[3:]
+    cosine = np.sqrt(max(1.0 - axial @ axial, 0.0))
+    skew = np.array([[0.0, -axial[2], axial[1]], [axial[2], 0.0, -axial[0]], [-axial[1], axial[0], 0.0]])
+    rotation = np.eye(3) + skew + skew @ skew / (1.0 + cosine)
+    return np.vstack([frame_rows(np.zeros(3)), frame_rows(pose[:3] + [0.0, 0.0, length], rotation)])
+
+
+def _in_strains(
+    pose: np.ndarray, effort: np.ndarray, tangent: np.ndarray, length: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Turn efforts and tangent over a far port's pose into gradient and Hessian of the energy over strains."""
+    scale = np.array([length] * 3 + [1.0] * 3)
+    rest = pose_rows(np.zeros(6), length)
+    element = Superelement(rest, np.array([0, 4]), energy=QuadraticEnergy(np.eye(6)), length=length)
+
+    def strain(p: np.ndarray) -> np.ndarray:
+        return element.strains(pose_rows(p, length)) / scale
+
+    # Central differences of an exact function: errors of about 1e-9 (first) and 1e-6 (second derivatives).
+    step = 1e-4
+    units = step * np.diag(scale)
+    jacobian = np.stack([(strain(pose + u) - strain(pose - u)) / (2.0 * step) for u in units], axis=1)
+    bend = np.empty((6, 6, 6))
+    for j, u in enumerate(units):
+        for k, v in enumerate(units):
+            corners = strain(pose + u + v) - strain(pose + u - v) - strain(pose - u + v) + strain(pose - u - v)
+            bend[:, j, k] = corners / (4.0 * step**2)
+    unit = MODULUS * length**3
+    inverse = np.linalg.inv(jacobian)
+    gradient = inverse.T @ (scale * effort) / unit
+    hessian = scale[:, None] * tangent * scale / unit - np.einsum("i,ijk->jk", gradient, bend)
+    return strain(pose), gradient, inverse.T @ hessian @ inverse
