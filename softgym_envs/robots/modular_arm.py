@@ -69,7 +69,6 @@ class ModularArm(Robot):
 
     name = "modular_arm"
     effectors = ("tip",)
-    stiffness_variable = "young_modulus"
     size = 0.1
 
     def __init__(
@@ -91,8 +90,7 @@ class ModularArm(Robot):
         super().__init__(**options)
         if body == "superelements" and any(self.gravity):
             raise ValueError("superelements have no mass: use body = 'solid' with gravity")
-        if any(self.gravity):
-            self.stiffness_variable = None
+        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.cells = tuple(cells)
         self.body = body
         self.stroke = float(stroke)
@@ -111,7 +109,7 @@ class ModularArm(Robot):
     def _dimensions(self) -> Iterator[DesignVariable]:
         for number, cell in enumerate(self.cells, start=1):
             name, _ = CELLS[cell]
-            variables = MODULES[name].design_space
+            variables = MODULES[name]().design_space
             for dimension, (low, high) in learned_module(name).box.items():
                 baseline = min(max(variables[dimension].baseline, low), high)
                 described = f"{variables[dimension].description} (cell {number})"

@@ -1,13 +1,11 @@
-"""Learned modules: exact derivatives, symmetry, errors against finite elements, and the arm that is built from them."""
+"""Learned modules: exact derivatives, symmetry and errors against finite elements."""
 
 import json
 
 import numpy as np
 import pytest
 
-from softgym_envs import make_robot
 from softgym_envs.errors import DesignError, WeightsError
-from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.modules import MODULES, learned_module
 from softgym_envs.robots.modules.energy import TERMS, ModuleEnergy
 from softgym_envs.robots.modules.learned import load_module
@@ -92,18 +90,3 @@ def test_files_that_are_not_learned_modules_are_named(tmp_path):
     (tmp_path / "block.json").write_text(json.dumps(record | {"format": 0}))
     with pytest.raises(WeightsError, match="format"):
         load_module(tmp_path / "block.json")
-
-
-def test_the_modular_arm_follows_finite_elements_of_the_whole_body():
-    found = {}
-    for body in ("superelements", "solid"):
-        robot = make_robot("modular_arm", cells=["leaf_x", "block"], body=body)
-        found[body] = Statics(robot.build()).solve(np.array([0.004, 0.0, 0.0])).condensed
-    moved = found["solid"].delta.e - robot.effector_rest
-    assert np.linalg.norm(moved) > 0.003
-    assert np.linalg.norm(found["superelements"].delta.e - found["solid"].delta.e) < 0.02 * np.linalg.norm(moved)
-
-
-def test_superelements_of_the_arm_have_no_weight():
-    with pytest.raises(ValueError, match="superelements have no mass"):
-        make_robot("modular_arm", gravity=(0.0, 0.0, -9.81))

@@ -19,8 +19,11 @@ from softgym_envs.robots.modules.learned import LearnedModule, polynomials
 from softgym_envs.robots.modules.registry import MODULES
 from softgym_envs.robots.modules.states import ModuleStates, solve_states
 
-RIDGE = 1e-4
+RIDGE = 1e-3
 """Weight of the squares of the weights of corrections, against overfitting."""
+
+GUESS_RIDGE = 1e-4
+"""Relative weight of the same squares in the first guess."""
 
 MARGIN = 1.1
 """Bodies are drawn from a box that is wider by this factor than the one that users may use."""
@@ -42,13 +45,13 @@ class Recipe:
 
     box: Mapping[str, tuple[float, float]]
     rotation: float
-    bodies: int = 16
+    bodies: int = 20
     unloaded: int = 32
     rays: int = 3
 
 
 RECIPES = {
-    "leaf_spring": Recipe({"leaf_length": (0.010, 0.025), "width": (0.008, 0.020), "thickness": (0.001, 0.0025)}, 0.6),
+    "leaf_spring": Recipe({"leaf_length": (0.010, 0.025), "width": (0.008, 0.020), "thickness": (0.001, 0.0025)}, 0.4),
     "solid_block": Recipe({"length": (0.010, 0.030), "width": (0.008, 0.020), "depth": (0.008, 0.020)}, 0.3),
 }
 """What is learned, by the name of the module. The form of the energy needs modules that three planes mirror."""
@@ -127,8 +130,32 @@ def _residuals(gradient: np.ndarray, hessian: np.ndarray, weights: _Weights) -> 
     return np.concatenate([strain, 0.1 * relative[..., _ROWS, _COLUMNS]], axis=-1)
 
 
+def _guess(model: LearnedModule, states: ModuleStates, products: _Products, Q: np.ndarray) -> np.ndarray:
+    """Return quadratic corrections near those of a model, which make the corrected strains those of the forces.
+
+    The gradient of the energy is ``G^T (k g)``. With ``G`` of the present corrections, this gives the corrected strains
+    ``g`` that each state needs, and they are linear in the corrections. Newton's method would not find the way from no
+    corrections at all: a leaf that bends without becoming shorter has a thousand times the energy.
+    """
+    state = _corrected(model, states, products)
+    wanted = np.linalg.solve(np.swapaxes(state.first, 1, 2), states.gradient[:, :, None])[:, :, 0] / state.k
+    found = np.zeros_like(model.corrections)
+    for strain in range(6):
+        own = np.flatnonzero((TERMS[:, 0] == strain) & (TERMS[:, 3] < 0))
+        columns = np.einsum("nt,nq->nqt", products.value[:, own], Q).reshape(len(states), -1)
+        ridge = GUESS_RIDGE * np.eye(columns.shape[1]) * (columns**2).sum(axis=0).mean()
+        missing = wanted[:, strain] - states.strain[:, strain]
+        found[:, own] = np.linalg.solve(columns.T @ columns + ridge, columns.T @ missing).reshape(-1, len(own))
+    return found
+
+
 def fit(
-    recipe: Recipe, module: str, states: ModuleStates, others: Mapping[str, float], steps: int = 30
+    recipe: Recipe,
+    module: str,
+    states: ModuleStates,
+    others: Mapping[str, float],
+    steps: int = 30,
+    degrees: tuple[int, int] = (3, 1),
 ) -> LearnedModule:
     """Return the superelement that fits states best.
 
@@ -138,8 +165,8 @@ def fit(
         states: to learn from.
         others: the values of the variables that were not varied.
         steps: largest number of steps of the search.
+        degrees: of the polynomials of stiffness and corrections.
     """
-    degrees = (3, 2)
     model = LearnedModule(
         module, dict(recipe.box), dict(others), recipe.rotation, np.empty((0, 6)), np.empty((0, 0)), {}, degrees
     )
@@ -151,6 +178,8 @@ def fit(
     model = replace(model, stiffness=start, corrections=np.zeros((Q.shape[1], len(TERMS))))
     products, weights = _products(states.strain), _weights(states, recipe.rotation)
     target = TERMS[:, 0]
+    for _ in range(5):
+        model = replace(model, corrections=_guess(model, states, products, Q))
 
     def errors_of(trial: LearnedModule) -> tuple[_Corrected, np.ndarray]:
         found = _corrected(trial, states, products)

@@ -62,9 +62,10 @@ def solve_states(
 ) -> ModuleStates:
     """Return the states of bodies at rest, and under half and full loads in random directions.
 
-    All loads of a body have the same energy, by its compliance at rest: the energy with which its softest rotation
-    would reach the angle ``rotation``. So soft motions become large and stiff ones stay small, as in a structure. Loads
-    at which the body is unstable, turns by more than 53 degrees or is not found are left out.
+    The largest moment of a body is the one that would turn its softest rotation by ``rotation``, by its compliance at
+    rest; the largest force is that moment over half the length. Such loads occur in structures of modules that are
+    about as soft: soft motions become large and stiff ones stay small. Loads at which the body is unstable, turns by
+    more than 53 degrees or is not found are left out.
 
     Args:
         module: the module.
@@ -84,11 +85,13 @@ def solve_states(
         rest = solver.solve(np.zeros(6), "effort").condensed
         stiffness = np.linalg.inv(rest.W.aa)
         kept.append((row, *_in_strains(np.zeros(6), np.zeros(6), stiffness, length)))
-        root = np.linalg.cholesky(stiffness)
-        size = rotation / np.sqrt(np.diag(rest.W.aa)[3:].max())
+        moment = rotation / np.diag(rest.W.aa)[3:].max()
+        scale = np.array([2.0 * moment / length] * 3 + [moment] * 3)
         for _ in range(rays):
             direction = rng.normal(size=6)
-            load = root @ (direction * (size / np.linalg.norm(direction)))
+            load = scale * (direction / np.linalg.norm(direction))
+            # At the middle of the module, where forces do not bend: the moments are those of the far port there.
+            load[3:5] += 0.5 * length * np.array([load[1], -load[0]])
             for share in (0.5, 1.0):
                 try:
                     found = solver.solve(share * load, "effort")
