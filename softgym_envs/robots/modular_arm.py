@@ -1,4 +1,4 @@
-"""The modular arm: a chain of compliant modules, bent by three cables through their ports (thesis, fig. 5.7)."""
+"""The modular arm: a chain of compliant modules, bent by two push-pull wires through their ports (thesis, fig. 5.7)."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ CELLS: dict[str, tuple[str, np.ndarray]] = {
 
 BODIES = ("superelements", "solid")
 
-CABLES = ("cable_0", "cable_120", "cable_240")
-"""Names of the cables, by the angle from x at which they run [degrees]."""
+WIRES = {"wire_x": (1.0, 0.0), "wire_y": (0.0, 1.0)}
+"""Wires, and the direction from the axis in which each runs."""
 
 
 class _Cell(NamedTuple):
@@ -50,7 +50,7 @@ class _Cell(NamedTuple):
 
 
 class ModularArm(Robot):
-    """Modules in a row on a clamped base. Cables run through guides that are fixed to the ports.
+    """Modules in a row on a clamped base. Wires that pull and push run through guides that are fixed to the ports.
 
     The kinds of the cells are an option, so that arms of other structures are other robots; their dimensions are the
     design.
@@ -59,8 +59,8 @@ class ModularArm(Robot):
         cells: what each cell is, from the base to the tip: names in `CELLS`.
         body: ``"superelements"``, learned modules with six unknowns for each port; or ``"solid"``, finite elements of
             the whole body, by which designs are judged.
-        stroke: largest displacement of a cable [m].
-        max_effort: largest tension of a cable [N]; small enough that three cables together do not buckle the modules.
+        stroke: largest displacement of a wire either way [m].
+        max_effort: largest force of a wire [N].
         **options: options of `Robot`.
 
     Raises:
@@ -76,8 +76,8 @@ class ModularArm(Robot):
         *,
         cells: Sequence[str] = ("leaf_x", "leaf_y", "leaf_x", "leaf_y"),
         body: str = "superelements",
-        stroke: float = 0.008,
-        max_effort: float = 0.3,
+        stroke: float = 0.006,
+        max_effort: float = 1.0,
         **options: Any,
     ) -> None:
         if isinstance(cells, str) or not cells:
@@ -97,13 +97,14 @@ class ModularArm(Robot):
         self.max_effort = float(max_effort)
         self.design_space = DesignSpace(
             *self._dimensions(),
-            DesignVariable("cable_radius", 0.010, 0.016, 0.012, "m", "distance of the cables from the axis"),
+            DesignVariable("wire_radius", 0.010, 0.016, 0.012, "m", "distance of the wires from the axis"),
             DesignVariable("young_modulus", 1.0e7, 4.0e7, 2.0e7, "Pa", "stiffness of the printed material", log=True),
         )
         self.effector_rest = np.array([0.0, 0.0, self._height(self.design_space.baseline)])
-        self.effort_scale = np.full(3, 0.2)
+        self.effort_scale = np.full(2, 0.2)
         self.actuators = tuple(
-            Actuator(name, 0.0, self.stroke, self.stroke / 20.0, max_effort=self.max_effort) for name in CABLES
+            Actuator(name, -self.stroke, self.stroke, self.stroke / 10.0, unilateral=False, max_effort=self.max_effort)
+            for name in WIRES
         )
 
     def _dimensions(self) -> Iterator[DesignVariable]:
@@ -131,7 +132,7 @@ class ModularArm(Robot):
         return last.height + last.length
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
-        """Stack the modules on a clamped port, and thread the cables through all ports above it."""
+        """Stack the modules on a clamped port, and thread the wires through all ports above it."""
         builder = ModelBuilder(gravity=self.gravity)
         ports = [builder.add_frame(np.zeros(3), fixed=True, fixed_spin=True)]
         for part in self._modules(design):
@@ -145,12 +146,12 @@ class ModularArm(Robot):
             ports.append(far)
         model = builder.build()
         rows = np.array(ports[1:])[:, None] + np.arange(4)
-        for actuator, angle in zip(self.actuators, np.deg2rad([0.0, 120.0, 240.0]), strict=True):
-            guide = design["cable_radius"] * np.array([np.cos(angle), np.sin(angle), 0.0])
+        for actuator, direction in zip(self.actuators, WIRES.values(), strict=True):
+            guide = design["wire_radius"] * np.array([*direction, 0.0])
             points = EmbeddedPoints.from_weights(rows, np.tile([1.0, *guide], (len(rows), 1)), model.nodes)
             model.add("a", Cable(actuator.name, points, guide, unilateral=actuator.unilateral))
         model.add("e", Point("tip", EmbeddedPoints.in_frame(ports[-1], np.zeros(3), model.nodes)))
         if self.body == "superelements":
-            half = design["cable_radius"]
+            half = design["wire_radius"]
             model.skins += [box_skin(port, (half, half, 0.001), model.nodes) for port in ports]
         return model

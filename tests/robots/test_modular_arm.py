@@ -11,11 +11,11 @@ from softgym_envs.mechanics.solvers.statics import Statics
 def test_the_modular_arm_follows_finite_elements_of_the_whole_body():
     found = {}
     for body in ("superelements", "solid"):
-        robot = make_robot("modular_arm", cells=["leaf_x", "block"], body=body)
-        found[body] = Statics(robot.build()).solve(np.array([0.004, 0.0, 0.0])).condensed
+        robot = make_robot("modular_arm", cells=["leaf_x", "leaf_y"], body=body)
+        found[body] = Statics(robot.build()).solve(np.array([0.002, 0.001])).condensed
     moved = found["solid"].delta.e - robot.effector_rest
-    assert np.linalg.norm(moved) > 0.003
-    assert np.linalg.norm(found["superelements"].delta.e - found["solid"].delta.e) < 0.02 * np.linalg.norm(moved)
+    assert np.linalg.norm(moved) > 0.002
+    assert np.linalg.norm(found["superelements"].delta.e - found["solid"].delta.e) < 0.01 * np.linalg.norm(moved)
 
 
 def test_superelements_of_the_arm_have_no_weight():
@@ -25,12 +25,10 @@ def test_superelements_of_the_arm_have_no_weight():
 
 def test_the_compliance_of_the_arm_is_the_derivative_of_its_equilibria():
     model = make_robot("modular_arm").build()
-    solver, command, step = Statics(model), np.array([0.004, 0.001, 0.0]), 1e-6
-    state = solver.solve(command)
-    W, taut = state.condensed.W, np.flatnonzero(~state.slack)
-    assert taut[0] == 0  # the cable that is pulled further below
-    moves = [solver.solve(command + s * step * np.eye(3)[0]).condensed.delta.e for s in (1.0, -1.0)]
-    held = W.ea[:, taut] @ np.linalg.inv(W.aa[np.ix_(taut, taut)])
+    solver, command, step = Statics(model), np.array([0.004, 0.001]), 1e-6
+    W = solver.solve(command).condensed.W
+    moves = [solver.solve(command + s * step * np.eye(2)[0]).condensed.delta.e for s in (1.0, -1.0)]
+    held = W.ea @ np.linalg.inv(W.aa)
     np.testing.assert_allclose((moves[0] - moves[1]) / (2.0 * step), held[:, 0], rtol=1e-3, atol=1e-4)
 
 
