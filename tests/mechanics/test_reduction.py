@@ -78,6 +78,7 @@ def test_swings_of_the_finger_with_held_cables(command):
     # The whole body, in all motions that keep the lengths of the cables
     assembly = model.assembly
     assembled = assembly.evaluate(statics.x, statics.effort, model.loads)
+    assert assembled is not None
     lower = csc_matrix((assembled.tangent, assembly.indices, assembly.indptr)).toarray()
     stiffness = lower + np.tril(lower, -1).T
     rows = np.array([model.kinematics.row_velocity(statics.x, unit).ravel() for unit in np.eye(model.equations)])
@@ -93,7 +94,8 @@ def test_swings_of_the_finger_with_held_cables(command):
 
 def test_dependent_values_are_rejected():
     model = cases.rod(clamped=True, elements=2, radius=RADIUS)
-    tip = model.constraints["e"][0]
+    (tip,) = model.constraints["e"]
+    assert isinstance(tip, Point)
     model.add("e", Point("again", tip.embedding))
     with pytest.raises(ValueError, match="depend on each other"):
         reduce_motion(Statics(model))
