@@ -405,6 +405,29 @@ def robustness() -> str:
     return markdown(["robot", "plant", *CONTROLLERS], rows, "llrrr")
 
 
+def modular_arm() -> str:
+    """Arms on superelements against finite elements of the whole body."""
+    from benchmarks.modular import ARMS
+
+    def cell(name: str, key: str, form: str, unit: str) -> str:
+        return figure("modular_arm", f"{name}: {key}", form) + unit
+
+    rows = [
+        [
+            name,
+            cell(name, "tip, mean error [% of its motion]", ".2f", " %")
+            + ", "
+            + cell(name, "tip, largest error [% of its motion]", ".2f", " %"),
+            cell(name, "compliance of the tip, largest error [%]", ".1f", " %"),
+            cell(name, "superelements [CPU ms]", ".0f", " ms"),
+            cell(name, "finite elements [CPU s]", ".1f", " s"),
+        ]
+        for name in ARMS
+    ]
+    head = ["arm", "tip: mean and largest error", "compliance of the tip: largest error"]
+    return markdown([*head, "superelements", "finite elements"], rows, "lrrrr")
+
+
 def side_by_side() -> str:
     """The same problems in several codes."""
     rows = []
@@ -555,7 +578,7 @@ TABLES: dict[str, Callable[[], str]] = {
         test_set, trust, calibrated, buckling, predicted_tracking, trajectories, design_gradients, networks,
         design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop,
-        validation, contact, surrogate_speed, fem_speed, deployed, robustness, provenance,
+        validation, contact, surrogate_speed, fem_speed, deployed, robustness, modular_arm, provenance,
     )
 }  # fmt: skip
 """Tables by the name in a marked place."""

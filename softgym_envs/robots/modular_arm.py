@@ -142,7 +142,14 @@ class ModularArm(Robot):
             else:
                 far = builder.add_frame(origin + [0.0, 0.0, part.length])
                 energy = learned_module(part.kind).energy(part.design)
-                builder.add_superelement(ports[-1], far, energy, length=part.length, rotation=part.axes)
+                builder.add_superelement(
+                    ports[-1],
+                    far,
+                    energy,
+                    length=part.length,
+                    rotation=part.axes,
+                    young_modulus=part.design["young_modulus"],
+                )
             ports.append(far)
         model = builder.build()
         rows = np.array(ports[1:])[:, None] + np.arange(4)

@@ -80,6 +80,7 @@ class Superelement(ElementBlock):
         length: distance of the ports along the third axis of the part [m].
         origin: middle of the near port at rest [m], shape (3,); default the origin of the near frame.
         rotation: matrix whose columns are the axes of the part at rest, shape (3, 3); default those of space.
+        young_modulus: of its material, from which the stiffness of contact is chosen [Pa].
         inertia: kinetic energy ``1/2 sum M_ab v_a . v_b`` of the rows (middle and axes) of both ports [kg, kg m,
             kg m2], shape (8, 8); default none.
     """
@@ -95,6 +96,7 @@ class Superelement(ElementBlock):
         length: float,
         origin: np.ndarray | None = None,
         rotation: np.ndarray | None = None,
+        young_modulus: float = 0.0,
         inertia: np.ndarray | None = None,
     ) -> None:
         if not (np.isfinite(length) and length > 0.0):
@@ -103,6 +105,7 @@ class Superelement(ElementBlock):
         first, last = (int(row) for row in ends)
         start = nodes[first] if origin is None else np.asarray(origin, dtype=float)
         self.energy, self.length = energy, float(length)
+        self._young_modulus = float(young_modulus)
         self.nodes_used = np.concatenate([first + np.arange(4), last + np.arange(4)])
         ports = np.zeros((8, 8))
         for slot, row, middle in ((0, first, start), (4, last, start + length * axes[:, 2])):
@@ -123,6 +126,10 @@ class Superelement(ElementBlock):
         self._viscous = energy.evaluate(np.zeros(6))[2]
         self.stiffness = float(np.trace(self._viscous[:3, :3]) / 3.0)
         self._line = (np.array([[first, last]]), np.array([[0.5, 0.5]]), np.array([[[-1.0, 1.0]]]) / length)
+
+    @property
+    def largest_young_modulus(self) -> float:
+        return self._young_modulus
 
     def strains(self, x: np.ndarray) -> np.ndarray:
         """Return the strains (6,) at rows ``x`` (n, 3)."""

@@ -10,9 +10,7 @@ from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from softgym_envs.robots.modules.base import Module as Module
-    from softgym_envs.robots.modules.learned import LearnedModule as LearnedModule
     from softgym_envs.robots.modules.learned import learned_module as learned_module
-    from softgym_envs.robots.modules.learning import learn_module as learn_module
     from softgym_envs.robots.modules.registry import MODULES as MODULES
     from softgym_envs.robots.modules.structure import Link as Link
     from softgym_envs.robots.modules.structure import Structure as Structure
@@ -21,8 +19,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "base": ["Module"],
-        "learned": ["LearnedModule", "learned_module"],
-        "learning": ["learn_module"],
+        "learned": ["learned_module"],
         "registry": ["MODULES"],
         "structure": ["Link", "Structure"],
     },

@@ -1,5 +1,7 @@
 """How superelements are learned: least squares on gradients and Hessians of the energy from finite elements.
 
+``python -m softgym_envs.robots.modules.learning leaf_spring`` learns one again and writes it to the current folder.
+
 The residuals are what a user sees: the error of the strains under the load of a state, relative to the largest of the
 module, and the error of the stiffness relative to that of the state. Both weigh soft and stiff motions alike. The
 derivatives of the residuals are exact, and Levenberg and Marquardt's method finds the minimum.
@@ -288,3 +290,12 @@ def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
     others = {v.name: v.baseline for v in made.design_space if v.name not in names and v.name != "young_modulus"}
     model = fit(recipe, module, states, others)
     return replace(model, errors={name: errors(model, each) for name, each in tests.items()})
+
+
+if __name__ == "__main__":
+    import sys
+
+    for name in sys.argv[1:]:
+        learned = learn_module(name)
+        learned.save(f"{name}.json")
+        print(f"wrote {name}.json: {learned.errors}")
