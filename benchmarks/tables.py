@@ -418,13 +418,13 @@ def modular_arm() -> str:
             cell(name, "tip, mean error [% of its motion]", ".2f", " %")
             + ", "
             + cell(name, "tip, largest error [% of its motion]", ".2f", " %"),
-            cell(name, "compliance of the tip, largest error [%]", ".1f", " %"),
+            cell(name, "compliance of the tip, wires held, largest error [%]", ".1f", " %"),
             cell(name, "superelements [CPU ms]", ".0f", " ms"),
             cell(name, "finite elements [CPU s]", ".1f", " s"),
         ]
         for name in ARMS
     ]
-    head = ["arm", "tip: mean and largest error", "compliance of the tip: largest error"]
+    head = ["arm", "tip: mean and largest error", "compliance of the tip, wires held: largest error"]
     return markdown([*head, "superelements", "finite elements"], rows, "lrrrr")
 
 
