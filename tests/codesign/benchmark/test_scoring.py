@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from softgym_envs.codesign.benchmark import board, regret, runs
+from softgym_envs.codesign.benchmark.frozen import load_problem
 from softgym_envs.codesign.benchmark.problem import Score
 from softgym_envs.codesign.benchmark.scoring import Reference, front, hypervolume, improvement, normalised
 from softgym_envs.codesign.benchmark.search import make_optimiser, solve
@@ -166,3 +167,8 @@ def test_unseen_goals_tell_winners_that_fit_the_search_goals_only():
     assert [float(contest.regrets(m)[0]) for m in "ab"] == [0.0, 0.0]
     assert [float(contest.unseen(m)[0]) for m in "ab"] == [0.5, 1.25]
     assert "| 50.0 | 125.0 |" in board.regret_table(stored, unseen=True)
+
+
+def test_stored_runs_are_of_the_problems_as_they_are_frozen():
+    hashes = {run.problem: run.hash for run, _ in runs.stored_runs()}
+    assert {name: load_problem(name).hash for name in hashes} == hashes
