@@ -251,8 +251,11 @@ def _calibrated(model: SurrogateModel, calibration: Calibration, limit: float = 
 
 
 def safe_limit(judged: Predictions, tolerance: float) -> float:
-    """Return the largest uncertainty to be trusted: at most the tolerance [m], below that of all errors above it."""
-    wrong = judged.found & (judged.error > tolerance)
+    """Return the largest uncertainty to be trusted: at most the tolerance [m], below that of all wrong states.
+
+    A state is wrong if its error is above the tolerance, or if it has no equilibrium on FEM and yet is trusted.
+    """
+    wrong = (judged.found & (judged.error > tolerance)) | (judged.trusted & ~judged.found)
     return min(tolerance, SAFETY * float(judged.uncertainty[wrong].min(initial=np.inf)))
 
 

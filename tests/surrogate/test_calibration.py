@@ -232,13 +232,16 @@ def test_bodies_that_are_left_out_are_judged_by_the_others(trunk):
 
 
 def test_the_limit_is_below_all_wrong_states():
-    def judged(error, uncertainty):
-        values = np.array(error), np.array(uncertainty)
-        rows = len(values[0])
-        return Predictions(values[0], values[1], values[1], np.ones(rows, bool), np.ones(rows), np.ones(rows, bool))
+    def judged(error, uncertainty, found=None):
+        error = np.array(error)
+        every = np.ones(len(error), bool)
+        found = every if found is None else np.array(found)
+        return Predictions(error, np.array(uncertainty), np.array(uncertainty), every, np.ones(len(error)), found)
 
     assert safe_limit(judged([1e-3, 1e-4], [5e-3, 1e-4]), 2e-3) == 2e-3
     assert safe_limit(judged([1e-3, 3e-3, 5e-3], [1e-4, 1e-3, 4e-4]), 2e-3) == pytest.approx(0.8 * 4e-4)
+    # The second state is trusted, but has no equilibrium on FEM.
+    assert safe_limit(judged([1e-3, np.nan], [1e-4, 6e-4], [True, False]), 2e-3) == pytest.approx(0.8 * 6e-4)
 
 
 def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
@@ -317,6 +320,7 @@ def test_shipped_weights_hold_what_trust_promises(variant):
     rows = dict(model.card["calibration"]["strata"])
     assert model.domain.limit <= robot.goal_tolerance
     assert max(row["worst_trusted"] for row in rows.values()) <= robot.goal_tolerance
+    assert all(row["unsolved"] == 0 for row in rows.values())
     assert ("adversarial" in rows) == bool(model.card["calibration"]["attacks"])
     rows.pop("adversarial", None)
     rows.pop(module.TOUCHING, None)
