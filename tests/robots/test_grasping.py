@@ -131,6 +131,19 @@ def test_closing_on_other_objects(robot, kind):
     assert (grasp.gap > 0.0).all()
 
 
+def test_sliding_on_an_object_needs_no_potential(robot):
+    """Friction of sliding points has no potential: good Newton steps climb what the line search takes for one."""
+    design = {
+        **dict(e1=0.0124, e2=0.0075, e3=0.0035),
+        **{f"d{k}": d for k, d in enumerate((0.0137, 0.0269, 0.0272, 0.0209, 0.0136, 0.0222, 0.0123))},
+    }
+    ball = GraspObject("sphere", distance=20.1e-3, height=82e-3, offset=-1e-3, size=40e-3)
+    grasp = evaluate_grasp(robot, design, ball, angle=math.radians(20.0), angles=5)
+    assert grasp.status == "ok", grasp.reason
+    assert grasp.sliding.max() > 0 and grasp.contact_force > 0.1
+    assert grasp.iterations.sum() < 60
+
+
 def test_an_object_inside_the_finger_is_infeasible(robot):
     grasp = evaluate_grasp(robot, {}, GraspObject(distance=-0.005))
     assert grasp.status == "infeasible" and "object at rest" in grasp.reason

@@ -248,10 +248,10 @@ class Statics:
         change[driven] = (target - linear.delta)[driven]
         last, self._bend = self._bend, None
         expected = None if last is None or linear.inertia is not None else last.expected(change)
-        straight, corrections, full, crawls = 0.0, np.zeros(self.model.equations), False, 0
+        straight, corrections, full, crawls, norm = 0.0, np.zeros(self.model.equations), False, 0, np.inf
         for iteration in range(self.max_iterations + 1):
             step_q, step_effort = self._correction(None, linear.delta, self.effort, target, driven)
-            norm = self._norm(step_q)
+            previous, norm = norm, self._norm(step_q)
             if not np.isfinite(norm):
                 raise NewtonFailure
             if full and norm <= self.tolerance:
@@ -272,7 +272,9 @@ class Statics:
                 if found is None:
                     expected = None
             if found is None:
-                found = self._search(step_q, step_effort, penalty, slope, anyway=norm < self._round_off)
+                # Sliding friction has no potential, so that a good step can climb: it is known by being shorter.
+                climbs = linear.sliding and slope > 0.0 and norm < 0.5 * previous
+                found = self._search(step_q, step_effort, penalty, slope, anyway=climbs or norm < self._round_off)
             if found is None:
                 raise NewtonFailure
             x, effort, assembled, length = found
