@@ -30,9 +30,15 @@ SYSTEM_CHECK := import gmsh, pyvista; plotter = pyvista.Plotter(off_screen=True,
 	sys.exit(not plotter.screenshot(return_img=True).std() > 0)
 
 # Tests of studies in a database start their own PostgreSQL server; tests of reports open them in Chromium. Debian keeps
-# the programs of PostgreSQL off the search path.
+# the programs of PostgreSQL off the search path. (A shell function must not be called "chromium": "command -v" finds it.)
 POSTGRES_CHECK := ls /usr/lib/postgresql/*/bin/initdb || command -v initdb
 CHROMIUM_CHECK := command -v chromium || command -v chromium-browser || command -v google-chrome
+
+# Shell command that installs Debian packages. Mirrors fail now and then, and other programs lock the package database: it
+# waits and tries three times. A list that does not update (apt-get update) need not be the one of these packages.
+APT_OPTIONS := -o Acquire::Retries=3 -o DPkg::Lock::Timeout=120
+apt_install = { for pause in 0 20 60; do sleep $$pause; apt-get $(APT_OPTIONS) update; DEBIAN_FRONTEND=noninteractive \
+	apt-get $(APT_OPTIONS) install -y --no-install-recommends $(1) && break; done; } </dev/null || true
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
@@ -52,8 +58,7 @@ $(VENV)/.stamp-system: $(VENV)/.stamp
 	@check() { $(BIN)/python -c '$(SYSTEM_CHECK)' >/dev/null 2>&1; }; \
 	if ! check && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		echo "setup: installing the system libraries of gmsh and vtk"; \
-		{ apt-get update && DEBIAN_FRONTEND=noninteractive \
-			apt-get install -y --no-install-recommends $(SYSTEM_PACKAGES); } </dev/null || true; \
+		$(call apt_install,$(SYSTEM_PACKAGES)); \
 	fi; \
 	if check; then touch $@; else \
 		echo "setup: gmsh or off-screen pictures do not work here; install (Debian names): $(SYSTEM_PACKAGES)" >&2; \
@@ -62,17 +67,16 @@ $(VENV)/.stamp-system: $(VENV)/.stamp
 # The Debian package of PostgreSQL would create and start a system server, which the tests do not use: NO_CLUSTER prevents it.
 NO_CLUSTER := /etc/postgresql-common/createcluster.d/softgym-setup.conf
 test-programs:
-	@postgres() { { $(POSTGRES_CHECK); } >/dev/null 2>&1; }; chromium() { { $(CHROMIUM_CHECK); } >/dev/null 2>&1; }; \
-	missing="$$(postgres || echo postgresql) $$(chromium || echo chromium)"; \
+	@has_postgres() { { $(POSTGRES_CHECK); } >/dev/null 2>&1; }; has_chromium() { { $(CHROMIUM_CHECK); } >/dev/null 2>&1; }; \
+	missing="$$(has_postgres || echo postgresql) $$(has_chromium || echo chromium)"; \
 	if [ "$$missing" != " " ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		echo "setup: installing programs of the tests: $$missing"; \
 		mkdir -p $(dir $(NO_CLUSTER)) && echo "create_main_cluster = false" > $(NO_CLUSTER); \
-		{ apt-get update && for package in $$missing; do DEBIAN_FRONTEND=noninteractive \
-			apt-get install -y --no-install-recommends $$package; done; } </dev/null || true; \
+		for package in $$missing; do $(call apt_install,$$package); done; \
 		rm -f $(NO_CLUSTER); \
 	fi; \
-	postgres || echo "setup: without PostgreSQL, tests of shared studies are skipped; install (Debian name): postgresql" >&2; \
-	chromium || echo "setup: without Chromium, tests of reports in a browser are skipped; install (Debian name): chromium" >&2
+	has_postgres || echo "setup: without PostgreSQL, tests of shared studies are skipped; install (Debian name): postgresql" >&2; \
+	has_chromium || echo "setup: without Chromium, tests of reports in a browser are skipped; install (Debian name): chromium" >&2
 
 demo: setup
 	$(BIN)/softgym codesign --config configs/codesign/finger_reach.yaml --folder $(DEMO)
