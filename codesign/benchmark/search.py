@@ -22,7 +22,9 @@ class Optimiser(Protocol):
     """What `solve` needs of an optimiser.
 
     One that works with several fidelities also has ``share``: the share of the goals and of the training's steps that
-    the next body is scored with.
+    the next body is scored with. One that evaluates the learned model itself has ``steps_left``, which is set before
+    each `ask` to the environment steps that it may spend, and ``take_charge()``, which returns the environment steps
+    and CPU seconds that it has spent since; they count as those of the body scored next.
     """
 
     def ask(self) -> Mapping[str, float]:
@@ -41,7 +43,8 @@ class Search:
         level: name of the budget: small, medium or large.
         judge: who controls the bodies; default that of the problem.
         seed: added to those of trainings.
-        limit: largest number of bodies; default none besides the budget.
+        limit: largest number of bodies; default none besides the budget. A search also ends when it has spent the
+            environment steps of so many baselines, for methods whose bodies cost more than a score.
     """
 
     problem: FrozenProblem
@@ -71,7 +74,17 @@ class Search:
         """Whether budget is left. The score that crosses a limit is the last one, and it counts."""
         if self.limit is not None and len(self.ledger) >= self.limit:
             return False
+        if self.ledger and self.steps_left <= 0:
+            return False
         return all(value < max(getattr(self.limits, name), 1) for name, value in self.spent.items())
+
+    @property
+    def steps_left(self) -> float:
+        """Environment steps that may be spent before the last body begins."""
+        allowed = float(self.limits.environment_steps)
+        if self.limit is not None and self.ledger and self.ledger[0].environment_steps:
+            allowed = min(allowed, self.limit * self.ledger[0].environment_steps)
+        return allowed - self.spent["environment_steps"]
 
     def evaluate(self, design: Mapping[str, float], budget: float = 1.0) -> Score:
         """Score a body and write it into the ledger; see `FrozenProblem.evaluate`.
@@ -110,9 +123,16 @@ def solve(search: Search, optimiser: Optimiser) -> float:
     began = time.process_time()
     if not search.ledger:
         search.evaluate(search.problem.definition.baseline_values)
+    charges = hasattr(optimiser, "take_charge")
     while search.open:
+        if charges:
+            optimiser.steps_left = search.steps_left - search.ledger[0].environment_steps  # type: ignore[attr-defined]
         design = optimiser.ask()
-        optimiser.tell(search.evaluate(design, getattr(optimiser, "share", 1.0)))
+        row = search.evaluate(design, getattr(optimiser, "share", 1.0))
+        if charges:
+            steps, seconds = optimiser.take_charge()  # type: ignore[attr-defined]
+            row.environment_steps, row.cpu_seconds = row.environment_steps + steps, row.cpu_seconds + seconds
+        optimiser.tell(row)
     return time.process_time() - began - search.spent["cpu_seconds"]
 
 
@@ -220,6 +240,12 @@ def _optuna(name: str, **options: Any) -> Callable[[FrozenProblem, int], Optimis
     return make
 
 
+def _gradient(problem: FrozenProblem, seed: int) -> Optimiser:
+    from softgym_envs.codesign.benchmark.descents import GradientOptimiser
+
+    return GradientOptimiser(problem, seed)
+
+
 METHODS: dict[str, Callable[[FrozenProblem, int], Optimiser]] = {
     "random": _optuna("random"),
     "sobol": _optuna("qmc", scramble=True),
@@ -227,12 +253,13 @@ METHODS: dict[str, Callable[[FrozenProblem, int], Optimiser]] = {
     "gp": _optuna("gp", n_startup_trials=8),
     "cmaes": _optuna("cmaes"),
     "nsgaii": _optuna("nsgaii", population_size=8),
+    "gradient": _gradient,
     "halving": _halving("SuccessiveHalvingPruner", min_resource=1, reduction_factor=2),
     "hyperband": _halving("HyperbandPruner", min_resource=1, max_resource=4, reduction_factor=2),
 }
 """Baselines: name -> function of problem and seed. A new one is one row."""
 
-SINGLE_OBJECTIVE = ("cmaes", "halving", "hyperband")
+SINGLE_OBJECTIVE = ("cmaes", "gradient", "halving", "hyperband")
 """Methods that know a single objective only."""
 
 

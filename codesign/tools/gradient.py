@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -17,6 +18,20 @@ from softgym_envs.codesign.tools.plots import draw_descents
 from softgym_envs.codesign.tools.records import BestDesign, Descent, GradientResult
 from softgym_envs.config import provenance
 from softgym_envs.storage import write_json
+
+
+class Cost(Protocol):
+    """A cost of the designs of a box, with gradients."""
+
+    @property
+    def box(self) -> Box:
+        """The designs."""
+
+    def __call__(self, unit: Tensor) -> Tensor:
+        """Return the cost of points (B, d) in unit coordinates, shape (B,)."""
+
+    def with_gradient(self, unit: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the cost of one point (d,) and its gradient (d,)."""
 
 
 class WeightedCost:
@@ -70,7 +85,7 @@ class WeightedCost:
         return float(cost[0].detach()), gradient[0].numpy()
 
 
-def descend(cost: WeightedCost, start: np.ndarray, *, iterations: int = 100, tolerance: float = 1e-6) -> Descent:
+def descend(cost: Cost, start: np.ndarray, *, iterations: int = 100, tolerance: float = 1e-6) -> Descent:
     """Minimise a cost within the box from one start (d,) in unit coordinates (L-BFGS-B).
 
     It ends when no component of the projected gradient exceeds the tolerance.
