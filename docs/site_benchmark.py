@@ -15,6 +15,7 @@ PARTS = {
     "regrets": board.regret_table,
     "unseen": board.unseen_table,
     "methods": board.method_table,
+    "winners": board.winners_table,
 }
 """Name of a part, in ``<!-- benchmark: NAME -->`` -> the function that writes it."""
 

@@ -14,6 +14,7 @@ from softgym_envs.codesign.benchmark.regret import MethodRow, Stored, contests, 
 from softgym_envs.codesign.benchmark.runs import stored_runs
 from softgym_envs.codesign.benchmark.scoring import DATA, normalised, reference
 from softgym_envs.codesign.benchmark.submission import Submission
+from softgym_envs.codesign.benchmark.winners import rank_correlation, stored_winners
 
 SUBMISSIONS = DATA / "submissions"
 """Accepted submissions, one JSON file each."""
@@ -210,3 +211,28 @@ def reference_table(data: Path = DATA) -> str:
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = ["| " + " | ".join(header) + " |", "| " + " | ".join("---" for _ in header) + " |"]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def winners_table(data: Path = DATA) -> str:
+    """Return the stored winners of the median seeds on both models, and what all stored winners say together."""
+    rows = stored_winners(data)
+    if not rows:
+        return "No winners are stored."
+    cells, notes = [], []
+    for name in sorted({row.problem for row in rows}):
+        problem = load_problem(name, check=False)
+        unit, sign = problem.definition.primary, problem.definition.primary.sign
+        members = [row for row in rows if row.problem == name]
+        for row in sorted((row for row in members if row.median), key=lambda row: -row.surrogate):
+            fem = "no equilibrium" if row.fem is None else f"{sign * unit.scale * row.fem:.4f}"
+            values = [f"{sign * unit.scale * row.surrogate:.4f}", fem, f"{unit.scale * row.exploitation:.4f}"]
+            cells.append([f"`{name}`", row.method, f"{row.seed}", *values])
+                [f"`{name}`", row.method, f"{row.seed}", f"{sign * unit.scale * row.surrogate:.4f}", fem, exploited]
+            )
+        gaps = unit.scale * np.array([row.exploitation for row in members if row.fem is not None])
+        notes.append(
+            f"* `{name}`: {len(members)} winners; exploitation {gaps.min():.4f} to {gaps.max():.4f} {unit.unit}, "
+            f"mean {gaps.mean():.4f} {unit.unit}; Kendall's tau {rank_correlation(members):.2f}."
+        )
+    header = ["problem", "method", "median seed", "learned model [mm]", "finite elements [mm]", "exploitation [mm]"]
+    return _table(header, cells) + "\n\n" + "\n".join(notes)

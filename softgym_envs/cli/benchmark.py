@@ -1,4 +1,4 @@
-"""Verbs of the benchmark of co-design: list, show, run, verify, table, board, judges, freeze."""
+"""Verbs of the benchmark of co-design: list, show, run, winners, verify, table, board, judges, freeze."""
 
 from __future__ import annotations
 
@@ -124,6 +124,35 @@ def judges(name: str, bodies: int, folder: Path) -> None:
         found = runs.judges(folder, name, bodies)
     for judge, row in found["judges"].items():
         click.echo(f"{judge}: Kendall's tau {row['kendall_tau']:.2f}, mean exploitation {row['exploitation']:.3g} (SI)")
+
+
+@benchmark.command()
+@click.argument("names", nargs=-1, required=True)
+@click.option(
+    "--every", multiple=True, help="Check the winners of all seeds of this method; several with several options."
+)
+@click.option("--store", is_flag=True, help="Add the winners to the stored ones (source checkout).")
+@results
+def winners(names: tuple[str, ...], every: tuple[str, ...], store: bool, folder: Path) -> None:
+    """Check the winners of the stored searches of problems NAMES on finite elements.
+
+    They are those of each method's median seed under the inverse QP, on the search goals, with the budget `small`.
+    Exploitation is the score on the learned model minus that on finite elements. An interrupted call continues.
+    """
+    from softgym_envs.codesign.benchmark import winners as module
+
+    for name in names:
+        with options.resumable():
+            rows = module.check(folder, name, every)
+        for row in rows:
+            exact = "no equilibrium" if row.fem is None else f"{row.fem:.4g}"
+            click.echo(
+                f"{name} {row.method} seed {row.seed}: learned model {row.surrogate:.4g}, finite elements {exact}, "
+                f"exploitation {row.exploitation:.2g} (SI)"
+            )
+        click.echo(f"{name}: Kendall's tau {module.rank_correlation(rows):.2f} over {len(rows)} winners")
+        if store:
+            click.echo(f"wrote {module.store(rows)}")
 
 
 @benchmark.command()

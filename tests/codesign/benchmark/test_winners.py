@@ -1,0 +1,29 @@
+"""Winners on finite elements."""
+
+import math
+
+import pytest
+
+from softgym_envs.codesign.benchmark import board, runs, winners
+
+
+def test_winners_are_scored_on_both_models_and_stored(tiny, tmp_path):
+    for seed in (0, 1, 2):
+        runs.run(tmp_path, "tiny-v1", "random", "qp", "small", seed)
+    runs.collect(tmp_path, tmp_path)
+    (median,) = winners.check(tmp_path, "tiny-v1", data=tmp_path)
+    every = winners.check(tmp_path, "tiny-v1", ["random"], data=tmp_path)
+    assert [row.seed for row in every] == [0, 1, 2] and [row for row in every if row.median] == [median]
+    assert sorted(row.surrogate for row in every)[1] == median.surrogate
+    assert abs(median.exploitation) < 0.1 * abs(median.fem)
+    winners.store([median], tmp_path)
+    winners.store(every, tmp_path)
+    assert winners.stored_winners(tmp_path) == every
+    text = board.winners_table(tmp_path)
+    assert "| `tiny-v1` | random |" in text and "3 winners" in text
+    assert -1.0 <= winners.rank_correlation(every) <= 1.0 and math.isnan(winners.rank_correlation(every[:2]))
+
+
+def test_problems_without_stored_searches_are_refused(tiny, tmp_path):
+    with pytest.raises(ValueError, match="no searches"):
+        winners.check(tmp_path, "tiny-v1", data=tmp_path)
