@@ -208,11 +208,6 @@ def reference_table(data: Path = DATA) -> str:
     return _table(["problem", "baseline [SI]", "best known [SI]", "found by"], rows)
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = ["| " + " | ".join(header) + " |", "| " + " | ".join("---" for _ in header) + " |"]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
-
-
 def winners_table(data: Path = DATA) -> str:
     """Return the stored winners of the median seeds on both models, and what all stored winners say together."""
     rows = stored_winners(data)
@@ -227,8 +222,6 @@ def winners_table(data: Path = DATA) -> str:
             fem = "no equilibrium" if row.fem is None else f"{sign * unit.scale * row.fem:.4f}"
             values = [f"{sign * unit.scale * row.surrogate:.4f}", fem, f"{unit.scale * row.exploitation:.4f}"]
             cells.append([f"`{name}`", row.method, f"{row.seed}", *values])
-                [f"`{name}`", row.method, f"{row.seed}", f"{sign * unit.scale * row.surrogate:.4f}", fem, exploited]
-            )
         gaps = unit.scale * np.array([row.exploitation for row in members if row.fem is not None])
         notes.append(
             f"* `{name}`: {len(members)} winners; exploitation {gaps.min():.4f} to {gaps.max():.4f} {unit.unit}, "
@@ -236,3 +229,8 @@ def winners_table(data: Path = DATA) -> str:
         )
     header = ["problem", "method", "median seed", "learned model [mm]", "finite elements [mm]", "exploitation [mm]"]
     return _table(header, cells) + "\n\n" + "\n".join(notes)
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(header) + " |", "| " + " | ".join("---" for _ in header) + " |"]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
