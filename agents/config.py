@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from pydantic import Field, field_validator, model_validator
 
+from softgym_envs.backends.time_steps import shared_options
 from softgym_envs.config import BesideConfig, Config
 from softgym_envs.envs.options import EnvironmentOptions, default_backend, set_up
 from softgym_envs.envs.registration import EnvironmentRow, find_row
@@ -120,8 +121,8 @@ class EnvironmentConfig(Config):
         return set_up(row.robot, row.task, self.backend, EnvironmentOptions.check(options)).together
 
     def on(self, backend: str) -> EnvironmentConfig:
-        """Return the same environment on another backend, without the options of the present backend."""
-        options = self.backend_options if backend == self.backend else {}
+        """Return the same environment on another backend, with those options of the present one that mean the same."""
+        options = self.backend_options if backend == self.backend else shared_options(self.backend_options)
         return self.model_copy(update={"backend": backend, "backend_options": options})
 
     def make_robot(self) -> Robot:

@@ -74,11 +74,10 @@ def check_tests(config: StudyConfig) -> None:
 
 def finalist_environment(config: StudyConfig, backend: str, options: Mapping[str, float]) -> EnvironmentConfig:
     """Return the environment in which finalists are tested on a backend."""
-    own = config.environment_of(options)
-    backend_options: dict[str, Any] = own.backend_options if backend == own.backend else {}
+    found = config.environment_of(options).on(backend)
     if backend == "fem":
-        backend_options = {**backend_options, **config.finalists.fem_options}
-    return own.model_copy(update={"backend": backend, "backend_options": backend_options})
+        found = found.model_copy(update={"backend_options": {**found.backend_options, **config.finalists.fem_options}})
+    return found
 
 
 def _test(folder: StudyFolder, plan: PlannedTest) -> FinalistTest:

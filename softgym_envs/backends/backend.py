@@ -44,15 +44,16 @@ class State:
         condensed: condensed model at the state; learned models evaluate it when it is first read.
         bonds: forces in the bonds of the body [N], in the order of its model; empty if it has none.
         velocity: effector velocities [m/s], shape (k, 3); zero without dynamics.
-        motion: time, velocities and energies of the body; None without dynamics.
+        motion: time, velocities and energies of the body; None without dynamics, and on the surrogate.
         stable: the equilibrium is stable whether displacements or efforts are commanded (always True on the
             surrogate). In dynamics: the tangent of the time step, including inertia, is positive definite.
         uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM.
-        trusted: the state lies where the learned model may be trusted; always True for FEM.
+        trusted: the state lies where the learned model may be trusted; always True for FEM without superelements.
         doubt: why it is not trusted, 0 if it is: a sum of numbers in `softgym_envs.surrogate.domain.DOUBTS`.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
         contacts: where the body touches, with forces and gaps; None if it cannot touch anything.
-        memory: what the backend needs to go on from here where friction depends on the path; None without contact.
+        memory: what the backend needs besides to go on from here: the past of friction, or the motion of a learned
+            model; None where the other attributes are enough.
     """
 
     command: np.ndarray

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State
+from softgym_envs.backends.time_steps import TimeSteps
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.constraints.cable import Cable
@@ -18,6 +19,7 @@ from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.domain import LOADED
 
 TOUCH_RADIUS = 2.5e-3
 """Radius over which a touch is spread [m]."""
@@ -53,7 +55,7 @@ class FEMBackend(Backend):
 
     Attributes:
         model: the present body.
-        substeps: time steps of a control step.
+        steps: time steps of a control step, and damping.
         step_options: options of `Dynamics`.
         largest_efforts: of the actuators, shape (n_a,).
     """
@@ -76,15 +78,11 @@ class FEMBackend(Backend):
     ) -> None:
         if not isinstance(dynamics, bool):
             raise ValueError(f"dynamics = {dynamics!r} is unknown; allowed: True, False")
-        for name, value in (("control_step", control_step), ("time_step", time_step)):
-            if not (np.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} = {value} s must be positive and finite")
         self.robot = robot
         self.moving = dynamics
-        self.control_step = control_step
-        self.substeps = max(1, int(np.ceil(control_step / time_step - 1e-9)))
+        self.steps = TimeSteps(control_step, time_step, mass_damping, stiffness_damping)
         self.step_options: dict[str, Any] = {
-            "step": control_step / self.substeps,
+            "step": self.steps.step,
             "scheme": scheme,
             "mass_damping": mass_damping,
             "stiffness_damping": stiffness_damping,
@@ -116,8 +114,8 @@ class FEMBackend(Backend):
                 # Loads would move the actuators, so they are held.
                 rest = statics.solve(zero)
             self._dynamics = Dynamics(model, **self.step_options) if self.moving else None
-            self._rest = self._state(rest, zero, still=True)
             self.model, self._statics, self.design = model, statics, complete
+            self._rest = self._state(rest, zero, still=True)
             self._own_loads = model.nodal_loads.copy()
         self.touch(None)
         self.restore(self._rest)
@@ -286,8 +284,7 @@ class FEMBackend(Backend):
         start = self.state.effort
         if mode == "displacement":
             start = self.state.command if self._mode == mode else self.state.displacement
-        parts = start + np.arange(1, self.substeps + 1)[:, None] / self.substeps * (command - start)
-        parts[-1] = command  # without round-off
+        parts = self.steps.ramp(start, command)
         aims = np.clip(parts, -self.largest_efforts, self.largest_efforts) if mode == "effort" else parts
         done, motion = self._dynamics.advance_compiled(
             aims, mode, largest_effort=self.largest_efforts, effector_force=load
@@ -338,6 +335,7 @@ class FEMBackend(Backend):
         if motion is not None and not still:
             assert self._dynamics is not None
             velocity = self._dynamics.effector_velocity().reshape(-1, 3)
+        known = all(block.knows(equilibrium.x) for block in self.model.blocks)
         return State(
             command=np.array(command, dtype=float),
             displacement=equilibrium.delta[slices["a"]],
@@ -350,6 +348,8 @@ class FEMBackend(Backend):
             motion=motion,
             bonds=equilibrium.effort[len(condensed.effort) :],
             stable=equilibrium.stable,
+            trusted=known,
+            doubt=0 if known else LOADED,
             contacts=equilibrium.contacts,
             memory=equilibrium.memory,
         )

@@ -97,9 +97,7 @@ class FEMBatch(BatchBackend):
         first, present = self._first, self._present
         step = first.step_options
         if self.moving:
-            parts = np.arange(1, first.substeps + 1)[:, None] / first.substeps
-            targets = self._targets(self.command[:, None] + parts * (command - self.command)[:, None])
-            targets[:, -1, : command.shape[1]] = command
+            targets = self._targets(first.steps.ramp(self.command, command).swapaxes(0, 1))
         else:
             targets = self._targets(command[:, None])
         solved = self._beams.march(

@@ -11,12 +11,15 @@ import numpy as np
 
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.backends.batch import BatchBackend, BatchState
+from softgym_envs.backends.surrogate_motion import MotionState, SurrogateMotion
+from softgym_envs.backends.time_steps import TimeSteps
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.inertia import read_inertia
 from softgym_envs.surrogate.model import Context, SurrogateModel
-from softgym_envs.surrogate.pretrained import pretrained_model
+from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
 
 #: A search ends when its next step is below this [quarter of the actuator range]: 3e-7 m for a cable of 20 mm. Single
 #: precision does not allow much less.
@@ -130,11 +133,13 @@ class SurrogateBody:
     Args:
         model: the learned model.
         design: the body.
+        motion: what steps it in time; None in statics.
     """
 
-    def __init__(self, model: SurrogateModel, design: Design) -> None:
-        self.model, self.design = model, design
+    def __init__(self, model: SurrogateModel, design: Design, motion: SurrogateMotion | None = None) -> None:
+        self.model, self.design, self._motion = model, design, motion
         self._context, self._unilateral = model.context(design.array[None]), model.robot.unilateral
+        self._inertia = np.zeros((1, 0)) if motion is None else motion.inertia.body(design.array[None])
 
     def rest(self) -> State:
         """Return the state at rest.
@@ -154,9 +159,7 @@ class SurrogateBody:
             ConvergenceError: if the search does not find it.
             ValueError: for a malformed command.
         """
-        command = np.asarray(command, dtype=float)
-        if command.shape != (self.model.count,) or not np.isfinite(command).all():
-            raise ValueError(f"command must be {self.model.count} finite numbers, got {command.tolist()}")
+        command = self._checked(command)
         place = start.displacement[None]
         if mode == "displacement":
             found = solve_displacements(
@@ -172,8 +175,39 @@ class SurrogateBody:
             raise ConvergenceError(f"the surrogate finds no equilibrium under {mode}s {command.tolist()}")
         return self._state(command, found)
 
+    def advance(self, command: np.ndarray, mode: str, start: State) -> State:
+        """Return the state a control step after ``start``, in motion.
+
+        Raises:
+            ConvergenceError: if a time step is not solved.
+            ValueError: for a malformed command, or for commanded efforts.
+        """
+        assert self._motion is not None
+        command = self._checked(command)
+        if mode != "displacement":
+            raise ValueError(f"mode = {mode!r} is not available in motion on the surrogate; allowed: 'displacement'")
+        moved, found = self._motion.advance(
+            self._context, self._inertia, start.memory, start.command[None], command[None]
+        )
+        if not found[0]:
+            raise ConvergenceError(f"the surrogate cannot move to displacements {command.tolist()}")
+        state = self._state(command, self._motion.judged(self._context, moved, command[None], found))
+        return replace(
+            state,
+            condensed=partial(_first, self._motion, moved),
+            velocity=self._motion.effector_velocity(moved).reshape(-1, 3),
+            memory=moved,
+        )
+
+    def _checked(self, command: np.ndarray) -> np.ndarray:
+        command = np.asarray(command, dtype=float)
+        if command.shape != (self.model.count,) or not np.isfinite(command).all():
+            raise ValueError(f"command must be {self.model.count} finite numbers, got {command.tolist()}")
+        return command
+
     def _state(self, command: np.ndarray, found: BatchState) -> State:
         displacement, effort, effector = found.displacement[0], found.effort[0], found.effector[0]
+        motion = self._motion
         return State(
             command=command.copy(),
             displacement=displacement,
@@ -183,6 +217,7 @@ class SurrogateBody:
             # W is evaluated on demand, because many agents never read it.
             condensed=partial(_condensed, self.model, self._context, displacement, effort, effector),
             velocity=np.zeros((len(effector) // 3, 3)),
+            memory=None if motion is None else motion.at_rest(self._context, found.displacement, found.effort),
             uncertainty=float(found.uncertainty[0]),
             trusted=bool(found.doubt[0] == 0),
             doubt=int(found.doubt[0]),
@@ -198,17 +233,45 @@ def _condensed(
     return CondensedModel(W, np.concatenate([displacement, effector]) - W @ full, full, model.roles, model.rows)
 
 
+def _first(motion: SurrogateMotion, state: MotionState) -> CondensedModel:
+    """Condensed model of the last time step of one body."""
+    many = motion.condensed(state)
+    return CondensedModel(many.compliance[0], many.free[0], many.effort[0], many.roles, many.rows)
+
+
+def _motion_of(
+    model: SurrogateModel, weights: str | Path | None, dynamics: bool, steps: TimeSteps
+) -> SurrogateMotion | None:
+    """Return what steps bodies of a model in time; None without dynamics.
+
+    Raises:
+        WeightsError: if there is no inertia beside the weights.
+    """
+    if not isinstance(dynamics, bool):
+        raise ValueError(f"dynamics = {dynamics!r} is unknown; allowed: True, False")
+    if not dynamics:
+        return None
+    folder = pretrained_folder(model.robot) if weights is None else Path(weights)
+    return SurrogateMotion(model, read_inertia(folder, model.robot), steps)
+
+
 class SurrogateBackend(Backend):
-    """States from a learned condensed model.
+    """States from a learned condensed model: static equilibria, or motion in time with a learned inertia.
 
     Args:
         robot: the robot.
         design: first design; missing variables take their baseline.
         weights: folder of weights; default the shipped ones.
         members: how many members of the ensemble to use, fewer for speed; default all.
+        dynamics: step in time, starting from the static equilibrium; for the robots whose weights have an inertia.
+        control_step: duration of one `step` [s].
+        time_step: largest physical time step [s]; commands are ramped over those of a control step.
+        mass_damping: Rayleigh's alpha [1/s].
+        stiffness_damping: Rayleigh's beta [s].
 
     Attributes:
         model: the learned model.
+        steps: time steps of a control step, and damping.
 
     Raises:
         WeightsError: if there are no weights for the robot, or they are damaged.
@@ -221,6 +284,12 @@ class SurrogateBackend(Backend):
         design: Mapping[str, float] | None = None,
         weights: str | Path | None = None,
         members: int | None = None,
+        *,
+        dynamics: bool = False,
+        control_step: float = 0.05,
+        time_step: float = 0.01,
+        mass_damping: float = 0.0,
+        stiffness_damping: float = 0.01,
     ) -> None:
         if not robot.convex:
             raise ValueError(
@@ -229,13 +298,16 @@ class SurrogateBackend(Backend):
             )
         self.robot = robot
         self.model = pretrained_model(robot, weights, members)
+        self.steps = TimeSteps(control_step, time_step, mass_damping, stiffness_damping)
+        self._motion = _motion_of(self.model, weights, dynamics, self.steps)
+        self.moving = dynamics
         self._body: SurrogateBody | None = None
         self.reset(robot.design_space.complete(design))
 
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)
         if self._body is None or complete != self.design:
-            body = SurrogateBody(self.model, complete)
+            body = SurrogateBody(self.model, complete, self._motion)
             self._rest = body.rest()
             self._body, self.design = body, complete
         self.state = self._rest
@@ -245,8 +317,16 @@ class SurrogateBackend(Backend):
         if force is not None and np.any(force):
             raise ValueError("the surrogate does not support forces on effectors; use backend='fem'")
         assert self._body is not None
-        self.state = self._body.solve(command, mode, self.state)
+        if self.moving:
+            self.state = self._body.advance(command, mode, self.state)
+        else:
+            self.state = self._body.solve(command, mode, self.state)
         return self.state
+
+    def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
+        """Return the static equilibrium under a command without going there."""
+        assert self._body is not None
+        return self._body.solve(command, mode, self.state)
 
     def restore(self, state: State) -> None:
         self.state = state
@@ -260,6 +340,8 @@ class SurrogateBatch(BatchBackend):
         designs: bodies, shape (B, number of design variables).
         weights: as for `SurrogateBackend`.
         members: as for `SurrogateBackend`.
+        dynamics: as for `SurrogateBackend`.
+        **steps: attributes of `TimeSteps`.
 
     Attributes:
         model: the learned model.
@@ -274,9 +356,14 @@ class SurrogateBatch(BatchBackend):
         designs: np.ndarray,
         weights: str | Path | None = None,
         members: int | None = None,
+        *,
+        dynamics: bool = False,
+        **steps: float,
     ) -> None:
         self.robot = robot
         self.model = pretrained_model(robot, weights, members)
+        self._motion = _motion_of(self.model, weights, dynamics, TimeSteps(**steps))
+        self.moving = dynamics
         self._unilateral = robot.unilateral
         count = len(designs)
         # One body for all rows, until they differ.
@@ -284,6 +371,10 @@ class SurrogateBatch(BatchBackend):
         self.command = np.zeros((count, len(robot.actuators)))
         rest = self._found_rest(self._context.rows(np.zeros(1, dtype=np.int64)), designs[:1])
         self._rest, self.state = rest.repeat(count), rest.repeat(count)
+        if self._motion is not None:
+            self._inertia = self._motion.inertia.body(designs)
+            self._moving = self._motion.at_rest(self._context, self._rest.displacement, self._rest.effort)
+            self._settled = rest.repeat(count)
         other = np.flatnonzero((designs != designs[:1]).any(axis=1))
         if len(other):
             self.begin(other, designs[other])
@@ -300,19 +391,31 @@ class SurrogateBatch(BatchBackend):
         context = self.model.context(designs)
         self._context.put(index, context)
         self._rest.put(index, self._found_rest(context, designs))
+        if self._motion is not None:
+            self._inertia[index] = self._motion.inertia.body(designs)
         self.rest(index)
         return {}
 
     def rest(self, index: np.ndarray) -> None:
         self.command[index] = 0.0
-        self.state.put(index, self._rest.rows(index))
+        rest = self._rest.rows(index)
+        self.state.put(index, rest)
         self.state.slack[index] = False
+        if self._motion is not None:
+            still = self._motion.at_rest(self._context.rows(index), rest.displacement, rest.effort)
+            self._moving.put(index, still)
+            self._settled.put(index, rest)
 
     def step(self, command: np.ndarray) -> None:
         present = self.state
-        state = solve_displacements(
-            self.model, self._context, command, present.displacement, self._unilateral, present.slack
-        )
+        if self._motion is None:
+            state = solve_displacements(
+                self.model, self._context, command, present.displacement, self._unilateral, present.slack
+            )
+        else:
+            moved, solved = self._motion.advance(self._context, self._inertia, self._moving, self.command, command)
+            self._moving = moved.where(solved, self._moving)
+            state = self._motion.judged(self._context, self._moving, command, solved)
         found = state.converged.copy()
         if found.all():
             self.command, self.state = command, replace(state, converged=found)
@@ -326,11 +429,17 @@ class SurrogateBatch(BatchBackend):
         return np.where(found.converged[:, None], found.effector[:, :3], np.nan)
 
     @property
+    def velocity(self) -> np.ndarray | None:
+        return None if self._motion is None else self._motion.effector_velocity(self._moving)[:, :3]
+
+    @property
     def stable(self) -> np.ndarray:
         return np.ones(len(self.command), dtype=bool)
 
     @property
     def condensed(self) -> CondensedModel:
+        if self._motion is not None:
+            return self._motion.condensed(self._moving)
         batch = self.model.condensed(self._context, self.state.displacement)
         effort, delta = batch.effort.copy(), batch.delta.array
         # Slack cables carry no effort; the network's may differ from zero by rounding.
@@ -339,7 +448,16 @@ class SurrogateBatch(BatchBackend):
         return CondensedModel(batch.compliance, free, effort, batch.roles, batch.rows)
 
     def settled(self) -> BatchState:
-        return self.state
+        if self._motion is None:
+            return self.state
+        # The search for slack cables starts where they were last.
+        last = self._settled
+        found = solve_displacements(
+            self.model, self._context, self.command, last.displacement, self._unilateral, last.slack
+        )
+        self._settled = replace(found.where(found.converged, last), converged=found.converged)
+        return self._settled
 
     def gradient(self, effector: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return displacement_gradient(self.model, self._context, self.state, effector, effort)
+        state = self.state if self._motion is None else self._settled
+        return displacement_gradient(self.model, self._context, state, effector, effort)

@@ -17,7 +17,13 @@ from softgym_envs.version import __version__
 SECTIONS = {
     "Environments": (environments.list_, environments.rollout, environments.record, environments.view),
     "Robots": (robots.show, robots.export),
-    "Surrogates": (surrogates.dataset, surrogates.fit, surrogates.calibrate_trust, surrogates.deploy),
+    "Surrogates": (
+        surrogates.dataset,
+        surrogates.fit,
+        surrogates.fit_inertia,
+        surrogates.calibrate_trust,
+        surrogates.deploy,
+    ),
     "Agents": (agents.train, agents.evaluate, agents.results, agents.deploy_policy),
     "Design and control": (codesign.codesign, codesign.optimise, codesign.sensitivity, codesign.calibrate),
     "Benchmark": (benchmark.benchmark,),

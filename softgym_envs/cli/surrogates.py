@@ -1,4 +1,4 @@
-"""Verbs for surrogates: dataset, fit, deploy."""
+"""Verbs for surrogates: dataset, fit, fit-inertia, calibrate-trust, deploy."""
 
 from __future__ import annotations
 
@@ -83,6 +83,32 @@ def calibrate_trust(
         state_folder=folder, kept_only=kept_only,
     )  # fmt: skip
     click.echo(json.dumps({name: asdict(row) for name, row in found.items()}, indent=2))
+
+
+@click.command("fit-inertia")
+@click.argument("robot", shell_complete=options.complete_robot)
+@options.robot_option
+@click.option("--weights", type=options.PATH, help="Folder of the weights (default: the shipped weights).")
+@click.option("--bodies", type=click.IntRange(8), default=128, show_default=True, help="Number of bodies.")
+@click.option("--states", type=click.IntRange(1), default=4, show_default=True, help="Commands of each body.")
+@click.option("--degree", type=click.IntRange(1), default=3, show_default=True, help="Degree of the polynomials.")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+def fit_inertia(
+    robot: str, options_: tuple[str, ...], weights: Path | None, bodies: int, states: int, degree: int, workers: int
+) -> None:
+    """Learn the inertia of a robot, for motion on its surrogate.
+
+    Bodies are drawn and reduced about equilibria on FEM. The result is written beside the weights.
+    """
+    from softgym_envs.surrogate.inertia import write_inertia
+    from softgym_envs.surrogate.inertia_training import fit_inertia as run
+    from softgym_envs.surrogate.pretrained import pretrained_folder
+
+    body = options.robot_of(robot, options_)
+    found = run(body, bodies=bodies, states=states, degree=degree, workers=workers, progress=True)
+    write_inertia(found, weights or pretrained_folder(body))
+    names = ("bodies", "states", "tested_bodies", "mean_frequency_error", "largest_frequency_error")
+    click.echo(json.dumps({name: found.card[name] for name in names}, indent=2))
 
 
 @click.command()

@@ -148,7 +148,7 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
         sampled=design_names(space, options.sample_design),
         shown=design_names(space, options.design_in_observation),
         action_mode=options.action_mode,
-        plants=Plants.check(plant or None, made, backend),
+        plants=Plants.check(plant or None, made, backend, moving=bool(backend_options.get("dynamics", False))),
     )
 
 

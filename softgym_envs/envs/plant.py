@@ -49,8 +49,16 @@ class Plants:
     high: Plant
 
     @classmethod
-    def check(cls, option: Mapping[str, float | Sequence[float]] | None, robot: Robot, backend: str) -> Plants | None:
+    def check(
+        cls, option: Mapping[str, float | Sequence[float]] | None, robot: Robot, backend: str, *, moving: bool = False
+    ) -> Plants | None:
         """Return the plants of the option ``plant``: a number or a range for each attribute. None without the option.
+
+        Args:
+            option: the option.
+            robot: the robot.
+            backend: name of its backend.
+            moving: whether that computes motion in time.
 
         Raises:
             ValueError: for an unknown name, a value out of bounds, or a plant that the robot or its backend cannot be.
@@ -81,6 +89,10 @@ class Plants:
             raise ValueError(
                 f"plant stiffness: robot '{robot.name}' has weight, contacts or limited efforts, which do not scale "
                 "with its stiffness; change its design instead"
+            )
+        if not stiff and moving:
+            raise ValueError(
+                "plant stiffness changes frequencies, which dynamics=True would not show; change the design"
             )
         return found
 

@@ -106,6 +106,8 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         if setup.backend != "surrogate":
             supported = [name for name, other in ENVIRONMENTS.items() if other.backend == "surrogate"]
             raise ValueError(f"id = {id!r} is not an environment on the surrogate; allowed: {', '.join(supported)}")
+        if setup.backend_options.get("dynamics", False):
+            raise ValueError("dynamics is not available on tensors; allowed: False, or gymnasium.make_vec")
         if setup.plants is not None:
             raise ValueError("plant is not available on tensors; allowed: None, or gymnasium.make_vec")
         self.robot, self.task, self.spaces = setup.robot, setup.task, setup.spaces()

@@ -117,6 +117,15 @@ class Kinematics:
         """Velocities of the equations (N,) that give the rows at ``x`` (n, 3) the velocities (n, 3)."""
         return self._equations(velocity, 0.5 * np.cross(x[self._directors], velocity[self._directors]).sum(axis=1))
 
+    def equation_force(self, x: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """Forces on the equations (N,) of forces on all rows at ``x``, both (n, 3): the transpose of `row_velocity`."""
+        out = np.zeros(self.equations)
+        out[: len(self.free_dofs)] = force.ravel()[self.free_dofs]
+        if self.map is not None:
+            self.map.linearise(x)
+            out += self.map.matrix.T @ force[self.frames.carried].ravel()
+        return out
+
     def increment(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Displacements and rotation vectors of the equations (N,) that lead from rows ``start`` to ``end``, (n, 3)."""
         turn = np.einsum("fki,fkj->fij", end[self._directors], start[self._directors])

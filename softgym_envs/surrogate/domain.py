@@ -12,11 +12,12 @@ import numpy as np
 from softgym_envs.robots.base import Robot
 
 #: Why a state is not trusted. Batched states hold the sum of these numbers, 0 for a trusted state.
-OUTSIDE, SPREAD, SOFT = 1, 2, 4
+OUTSIDE, SPREAD, SOFT, LOADED = 1, 2, 4, 8
 
-DOUBTS = {OUTSIDE: "outside box", SPREAD: "spread", SOFT: "softening"}
+DOUBTS = {OUTSIDE: "outside box", SPREAD: "spread", SOFT: "softening", LOADED: "loads"}
 """The reasons in words: body or displacements lie outside the box of the training states; the uncertainty is above the
-limit; the actuators are so soft that the body may be about to buckle."""
+limit; the actuators are so soft that the body may be about to buckle; a learned superelement carries larger loads than
+those that it was learned under."""
 
 SLACK = 1e-3
 """Actuators that end farther beyond their commands than this are slack [half their range]."""

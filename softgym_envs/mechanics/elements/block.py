@@ -59,6 +59,10 @@ class ElementBlock(ABC):
         """Young's modulus [Pa] of the stiffest element; zero for parts that are not elastic."""
         return 0.0
 
+    def knows(self, x: np.ndarray) -> bool:
+        """Whether the energy is known at rows ``x`` (n, 3); learned ones are known where they were learned."""
+        return True
+
     @abstractmethod
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Pairs of degrees of freedom of the tangent's entries: (rows, columns), index arrays of one shape.

@@ -36,6 +36,9 @@ class PortEnergy(Protocol):
     def evaluate(self, strains: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the energy [J], its gradient (6,) [N, N m] and its Hessian (6, 6) at strains (6,)."""
 
+    def knows(self, strains: np.ndarray) -> bool:
+        """Whether the energy is known at strains (6,)."""
+
 
 @dataclass(frozen=True)
 class QuadraticEnergy:
@@ -52,6 +55,9 @@ class QuadraticEnergy:
     def evaluate(self, strains: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         gradient = self.stiffness @ strains
         return 0.5 * float(strains @ gradient), gradient, self.stiffness
+
+    def knows(self, strains: np.ndarray) -> bool:
+        return True
 
 
 def _strain_forms() -> np.ndarray:
@@ -135,6 +141,9 @@ class Superelement(ElementBlock):
         """Return the strains (6,) at rows ``x`` (n, 3)."""
         z = x[self.nodes_used]
         return 0.5 * np.einsum("iab,ad,bd->i", self._forms, z, z, optimize=True) - self._rest
+
+    def knows(self, x: np.ndarray) -> bool:
+        return self.energy.knows(self.strains(x))
 
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
         return [lower_pairs((3 * self.nodes_used[:, None] + np.arange(3)).reshape(1, 24))]
