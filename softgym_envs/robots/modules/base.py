@@ -12,6 +12,7 @@ import numpy as np
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.pose import Pose
+from softgym_envs.mechanics.elements.tetrahedra import SolidOptions
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Drawing
@@ -106,8 +107,7 @@ class Module(ABC):
             mesh.tetrahedra,
             fixed=clamped,
             element="quadratic",
-            young_modulus=complete["young_modulus"],
-            poisson_ratio=complete["poisson_ratio"],
+            **self.elasticity(complete, rotation),
         )
         height = heights(builder.nodes[start:])
         if near is not None:
@@ -116,6 +116,10 @@ class Module(ABC):
             far = builder.add_frame(origin + length * rotation[:, 2])
         builder.carry(far, start + np.flatnonzero(height > (1.0 - 1e-6) * length))
         return far
+
+    def elasticity(self, design: Mapping[str, float], rotation: np.ndarray) -> SolidOptions:
+        """Return the elasticity of the body of a complete design; the columns of ``rotation`` (3, 3) are its axes."""
+        return {"young_modulus": design["young_modulus"], "poisson_ratio": design["poisson_ratio"]}
 
     def model(self, design: Mapping[str, float] | None = None, *, refine: float = 1.0) -> MechanicalModel:
         """Return the model of a design with the near port clamped; its six actuators drive the pose of the far port."""

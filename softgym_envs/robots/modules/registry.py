@@ -8,6 +8,7 @@ MODULES = Registry(
     "module",
     {
         "solid_block": "softgym_envs.robots.modules.solid_block:SolidBlock",
+        "printed_block": "softgym_envs.robots.modules.printed_block:PrintedBlock",
         "leaf_spring": "softgym_envs.robots.modules.leaf_spring:LeafSpring",
         "crossed_leaves": "softgym_envs.robots.modules.crossed_leaves:CrossedLeaves",
         "notch_hinge": "softgym_envs.robots.modules.notch_hinge:NotchHinge",
