@@ -275,6 +275,10 @@ class Robot(ABC):
             error.add_note(f"while assembling robot '{self.name}' for {complete}")
             raise
 
+    def printable(self) -> Robot:
+        """Return the robot whose solid parts are this one's body; it takes the same designs."""
+        return self
+
     def _add_contact(self, model: MechanicalModel, design: Mapping[str, float]) -> None:
         obstacles = (*self.own_obstacles(model, design), *self.obstacles)
         if not obstacles and not self.self_contact:

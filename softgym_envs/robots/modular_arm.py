@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.errors import unknown_name
+from softgym_envs.errors import InfeasibleDesign, unknown_name
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
@@ -28,6 +28,14 @@ CELLS: dict[str, tuple[str, np.ndarray]] = {
     "block": ("solid_block", np.eye(3)),
 }
 """What a cell may be: a module, and the axes in which it stands. A ``leaf_x`` bends towards x."""
+
+KINDS = (*CELLS, "none")
+"""What a cell may be whose kind is part of the design, by the whole part of its variable ``kind``."""
+
+SHARES = {"leaf_spring": ("leaf_length", "width", "thickness"), "solid_block": ("length", "width", "depth")}
+"""Dimensions of a module that ``length``, ``width`` and ``depth`` of a cell set if its kind is part of the design."""
+
+MOST_CELLS = 12
 
 BODIES = ("superelements", "solid")
 
@@ -52,11 +60,13 @@ class _Cell(NamedTuple):
 class ModularArm(Robot):
     """Modules in a row on a clamped base. Wires that pull and push run through guides that are fixed to the ports.
 
-    The kinds of the cells are an option, so that arms of other structures are other robots; their dimensions are the
-    design.
+    If ``cells`` is a list of kinds, arms of other structures are other robots, and the dimensions of the cells are the
+    design. If it is a number, the structure is part of the design: ``kind_1`` from 0 to 4 says what the first cell is
+    (`KINDS`; a cell that is ``none`` is left out), and ``length_1``, ``width_1`` and ``depth_1`` are its dimensions as
+    shares of their learned ranges, because each kind has its own.
 
     Args:
-        cells: what each cell is, from the base to the tip: names in `CELLS`.
+        cells: what each cell is, from the base to the tip: names in `CELLS`; or the largest number of cells.
         body: ``"superelements"``, learned modules with six unknowns for each port; or ``"solid"``, finite elements of
             the whole body, by which designs are judged.
         stroke: largest displacement of a wire either way [m].
@@ -74,24 +84,26 @@ class ModularArm(Robot):
     def __init__(
         self,
         *,
-        cells: Sequence[str] = ("leaf_x", "leaf_y", "leaf_x", "leaf_y"),
+        cells: Sequence[str] | int = ("leaf_x", "leaf_y", "leaf_x", "leaf_y"),
         body: str = "superelements",
         stroke: float = 0.006,
         max_effort: float = 1.0,
         **options: Any,
     ) -> None:
-        if isinstance(cells, str) or not cells:
-            raise ValueError(f"cells must be a list of names, got {cells!r}; allowed: {', '.join(CELLS)}")
-        for cell in cells:
-            if cell not in CELLS:
-                raise ValueError(unknown_name("cell", cell, CELLS))
+        if isinstance(cells, int) and not isinstance(cells, bool):
+            if not 1 <= cells <= MOST_CELLS:
+                raise ValueError(f"cells = {cells} is out of bounds; allowed: 1 to {MOST_CELLS}")
+        elif isinstance(cells, str | bool) or not cells:
+            raise ValueError(f"cells must be a number or a list of names, got {cells!r}; allowed: {', '.join(CELLS)}")
+        elif unknown := [cell for cell in cells if cell not in CELLS]:
+            raise ValueError(unknown_name("cell", unknown[0], CELLS))
         if body not in BODIES:
             raise ValueError(unknown_name("body", body, BODIES))
         super().__init__(**options)
         if body == "superelements" and any(self.gravity):
             raise ValueError("superelements have no mass: use body = 'solid' with gravity")
         self.stiffness_variable = None if any(self.gravity) else "young_modulus"
-        self.cells = tuple(cells)
+        self.cells = cells if isinstance(cells, int) else tuple(cells)
         self.body = body
         self.stroke = float(stroke)
         self.max_effort = float(max_effort)
@@ -108,31 +120,56 @@ class ModularArm(Robot):
         )
 
     def _dimensions(self) -> Iterator[DesignVariable]:
+        if isinstance(self.cells, int):
+            yield from _free_cells(self.cells)
+            return
         for number, cell in enumerate(self.cells, start=1):
             name, _ = CELLS[cell]
             variables = MODULES[name]().design_space
             for dimension, (low, high) in learned_module(name).box.items():
-                baseline = min(max(variables[dimension].baseline, low), high)
                 described = f"{variables[dimension].description} (cell {number})"
-                yield DesignVariable(f"{dimension}_{number}", low, high, baseline, "m", described)
+                yield DesignVariable(f"{dimension}_{number}", low, high, _typical(name, dimension), "m", described)
+
+    def kinds(self, design: Mapping[str, float] | None = None) -> tuple[str, ...]:
+        """Return what each cell of a design is, from the base to the tip: names in `KINDS`."""
+        if not isinstance(self.cells, int):
+            return self.cells
+        complete = self.design_space.complete(design)
+        numbers = [int(complete[f"kind_{number}"]) for number in range(1, self.cells + 1)]
+        return tuple(KINDS[min(number, len(KINDS) - 1)] for number in numbers)
 
     def _modules(self, design: Mapping[str, float]) -> Iterator[_Cell]:
         """Yield the cells of a complete design from the base to the tip."""
         height = 0.0
-        for number, cell in enumerate(self.cells, start=1):
+        for number, cell in enumerate(self.kinds(design), start=1):
+            if cell == "none":
+                continue
             name, axes = CELLS[cell]
-            own = {dimension: design[f"{dimension}_{number}"] for dimension in learned_module(name).box}
+            own = self._size(design, name, number)
             own["young_modulus"] = design["young_modulus"]
             part = _Cell(name, MODULES[name](), own, axes, height)
             yield part
             height += part.length
 
+    def _size(self, design: Mapping[str, float], module: str, number: int) -> dict[str, float]:
+        """Return the dimensions of a cell that is a module [m]."""
+        box = learned_module(module).box
+        if not isinstance(self.cells, int):
+            return {dimension: design[f"{dimension}_{number}"] for dimension in box}
+        shares = dict(zip(SHARES[module], ("length", "width", "depth"), strict=True))
+        return {d: low + design[f"{shares[d]}_{number}"] * (high - low) for d, (low, high) in box.items()}
+
+    def printable(self) -> ModularArm:
+        options: dict[str, Any] = {**self._options, "body": "solid"}
+        return ModularArm(**options)
+
     def _height(self, design: Mapping[str, float]) -> float:
-        *_, last = self._modules(design)
-        return last.height + last.length
+        return sum(part.length for part in self._modules(design))
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Stack the modules on a clamped port, and thread the wires through all ports above it."""
+        if set(self.kinds(design)) == {"none"}:
+            raise InfeasibleDesign("all cells of the arm are left out; allowed: at least one that is not 'none'")
         builder = ModelBuilder(gravity=self.gravity)
         ports = [builder.add_frame(np.zeros(3), fixed=True, fixed_spin=True)]
         for part in self._modules(design):
@@ -162,3 +199,25 @@ class ModularArm(Robot):
             half = design["wire_radius"]
             model.skins += [box_skin(port, (half, half, 0.001), model.nodes) for port in ports]
         return model
+
+
+def _typical(module: str, dimension: str) -> float:
+    """Return a module's baseline of a dimension, or the nearest value that was learned [m]."""
+    low, high = learned_module(module).box[dimension]
+    return min(max(MODULES[module]().design_space[dimension].baseline, low), high)
+
+
+def _free_cells(count: int) -> Iterator[DesignVariable]:
+    """Yield the variables of cells whose kinds are part of the design; at the baseline, leaves that take turns."""
+    box = learned_module("leaf_spring").box
+    for number in range(1, count + 1):
+        kind = KINDS.index("leaf_x" if number % 2 else "leaf_y") + 0.5
+        described = (
+            f"what the cell is: {', '.join(f'{k} from {place}' for place, k in enumerate(KINDS))} (cell {number})"
+        )
+        yield DesignVariable(f"kind_{number}", 0.0, float(len(KINDS)), kind, "-", described)
+        for name, dimension in zip(("length", "width", "depth"), SHARES["leaf_spring"], strict=True):
+            low, high = box[dimension]
+            share = (_typical("leaf_spring", dimension) - low) / (high - low)
+            described = f"{name} as a share of its range (cell {number})"
+            yield DesignVariable(f"{name}_{number}", 0.0, 1.0, share, "-", described)

@@ -1,11 +1,15 @@
 """The modular arm on superelements against finite elements of its whole body."""
 
+import gymnasium
 import numpy as np
 import pytest
 
 from softgym_envs import make_robot
-from softgym_envs.errors import DesignError
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.geometry.export import export_body
+from softgym_envs.surrogate.domain import doubt_text
 
 
 def test_the_modular_arm_follows_finite_elements_of_the_whole_body():
@@ -44,8 +48,71 @@ def test_cells_are_an_option_and_their_dimensions_the_design():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"cells": ["leaf_z"]}, "unknown cell 'leaf_z'"), ({"cells": []}, "list of names"), ({"body": "fem"}, "'fem'")],
+    [
+        ({"cells": ["leaf_z"]}, "unknown cell 'leaf_z'"),
+        ({"cells": []}, "list of names"),
+        ({"cells": True}, "list of names"),
+        ({"cells": 13}, "cells = 13 is out of bounds; allowed: 1 to 12"),
+        ({"body": "fem"}, "'fem'"),
+    ],
 )
 def test_wrong_options_of_the_arm_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         make_robot("modular_arm", **options)
+
+
+def test_the_structure_may_be_part_of_the_design():
+    """The baseline is the arm of the same leaves; cells can be left out, but not all; shares span learned ranges."""
+    free, fixed = make_robot("modular_arm", cells=4), make_robot("modular_arm")
+    assert free.kinds() == fixed.cells
+    tips = [Statics(robot.build()).solve(np.array([0.004, -0.002])).delta[2:] for robot in (free, fixed)]
+    np.testing.assert_allclose(*tips, atol=1e-9)
+    design = {
+        "kind_1": 2.0,
+        "kind_2": 0.0,
+        "kind_3": 3.9,
+        "kind_4": 4.0,
+        "length_1": 0.0,
+        "depth_1": 1.0,
+        "length_2": 1.0,
+    }
+    assert free.kinds(design) == ("block", "leaf_x", "none", "none")
+    same = make_robot("modular_arm", cells=["block", "leaf_x"])
+    sizes = {"length_1": 0.010, "width_1": 0.020, "depth_1": 0.020, "leaf_length_2": 0.025}
+    tips = [
+        Statics(robot.build(d)).solve(np.array([0.002, 0.0])).delta[2:] for robot, d in ((free, design), (same, sizes))
+    ]
+    np.testing.assert_allclose(*tips, atol=1e-9)
+    with pytest.raises(InfeasibleDesign, match="all cells of the arm are left out"):
+        free.build({f"kind_{k}": 3.5 for k in range(1, 5)})
+
+
+def test_loads_that_were_not_learned_are_told():
+    """A leaf that is bent about its stiff axis carries 68 times the largest load that it was learned under."""
+    usual, bent = ({"cells": cells} for cells in (["leaf_x", "leaf_y"], ["leaf_x", "block"]))
+    for options, command, trusted in ((usual, [0.002, 0.001], True), (bent, [0.0, 0.002], False)):
+        env = gymnasium.make("SoftGym/ModularReach-v0", robot_options=options)
+        _, info = env.reset(seed=0)
+        assert info["trusted"]
+        state = env.unwrapped.backend.step(np.array(command))
+        assert state.trusted == trusted and (state.doubt == 0) == trusted
+    assert "loads" in doubt_text(state.doubt)
+    solid = FEMBackend(make_robot("modular_arm", body="solid", **bent))
+    assert solid.step(np.array([0.0, 0.002])).trusted
+
+
+def test_environments_draw_structures():
+    env = gymnasium.make("SoftGym/ModularReach-v0", robot_options={"cells": 3}, sample_design=True)
+    structures = set()
+    for seed in range(6):
+        env.reset(seed=seed)
+        structures.add(env.unwrapped.robot.kinds(env.unwrapped.design))
+        observation, *_ = env.step(env.action_space.sample())
+        assert np.isfinite(observation).all()
+    assert len(structures) > 3
+
+
+def test_the_arm_is_written_as_its_solid_body(tmp_path):
+    path = export_body(make_robot("modular_arm", cells=2), tmp_path / "arm.stl", {"kind_1": 2.5})
+    assert path.stat().st_size > 10_000
+    assert make_robot("modular_arm", cells=2).printable().body == "solid"

@@ -61,6 +61,22 @@ def test_a_block_obeys_beam_theory():
     assert found[Z, Z] == pytest.approx(length / (E * area), rel=1e-6)
 
 
+def test_a_printed_block_is_lighter_softer_and_turns_with_its_lattice():
+    """Along z it has the share of its walls; in other directions less. Full walls give the solid block."""
+    block, solid = MODULES["printed_block"](), MODULES["solid_block"]()
+    slender = {"length": 0.06, "width": 0.01, "depth": 0.01, "poisson_ratio": 0.0}
+    whole = solid.compliance(slender)
+    np.testing.assert_allclose(block.compliance({**slender, "wall_x": 1.0}), whole, rtol=2e-3, atol=1e-6 * whole.max())
+    walls = {"wall_x": 0.2, "wall_y": 0.4}
+    found = block.compliance({**slender, **walls})
+    assert found[2, 2] == pytest.approx(whole[2, 2] / (1.0 - 0.8 * 0.6), rel=1e-3)
+    assert found[5, 5] > whole[5, 5] / 0.52  # torsion shears the lattice
+    turned = block.compliance({**slender, **walls, "angle": np.pi / 2})
+    other = block.compliance({**slender, "wall_x": 0.4, "wall_y": 0.2})
+    scale = np.sqrt(np.outer(np.diag(other), np.diag(other)))
+    np.testing.assert_allclose(turned / scale, other / scale, atol=3e-3)
+
+
 def test_a_tube_twists_by_bredt():
     radius, wall, length = 0.010, 0.003, 0.040
     design = {"radius": radius, "wall": wall, "length": length, "young_modulus": E, "poisson_ratio": 0.3}

@@ -39,6 +39,7 @@ def export_body(
         ValueError: for another ending, or a robot without an exact shape (STEP) or a solid part (STL).
     """
     path = _check_path(path)
+    robot = robot.printable()
     if path.suffix == ".step":
         write_drawing(robot.drawing(robot.design_space.complete(design)), path, time_limit=time_limit)
     elif isinstance(robot, MeshedRobot):

@@ -80,20 +80,32 @@ class ModuleEnergy:
         length: of the module [m].
         stiffness: ``k`` [J], shape (6,).
         corrections: ``c`` of `TERMS`, shape (len(TERMS),).
+        rotation: the largest load that was learned, as the angle by which it would turn the softest rotation [rad];
+            see `softgym_envs.robots.modules.states.solve_states`. Default any load.
 
     Raises:
         ValueError: for a stiffness that is not positive.
     """
 
-    def __init__(self, length: float, stiffness: np.ndarray, corrections: np.ndarray) -> None:
+    def __init__(self, length: float, stiffness: np.ndarray, corrections: np.ndarray, rotation: float = np.inf) -> None:
         self.stiffness = np.array(stiffness, dtype=float)
         self.corrections = np.array(corrections, dtype=float)
         if not (self.stiffness > 0.0).all():
             raise ValueError(f"the stiffness of a module must be positive, got {self.stiffness.tolist()} J")
         self._scale = np.array([1.0 / length] * 3 + [1.0] * 3)
+        moment = rotation * self.stiffness[3:].min()
+        self._largest = np.array([2.0 * moment / length] * 3 + [moment] * 3)
 
     def evaluate(self, strains: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the energy [J], its gradient (6,) [N, N m] and its Hessian (6, 6) at strains (6,) [m, 1]."""
         gradient, hessian = np.empty(6), np.empty((6, 6))
         energy = _energy(self._scale * strains, TERMS, self.stiffness, self.corrections, gradient, hessian)
         return energy, self._scale * gradient, self._scale[:, None] * hessian * self._scale
+
+    def load(self, strains: np.ndarray) -> float:
+        """Return the load at strains (6,) over the largest one that was learned."""
+        return float(np.linalg.norm(self.evaluate(strains)[1] / self._largest))
+
+    def knows(self, strains: np.ndarray) -> bool:
+        """Whether the load at strains (6,) is at most the largest one that was learned."""
+        return self.load(strains) <= 1.0

@@ -86,6 +86,7 @@ class LearnedModule:
             length,
             complete["young_modulus"] * length**3 * np.exp(polynomials(unit, self.degrees[0]) @ self.stiffness)[0],
             (polynomials(unit, self.degrees[1]) @ self.corrections)[0],
+            self.rotation,
         )
 
     def save(self, path: str | Path) -> None:
