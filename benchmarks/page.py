@@ -23,12 +23,23 @@ from pathlib import Path
 
 from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
+from benchmarks.motion import TABLES as MOTION_TABLES
+from benchmarks.printed import TABLES as PRINTED_TABLES
 from benchmarks.recorded import figure
+from benchmarks.structures import TABLES as STRUCTURE_TABLES
 from benchmarks.tables import TABLES as OTHER_TABLES
 from benchmarks.zigzag_tables import ZIGZAG_TABLES
 from softgym_envs.errors import DataError
 
-TABLES = OTHER_TABLES | ZIGZAG_TABLES | CONVERGENCE_TABLES | ACCURATE_TABLES
+TABLES = (
+    OTHER_TABLES
+    | ZIGZAG_TABLES
+    | CONVERGENCE_TABLES
+    | ACCURATE_TABLES
+    | MOTION_TABLES
+    | PRINTED_TABLES
+    | STRUCTURE_TABLES
+)
 ROOT = Path(__file__).resolve().parents[1]
 MARKER = re.compile(r"(<!-- bench: (?P<key>.+?) -->)(?P<text>.*?)(<!-- /bench -->)", re.DOTALL)
 
