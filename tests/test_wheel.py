@@ -16,5 +16,6 @@ def test_all_data_files_are_in_the_wheel():
         folder = (ROOT / package.replace(".", "/")).resolve()
         shipped |= {path.resolve() for pattern in globs for path in folder.glob(pattern) if path.is_file()}
     folders = [ROOT / name for name in ("softgym_envs", "agents", "codesign", "configs")]
-    needed = {path for folder in folders for path in folder.rglob("*") if path.is_file() and path.suffix not in LEFT_OUT}
+    files = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
+    needed = {path for path in files if path.suffix not in LEFT_OUT}
     assert sorted(str(path.relative_to(ROOT)) for path in needed - shipped) == []
