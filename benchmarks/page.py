@@ -23,6 +23,7 @@ from pathlib import Path
 
 from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
+from benchmarks.grasp_codesign import TABLES as GRASP_TABLES
 from benchmarks.motion import TABLES as MOTION_TABLES
 from benchmarks.printed import TABLES as PRINTED_TABLES
 from benchmarks.recorded import figure
@@ -36,6 +37,7 @@ TABLES = (
     | ZIGZAG_TABLES
     | CONVERGENCE_TABLES
     | ACCURATE_TABLES
+    | GRASP_TABLES
     | MOTION_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
