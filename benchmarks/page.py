@@ -22,6 +22,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
+from benchmarks.contact_sets import TABLES as SET_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
 from benchmarks.grasp_codesign import TABLES as GRASP_TABLES
 from benchmarks.motion import TABLES as MOTION_TABLES
@@ -38,6 +39,7 @@ TABLES = (
     | CONVERGENCE_TABLES
     | ACCURATE_TABLES
     | GRASP_TABLES
+    | SET_TABLES
     | MOTION_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
