@@ -40,10 +40,10 @@ def test_scenes_are_kept_and_both_models_are_compared(tmp_path, monkeypatch):
     monkeypatch.setattr(contact_sets, "LEARNED", (1,))
     chain = contact_sets.close_chain
     monkeypatch.setattr(contact_sets, "close_fem", lambda model, scene, self_contact: chain(model, scene))
-    found = compare(model, tmp_path, taught=2, chain_taught=2, tests=1, steps=200)
+    found = compare(model, tmp_path, taught=2, chain_taught=2, tests=1, steps=100)
     assert found["chain, 2 bars"]["force_error, worst"] == 0.0
     assert found["states of finite elements"] == 2 * INCREMENTS
-    assert found["taught by finite elements, its own scenes"]["tip_error, median"] < 2e-3
+    assert found["taught by finite elements, its own scenes"]["tip_error, median"] < 5e-3
     monkeypatch.setattr(contact_sets, "make_scene", lambda *_: pytest.fail("the scenes are kept"))
     (scene,) = kept_scenes(model, tmp_path, (2,), 1, contact_sets.TEST_SEED)
     drawn = draw_scene(model, 2, np.random.default_rng([contact_sets.TEST_SEED, 2, 0]))
