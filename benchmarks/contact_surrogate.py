@@ -28,12 +28,8 @@ if TYPE_CHECKING:
 INCREMENTS = 12
 MOST_DRAWS = 3000
 """Scenes that are drawn before giving up on one."""
-CROWDED = 5
-"""Number of bars from which on they are placed one after the other."""
 GAPS = (1.0e-4, 2.5e-4)
 """Distance of a further bar from the bent finger [m]: half of the distance of contact and less."""
-SMALL_GAPS = (GAPS, (2.5e-4, 3.0e-4), (3.0e-4, 3.5e-4))
-"""Distances that are tried one after the other, so that a bar does not take the load off those before it."""
 BLOCK, STATES = 1000, 50
 """Bodies of a batch, and states of each body, in which W is checked."""
 
@@ -73,10 +69,8 @@ def draw_scene(model: ChainModel, contacts: int, rng: np.random.Generator) -> Sc
     """Draw a body and bars, all of which the closed chain presses.
 
     Bars stand before outer corners of the zigzag. The force on each is at least 1 % of the sum, which is at least
-    0.1 N. Half of the bodies have zigzags that are moved towards a straight line. The first bar bends the finger. Up to
-    four bars, the others are placed together before the bent finger; more are placed one after the other, each before
-    the finger that the bars before it have bent, and one that takes the load off another is left out. Few bodies press
-    five bars: none of 84 random ones pressed six.
+    0.1 N. Half of the bodies have zigzags that are moved towards a straight line. The first bar bends the finger, and
+    the others are placed together before the bent finger. Scenes with more than four bars are rare.
 
     Raises:
         RuntimeError: if no scene is found in which the body at rest is free.
@@ -93,24 +87,13 @@ def draw_scene(model: ChainModel, contacts: int, rng: np.random.Generator) -> Sc
         prepared = model.prepare(row)
         if not prepared.known[0]:
             continue
-        chosen = rng.permutation(model.chain.points + 1)
-        if contacts < CROWDED:
-            chosen = np.sort(chosen[:contacts])
-            groups = [chosen[:1], chosen[1:]]
-        else:
-            groups = [chosen[k : k + 1] for k in range(len(chosen))]
+        chosen = np.sort(rng.permutation(model.chain.points + 1)[:contacts])
         bars: list[Cylinder] = []
-        for group in groups:
+        for group in (chosen[:1], chosen[1:]):
             batch = _closed(model, row, bars, angle)
             if batch is None:
                 break
-            for gaps in SMALL_GAPS if contacts >= CROWDED and bars else (GAPS,):
-                new = _bars_before(batch, corners, group, friction, gaps, rng, len(bars))
-                if gaps is GAPS or _all_press(_closed(model, row, [*bars, *new], angle)):
-                    bars += new
-                    break
-            if len(bars) == contacts:
-                break
+            bars += _bars_before(batch, corners, group, friction, rng, len(bars))
         if len(bars) < contacts or ChainBatch(prepared, [bars]).states.gap[0] < 0.001:
             continue
         if _all_press(_closed(model, row, bars, angle)):
@@ -140,7 +123,6 @@ def _bars_before(
     corners: slice,
     group: np.ndarray,
     friction: float,
-    gaps: tuple[float, float],
     rng: np.random.Generator,
     placed: int,
 ) -> list[Cylinder]:
@@ -153,7 +135,7 @@ def _bars_before(
     places = carried_points(batch.memory.q, chain.marker_nodes[corners], arms)[0]
     bars = []
     for k in group:
-        gap = rng.uniform(*gaps) if placed else -rng.uniform(0.001, 0.004)
+        gap = rng.uniform(*GAPS) if placed else -rng.uniform(0.001, 0.004)
         radius = float(rng.uniform(0.002, 0.0025))
         centre = (float(places[k, 0] + radius + gap), float(places[k, 1]), 0.0)
         name = f"bar {placed + len(bars) + 1}"
