@@ -253,12 +253,15 @@ def _arrays(scene: Kept) -> dict[str, Any]:
 
 
 def _scene(file: dict[str, np.ndarray]) -> Kept:
-    closings = [
-        Closing(*(file[f"{name} {key}"] for key in Closing._fields)) if f"{name} force" in file else None
-        for name in ("fem", "chain")
-    ]
-    assert closings[0] is not None
-    return Kept(file["design"], file["bars"], float(file["angle"]), closings[0], closings[1])
+    def closing(name: str) -> Closing | None:
+        if f"{name} force" not in file:
+            return None
+        force, tip, torque, seconds = (file[f"{name} {key}"] for key in Closing._fields)
+        return Closing(force, tip, torque, float(seconds))
+
+    fem = closing("fem")
+    assert fem is not None
+    return Kept(file["design"], file["bars"], float(file["angle"]), fem, closing("chain"))
 
 
 def errors_of(predictions: list[Closing | None], scenes: list[Kept]) -> dict[str, float]:

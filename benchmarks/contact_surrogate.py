@@ -133,7 +133,7 @@ def _bars_before(
     prepared, chain = batch.prepared, batch.prepared.chain
     arms = (prepared.bodies.markers - prepared.bodies.nodes[:, chain.marker_nodes])[:, corners]
     places = carried_points(batch.memory.q, chain.marker_nodes[corners], arms)[0]
-    bars = []
+    bars: list[Cylinder] = []
     for k in group:
         gap = rng.uniform(*GAPS) if placed else -rng.uniform(0.001, 0.004)
         radius = float(rng.uniform(0.002, 0.0025))
