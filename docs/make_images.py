@@ -49,6 +49,7 @@ COMMANDS: dict[str, tuple[float, ...]] = {
     "two_finger_friction_gripper": (0.6, 0.6, 0.6, 0.6),
     "three_finger_friction_gripper": (0.5, 0.5, 0.3, 0.3, 0.3, 0.3),
 }
+ROBOT_OPTIONS: dict[str, dict[str, Any]] = {"modular_arm": {"body": "solid"}}
 MODULE_MOTIONS = {
     "solid_block": (2, -0.003),
     "leaf_spring": (4, 0.5),
@@ -65,14 +66,16 @@ FILM_SIZE, FILM_FRAMES = (360, 300), 30
 FILM_AGENTS = {"finger_grasp": "force", "gripper_lift": "close", "tetrapod_carry": "tetrapod_carry"}
 """Agents of the films of environments, where it is not the inverse QP."""
 FILM_STEPS = {"gripper_lift": 50, "tetrapod_carry": 60}
-FILM_OPTIONS: dict[str, dict[str, Any]] = {
-    "finger_grasp": {"backend": "fem", "robot_options": {"object": "hexagon"}}  # easier to see than a plane
+OPTIONS: dict[str, dict[str, Any]] = {
+    "finger_grasp": {"backend": "fem", "robot_options": {"object": "hexagon"}},  # easier to see than a plane
+    "modular_reach": {"backend": "fem", "robot_options": {"body": "solid"}},  # superelements are drawn as bars
 }
+"""Options of environments for their pictures and films."""
 
 
 def draw_robot(name: str) -> np.ndarray:
     """Draw a robot at rest and actuated, side by side."""
-    robot = make_robot(name)
+    robot = make_robot(name, **ROBOT_OPTIONS.get(name, {}))
     count = len(robot.actuators)
     command = robot.upper * np.array(COMMANDS.get(name, (0.5,) * count)[:count])
     renderer = ImageRenderer(robot, (WIDTH // 2, HEIGHT))
@@ -84,7 +87,8 @@ def draw_robot(name: str) -> np.ndarray:
 
 def draw_environment(name: str) -> np.ndarray:
     """Draw an environment on finite elements while the inverse QP moves it to its goal."""
-    env = gymnasium.make(environment_pages()[name], backend="fem", render_mode="rgb_array", render_size=(WIDTH, HEIGHT))
+    options = {"backend": "fem", **OPTIONS.get(name, {})}
+    env = gymnasium.make(environment_pages()[name], render_mode="rgb_array", render_size=(WIDTH, HEIGHT), **options)
     act = make_agent("qp")
     observation, _ = env.reset(seed=1)
     unwrapped: Any = env.unwrapped
@@ -98,7 +102,7 @@ def draw_environment(name: str) -> np.ndarray:
 def draw_film(name: str, path: Path) -> None:
     """Write a small film of one episode of an environment."""
     identifier = environment_pages()[name]
-    options = {"backend": None, **FILM_OPTIONS.get(name, {})}
+    options = {"backend": None, **OPTIONS.get(name, {})}
     env = gymnasium.make(identifier, render_mode="rgb_array", render_size=FILM_SIZE, **options)
     observation, _ = env.reset(seed=1)
     unwrapped: Any = env.unwrapped

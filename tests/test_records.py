@@ -13,19 +13,8 @@ from softgym_envs.errors import ConfigError
 
 ENTRIES = [(path.name, name, entry) for path in SOURCES for name, entry in json.loads(path.read_text()).items()]
 
-WAITING = ("calibration", "design_optima", "shared_finger")
-"""Results of uncommitted code whose times an idle machine has to measure again."""
 
-
-@pytest.mark.parametrize(
-    ("file", "name", "entry"),
-    [
-        pytest.param(
-            *entry, marks=pytest.mark.xfail(strict=True) if entry[1] in WAITING else (), id="-".join(entry[:2])
-        )
-        for entry in ENTRIES
-    ],
-)
+@pytest.mark.parametrize(("file", "name", "entry"), ENTRIES, ids=["-".join(entry[:2]) for entry in ENTRIES])
 def test_recorded_results_come_from_a_commit(file, name, entry):
     commit = str(entry.get("commit"))
     assert re.fullmatch("[0-9a-f]{7,40}", commit), f"'{name}' in {file} comes from {commit}: measure it again"

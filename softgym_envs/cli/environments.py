@@ -53,8 +53,9 @@ def list_(as_json: bool) -> None:
         click.echo(json.dumps({"environments": rows, **{title: list(table) for title, table in tables.items()}}))
         return
     click.echo("environments:")
+    width = max(map(len, ENVIRONMENTS))
     for identifier, row in ENVIRONMENTS.items():
-        click.echo(f"  {identifier:28s} robot {row.robot}, task {row.task}, {row.max_episode_steps} steps")
+        click.echo(f"  {identifier:{width}s}  robot {row.robot}, task {row.task}, {row.max_episode_steps} steps")
     for title, table in tables.items():
         click.echo(f"{title}: {', '.join(table)}")
 

@@ -10,6 +10,9 @@ import numpy as np
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.beams import Beam
 
+BRIDGE_SECTIONS = 9
+"""Outlines along a bar between two frames."""
+
 
 @dataclass(frozen=True)
 class Skin:
@@ -40,13 +43,41 @@ def tube_skin(beam: Beam, nodes: np.ndarray, outline: np.ndarray) -> Skin:
     local = np.concatenate([np.zeros((count, k, 1)), corners], axis=2).reshape(-1, 3)
     ids = np.repeat(beam.chain, k)[:, None] + np.arange(4)
     points = EmbeddedPoints.from_weights(ids, np.column_stack([np.ones(len(local)), local]), nodes)
+    # d_1 points along the beam: the outline is seen counter-clockwise from its far end.
+    return Skin(points, _swept_triangles(count, k))
+
+
+def _swept_triangles(count: int, k: int) -> np.ndarray:
+    """Return the sides and flat ends of ``count`` outlines of ``k`` corners, counter-clockwise from the far end."""
     a = (k * np.arange(count - 1)[:, None] + np.arange(k)).ravel()
     b = (k * np.arange(count - 1)[:, None] + (np.arange(k) + 1) % k).ravel()
     sides = np.concatenate([np.column_stack([a, b, b + k]), np.column_stack([a, b + k, a + k])])
     fan = np.column_stack([np.zeros(k - 2, dtype=np.int64), np.arange(1, k - 1), np.arange(2, k)])
-    end = k * (count - 1)
-    # d_1 points along the beam: the outline is seen counter-clockwise from its far end.
-    return Skin(points, np.concatenate([sides, fan[:, ::-1], fan + end]))
+    return np.concatenate([sides, fan[:, ::-1], fan + k * (count - 1)])
+
+
+def bridge_skin(first: int, second: int, half_widths: Sequence[float], axes: np.ndarray, nodes: np.ndarray) -> Skin:
+    """Return a bar between two frames, which bends with them as a beam does: tangent to both, by cubic polynomials.
+
+    Args:
+        first: first row of the frame where it begins, with the third director along the bar.
+        second: first row of the frame where it ends.
+        half_widths: of its section along the first two axes [m].
+        axes: of the bar, as columns, in the frames at rest, shape (3, 3).
+        nodes: rest rows [m], shape (n, 3).
+    """
+    s = np.linspace(0.0, 1.0, BRIDGE_SECTIONS)[:, None]
+    length = float(np.linalg.norm(nodes[second] - nodes[first]))
+    signs = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
+    k = len(signs)
+    x, y = (axes[:2, :2] @ (signs * half_widths).T)[:, None]
+    ends = np.ones((len(s), k))
+    near, far = (1.0 - s) ** 2 * (1.0 + 2.0 * s), s**2 * (3.0 - 2.0 * s)
+    rise, fall = length * s * (1.0 - s) ** 2, length * s**2 * (s - 1.0)
+    columns = (near * ends, (1.0 - s) * x, (1.0 - s) * y, rise * ends, far * ends, s * x, s * y, fall * ends)
+    weights = np.stack([np.broadcast_to(c, ends.shape).ravel() for c in columns], axis=1)
+    ids = np.tile(np.concatenate([first + np.arange(4), second + np.arange(4)]), (len(weights), 1))
+    return Skin(EmbeddedPoints.from_weights(ids, weights, nodes), _swept_triangles(len(s), k))
 
 
 def box_skin(row: int, half_extents: Sequence[float], nodes: np.ndarray, *, divisions: int = 1) -> Skin:

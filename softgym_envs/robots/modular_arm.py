@@ -14,7 +14,7 @@ from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import box_skin
+from softgym_envs.mechanics.skins import box_skin, bridge_skin
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.modules.base import Module
 from softgym_envs.robots.modules.learned import learned_module
@@ -198,6 +198,10 @@ class ModularArm(Robot):
         if self.body == "superelements":
             half = design["wire_radius"]
             model.skins += [box_skin(port, (half, half, 0.001), model.nodes) for port in ports]
+            for part, near, far in zip(self._modules(design), ports[:-1], ports[1:], strict=True):
+                _, width, depth = SHARES[part.kind]
+                section = (0.5 * part.design[depth], 0.5 * part.design[width])
+                model.skins.append(bridge_skin(near, far, section, part.axes, model.nodes))
         return model
 
 

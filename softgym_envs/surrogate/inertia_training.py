@@ -104,6 +104,8 @@ def fit_inertia(
     """
     from tqdm import tqdm
 
+    terms = Polynomials(Features(robot).design_size + len(robot.actuators), degree).count
+    _check_states(bodies, states, degree, terms, (bodies - bodies // TESTED) * (states + 1))
     plan = SamplingPlan(bodies, states, boundary=0.25)
     jobs = [(robot, plan, group) for group in range(bodies)]
     results = parallel_map(sample_periods, jobs, workers)
@@ -117,12 +119,7 @@ def fit_inertia(
     tested, taught = Periods.joined(found[:count]), Periods.joined(found[count:])
     order = taught.periods.shape[1]
     card = {**card_of(robot, "inertia"), "bodies": len(found) - count, "states": len(taught.design)}
-    terms = Polynomials(Features(robot).design_size + len(robot.actuators), degree).count
-    if terms > len(taught.design):
-        raise ValueError(
-            f"bodies = {bodies} with {states} commands each gave {len(taught.design)} states; degree = {degree} needs "
-            f"at least {terms}"
-        )
+    _check_states(bodies, states, degree, terms, len(taught.design))
     inertia = LearnedInertia(robot, np.zeros((terms, order * (order + 1) // 2)), degree, card)
     body = inertia.body(taught.design)
     monomials = inertia.monomials(inertia.inputs(body, taught.displacement))
@@ -137,6 +134,14 @@ def fit_inertia(
         "largest_frequency_error": float(errors.max()),
     }
     return inertia
+
+
+def _check_states(bodies: int, states: int, degree: int, terms: int, count: int) -> None:
+    if terms > count:
+        raise ValueError(
+            f"bodies = {bodies} with {states} commands each give {count} states to learn from; degree = {degree} needs "
+            f"at least {terms}"
+        )
 
 
 def frequency_errors(inertia: LearnedInertia, states: Periods) -> np.ndarray:

@@ -43,7 +43,7 @@ class BodySurface:
         start = len(model.nodes)
         for skin in model.skins:
             parts.append(skin.triangles + start)
-            held.append(model.fixed[skin.points.node_ids[:, 0]])
+            held.append(model.fixed[skin.points.node_ids[:, ::4]].all(axis=1))  # the origins of its frames
             start += len(skin.points.node_ids)
         corners = np.concatenate(parts)
         self.clamped = np.concatenate(held)[corners].all(axis=1)
