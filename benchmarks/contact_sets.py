@@ -318,7 +318,7 @@ def contact_sets_table() -> str:
                 middle, worst = (factor * row[f"{column}, {name}"] for name in ("median", "worst"))
                 cells.append(f"{middle:.2g}, {worst:.2g}" if worst < 100.0 else f"{middle:.0f}, {worst:.0f}")
             rows.append([title if column == "force_error" else "", unit, *cells])
-    return markdown(["model", "error: median, worst", *(f"{k} bars" for k in TESTED)], rows, "llrrrr")
+    return markdown(["model", "error: median, worst", *(f"{k} bar{'s'[: k > 1]}" for k in TESTED)], rows, "llrrrr")
 
 
 TABLES = {"contact_sets": contact_sets_table}
