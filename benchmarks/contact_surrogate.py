@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 import numpy as np
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 INCREMENTS = 12
 MOST_DRAWS = 3000
 """Scenes that are drawn before giving up on one."""
+GAPS = (1.0e-4, 2.5e-4)
+"""Distance of a further bar from the bent finger [m]: half of the distance of contact and less."""
 BLOCK, STATES = 1000, 50
 """Bodies of a batch, and states of each body, in which W is checked."""
 
@@ -47,64 +49,106 @@ class Scene:
     angle: float
 
 
+class Closing(NamedTuple):
+    """States while a finger closes on k bars.
+
+    Attributes:
+        force: of the bars on the finger [N], shape (INCREMENTS, k, 2).
+        tip: [m], shape (INCREMENTS, 2).
+        torque: [N m], shape (INCREMENTS,).
+        seconds: of the CPU.
+    """
+
+    force: np.ndarray
+    tip: np.ndarray
+    torque: np.ndarray
+    seconds: float
+
+
 def draw_scene(model: ChainModel, contacts: int, rng: np.random.Generator) -> Scene:
     """Draw a body and bars, all of which the closed chain presses.
 
     Bars stand before outer corners of the zigzag. The force on each is at least 1 % of the sum, which is at least
-    0.1 N. Half of the bodies have zigzags that are moved towards a straight line.
+    0.1 N. Half of the bodies have zigzags that are moved towards a straight line. The first bar bends the finger, and
+    the others are placed together before the bent finger. Scenes with more than four bars are rare.
 
     Raises:
         RuntimeError: if no scene is found in which the body at rest is free.
     """
-    from softgym_envs.errors import InfeasibleDesign
-    from softgym_envs.mechanics.contact.obstacles import Cylinder
     from softgym_envs.surrogate.chain.contact import ChainBatch
-    from softgym_envs.surrogate.chain.model import carried_points
 
-    robot, chain = model.robot, model.chain
-    space = robot.design_space
-    domain = model.card["domain"]["design"]
-    corners = slice(1, 2 + chain.points)
+    corners = slice(1, 2 + model.chain.points)
     for _ in range(MOST_DRAWS):
-        values = {name: rng.uniform(*box) for name, box in domain.items()}
-        part = rng.choice([1.0, rng.uniform()])
-        for k in range(1, chain.points):
-            values[f"d{k}"] = values["d0"] + part * (values[f"d{k}"] - values["d0"])
-        design = space.complete(values)
-        try:
-            robot.outline(design)  # type: ignore[attr-defined]
-        except InfeasibleDesign:
+        row = _draw_body(model, rng)
+        if row is None:
             continue
         angle = float(np.radians(rng.uniform(15.0, 35.0)))
         friction = float(rng.uniform(0.0, 0.85))
-        row = design.array[None]
         prepared = model.prepare(row)
         if not prepared.known[0]:
             continue
-        arms = (prepared.bodies.markers - prepared.bodies.nodes[:, chain.marker_nodes])[:, corners]
-        chosen = np.sort(rng.permutation(chain.points + 1)[:contacts])
+        chosen = np.sort(rng.permutation(model.chain.points + 1)[:contacts])
         bars: list[Cylinder] = []
-        # The first bar bends the finger; the others are placed before the bent finger, then all press together.
         for group in (chosen[:1], chosen[1:]):
             batch = _closed(model, row, bars, angle)
             if batch is None:
                 break
-            places = carried_points(batch.memory.q, chain.marker_nodes[corners], arms)[0]
-            for k in group:
-                # Half of the distance of contact and less; the first bar stands in the way.
-                gap = rng.uniform(1e-4, 2.5e-4) if bars else -rng.uniform(0.001, 0.004)
-                radius = float(rng.uniform(0.002, 0.0025))
-                centre = (float(places[k, 0] + radius + gap), float(places[k, 1]), 0.0)
-                bars.append(Cylinder(centre, (0.0, 0.0, 1.0), radius, friction=friction, name=f"bar {len(bars) + 1}"))
+            bars += _bars_before(batch, corners, group, friction, rng, len(bars))
         if len(bars) < contacts or ChainBatch(prepared, [bars]).states.gap[0] < 0.001:
             continue
-        found = _closed(model, row, bars, angle)
-        if found is None or found.states.folded[0]:
-            continue
-        pressing = found.touching().pressing[0].sum(axis=1)
-        if (pressing > 0.01 * pressing.sum()).all() and pressing.sum() > 0.1:
-            return Scene(design.array, tuple(bars), angle)
+        if _all_press(_closed(model, row, bars, angle)):
+            return Scene(row[0], tuple(bars), angle)
     raise RuntimeError(f"no scene with {contacts} contacts was found")
+
+
+def _draw_body(model: ChainModel, rng: np.random.Generator) -> np.ndarray | None:
+    """Return a body (1, len(space)) from the box of the training, or None if its outline crosses itself."""
+    from softgym_envs.errors import InfeasibleDesign
+
+    robot = model.robot
+    values = {name: rng.uniform(*box) for name, box in model.card["domain"]["design"].items()}
+    part = rng.choice([1.0, rng.uniform()])
+    for k in range(1, model.chain.points):
+        values[f"d{k}"] = values["d0"] + part * (values[f"d{k}"] - values["d0"])
+    design = robot.design_space.complete(values)
+    try:
+        robot.outline(design)  # type: ignore[attr-defined]
+    except InfeasibleDesign:
+        return None
+    return design.array[None]
+
+
+def _bars_before(
+    batch: ChainBatch,
+    corners: slice,
+    group: np.ndarray,
+    friction: float,
+    rng: np.random.Generator,
+    placed: int,
+) -> list[Cylinder]:
+    """Return bars before the corners ``group`` of a bent finger; the first bar of a scene stands in the way."""
+    from softgym_envs.mechanics.contact.obstacles import Cylinder
+    from softgym_envs.surrogate.chain.model import carried_points
+
+    prepared, chain = batch.prepared, batch.prepared.chain
+    arms = (prepared.bodies.markers - prepared.bodies.nodes[:, chain.marker_nodes])[:, corners]
+    places = carried_points(batch.memory.q, chain.marker_nodes[corners], arms)[0]
+    bars: list[Cylinder] = []
+    for k in group:
+        gap = rng.uniform(*GAPS) if placed else -rng.uniform(0.001, 0.004)
+        radius = float(rng.uniform(0.002, 0.0025))
+        centre = (float(places[k, 0] + radius + gap), float(places[k, 1]), 0.0)
+        name = f"bar {placed + len(bars) + 1}"
+        bars.append(Cylinder(centre, (0.0, 0.0, 1.0), radius, friction=friction, name=name))
+    return bars
+
+
+def _all_press(batch: ChainBatch | None) -> bool:
+    """Whether a chain has closed without touching itself, and presses every bar."""
+    if batch is None or batch.states.folded[0]:
+        return False
+    pressing = batch.touching().pressing[0].sum(axis=1)
+    return bool((pressing > 0.01 * pressing.sum()).all() and pressing.sum() > 0.1)
 
 
 def _closed(model: ChainModel, row: np.ndarray, bars: Sequence[Cylinder], angle: float) -> ChainBatch | None:
@@ -118,17 +162,24 @@ def _closed(model: ChainModel, row: np.ndarray, bars: Sequence[Cylinder], angle:
     return batch
 
 
-def close_chain(model: ChainModel, scene: Scene) -> tuple[np.ndarray, np.ndarray, float, bool]:
-    """Return the forces of the bars [N] (k, 2), the tip [m] (2,), the torque [N m], and whether all was found."""
-    batch = _closed(model, scene.design[None], scene.bars, scene.angle)
-    if batch is None:
-        return np.zeros((len(scene.bars), 2)), np.zeros(2), 0.0, False
-    states = batch.states
-    return states.force[0], states.tip[0], float(states.torque[0]), True
+def close_chain(model: ChainModel, scene: Scene) -> Closing | None:
+    """Return what the chain predicts; None if an equilibrium is not found."""
+    from softgym_envs.surrogate.chain.contact import ChainBatch
+
+    batch = ChainBatch(model.prepare(scene.design[None]), [scene.bars])
+    rows = []
+    start = time.process_time()
+    for part in range(1, INCREMENTS + 1):
+        states = batch.close(np.array([scene.angle * part / INCREMENTS]))
+        if not states.found[0]:
+            return None
+        rows.append((states.force[0].copy(), states.tip[0].copy(), float(states.torque[0])))
+    force, tip, torque = (np.array(column) for column in zip(*rows, strict=True))
+    return Closing(force, tip, torque, time.process_time() - start)
 
 
-def close_fem(model: ChainModel, scene: Scene, self_contact: bool) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Return the forces of the bars [N] (k, 2), the tip [m] (2,), the torque [N m] and the seconds.
+def close_fem(model: ChainModel, scene: Scene, self_contact: bool) -> Closing:
+    """Return what finite elements compute.
 
     Raises:
         ConvergenceError: if finite elements find no equilibrium.
@@ -138,12 +189,14 @@ def close_fem(model: ChainModel, scene: Scene, self_contact: bool) -> tuple[np.n
     body = model.robot.build(dict(zip(model.robot.design_space.names, map(float, scene.design), strict=True)))
     body.set_contact(obstacles=scene.bars, settings=ContactSettings(self_contact=self_contact))
     statics = Statics(body)
+    rows = []
     start = time.process_time()
     for part in range(1, INCREMENTS + 1):
         state = statics.solve([scene.angle * part / INCREMENTS])
-    seconds = time.process_time() - start
-    assert state.contacts is not None
-    return state.contacts.total[:, :2], state.condensed.delta.e[:2], float(state.effort[0]), seconds
+        assert state.contacts is not None
+        rows.append((state.contacts.total[:, :2], state.condensed.delta.e[:2], float(state.effort[0])))
+    force, tip, torque = (np.array(column) for column in zip(*rows, strict=True))
+    return Closing(force, tip, torque, time.process_time() - start)
 
 
 def accuracy(model: ChainModel, counts: Sequence[int], scenes: int, seed: int, self_contact: bool) -> dict[str, Any]:
@@ -156,26 +209,15 @@ def accuracy(model: ChainModel, counts: Sequence[int], scenes: int, seed: int, s
             rng = np.random.default_rng([seed, contacts, number])
             row: dict[str, Any] = {"contacts": contacts, "scene": number}
             scene = draw_scene(model, contacts, rng)
-            force, tip, torque, found = close_chain(model, scene)
+            chain = close_chain(model, scene)
             try:
-                true_force, true_tip, true_torque, seconds = close_fem(model, scene, self_contact)
+                fem = close_fem(model, scene, self_contact)
             except (ConvergenceError, MeshingError) as error:
                 print(f"{contacts} contacts, scene {number}: finite elements fail: {error}", file=sys.stderr)
                 rows.append(row | {"fem": False})
                 continue
-            total, true = force.sum(axis=0), true_force.sum(axis=0)
-            size = float(np.abs(true_force[:, 0]).sum())
-            row |= {
-                "fem": True,
-                "found": found,
-                "pressed": int((np.linalg.norm(true_force, axis=1) > 1e-3 * max(size, 1e-9)).sum()),
-                "force": float(np.linalg.norm(true)),
-                "force_error": float(np.linalg.norm(total - true) / np.linalg.norm(true)),
-                "share_error": float(np.linalg.norm(force - true_force, axis=1).max() / np.linalg.norm(true)),
-                "tip_error": float(np.linalg.norm(tip - true_tip)),
-                "torque_error": abs(torque / true_torque - 1.0),
-                "fem_seconds": seconds,
-            }
+            row |= {"fem": True, "found": chain is not None, "fem_seconds": fem.seconds}
+            row |= final_errors(chain, fem) if chain is not None else {}
             print(json.dumps(row), file=sys.stderr, flush=True)
             rows.append(row)
     good = [row for row in rows if row.get("found")]
@@ -183,6 +225,20 @@ def accuracy(model: ChainModel, counts: Sequence[int], scenes: int, seed: int, s
         "rows": rows,
         "summary": _summary(good),
         "by_count": {str(k): _summary([r for r in good if r["contacts"] == k]) for k in counts},
+    }
+
+
+def final_errors(found: Closing, true: Closing) -> dict[str, float]:
+    """Errors of a model at the last angle."""
+    force, true_force = found.force[-1], true.force[-1]
+    total, size = float(np.linalg.norm(true_force.sum(axis=0))), float(np.abs(true_force[:, 0]).sum())
+    return {
+        "pressed": int((np.linalg.norm(true_force, axis=1) > 1e-3 * max(size, 1e-9)).sum()),
+        "force": total,
+        "force_error": float(np.linalg.norm((force - true_force).sum(axis=0)) / total),
+        "share_error": float(np.linalg.norm(force - true_force, axis=1).max() / total),
+        "tip_error": float(np.linalg.norm(found.tip[-1] - true.tip[-1])),
+        "torque_error": abs(found.torque[-1] / true.torque[-1] - 1.0),
     }
 
 

@@ -22,7 +22,9 @@ import sys
 from pathlib import Path
 
 from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
+from benchmarks.contact_sets import TABLES as SET_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
+from benchmarks.grasp_codesign import TABLES as GRASP_TABLES
 from benchmarks.motion import TABLES as MOTION_TABLES
 from benchmarks.printed import TABLES as PRINTED_TABLES
 from benchmarks.recorded import figure
@@ -36,6 +38,8 @@ TABLES = (
     | ZIGZAG_TABLES
     | CONVERGENCE_TABLES
     | ACCURATE_TABLES
+    | GRASP_TABLES
+    | SET_TABLES
     | MOTION_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES

@@ -15,7 +15,7 @@ HERE = Path(__file__).resolve().parent
 SOURCES = (HERE / "data" / "recorded.json", HERE / "results.json")
 """Later files take precedence: a benchmark that has been run replaces a recorded result."""
 
-DERIVED = ("design_networks", "learners", "networks", "strategies")
+DERIVED = ("design_networks", "grasp_codesign", "learners", "networks", "strategies")
 """Benchmarks that evaluate a data file of their own, in a second."""
 
 FORMAT = re.compile(r"(?P<pick>min|max)? *(?:\[(?P<item>\d+)\])? *(?P<form>.*)")
