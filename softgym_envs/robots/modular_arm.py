@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,14 +26,40 @@ CELLS: dict[str, tuple[str, np.ndarray]] = {
     "leaf_x": ("leaf_spring", np.eye(3)),
     "leaf_y": ("leaf_spring", _QUARTER_TURN),
     "block": ("solid_block", np.eye(3)),
+    "notch_x": ("notch_hinge", np.eye(3)),
+    "notch_y": ("notch_hinge", _QUARTER_TURN),
+    "tube": ("torsion_tube", np.eye(3)),
+    "accordion": ("accordion", np.eye(3)),
 }
 """What a cell may be: a module, and the axes in which it stands. A ``leaf_x`` bends towards x."""
 
-KINDS = (*CELLS, "none")
-"""What a cell may be whose kind is part of the design, by the whole part of its variable ``kind``."""
+NONE = "none"
+"""What a cell is that is left out, if the kinds of the cells are part of the design."""
 
-SHARES = {"leaf_spring": ("leaf_length", "width", "thickness"), "solid_block": ("length", "width", "depth")}
-"""Dimensions of a module that ``length``, ``width`` and ``depth`` of a cell set if its kind is part of the design."""
+KINDS = ("leaf_x", "leaf_y", "block")
+"""What the cells may be whose kinds are part of the design, unless an option says otherwise."""
+
+
+class _Shape(NamedTuple):
+    """What the arm knows of the shape of a module.
+
+    Attributes:
+        dimensions: what ``length``, ``width`` and ``depth`` of a cell set if its kind is part of the design.
+        section: half the width along x and y of a bar that stands for it [m], of a complete design.
+    """
+
+    dimensions: tuple[str, str, str]
+    section: Callable[[Mapping[str, float]], tuple[float, float]]
+
+
+SHAPES = {
+    "leaf_spring": _Shape(("leaf_length", "width", "thickness"), lambda d: (0.5 * d["thickness"], 0.5 * d["width"])),
+    "solid_block": _Shape(("length", "width", "depth"), lambda d: (0.5 * d["depth"], 0.5 * d["width"])),
+    "notch_hinge": _Shape(("radius", "width", "neck"), lambda d: (0.5 * d["neck"], 0.5 * d["width"])),
+    "torsion_tube": _Shape(("length", "radius", "wall"), lambda d: (d["radius"], d["radius"])),
+    "accordion": _Shape(("pitch", "width", "amplitude"), lambda d: (d["amplitude"], 0.5 * d["width"])),
+}
+"""By the name of the module. A tube is drawn as a square bar around it, an accordion as one around its folds."""
 
 MOST_CELLS = 12
 
@@ -61,12 +87,13 @@ class ModularArm(Robot):
     """Modules in a row on a clamped base. Wires that pull and push run through guides that are fixed to the ports.
 
     If ``cells`` is a list of kinds, arms of other structures are other robots, and the dimensions of the cells are the
-    design. If it is a number, the structure is part of the design: ``kind_1`` from 0 to 4 says what the first cell is
-    (`KINDS`; a cell that is ``none`` is left out), and ``length_1``, ``width_1`` and ``depth_1`` are its dimensions as
-    shares of their learned ranges, because each kind has its own.
+    design. If it is a number, the structure is part of the design: the whole part of ``kind_1`` says which of ``kinds``
+    the first cell is, and after the last of them that it is left out. ``length_1``, ``width_1`` and ``depth_1`` are its
+    dimensions as shares of their learned ranges, because each kind has its own (`SHAPES`).
 
     Args:
         cells: what each cell is, from the base to the tip: names in `CELLS`; or the largest number of cells.
+        kinds: what the cells may be if ``cells`` is a number: names in `CELLS`.
         body: ``"superelements"``, learned modules with six unknowns for each port; or ``"solid"``, finite elements of
             the whole body, by which designs are judged.
         stroke: largest displacement of a wire either way [m].
@@ -74,7 +101,7 @@ class ModularArm(Robot):
         **options: options of `Robot`.
 
     Raises:
-        ValueError: for an unknown cell or body, or gravity on superelements, which have no mass.
+        ValueError: for an unknown cell, kind or body, or gravity on superelements, which have no mass.
     """
 
     name = "modular_arm"
@@ -85,6 +112,7 @@ class ModularArm(Robot):
         self,
         *,
         cells: Sequence[str] | int = ("leaf_x", "leaf_y", "leaf_x", "leaf_y"),
+        kinds: Sequence[str] = KINDS,
         body: str = "superelements",
         stroke: float = 0.006,
         max_effort: float = 1.0,
@@ -97,6 +125,10 @@ class ModularArm(Robot):
             raise ValueError(f"cells must be a number or a list of names, got {cells!r}; allowed: {', '.join(CELLS)}")
         elif unknown := [cell for cell in cells if cell not in CELLS]:
             raise ValueError(unknown_name("cell", unknown[0], CELLS))
+        if isinstance(kinds, str) or not kinds:
+            raise ValueError(f"kinds must be a list of names, got {kinds!r}; allowed: {', '.join(CELLS)}")
+        if unknown := [kind for kind in kinds if kind not in CELLS]:
+            raise ValueError(unknown_name("kind", unknown[0], CELLS))
         if body not in BODIES:
             raise ValueError(unknown_name("body", body, BODIES))
         super().__init__(**options)
@@ -104,6 +136,7 @@ class ModularArm(Robot):
             raise ValueError("superelements have no mass: use body = 'solid' with gravity")
         self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.cells = cells if isinstance(cells, int) else tuple(cells)
+        self._kinds = (*kinds, NONE)
         self.body = body
         self.stroke = float(stroke)
         self.max_effort = float(max_effort)
@@ -121,7 +154,7 @@ class ModularArm(Robot):
 
     def _dimensions(self) -> Iterator[DesignVariable]:
         if isinstance(self.cells, int):
-            yield from _free_cells(self.cells)
+            yield from _free_cells(self.cells, self._kinds)
             return
         for number, cell in enumerate(self.cells, start=1):
             name, _ = CELLS[cell]
@@ -131,18 +164,18 @@ class ModularArm(Robot):
                 yield DesignVariable(f"{dimension}_{number}", low, high, _typical(name, dimension), "m", described)
 
     def kinds(self, design: Mapping[str, float] | None = None) -> tuple[str, ...]:
-        """Return what each cell of a design is, from the base to the tip: names in `KINDS`."""
+        """Return what each cell of a design is, from the base to the tip: names in `CELLS`, or ``"none"``."""
         if not isinstance(self.cells, int):
             return self.cells
         complete = self.design_space.complete(design)
         numbers = [int(complete[f"kind_{number}"]) for number in range(1, self.cells + 1)]
-        return tuple(KINDS[min(number, len(KINDS) - 1)] for number in numbers)
+        return tuple(self._kinds[min(number, len(self._kinds) - 1)] for number in numbers)
 
     def _modules(self, design: Mapping[str, float]) -> Iterator[_Cell]:
         """Yield the cells of a complete design from the base to the tip."""
         height = 0.0
         for number, cell in enumerate(self.kinds(design), start=1):
-            if cell == "none":
+            if cell == NONE:
                 continue
             name, axes = CELLS[cell]
             own = self._size(design, name, number)
@@ -156,7 +189,7 @@ class ModularArm(Robot):
         box = learned_module(module).box
         if not isinstance(self.cells, int):
             return {dimension: design[f"{dimension}_{number}"] for dimension in box}
-        shares = dict(zip(SHARES[module], ("length", "width", "depth"), strict=True))
+        shares = dict(zip(SHAPES[module].dimensions, ("length", "width", "depth"), strict=True))
         return {d: low + design[f"{shares[d]}_{number}"] * (high - low) for d, (low, high) in box.items()}
 
     def printable(self) -> ModularArm:
@@ -168,7 +201,7 @@ class ModularArm(Robot):
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Stack the modules on a clamped port, and thread the wires through all ports above it."""
-        if set(self.kinds(design)) == {"none"}:
+        if set(self.kinds(design)) == {NONE}:
             raise InfeasibleDesign("all cells of the arm are left out; allowed: at least one that is not 'none'")
         builder = ModelBuilder(gravity=self.gravity)
         ports = [builder.add_frame(np.zeros(3), fixed=True, fixed_spin=True)]
@@ -199,8 +232,7 @@ class ModularArm(Robot):
             half = design["wire_radius"]
             model.skins += [box_skin(port, (half, half, 0.001), model.nodes) for port in ports]
             for part, near, far in zip(self._modules(design), ports[:-1], ports[1:], strict=True):
-                _, width, depth = SHARES[part.kind]
-                section = (0.5 * part.design[depth], 0.5 * part.design[width])
+                section = SHAPES[part.kind].section(part.design)
                 model.skins.append(bridge_skin(near, far, section, part.axes, model.nodes))
         return model
 
@@ -211,17 +243,18 @@ def _typical(module: str, dimension: str) -> float:
     return min(max(MODULES[module]().design_space[dimension].baseline, low), high)
 
 
-def _free_cells(count: int) -> Iterator[DesignVariable]:
-    """Yield the variables of cells whose kinds are part of the design; at the baseline, leaves that take turns."""
-    box = learned_module("leaf_spring").box
+def _free_cells(count: int, kinds: Sequence[str]) -> Iterator[DesignVariable]:
+    """Yield the variables of cells whose kinds are part of the design; at the baseline, the first two take turns."""
     for number in range(1, count + 1):
-        kind = KINDS.index("leaf_x" if number % 2 else "leaf_y") + 0.5
+        kind = (number - 1) % min(2, len(kinds) - 1)
+        module, _ = CELLS[kinds[kind]]
+        box = learned_module(module).box
         described = (
-            f"what the cell is: {', '.join(f'{k} from {place}' for place, k in enumerate(KINDS))} (cell {number})"
+            f"what the cell is: {', '.join(f'{k} from {place}' for place, k in enumerate(kinds))} (cell {number})"
         )
-        yield DesignVariable(f"kind_{number}", 0.0, float(len(KINDS)), kind, "-", described)
-        for name, dimension in zip(("length", "width", "depth"), SHARES["leaf_spring"], strict=True):
+        yield DesignVariable(f"kind_{number}", 0.0, float(len(kinds)), kind + 0.5, "-", described)
+        for name, dimension in zip(("length", "width", "depth"), SHAPES[module].dimensions, strict=True):
             low, high = box[dimension]
-            share = (_typical("leaf_spring", dimension) - low) / (high - low)
+            share = (_typical(module, dimension) - low) / (high - low)
             described = f"{name} as a share of its range (cell {number})"
             yield DesignVariable(f"{name}_{number}", 0.0, 1.0, share, "-", described)

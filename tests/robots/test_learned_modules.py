@@ -7,16 +7,24 @@ import numpy as np
 import pytest
 
 from softgym_envs.errors import DesignError, WeightsError
-from softgym_envs.robots.modules import MODULES, learned_module
-from softgym_envs.robots.modules.energy import TERMS, ModuleEnergy
+from softgym_envs.robots.modules import MODULES, learned_module, learning
+from softgym_envs.robots.modules.energy import MIRRORED, ModuleEnergy, reflections, terms
 from softgym_envs.robots.modules.learned import load_module
 from softgym_envs.robots.modules.learning import RECIPES, Recipe, errors, fit
 from softgym_envs.robots.modules.states import ModuleStates, solve_states
 
+SYMMETRIES = (MIRRORED, ("y", "xz"))
+
+
+@pytest.fixture(scope="module", params=SYMMETRIES)
+def symmetry(request):
+    return request.param
+
 
 @pytest.fixture(scope="module")
-def energy():
-    return ModuleEnergy(0.03, [2.0, 3.0, 40.0, 0.5, 0.3, 0.2], np.random.default_rng(0).normal(size=len(TERMS)))
+def energy(symmetry):
+    corrections = np.random.default_rng(0).normal(size=len(terms(symmetry)))
+    return ModuleEnergy(0.03, [2.0, 3.0, 40.0, 0.5, 0.3, 0.2], corrections, symmetry)
 
 
 STRAINS = np.array([0.003, -0.002, -0.001, 0.2, -0.4, 0.3])
@@ -32,22 +40,53 @@ def test_gradient_and_hessian_are_the_derivatives_of_the_energy(energy):
         np.testing.assert_allclose(slope, hessian[k], rtol=1e-6, atol=1e-7 * abs(hessian[k]).max())
 
 
-@pytest.mark.parametrize("signs", [[-1, 1, 1, 1, -1, -1], [1, -1, 1, -1, 1, -1], [-1, -1, 1, 1, 1, -1]])
-def test_the_energy_has_the_reflections_of_the_module(energy, signs):
-    assert energy.evaluate(signs * STRAINS)[0] == pytest.approx(energy.evaluate(STRAINS)[0], rel=1e-12)
-    assert energy.evaluate(-STRAINS)[0] != pytest.approx(energy.evaluate(STRAINS)[0], rel=1e-3)
+def test_the_energy_has_the_reflections_of_the_module_and_no_others(energy, symmetry):
+    value = energy.evaluate(STRAINS)[0]
+    for signs in reflections(symmetry):
+        assert energy.evaluate(signs * STRAINS)[0] == pytest.approx(value, rel=1e-12)
+    others = [-np.ones(6), *([reflections(["x"])[0]] if "x" not in symmetry else [])]
+    for signs in others:
+        assert energy.evaluate(signs * STRAINS)[0] != pytest.approx(value, rel=1e-3)
 
 
-def test_a_fit_finds_the_energy_that_made_the_states():
+def test_any_energy_is_stable_at_rest_and_couples_only_strains_of_a_class(energy, symmetry):
+    hessian = energy.evaluate(np.zeros(6))[2]
+    assert np.linalg.eigvalsh(hessian)[0] > 0.0
+    coupled = {(int(i), int(j)) for i, j in np.argwhere(np.triu(hessian, 1) != 0.0)}
+    assert coupled == (set() if symmetry == MIRRORED else {(0, 2), (3, 5)})
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_modules_have_the_symmetry_that_they_state(name):
+    """Compliance at rest, in the strains of a superelement; the mesh is not quite symmetric."""
+    module = MODULES[name]()
+    design = {"angle": 0.5, "wall_x": 0.2, "wall_y": 0.4} if name == "printed_block" else {}
+    strained = strain_compliance(module, design)
+    scale = np.sqrt(np.outer(np.diag(strained), np.diag(strained)))
+    for signs in reflections(module.symmetry):
+        np.testing.assert_allclose(signs[:, None] * strained * signs / scale, strained / scale, atol=0.01)
+
+
+def strain_compliance(module, design):
+    """Compliance of a body at rest over the strains of a superelement."""
+    length = module.length(module.design_space.complete(design))
+    shift = np.eye(6)  # from the motion of the far port to strains
+    shift[0, 4], shift[1, 3] = -0.5 * length, 0.5 * length
+    return shift @ module.compliance(design) @ shift.T
+
+
+@pytest.mark.parametrize("name", ["solid_block", "crossed_leaves"])
+def test_a_fit_finds_the_energy_that_made_the_states(name):
+    symmetry = MODULES[name].symmetry
     rng, box = np.random.default_rng(1), {"length": (0.01, 0.03)}
     designs = rng.uniform(0.01, 0.03, size=(120, 1))
-    k, c = np.array([2.0, 3.0, 4.0, 0.5, 0.3, 0.2]), 0.3 * rng.normal(size=len(TERMS))
+    k, c = np.array([2.0, 3.0, 4.0, 0.5, 0.3, 0.2]), 0.3 * rng.normal(size=len(terms(symmetry)))
     strain = 0.05 * rng.normal(size=(120, 6))
     strain[:12] = 0.0
-    rows = [ModuleEnergy(1.0, k * d[0], c).evaluate(e) for d, e in zip(designs, strain, strict=True)]
+    rows = [ModuleEnergy(1.0, k * d[0], c, symmetry).evaluate(e) for d, e in zip(designs, strain, strict=True)]
     states = ModuleStates(designs, strain, np.array([r[1] for r in rows]), np.array([r[2] for r in rows]))
     stable = np.linalg.eigvalsh(states.hessian)[:, 0] > 0.0
-    found = fit(Recipe(box, 0.5), "solid_block", states.rows(stable), {})
+    found = fit(Recipe(box, 0.5), name, states.rows(stable), {})
     error = errors(found, states.rows(stable))["stiffness_mean"]
     linear = errors(replace(found, corrections=0.0 * found.corrections), states.rows(stable))["stiffness_mean"]
     assert error < 0.02 < 0.2 * linear
@@ -57,10 +96,7 @@ def test_a_fit_finds_the_energy_that_made_the_states():
 def test_a_learned_module_has_the_compliance_of_finite_elements(name):
     learned, module = learned_module(name), MODULES[name]()
     design = {each: 0.4 * low + 0.6 * high for each, (low, high) in learned.box.items()} | {"young_modulus": 3e7}
-    length = module.length(module.design_space.complete(design))
-    shift = np.eye(6)  # from the motion of the far port to strains
-    shift[0, 4], shift[1, 3] = -0.5 * length, 0.5 * length
-    strained = shift @ module.compliance(design) @ shift.T
+    strained = strain_compliance(module, design)
     found = np.linalg.inv(learned.energy(design).evaluate(np.zeros(6))[2])
     np.testing.assert_allclose(np.diag(found), np.diag(strained), rtol=0.04)
 
@@ -73,6 +109,31 @@ def test_a_learned_module_follows_finite_elements_under_a_load(name):
     states = solve_states(module, design, tuple(learned.box), rotation=learned.rotation, rays=1, rng=rng)
     assert len(states) > 1
     assert errors(learned, states)["strain_max"] < 0.03
+
+
+def test_bodies_are_drawn_from_the_box_in_any_order_of_its_dimensions(monkeypatch):
+    """Bounds that the module has for a dimension are not those of another one."""
+    drawn = []
+
+    def record(module, designs, names, **_):
+        drawn.append(dict(zip(names, designs.T, strict=True)))
+        raise InterruptedError
+
+    monkeypatch.setattr(learning, "solve_states", record)
+    with pytest.raises(InterruptedError):
+        learning.learn_module("accordion", Recipe({"width": (0.008, 0.014), "amplitude": (0.003, 0.0079)}, 0.3, 16))
+    for name, low, high in (("width", 0.008, 0.014), ("amplitude", 0.003, 0.0079)):
+        assert 0.9 * low < drawn[0][name].min() < 1.1 * low < 0.9 * high < drawn[0][name].max() < 1.1 * high
+
+
+def test_strains_that_were_not_learned_are_not_known():
+    """The first three count over the length; the load has its own limit."""
+    stiffness, corrections = [2.0, 3.0, 40.0, 0.5, 0.3, 0.2], np.zeros(len(terms()))
+    strained = ModuleEnergy(0.03, stiffness, corrections, largest_strains=np.array([0.1, 0.1, 0.01, 0.2, 0.2, 0.3]))
+    loaded = ModuleEnergy(0.03, stiffness, corrections, rotation=0.3)
+    for strains in ([0.0031, 0, 0, 0, 0, 0], [0, 0, -0.00031, 0, 0, 0], [0, 0, 0, 0, 0.21, 0]):
+        assert strained.knows(0.95 * np.array(strains)) and not strained.knows(np.array(strains))
+    assert loaded.knows(np.array([0, 0, 0, 0, 0, 0.29])) and not loaded.knows(np.array([0, 0, 0, 0, 0, 0.31]))
 
 
 def test_bodies_that_were_not_learned_are_named():

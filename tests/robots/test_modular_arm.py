@@ -12,11 +12,20 @@ from softgym_envs.robots.geometry.export import export_body
 from softgym_envs.surrogate.domain import doubt_text
 
 
-def test_the_modular_arm_follows_finite_elements_of_the_whole_body():
+@pytest.mark.parametrize(
+    ("cells", "command"),
+    [
+        (["leaf_x", "leaf_y"], [0.002, 0.001]),
+        (["notch_x", "notch_y"], [0.002, 0.001]),
+        (["tube"], [0.002, 0.001]),
+        (["accordion"], [0.002, 0.001]),
+    ],
+)
+def test_the_modular_arm_follows_finite_elements_of_the_whole_body(cells, command):
     found = {}
     for body in ("superelements", "solid"):
-        robot = make_robot("modular_arm", cells=["leaf_x", "leaf_y"], body=body)
-        found[body] = Statics(robot.build()).solve(np.array([0.002, 0.001])).condensed
+        robot = make_robot("modular_arm", cells=cells, body=body)
+        found[body] = Statics(robot.build()).solve(np.array(command)).condensed
     moved = found["solid"].delta.e - robot.effector_rest
     assert np.linalg.norm(moved) > 0.002
     assert np.linalg.norm(found["superelements"].delta.e - found["solid"].delta.e) < 0.01 * np.linalg.norm(moved)
@@ -54,6 +63,8 @@ def test_cells_are_an_option_and_their_dimensions_the_design():
         ({"cells": True}, "list of names"),
         ({"cells": 13}, "cells = 13 is out of bounds; allowed: 1 to 12"),
         ({"body": "fem"}, "'fem'"),
+        ({"cells": 2, "kinds": ["leaf"]}, "unknown kind 'leaf'"),
+        ({"cells": 2, "kinds": []}, "kinds must be a list of names"),
     ],
 )
 def test_wrong_options_of_the_arm_are_named(options, message):
@@ -85,6 +96,20 @@ def test_the_structure_may_be_part_of_the_design():
     np.testing.assert_allclose(*tips, atol=1e-9)
     with pytest.raises(InfeasibleDesign, match="all cells of the arm are left out"):
         free.build({f"kind_{k}": 3.5 for k in range(1, 5)})
+
+
+def test_the_kinds_of_free_cells_are_an_option():
+    """The baseline takes turns of the first two kinds; every kind has its own picture."""
+    robot = make_robot("modular_arm", cells=5, kinds=["accordion", "notch_y", "tube", "notch_x"])
+    assert robot.kinds() == ("accordion", "notch_y") * 2 + ("accordion",)
+    design = {f"kind_{number}": number - 1.0 for number in range(1, 6)}
+    assert robot.kinds(design) == ("accordion", "notch_y", "tube", "notch_x", "none")
+    model = robot.build({**design, "length_3": 1.0, "depth_2": 0.0})
+    same = make_robot("modular_arm", cells=["accordion", "notch_y", "tube", "notch_x"])
+    lengths = [model.constraints["e"][0].value(model.nodes)[2] for model in (model, same.build({"length_3": 0.04}))]
+    assert lengths[0] == pytest.approx(lengths[1])
+    assert len(model.skins) == 5 + 4
+    assert make_robot("modular_arm", cells=2, kinds=["tube"]).kinds() == ("tube", "tube")
 
 
 def test_loads_that_were_not_learned_are_told():

@@ -39,6 +39,7 @@ class Accordion(Module):
     """A wall in zigzag between two plates; it stretches along z and bends about y."""
 
     name = "accordion"
+    symmetry = ("y", "xz")
     design_space = DesignSpace(
         DesignVariable("folds", 1, 5, 3, "1", "number of folds; rounded"),
         DesignVariable("pitch", 0.006, 0.015, 0.008, "m", "length of a fold along z"),

@@ -38,10 +38,13 @@ class Module(ABC):
     Attributes:
         name: in `MODULES`.
         design_space: dimensions and material.
+        symmetry: reflections about its middle that map any body onto itself: the axes that each of them reverses.
+            ``"x"`` is the plane normal to x, ``"xz"`` half a turn about y.
     """
 
     name: ClassVar[str]
     design_space: ClassVar[DesignSpace]
+    symmetry: ClassVar[tuple[str, ...]] = ("x", "y", "z")
 
     @abstractmethod
     def drawing(self, design: Mapping[str, float]) -> Drawing:

@@ -34,6 +34,7 @@ class CrossedLeaves(Module):
     """Three leaves at 45 degrees between two plates: one in the middle, and one of half its width on each side."""
 
     name = "crossed_leaves"
+    symmetry = ("y", "xz")
     design_space = DesignSpace(
         DesignVariable("leaf_length", 0.012, 0.040, 0.025, "m", "free length of the leaves"),
         DesignVariable("width", 0.012, 0.030, 0.020, "m", "along y"),

@@ -5,71 +5,94 @@ length of the module,
 
     U = 1/2 sum_i k_i g_i^2,    g_i = e_i + sum_m c_m M_m(e),
 
-where ``M_m`` are products of two or three strains. Reflections in the three planes through the middle of a symmetric
-module change only signs of strains. So they split all products into classes, and each strain is in another one. Only
-products in the class of ``e_i`` correct it (`TERMS`): the energy has the symmetry of the module for any numbers ``k``
-and ``c``. It is never negative and has the stiffness ``k`` at rest. The corrections express for example that a leaf
+where ``M_m`` are products of up to three strains. Reflections that map a module onto itself change only signs of
+strains. So they split all products into classes, and only products in the class of ``e_i`` correct it (`terms`): the
+energy has the symmetry of the module for any numbers ``k`` and ``c``. If three planes mirror the module, each strain
+is in a class of its own. If fewer reflections map it onto itself, strains share a class and one is coupled with the
+other at rest: a strain is corrected by later ones of its class, and the stiffness is ``L D L^T``. The energy is never
+negative, and its stiffness at rest is positive definite for any ``c``. The corrections express for example that a leaf
 becomes shorter as it bends, at no cost of energy.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cache
 from itertools import combinations_with_replacement
 
 import numpy as np
 from numba import njit
 
-_SIGNS = np.array([[-1, 1, 1, 1, -1, -1], [1, -1, 1, -1, 1, -1], [-1, -1, 1, 1, 1, -1]])
-"""Sign of each strain under the reflections in the planes normal to x, y and z; the last one swaps the ports."""
+_SIGNS = {"x": (-1, 1, 1, 1, -1, -1), "y": (1, -1, 1, -1, 1, -1), "z": (-1, -1, 1, 1, 1, -1)}
+"""Sign of each strain when an axis through the middle of the module is reversed; the last one swaps the ports."""
+
+MIRRORED = ("x", "y", "z")
+"""Symmetry of a module that three planes mirror."""
 
 
-def _terms() -> np.ndarray:
-    own = {tuple(signs): strain for strain, signs in enumerate(_SIGNS.T)}
+def reflections(symmetry: Sequence[str]) -> np.ndarray:
+    """Return the sign of each strain under each reflection, shape (r, 6).
+
+    Args:
+        symmetry: the axes that each reflection reverses: ``"x"`` is the plane normal to x, ``"xz"`` half a turn about
+            y, ``"xyz"`` the point in the middle.
+    """
+    return np.array([np.prod([_SIGNS[axis] for axis in axes], axis=0) for axes in symmetry])
+
+
+@cache
+def terms(symmetry: tuple[str, ...] = MIRRORED) -> np.ndarray:
+    """Return the corrections of strains that a symmetry allows; see `reflections`.
+
+    Returns:
+        Shape (m, 4): the corrected strain, and the factors of the product; -1 for no factor.
+    """
+    signs = reflections(symmetry)
     rows = []
-    for degree in (2, 3):
+    for degree in (1, 2, 3):
         for factors in combinations_with_replacement(range(6), degree):
-            target = own.get(tuple(_SIGNS[:, list(factors)].prod(axis=1)))
-            if target is not None:
-                rows.append([target, *factors, *([-1] * (3 - degree))])
-    return np.array(rows, dtype=np.int64)
-
-
-TERMS = _terms()
-"""Corrections of the strains, shape (m, 4): the corrected strain, and the factors of the product; -1 for no factor."""
+            product = signs[:, list(factors)].prod(axis=1)
+            for target in range(6):
+                if (signs[:, target] == product).all() and (degree > 1 or target < factors[0]):
+                    rows.append([target, *factors, *([-1] * (3 - degree))])
+    found = np.array(rows, dtype=np.int64)
+    found.flags.writeable = False
+    return found
 
 
 @njit(cache=True, error_model="numpy")
 def _energy(e, terms, k, c, gradient, hessian):
     """Return the energy at strains (6,) and write its gradient (6,) and Hessian (6, 6)."""
-    g, G = e.copy(), np.eye(6)
+    # A factor that is not there, -1, is the last number: one. Derivatives by it are not used.
+    x, G, second = np.ones(7), np.zeros((6, 7)), np.zeros((7, 7))
+    x[:6] = e
+    g = e.copy()
+    for i in range(6):
+        G[i, i] = 1.0
     for m in range(terms.shape[0]):
         i, a, b, d = terms[m]
-        third = e[d] if d >= 0 else 1.0
-        g[i] += c[m] * e[a] * e[b] * third
-        G[i, a] += c[m] * e[b] * third
-        G[i, b] += c[m] * e[a] * third
-        if d >= 0:
-            G[i, d] += c[m] * e[a] * e[b]
+        g[i] += c[m] * x[a] * x[b] * x[d]
+        G[i, a] += c[m] * x[b] * x[d]
+        G[i, b] += c[m] * x[a] * x[d]
+        G[i, d] += c[m] * x[a] * x[b]
+    for m in range(terms.shape[0]):
+        i, a, b, d = terms[m]
+        factor = k[i] * g[i] * c[m]
+        second[a, b] += factor * x[d]
+        second[b, a] += factor * x[d]
+        second[a, d] += factor * x[b]
+        second[d, a] += factor * x[b]
+        second[b, d] += factor * x[a]
+        second[d, b] += factor * x[a]
     energy = 0.0
     gradient[:] = 0.0
-    hessian[:] = 0.0
+    hessian[:] = second[:6, :6]
     for i in range(6):
         energy += 0.5 * k[i] * g[i] * g[i]
         for p in range(6):
             gradient[p] += k[i] * g[i] * G[i, p]
             for q in range(6):
                 hessian[p, q] += k[i] * G[i, p] * G[i, q]
-    for m in range(terms.shape[0]):
-        i, a, b, d = terms[m]
-        factor = k[i] * g[i] * c[m]
-        third = e[d] if d >= 0 else 1.0
-        hessian[a, b] += factor * third
-        hessian[b, a] += factor * third
-        if d >= 0:
-            hessian[a, d] += factor * e[b]
-            hessian[d, a] += factor * e[b]
-            hessian[b, d] += factor * e[a]
-            hessian[d, b] += factor * e[a]
     return energy
 
 
@@ -79,33 +102,45 @@ class ModuleEnergy:
     Args:
         length: of the module [m].
         stiffness: ``k`` [J], shape (6,).
-        corrections: ``c`` of `TERMS`, shape (len(TERMS),).
+        corrections: ``c`` of the `terms` of its symmetry, shape (m,).
+        symmetry: of the module; see `reflections`.
         rotation: the largest load that was learned, as the angle by which it would turn the softest rotation [rad];
             see `softgym_envs.robots.modules.states.solve_states`. Default any load.
+        largest_strains: size of each strain that was learned, the first three over the length, shape (6,). Default any.
 
     Raises:
         ValueError: for a stiffness that is not positive.
     """
 
-    def __init__(self, length: float, stiffness: np.ndarray, corrections: np.ndarray, rotation: float = np.inf) -> None:
+    def __init__(
+        self,
+        length: float,
+        stiffness: np.ndarray,
+        corrections: np.ndarray,
+        symmetry: tuple[str, ...] = MIRRORED,
+        rotation: float = np.inf,
+        largest_strains: np.ndarray | float = np.inf,
+    ) -> None:
         self.stiffness = np.array(stiffness, dtype=float)
         self.corrections = np.array(corrections, dtype=float)
         if not (self.stiffness > 0.0).all():
             raise ValueError(f"the stiffness of a module must be positive, got {self.stiffness.tolist()} J")
+        self._terms = terms(symmetry)
         self._scale = np.array([1.0 / length] * 3 + [1.0] * 3)
-        moment = rotation * self.stiffness[3:].min()
-        self._largest = np.array([2.0 * moment / length] * 3 + [moment] * 3)
+        self._largest_strains = np.broadcast_to(largest_strains, 6) / self._scale
+        moment = rotation / np.diag(np.linalg.inv(self.evaluate(np.zeros(6))[2]))[3:].max()
+        self._largest_load = np.array([2.0 * moment / length] * 3 + [moment] * 3)
 
     def evaluate(self, strains: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the energy [J], its gradient (6,) [N, N m] and its Hessian (6, 6) at strains (6,) [m, 1]."""
         gradient, hessian = np.empty(6), np.empty((6, 6))
-        energy = _energy(self._scale * strains, TERMS, self.stiffness, self.corrections, gradient, hessian)
+        energy = _energy(self._scale * strains, self._terms, self.stiffness, self.corrections, gradient, hessian)
         return energy, self._scale * gradient, self._scale[:, None] * hessian * self._scale
 
     def load(self, strains: np.ndarray) -> float:
         """Return the load at strains (6,) over the largest one that was learned."""
-        return float(np.linalg.norm(self.evaluate(strains)[1] / self._largest))
+        return float(np.linalg.norm(self.evaluate(strains)[1] / self._largest_load))
 
     def knows(self, strains: np.ndarray) -> bool:
-        """Whether the load at strains (6,) is at most the largest one that was learned."""
-        return self.load(strains) <= 1.0
+        """Whether no strain of (6,) is larger than it was learned, and the load at them not either."""
+        return bool((np.abs(strains) <= self._largest_strains).all()) and self.load(strains) <= 1.0

@@ -17,10 +17,11 @@ import numpy as np
 
 from softgym_envs.errors import DesignError, WeightsError
 from softgym_envs.robots.modules.base import Module
-from softgym_envs.robots.modules.energy import TERMS, ModuleEnergy
+from softgym_envs.robots.modules.energy import ModuleEnergy, terms
 from softgym_envs.robots.modules.registry import MODULES
 
 FORMAT = 1
+_ARRAYS = ("stiffness", "corrections", "largest_strains")
 FOLDER = Path(__file__).parent / "energies"
 
 
@@ -42,7 +43,8 @@ class LearnedModule:
         others: the only value of each variable that was not varied, except Young's modulus.
         rotation: angle [rad] that defines the largest load; see `softgym_envs.robots.modules.states.solve_states`.
         stiffness: weights of the logarithm of ``k``, shape (p, 6).
-        corrections: weights of ``c``, shape (q, len(TERMS)).
+        corrections: weights of ``c``, shape (q, len(terms)).
+        largest_strains: size of each strain of the states, the first three over the length, shape (6,).
         errors: those on bodies that were not used, as `learning.errors` returns them.
         degrees: of the polynomials of ``stiffness`` and ``corrections``.
     """
@@ -53,8 +55,15 @@ class LearnedModule:
     rotation: float
     stiffness: np.ndarray
     corrections: np.ndarray
+    largest_strains: np.ndarray
     errors: Mapping[str, Mapping[str, float]]
     degrees: tuple[int, int]
+
+    @property
+    def terms(self) -> np.ndarray:
+        """The corrections that the symmetry of the module allows, shape (m, 4); see `energy.terms`."""
+        module: type[Module] = MODULES[self.module]
+        return terms(module.symmetry)
 
     def unit(self, designs: np.ndarray) -> np.ndarray:
         """Map dimensions (n, v) to [-1, 1] on a logarithmic scale."""
@@ -86,13 +95,15 @@ class LearnedModule:
             length,
             complete["young_modulus"] * length**3 * np.exp(polynomials(unit, self.degrees[0]) @ self.stiffness)[0],
             (polynomials(unit, self.degrees[1]) @ self.corrections)[0],
+            module.symmetry,
             self.rotation,
+            self.largest_strains,
         )
 
     def save(self, path: str | Path) -> None:
         """Write the superelement as JSON, for `load_module`."""
         record = {"format": FORMAT, **asdict(self)}
-        record |= {name: np.round(getattr(self, name), 8).tolist() for name in ("stiffness", "corrections")}
+        record |= {name: np.round(getattr(self, name), 8).tolist() for name in _ARRAYS}
         Path(path).write_text(json.dumps(record) + "\n")
 
 
@@ -109,11 +120,13 @@ def load_module(path: str | Path) -> LearnedModule:
             raise ValueError(f"it does not have format {FORMAT}")
         record["box"] = {name: (float(low), float(high)) for name, (low, high) in record["box"].items()}
         record["degrees"] = tuple(record["degrees"])
-        for name in ("stiffness", "corrections"):
+        record.setdefault("largest_strains", [np.inf] * 6)
+        for name in _ARRAYS:
             record[name] = np.array(record[name], dtype=float)
-        if record["corrections"].shape[-1] != len(TERMS):
-            raise ValueError(f"it has {record['corrections'].shape[-1]} corrections, needed {len(TERMS)}")
-        return LearnedModule(**record)
+        found = LearnedModule(**record)
+        if found.corrections.shape[-1] != len(found.terms):
+            raise ValueError(f"it has {found.corrections.shape[-1]} corrections, needed {len(found.terms)}")
+        return found
     except FileNotFoundError:
         raise WeightsError(f"superelement '{path}' does not exist; learn it with `learn_module`") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import qmc
 
-from softgym_envs.robots.modules.energy import TERMS
 from softgym_envs.robots.modules.learned import LearnedModule, polynomials
 from softgym_envs.robots.modules.registry import MODULES
 from softgym_envs.robots.modules.states import ModuleStates, solve_states
@@ -43,6 +42,7 @@ class Recipe:
         bodies: number of bodies to learn from, under loads.
         unloaded: number of further bodies, only at rest.
         rays: number of random directions of load for each body.
+        degrees: of the polynomials of stiffness and corrections; the first needs many bodies.
     """
 
     box: Mapping[str, tuple[float, float]]
@@ -50,28 +50,36 @@ class Recipe:
     bodies: int = 20
     unloaded: int = 32
     rays: int = 3
+    degrees: tuple[int, int] = (3, 1)
 
 
 RECIPES = {
     "leaf_spring": Recipe({"leaf_length": (0.010, 0.025), "width": (0.008, 0.020), "thickness": (0.001, 0.0025)}, 0.4),
     "solid_block": Recipe({"length": (0.010, 0.030), "width": (0.008, 0.020), "depth": (0.008, 0.020)}, 0.3),
+    "notch_hinge": Recipe(
+        {"radius": (0.003, 0.006), "width": (0.008, 0.014), "neck": (0.0018, 0.0035)}, 0.3, 16, 16, 2, (2, 1)
+    ),
+    "torsion_tube": Recipe({"length": (0.015, 0.040), "radius": (0.006, 0.010), "wall": (0.0015, 0.003)}, 0.3),
+    "accordion": Recipe(
+        {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)}, 0.4, 14, 16, 2, (2, 1)
+    ),
 }
-"""What is learned, by the name of the module. The form of the energy needs modules that three planes mirror."""
+"""What is learned, by the name of the module."""
 
 
 class _Products(NamedTuple):
-    """`TERMS` at strains: values (n, m), first (n, m, 6) and second derivatives (n, m, 6, 6)."""
+    """Products of strains at states: values (n, m), first (n, m, 6) and second derivatives (n, m, 6, 6)."""
 
     value: np.ndarray
     first: np.ndarray
     second: np.ndarray
 
 
-def _products(strain: np.ndarray) -> _Products:
-    n, m = len(strain), len(TERMS)
+def _products(strain: np.ndarray, terms: np.ndarray) -> _Products:
+    n, m = len(strain), len(terms)
     value, first, second = np.ones((n, m)), np.zeros((n, m, 6)), np.zeros((n, m, 6, 6))
     padded = np.column_stack([strain, np.ones(n)])
-    for t, (_, *factors) in enumerate(TERMS):
+    for t, (_, *factors) in enumerate(terms):
         value[:, t] = padded[:, factors].prod(axis=1)
         present = [p for p, f in enumerate(factors) if f >= 0]
         for p in present:
@@ -106,7 +114,7 @@ def _corrected(model: LearnedModule, states: ModuleStates, products: _Products) 
     n = len(states)
     value, first = states.strain.copy(), np.tile(np.eye(6), (n, 1, 1))
     second = np.zeros((n, 6, 6, 6))
-    for t, target in enumerate(TERMS[:, 0]):
+    for t, target in enumerate(model.terms[:, 0]):
         value[:, target] += c[:, t] * products.value[:, t]
         first[:, target] += c[:, t, None] * products.first[:, t]
         second[:, target] += c[:, t, None, None] * products.second[:, t]
@@ -133,7 +141,7 @@ def _residuals(gradient: np.ndarray, hessian: np.ndarray, weights: _Weights) -> 
 
 
 def _guess(model: LearnedModule, states: ModuleStates, products: _Products, Q: np.ndarray) -> np.ndarray:
-    """Return quadratic corrections near those of a model, which make the corrected strains those of the forces.
+    """Return a model's corrections with others of second degree near its own, which fit the forces better.
 
     The gradient of the energy is ``G^T (k g)``. With ``G`` of the present corrections, this gives the corrected strains
     ``g`` that each state needs, and they are linear in the corrections. Newton's method would not find the way from no
@@ -141,13 +149,18 @@ def _guess(model: LearnedModule, states: ModuleStates, products: _Products, Q: n
     """
     state = _corrected(model, states, products)
     wanted = np.linalg.solve(np.swapaxes(state.first, 1, 2), states.gradient[:, :, None])[:, :, 0] / state.k
-    found = np.zeros_like(model.corrections)
+    terms = model.terms
+    quadratic = (terms[:, 2] >= 0) & (terms[:, 3] < 0)
+    found = np.where(terms[:, 2] < 0, model.corrections, 0.0)
+    missing = wanted - states.strain
+    for t in np.flatnonzero(terms[:, 2] < 0):
+        missing[:, terms[t, 0]] -= (Q @ found[:, t]) * products.value[:, t]
     for strain in range(6):
-        own = np.flatnonzero((TERMS[:, 0] == strain) & (TERMS[:, 3] < 0))
+        own = np.flatnonzero((terms[:, 0] == strain) & quadratic)
         columns = np.einsum("nt,nq->nqt", products.value[:, own], Q).reshape(len(states), -1)
         ridge = GUESS_RIDGE * np.eye(columns.shape[1]) * (columns**2).sum(axis=0).mean()
-        missing = wanted[:, strain] - states.strain[:, strain]
-        found[:, own] = np.linalg.solve(columns.T @ columns + ridge, columns.T @ missing).reshape(-1, len(own))
+        solution = np.linalg.solve(columns.T @ columns + ridge, columns.T @ missing[:, strain])
+        found[:, own] = solution.reshape(-1, len(own))
     return found
 
 
@@ -157,7 +170,6 @@ def fit(
     states: ModuleStates,
     others: Mapping[str, float],
     steps: int = 30,
-    degrees: tuple[int, int] = (3, 1),
 ) -> LearnedModule:
     """Return the superelement that fits states best.
 
@@ -167,21 +179,33 @@ def fit(
         states: to learn from.
         others: the values of the variables that were not varied.
         steps: largest number of steps of the search.
-        degrees: of the polynomials of stiffness and corrections.
     """
     model = LearnedModule(
-        module, dict(recipe.box), dict(others), recipe.rotation, np.empty((0, 6)), np.empty((0, 0)), {}, degrees
+        module,
+        dict(recipe.box),
+        dict(others),
+        recipe.rotation,
+        np.empty((0, 6)),
+        np.empty((0, 0)),
+        np.abs(states.strain).max(axis=0),
+        {},
+        recipe.degrees,
     )
     unit = model.unit(states.designs)
-    P, Q = polynomials(unit, degrees[0]), polynomials(unit, degrees[1])
+    P, Q = polynomials(unit, recipe.degrees[0]), polynomials(unit, recipe.degrees[1])
     rest = (states.strain == 0.0).all(axis=1)
-    diagonal = np.log(np.einsum("nii->ni", states.hessian[rest]))
-    start = np.linalg.lstsq(P[rest], diagonal, rcond=None)[0]
-    model = replace(model, stiffness=start, corrections=np.zeros((Q.shape[1], len(TERMS))))
-    products, weights = _products(states.strain), _weights(states, recipe.rotation)
-    target = TERMS[:, 0]
-    for _ in range(5):
-        model = replace(model, corrections=_guess(model, states, products, Q))
+    # At rest the stiffness is L D L^T: D is k, and a correction of first degree is an entry of L.
+    lower = np.linalg.cholesky(states.hessian[rest])
+    root = np.einsum("nii->ni", lower)
+    start = np.linalg.lstsq(P[rest], 2.0 * np.log(root), rcond=None)[0]
+    terms = model.terms
+    target = terms[:, 0]
+    corrections = np.zeros((Q.shape[1], len(terms)))
+    for t in np.flatnonzero(terms[:, 2] < 0):
+        i, j = terms[t, :2]
+        corrections[:, t] = np.linalg.lstsq(Q[rest], lower[:, j, i] / root[:, i], rcond=None)[0]
+    model = replace(model, stiffness=start, corrections=corrections)
+    products, weights = _products(states.strain, terms), _weights(states, recipe.rotation)
 
     def errors_of(trial: LearnedModule) -> tuple[_Corrected, np.ndarray]:
         found = _corrected(trial, states, products)
@@ -190,6 +214,11 @@ def fit(
     def cost_of(trial: LearnedModule, residual: np.ndarray) -> float:
         return float((residual**2).sum() + RIDGE * (trial.corrections**2).sum())
 
+    # The guesses do not always come closer: the search begins at the best of them.
+    trials = [model]
+    for _ in range(5):
+        trials.append(replace(model, corrections=_guess(trials[-1], states, products, Q)))
+    model = min(trials, key=lambda trial: cost_of(trial, errors_of(trial)[1]))
     state, residual = errors_of(model)
     cost, damping = cost_of(model, residual), 1e-3
     for _ in range(steps):
@@ -246,7 +275,7 @@ def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
         the states, to first order; ``stiffness_mean`` and ``stiffness_max``: largest relative error of the stiffness
         over all directions of motion.
     """
-    found = _corrected(model, states, _products(states.strain))
+    found = _corrected(model, states, _products(states.strain, model.terms))
     weights = _weights(states, 1.0)
     strain = np.einsum("nij,nj->ni", weights.compliance, found.gradient() - states.gradient)
     strain = np.linalg.norm(strain, axis=1) / np.linalg.norm(states.strain, axis=1).max()
@@ -273,7 +302,7 @@ def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
 
     def bodies(unit: np.ndarray) -> np.ndarray:
         found = np.exp(0.5 * (low + high) + 0.5 * unit * (high - low))
-        bounds = np.array([[v.low, v.high] for v in made.design_space if v.name in names])
+        bounds = np.array([[made.design_space[name].low, made.design_space[name].high] for name in names])
         return np.clip(found, bounds[:, 0], bounds[:, 1])
 
     def solved(unit: np.ndarray, rays: int, seed: int) -> ModuleStates:

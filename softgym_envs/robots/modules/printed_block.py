@@ -28,6 +28,7 @@ class PrintedBlock(SolidBlock):
     """
 
     name = "printed_block"
+    symmetry = ("z", "xy")
     design_space = DesignSpace(
         *SolidBlock.design_space,
         DesignVariable("wall_x", 0.1, 1.0, 0.3, "1", "thickness of the walls across x over their distance"),
