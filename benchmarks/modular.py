@@ -6,6 +6,8 @@ import time
 
 import numpy as np
 
+from benchmarks.recorded import figure
+from benchmarks.tables import markdown
 from softgym_envs.mechanics.condensation import RoleMatrix
 
 ARMS = {
@@ -63,3 +65,46 @@ def modular_arm() -> dict[str, object]:
             f"{name}: times faster": slow / fast,
         }
     return result
+
+
+def modular_arm_table() -> str:
+    """Arms on superelements against finite elements of the whole body."""
+
+    def cell(name: str, key: str, form: str, unit: str) -> str:
+        return figure("modular_arm", f"{name}: {key}", form) + unit
+
+    rows = [
+        [
+            name,
+            cell(name, "tip, mean error [% of its motion]", ".2f", " %")
+            + ", "
+            + cell(name, "tip, largest error [% of its motion]", ".2f", " %"),
+            cell(name, "compliance of the tip, wires held, largest error [%]", ".1f", " %"),
+            cell(name, "superelements [CPU ms]", ".0f", " ms"),
+            cell(name, "finite elements [CPU s]", ".1f", " s"),
+        ]
+        for name in ARMS
+    ]
+    head = ["arm", "tip: mean and largest error", "compliance of the tip, wires held: largest error"]
+    return markdown([*head, "superelements", "finite elements"], rows, "lrrrr")
+
+
+def module_energies_table() -> str:
+    """Errors of the learned energies that come with the package, on bodies that were not learned."""
+    from softgym_envs.robots.modules import learned_module
+    from softgym_envs.robots.modules.learning import RECIPES
+
+    rows = []
+    for name in RECIPES:
+        learned = learned_module(name)
+        for place, found in sorted(learned.errors.items(), reverse=True):
+            percent = {of: 100.0 * error for of, error in found.items()}
+            cells = [f"{percent[f'{of}_mean']:.1f} %, {percent[f'{of}_max']:.1f} %" for of in ("strain", "stiffness")]
+            first = [f"`{name}`", f"{learned.rotation:g}"] if place == "inside" else ["", ""]
+            rows.append([*first, place, *cells])
+    head = ["module", "load [rad]", "bodies", "strains: mean, largest", "stiffness: mean, largest"]
+    return markdown(head, rows, "lrlrr")
+
+
+TABLES = {"modular_arm": modular_arm_table, "module_energies": module_energies_table}
+"""Tables of pages by name."""

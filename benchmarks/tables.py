@@ -405,46 +405,6 @@ def robustness() -> str:
     return markdown(["robot", "plant", *CONTROLLERS], rows, "llrrr")
 
 
-def modular_arm() -> str:
-    """Arms on superelements against finite elements of the whole body."""
-    from benchmarks.modular import ARMS
-
-    def cell(name: str, key: str, form: str, unit: str) -> str:
-        return figure("modular_arm", f"{name}: {key}", form) + unit
-
-    rows = [
-        [
-            name,
-            cell(name, "tip, mean error [% of its motion]", ".2f", " %")
-            + ", "
-            + cell(name, "tip, largest error [% of its motion]", ".2f", " %"),
-            cell(name, "compliance of the tip, wires held, largest error [%]", ".1f", " %"),
-            cell(name, "superelements [CPU ms]", ".0f", " ms"),
-            cell(name, "finite elements [CPU s]", ".1f", " s"),
-        ]
-        for name in ARMS
-    ]
-    head = ["arm", "tip: mean and largest error", "compliance of the tip, wires held: largest error"]
-    return markdown([*head, "superelements", "finite elements"], rows, "lrrrr")
-
-
-def module_energies() -> str:
-    """Errors of the learned energies that come with the package, on bodies that were not learned."""
-    from softgym_envs.robots.modules import learned_module
-    from softgym_envs.robots.modules.learning import RECIPES
-
-    rows = []
-    for name in RECIPES:
-        learned = learned_module(name)
-        for place, found in sorted(learned.errors.items(), reverse=True):
-            percent = {of: 100.0 * error for of, error in found.items()}
-            cells = [f"{percent[f'{of}_mean']:.1f} %, {percent[f'{of}_max']:.1f} %" for of in ("strain", "stiffness")]
-            first = [f"`{name}`", f"{learned.rotation:g}"] if place == "inside" else ["", ""]
-            rows.append([*first, place, *cells])
-    head = ["module", "load [rad]", "bodies", "strains: mean, largest", "stiffness: mean, largest"]
-    return markdown(head, rows, "lrlrr")
-
-
 def side_by_side() -> str:
     """The same problems in several codes."""
     rows = []
@@ -595,8 +555,7 @@ TABLES: dict[str, Callable[[], str]] = {
         test_set, trust, calibrated, buckling, predicted_tracking, trajectories, design_gradients, networks,
         design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop,
-        validation, contact, surrogate_speed, fem_speed, deployed, robustness, modular_arm,
-        module_energies, provenance,
+        validation, contact, surrogate_speed, fem_speed, deployed, robustness, provenance,
     )
 }  # fmt: skip
 """Tables by the name in a marked place."""
