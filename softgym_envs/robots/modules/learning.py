@@ -63,6 +63,9 @@ RECIPES = {
     "accordion": Recipe(
         {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)}, 0.4, 14, 16, 2, (2, 1)
     ),
+    "crossed_leaves": Recipe(
+        {"leaf_length": (0.012, 0.020), "width": (0.012, 0.018), "thickness": (0.001, 0.0018)}, 0.3, 16, 16, 2, (2, 1)
+    ),
 }
 """What is learned, by the name of the module."""
 
