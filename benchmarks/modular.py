@@ -99,7 +99,7 @@ def module_energies_table() -> str:
         learned = learned_module(name)
         for place, found in sorted(learned.errors.items(), reverse=True):
             percent = {of: 100.0 * error for of, error in found.items()}
-            cells = [f"{percent[f'{of}_mean']:.1f} %, {percent[f'{of}_max']:.1f} %" for of in ("strain", "stiffness")]
+            cells = [f"{percent[f'{of}_mean']:.2g} %, {percent[f'{of}_max']:.2g} %" for of in ("strain", "stiffness")]
             first = [f"`{name}`", f"{learned.rotation:g}"] if place == "inside" else ["", ""]
             rows.append([*first, place, *cells])
     head = ["module", "load [rad]", "bodies", "strains: mean, largest", "stiffness: mean, largest"]
