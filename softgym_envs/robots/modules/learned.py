@@ -120,6 +120,7 @@ def load_module(path: str | Path) -> LearnedModule:
             raise ValueError(f"it does not have format {FORMAT}")
         record["box"] = {name: (float(low), float(high)) for name, (low, high) in record["box"].items()}
         record["degrees"] = tuple(record["degrees"])
+        # Files of earlier versions do not limit strains.
         record.setdefault("largest_strains", [np.inf] * 6)
         for name in _ARRAYS:
             record[name] = np.array(record[name], dtype=float)
