@@ -32,9 +32,9 @@ def final_distances(agent, env, seeds=2):
     return np.array(found)
 
 
-@pytest.mark.parametrize("cavities", [2, 4])
-def test_the_estimator_reaches_goals_that_the_model_alone_misses(cavities):
-    env = gymnasium.make(ID, robot_options={"cavities": cavities})
+@pytest.mark.parametrize("options", [{"cavities": 2}, {"cavities": 4}, {"cavities": 2, "sealed": True}])
+def test_the_estimator_reaches_goals_that_the_model_alone_misses(options):
+    env = gymnasium.make(ID, robot_options=options)
     estimated = final_distances(make_baseline("qp_estimated"), env)
     blind = final_distances(make_baseline("qp_model"), env)
     assert (estimated < env.unwrapped.task.success_distance).all()

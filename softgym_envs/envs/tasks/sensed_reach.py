@@ -76,7 +76,7 @@ class SensedReach(Reach):
         return self._load
 
     def sense(self, state: State) -> np.ndarray:
-        """Return the changes of the cavities' volumes over their scale, shape (s,)."""
+        """Return the changes of the cavities' volumes, or their pressures, over their scale, shape (s,)."""
         return state.condensed.delta.s / self.robot.sensor_scale
 
     def feel(self) -> np.ndarray:
@@ -86,7 +86,7 @@ class SensedReach(Reach):
         return np.array([1.0, *(2.0 * (np.array(self.touched) + 0.5) / np.array(self.grid.cells) - 1.0)])
 
     def recall(self, reading: np.ndarray, new: bool) -> np.ndarray:
-        """Return the commands and volumes of the readings before the present one, shape ((history - 1) (n_a + s),)."""
+        """Return the commands and cavities of the readings before the present one, shape ((history - 1) (n_a + s),)."""
         if new:
             known = [reading, *self._readings]
             self._readings = (known + self.history * known[-1:])[: self.history]
