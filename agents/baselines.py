@@ -16,7 +16,7 @@ from softgym_envs.control.embedded import PICorrection
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.errors import ConvergenceError, WeightsError
-from softgym_envs.estimation import Estimator, Noise, Readings, Touch
+from softgym_envs.estimation import Estimator, Noise, Touch
 from softgym_envs.robots.base import Robot
 
 Agent = Callable[[np.ndarray, Any], np.ndarray]
@@ -139,8 +139,9 @@ class EstimatedQPAgent(InverseQPAgent):
             raise ValueError(f"agent 'qp_estimated' needs a task that shows sensors; '{env.task.name}' does not")
         super()._begin(env)
         # A tenth of a percent stands for the differences between touches of the plant and of the estimator.
-        volume = max(env.plant.noise, 1e-3) * float(np.mean(env.robot.sensor_scale))
-        noise = Noise(displacement=1e-5, volume=volume)
+        level = max(env.plant.noise, 1e-3) * float(np.mean(env.robot.sensor_scale))
+        # A body has sensors of one kind; the other level is not used.
+        noise = Noise(displacement=1e-5, volume=level, pressure=level)
         self._estimators[env] = Estimator(env.robot, design=env.design, noise=noise)
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
@@ -148,8 +149,7 @@ class EstimatedQPAgent(InverseQPAgent):
         load = None if task.touched is None else Touch(task.grid, task.touched, task.largest_force)
         if load != estimator.load:
             estimator.touch(load)
-        volumes = estimator.rest_volumes + env.sensed.sensors * env.robot.sensor_scale
-        found = estimator.update(Readings(present, volumes))
+        found = estimator.update(estimator.reading(present, env.sensed.sensors * env.robot.sensor_scale))
         state = found.near.state
         aim = env.aim + state.condensed.delta.e[:3] - found.effector[:3]
         return controller.solve(state.condensed, aim, present, state.slack)

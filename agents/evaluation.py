@@ -284,7 +284,9 @@ def _evaluate(
                 act = make_baseline("random", seed + index)
             path = goals[index]
             body = design if design is None or isinstance(design, dict) else design[index]
-            observation, info = env.reset(seed=seed, options={"design": body, "goal": path})
+            # Episodes have touches, plants and noise of their own, whichever process runs them.
+            start = {"design": body, "goal": path}
+            observation, info = env.reset(seed=seed + int(index), options=start)
             total, effort, distance, count, ended = 0.0, 0.0, 0.0, 0, False
             while not ended:
                 action = act(observation, env.unwrapped)

@@ -32,6 +32,7 @@ AGENTS = LEARNERS | {
     "qp": "QP",
     "qp_model": "QP, model",
     "qp_pi": "QP, model, PI",
+    "qp_estimated": "QP, estimator",
     "close": "open loop",
     "force": "force control",
     "random": "random",

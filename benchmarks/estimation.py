@@ -1,6 +1,7 @@
 """Accuracy of the estimator on finite elements: touches at random places of the sensorized finger's grid.
 
-``python -m benchmarks.estimation [--cavities 2] [--touches 100] [--readings 10]`` prints a line of JSON.
+``python -m benchmarks.estimation [--cavities 2] [--sealed] [--touches 100] [--readings 10]`` prints a line of JSON.
+``softgym bench sealed_finger`` compares volumes of open cavities with pressures of sealed ones, and their stiffness.
 
 Each touch is one body with a random pull, an error of the cable, a force and a place in a cell, constant over a number
 of readings with new noise of the volumes. Its place is one point, which is not a corner of the estimator's cell: the
@@ -18,7 +19,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.estimation import Estimator, Noise, Readings, Touch, finger_grid
+from softgym_envs.estimation import Estimator, Noise, Touch, finger_grid
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.registry import make_robot
 
@@ -33,15 +34,17 @@ def measure(
     noise_share: float,
     seed: int,
     design: Mapping[str, float],
+    sealed: bool = False,
 ) -> dict[str, float | None]:
     """Return errors, coverage and speed of a body whose missing variables take their baseline.
 
-    The noise of the volumes is a share of their change under the full pull in the baseline: that of one sensor.
+    The noise of volumes or pressures is a share of their change under the full pull in the baseline, one for all.
     """
     rng = np.random.default_rng(seed)
-    robot = make_robot("sensorized_finger", cavities=cavities)
+    robot = make_robot("sensorized_finger", cavities=cavities, sealed=sealed)
     change = Statics(robot.build()).solve([LARGEST_PULL]).condensed.delta.s
-    noise = Noise(displacement=1e-4, volume=noise_share * float(np.abs(change).mean()))
+    level = noise_share * float(np.abs(change).mean())
+    noise = Noise(displacement=1e-4, volume=level, pressure=level)
     grid = finger_grid(pitch)
     tip, force, inside, forces_inside, misfits, certain = [], [], [], [], [], []
     cpu, alone, steps, solved, buckled = 0.0, [], 0, 0, 0
@@ -62,11 +65,10 @@ def measure(
         except ConvergenceError:  # the finger has buckled: there is no reading to explain
             buckled += 1
             continue
-        volumes = estimator.rest_volumes + state.condensed.delta.s
         begin, found_equilibria = time.process_time(), 0
         for _ in range(readings):
-            measured = volumes + noise.volume * rng.standard_normal(cavities)
-            found = estimator.update(Readings(command, measured))
+            measured = state.condensed.delta.s + level * rng.standard_normal(cavities)
+            found = estimator.update(estimator.reading(command, measured))
             misfits.append(found.misfit)
             found_equilibria += found.equilibria
         cpu += time.process_time() - begin
@@ -74,7 +76,7 @@ def measure(
         solved += found_equilibria
         for _ in range(20):
             begin = time.process_time()
-            if not estimator.update(Readings(command, measured)).equilibria:
+            if not estimator.update(estimator.reading(command, measured)).equilibria:
                 alone.append(time.process_time() - begin)
         error = found.effector - state.condensed.delta.e
         tip.append(float(np.linalg.norm(error)))
@@ -92,7 +94,7 @@ def measure(
         "touches": len(tip),
         "touches without equilibrium": buckled,
         "readings": readings,
-        "volume noise [mm3]": noise.volume * 1e9,
+        "noise of pressure [Pa]" if sealed else "volume noise [mm3]": level if sealed else level * 1e9,
         "tip error mean [% of length]": 100 * float(np.mean(tip)) / LENGTH,
         "tip error 95th [% of length]": 100 * float(np.percentile(tip, 95)) / LENGTH,
         "tip error worst [% of length]": 100 * float(np.max(tip)) / LENGTH,
@@ -112,15 +114,42 @@ def measure(
     }
 
 
+def sealed_finger() -> dict[str, object]:
+    """Sensorized finger: stiffness that sealed air adds, and estimates from its pressure beside those from volumes."""
+    result: dict[str, object] = {}
+    for mesh, cavities in (("published", 2), ("published", 4), ("accurate", 2)):
+        pair = []
+        for sealed in (False, True):
+            statics = Statics(make_robot("sensorized_finger", cavities=cavities, sealed=sealed, mesh=mesh).build())
+            for pull in np.linspace(0.25, 1.0, 4) * LARGEST_PULL:
+                state = statics.solve([pull])
+            pair.append((float(state.effort[0]), float(state.condensed.W.ee[1, 1]), state.condensed.delta))
+        (tension, compliance, delta), (sealed_tension, sealed_compliance, sealed_delta) = pair
+        result[f"{mesh}, {cavities} cavities"] = {
+            "tension, open [N]": tension,
+            "tension, sealed [%]": 100.0 * (sealed_tension / tension - 1.0),
+            "compliance of the tip along y, sealed [%]": 100.0 * (sealed_compliance / compliance - 1.0),
+            "tip, sealed [mm]": 1e3 * float(np.linalg.norm(sealed_delta.e - delta.e)),
+            "pressure [kPa]": 1e-3 * float(np.mean(sealed_delta.s)),
+        }
+    for cavities in (2, 4):
+        for sealed in (False, True):
+            found = measure(cavities, 60, 10, 5e-3, 0.01, 0, {}, sealed)
+            result[f"estimate, {cavities} cavities, {'sealed' if sealed else 'open'}"] = found
+    return result
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cavities", type=int, default=2)
+    parser.add_argument("--sealed", action="store_true", help="pressures of sealed cavities instead of volumes")
     parser.add_argument("--touches", type=int, default=100)
     parser.add_argument("--readings", type=int, default=10)
     parser.add_argument("--pitch", type=float, default=5e-3)
-    parser.add_argument("--noise", type=float, default=0.01, help="of the volumes' change under the full pull")
+    parser.add_argument("--noise", type=float, default=0.01, help="of the sensors' change under the full pull")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--design", type=json.loads, default={}, help="JSON object of design variables, SI units")
     given = parser.parse_args()
-    result = measure(given.cavities, given.touches, given.readings, given.pitch, given.noise, given.seed, given.design)
+    options = (given.touches, given.readings, given.pitch, given.noise, given.seed, given.design, given.sealed)
+    result = measure(given.cavities, *options)
     print(json.dumps({name: round(value, 4) for name, value in result.items() if value is not None}))

@@ -468,6 +468,35 @@ def sensor_convergence() -> str:
     return markdown(["finger", "elements", "size away from the cavities", "nodes", "volume change [µL]"], rows, "lllrr")
 
 
+def sealed_stiffness() -> str:
+    """How much sealed air stiffens the sensorized finger."""
+    keys = ("tension, open [N]", "tension, sealed [%]", "compliance of the tip along y, sealed [%]", "tip, sealed [mm]")
+    rows = []
+    for name, row in results("sealed_finger").items():
+        if not name.startswith("estimate"):
+            forms = (".1f", "+.1f", "+.1f", ".2f")
+            cells = [format(row[key], form) for key, form in zip(keys, forms, strict=True)]
+            rows.append([name, f"{row['pressure [kPa]']:.1f}", *cells])
+    head = ["mesh", "pressure [kPa]", "tension, open [N]", "tension, sealed [%]"]
+    return markdown([*head, "compliance of the tip along y, sealed [%]", "tip moved [mm]"], rows, "lrrrrr")
+
+
+def sealed_estimates() -> str:
+    """Estimates from pressures of sealed cavities beside those from volumes of open ones."""
+    found = {key.removeprefix("estimate, "): v for key, v in results("sealed_finger").items() if "estimate" in key}
+    lines = {
+        "error of the tip, mean [% of the length]": ("tip error mean [% of length]", ".2f"),
+        "error of the tip, 95th percentile [% of the length]": ("tip error 95th [% of length]", ".2f"),
+        "error of the force, median [%]": ("force error median [%]", ".1f"),
+        "error of the force, mean [%]": ("force error mean [%]", ".1f"),
+        "touches whose force is claimed to 10 % [%]": ("force told to 10 % [% of touches]", ".0f"),
+        "truth within 95 %: tip [% of touches]": ("coverage tip [%]", ".1f"),
+        "truth within 95 %: force [% of touches]": ("coverage force [%]", ".1f"),
+    }
+    rows = [[title, *(format(row[key], form) for row in found.values())] for title, (key, form) in lines.items()]
+    return markdown(["", *found], rows, "l" + "r" * len(found))
+
+
 def stiff_flop() -> str:
     """Rest compliance of the Stiff-Flop trunk."""
     rows = []
@@ -554,7 +583,8 @@ TABLES: dict[str, Callable[[], str]] = {
         headlines, codesign, codesign_goals, codesign_bodies, learners, strategies, kills, profile, agents, carry,
         test_set, trust, calibrated, buckling, predicted_tracking, trajectories, design_gradients, networks,
         design_optima,
-        tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, side_by_side, stiff_flop,
+        tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, sealed_stiffness,
+        sealed_estimates, side_by_side, stiff_flop,
         validation, contact, surrogate_speed, fem_speed, deployed, robustness, provenance,
     )
 }  # fmt: skip

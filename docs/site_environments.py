@@ -87,10 +87,11 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         ]
         if task.sensors:
             count = len(robot.sensor_scale)
-            volumes = f"x / (1 + abs(x)) of it over {quantity(float(robot.sensor_scale[0]), 'm3')}"
+            unit_seen = robot.sensor_unit
+            volumes = f"x / (1 + abs(x)) of it over {quantity(float(robot.sensor_scale[0]), unit_seen)}"
             parts = [
                 parts[0],
-                (count, "change of the volume of each cavity since the body was undeformed", volumes, "m3"),
+                (count, "change of the volume of each cavity since the body was undeformed", volumes, unit_seen),
                 (1, "whether a cell of the grid is touched", "1 or -1", ""),
                 (2, "touched cell across and along the body", "grid to [-1, 1], 0 without a touch", ""),
                 parts[4],

@@ -345,7 +345,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             info |= {f"plant_{name}": value for name, value in asdict(self.plant).items()}
         velocity = state.velocity[0] if self.spaces.moving else None
         shown = self._sensed or true
-        sensors = np.concatenate([squash(shown.sensors), self.task.feel()]) if self.task.sensors else None
+        sensors = self._shown(squash(shown.sensors), sense) if self.task.sensors else None
         observation = self.spaces.observe(
             self.command,
             shown.displacement,
@@ -357,6 +357,12 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             sensors,
         )
         return observation, reward, {name: _with_dtype(value) for name, value in info.items()}
+
+    def _shown(self, readings: np.ndarray, new: bool) -> np.ndarray:
+        """Return the sensor values of an observation for readings in [-1, 1] (s,): these, touch, earlier readings."""
+        command = (self.command - self.spaces.middle) / self.spaces.half_range
+        earlier = self.task.recall(np.concatenate([command, readings]), new)
+        return np.concatenate([readings, self.task.feel(), earlier])
 
     def _kinematics(self, commands: np.ndarray) -> np.ndarray:
         """Return the effectors [m] (1, 3) that commands (1, n_a) lead to; NaN without an equilibrium."""

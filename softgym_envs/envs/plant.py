@@ -85,10 +85,10 @@ class Plants:
             raise ValueError(f"plant cable_friction needs backend 'fem': '{backend}' has no friction of cables")
         stiff = found.low.stiffness == found.high.stiffness == 1.0
         limited = any(np.isfinite(actuator.max_effort) for actuator in robot.actuators)
-        if not stiff and (any(robot.gravity) or robot.touches or limited):
+        if not stiff and (any(robot.gravity) or robot.touches or robot.sealed or limited):
             raise ValueError(
-                f"plant stiffness: robot '{robot.name}' has weight, contacts or limited efforts, which do not scale "
-                "with its stiffness; change its design instead"
+                f"plant stiffness: robot '{robot.name}' has weight, contacts, sealed air or limited efforts, which do "
+                "not scale with its stiffness; change its design instead"
             )
         if not stiff and moving:
             raise ValueError(

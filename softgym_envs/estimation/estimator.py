@@ -20,7 +20,7 @@ from softgym_envs.estimation.loads import Load
 from softgym_envs.estimation.places import Mixture
 from softgym_envs.estimation.posterior import Gaussian, Posterior, most_probable
 from softgym_envs.mechanics.condensation import CondensedModel
-from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
@@ -36,12 +36,14 @@ class Noise:
     Attributes:
         displacement: of the true displacement of an actuator around its command [m].
         volume: of the measured volume of a cavity [m3].
+        pressure: of the measured pressure of the air in a sealed cavity [Pa].
         effort: of the measured effort of an actuator [N]; None if it is not measured.
         drift: of each parameter of the load from one reading to the next, as a part of its spread before any reading.
     """
 
     displacement: float = 1e-4
     volume: float = 1e-9
+    pressure: float = 10.0
     effort: float | None = None
     drift: float = 0.0
 
@@ -52,13 +54,15 @@ class Readings:
 
     Attributes:
         command: commanded displacements of the actuators, shape (n_a,).
-        volumes: of the cavities [m3], shape (n_s,).
+        volumes: of the open cavities [m3], shape (open,).
         efforts: of the actuators, shape (n_a,), if they are measured.
+        pressures: gauge pressures of the air in the sealed cavities [Pa], shape (sealed,).
     """
 
     command: np.ndarray
-    volumes: np.ndarray
+    volumes: np.ndarray | None = None
     efforts: np.ndarray | None = None
+    pressures: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -174,7 +178,7 @@ class Estimator:
     their product alone is known.
 
     Args:
-        robot: the body; its cavities are sensors.
+        robot: the body; its cavities are sensors: of volume if they are open, of pressure if they are sealed.
         design: missing variables take their baseline.
         load: what may act on the body, e.g. `Touch` or `Payload`; None for a body without load.
         noise: of sensors and actuators.
@@ -216,7 +220,11 @@ class Estimator:
         sizes = dict(model.roles)
         self._counts = sizes.get("a", 0), sizes.get("e", 0), sizes.get("c", 0)
         n_a = self._counts[0]
-        self.rest_volumes = np.array([c.rest_volume for c in model.constraints["s"] if isinstance(c, Cavity)])
+        sensors = model.constraints["s"]
+        self.rest_volumes = np.array([c.rest_volume for c in sensors if isinstance(c, Cavity)])
+        self._sealed = np.array([isinstance(c, SealedAir) for c in sensors], dtype=bool)
+        self._rest = np.zeros(len(sensors))  # readings of the undeformed body; pressures are relative to ambient
+        self._rest[~self._sealed] = self.rest_volumes
         unlimited = np.full(n_a, np.inf)
         actuators = Gaussian(np.zeros(n_a), self.noise.displacement**2 * np.eye(n_a), -unlimited, unlimited)
         if self.belief is not None:
@@ -230,6 +238,11 @@ class Estimator:
         if load is not None and not self._drift.any():
             size = float(np.sqrt(load.prior.covariance[0, 0]))
             self._mixture = Mixture.before_readings(load.places(self._counts[1]), actuators, size)
+
+    def reading(self, command: np.ndarray, change: np.ndarray, efforts: np.ndarray | None = None) -> Readings:
+        """Return the readings for values of the sensor rows of the condensed model, ``delta.s`` (n_s,)."""
+        values = self._rest + change
+        return Readings(command, values[~self._sealed], efforts, values[self._sealed])
 
     def forces(self, load: np.ndarray) -> np.ndarray:
         """Return the forces on effectors and touched points for parameters of the load (m,) [N]."""
@@ -251,7 +264,7 @@ class Estimator:
         delta, effort = near.rows(displacement, self.forces(load))
         by_displacement, by_effort = near.response
         cavities = near.state.condensed.slices.get("s", slice(0, 0))
-        values, slope = self.rest_volumes + delta[cavities], by_displacement[cavities]
+        values, slope = self._rest + delta[cavities], by_displacement[cavities]
         if self.noise.effort is not None:
             values, slope = np.concatenate([values, effort]), np.vstack([slope, by_effort])
         return values, slope @ self._parameters_to_rows(load)
@@ -269,8 +282,11 @@ class Estimator:
         n_a = self._counts[0]
         assert self.belief is not None
         command = _checked("command", readings.command, n_a)
-        parts = [_checked("volumes", readings.volumes, len(self.rest_volumes))]
-        noise = [np.full(len(self.rest_volumes), self.noise.volume)]
+        sealed = self._sealed
+        cavities = np.zeros(len(sealed))
+        cavities[~sealed] = _checked("volumes", readings.volumes, int((~sealed).sum()))
+        cavities[sealed] = _checked("pressures", readings.pressures, int(sealed.sum()))
+        parts, noise = [cavities], [np.where(sealed, self.noise.pressure, self.noise.volume)]
         if self.noise.effort is not None:
             parts.append(_checked("efforts", readings.efforts, n_a))
             noise.append(np.full(n_a, self.noise.effort))
@@ -351,7 +367,7 @@ class Estimator:
 
         slices = near.state.condensed.slices
         cavities, effectors = slices.get("s", slice(0, 0)), slices["e"]
-        base, response = self.rest_volumes + delta[cavities], by_displacement[cavities]
+        base, response = self._rest + delta[cavities], by_displacement[cavities]
         if self.noise.effort is not None:
             base, response = np.concatenate([base, effort]), np.vstack([response, by_effort])
         self._mixture = before.after(evidence.measured, evidence.spread, base, at_places(response))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from softgym_envs.mechanics.assembly import Assembly
 from softgym_envs.mechanics.compilation import announce_compilation
 from softgym_envs.mechanics.constraints.cable import Cable
-from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.mechanics.constraints.cavity import ATMOSPHERE, Cavity, SealedAir
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
@@ -21,6 +21,7 @@ from softgym_envs.mechanics.contact.contact import Contact, ContactSettings
 from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
 from softgym_envs.mechanics.contact.surface import surface_of
 from softgym_envs.mechanics.elements.block import ElementBlock
+from softgym_envs.mechanics.elements.gas import EnclosedGas
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, quadratic_triangles
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, check_nodes
 from softgym_envs.mechanics.frames import Frames
@@ -339,6 +340,24 @@ class MechanicalModel:
         if isinstance(solid, QuadraticTetrahedra) and surface.ndim == 2 and surface.shape[1] == 3:
             surface = quadratic_triangles(surface, solid.connectivity)
         return Cavity(name, surface, self.nodes)
+
+    def seal(self, cavity: Cavity, ambient: float = ATMOSPHERE) -> SealedAir:
+        """Close a cavity: its air resists changes of volume by Boyle's law, isothermally (see `EnclosedGas`).
+
+        Args:
+            cavity: from `cavity`.
+            ambient: absolute pressure around the body, and of the air at rest [Pa].
+
+        Returns:
+            The gauge pressure of the air [Pa], which may be added as a sensor (role s).
+
+        Raises:
+            ValueError: if the ambient pressure is not positive and finite.
+        """
+        air = SealedAir(cavity, ambient)
+        self.blocks.append(EnclosedGas(air))
+        self._assembly = self._warping = None
+        return air
 
     def add_effector(
         self, name: str, point: ArrayLike, *, hint: np.ndarray | None = None, block: int = 0, radius: float = 0.0

@@ -130,7 +130,9 @@ class Robot(ABC):
         size: a characteristic length [m], for scaling.
         effector_rest: nominal effector of the baseline body at rest [m], before loads, shape (3,).
         effort_scale: typical effort of each actuator of the baseline body [N, ...], shape (n_a,).
-        sensor_scale: typical reading of each sensor row of the condensed model [m3]; empty for a robot without sensors.
+        sensor_scale: typical reading of each sensor row of the condensed model; empty for a robot without sensors.
+        sensor_unit: unit of the sensor rows.
+        sealed: whether the body encloses air that resists changes of its volume.
         goal_axes: which coordinates of the first effector count towards a goal, 1 or 0, shape (3,).
         goal_tolerance: distance at which a goal counts as reached [m].
         picture_axes: coordinates that pictures show towards the viewer, to the right and up: (0, 1, 2), (1, 2, 0) or
@@ -161,6 +163,8 @@ class Robot(ABC):
     effector_rest: np.ndarray
     effort_scale: np.ndarray
     sensor_scale: np.ndarray = np.zeros(0)
+    sensor_unit: str = "m3"
+    sealed: bool = False
     goal_axes: np.ndarray = np.ones(3)
     goal_tolerance: float = 0.002
     picture_axes: tuple[int, int, int] = (0, 1, 2)

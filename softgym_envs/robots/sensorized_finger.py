@@ -3,7 +3,7 @@
 The finger hangs along -z, is clamped by a flange at z = 0, and bends towards +y when its cable is pulled, which
 squeezes the cavities. Seven lengths and angles shape its notches, bellows and cavities. With four cavities (thesis
 3.3.6) a wall in the plane x = 0 splits each cavity in two, so that the sensors can distinguish a lateral force from a
-pull.
+pull. With sealed cavities the sensors measure the pressure of their air, which stiffens the finger.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import InfeasibleDesign
-from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Actuator, MeshedRobot
@@ -52,7 +52,8 @@ class SensorReadings:
     Attributes:
         volume_change: ``f1 = |V(pull) - V(0)|`` of the first cavity [m3].
         bending_angle: ``f2 = acos(|p_z| / |p|)`` of the tip point p under the pull [rad].
-        relative_volume_change: ``f3 = f1 / V(pull)`` (eq. 3.4), the relative change of pressure of a closed cavity.
+        relative_volume_change: ``f3 = f1 / V(pull)`` (eq. 3.4); if the cavity is sealed, its gauge pressure over the
+            ambient one.
         initial_volume: ``f4 = V(0)`` of the first cavity [m3].
         pressure_sensitivity: change of the first cavity's volume over its volume at rest (sec. 3.3.6), the smaller of
             that under the pull and that under the lateral force; None with two cavities.
@@ -76,10 +77,11 @@ class SensorReadings:
 
 
 class SensorizedFinger(MeshedRobot):
-    """Cable-driven soft finger that senses the volumes of its cavities.
+    """Cable-driven soft finger that senses the volumes of its cavities, or the pressures if they are sealed.
 
     The condensed model has the actuator (the cable), the effector (the tip point) and the sensors: one row of role
-    ``s`` per cavity, whose delta is the change of its volume [m3], from the base to the tip and from -x to +x.
+    ``s`` per cavity, whose delta is the change of its volume [m3] or its gauge pressure [Pa], from the base to the tip
+    and from -x to +x.
 
     Args:
         cavities: 2 (one in each bellow) or 4 (two in each, with a wall between; its thickness is then a variable).
@@ -90,6 +92,8 @@ class SensorizedFinger(MeshedRobot):
         unilateral: whether the cable cannot push (default).
         tip_height: height of the effector over the bottom [m]: 0 as published, 10 mm as in the `SoftFinger`.
         cable_clearance: height of the cable over the bellows [m]: 0.8 mm in the published study, 1 mm as built.
+        sealed: whether the cavities are closed. Their air then follows Boyle's law at constant temperature, from
+            101,325 Pa in the undeformed body and outside of it.
         **options: options of `MeshedRobot`.
     """
 
@@ -113,6 +117,7 @@ class SensorizedFinger(MeshedRobot):
         unilateral: bool = True,
         tip_height: float = 0.0,
         cable_clearance: float = 0.8e-3,
+        sealed: bool = False,
         **options: Any,
     ) -> None:
         if cavities not in (2, 4):
@@ -141,19 +146,23 @@ class SensorizedFinger(MeshedRobot):
             DesignVariable("young_modulus", 1.0e6, 1.0e7, 3.0e6, "Pa", "stiffness of the silicone", log=True),
             DesignVariable("poisson_ratio", 0.30, 0.499, 0.30, "1", "0.5 is incompressible"),
         )
-        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
+        self.sealed = sealed
+        # The stiffness of air does not scale with that of the material.
+        self.stiffness_variable = None if any(self.gravity) or sealed else "young_modulus"
         self.tip_height = float(tip_height)
         self.cable_clearance = float(cable_clearance)
         self.effector_rest = np.array([0.0, self.tip_height, -3.0 * LENGTH * mm])
         self.effort_scale = np.array([20.0])
-        # What a pull of 10 mm takes from each cavity of the baseline body.
-        self.sensor_scale = np.full(cavities, 57e-9 if cavities == 2 else 23e-9)
+        # What a pull of 10 mm does to each cavity of the baseline body: its volume [m3] or its pressure [Pa] changes.
+        volume, pressure = (57e-9, 7.4e3) if cavities == 2 else (23e-9, 6.5e3)
+        self.sensor_scale = np.full(cavities, pressure if sealed else volume)
+        self.sensor_unit = "Pa" if sealed else "m3"
         self.actuators = (Actuator("cable", 0.0, 0.015, 0.001, unilateral=unilateral),)
 
     @property
     def weights_name(self) -> str:
-        """``sensorized_finger_2cavities`` or ``sensorized_finger_4cavities``."""
-        return f"sensorized_finger_{self.cavities}cavities"
+        """``sensorized_finger_2cavities`` or ``sensorized_finger_4cavities``, with ``_sealed`` if they are sealed."""
+        return f"sensorized_finger_{self.cavities}cavities{'_sealed' if self.sealed else ''}"
 
     # -- shape ------------------------------------------------------------------------------------------------------
 
@@ -229,7 +238,8 @@ class SensorizedFinger(MeshedRobot):
         hint = self.reference_element(mesh, self.effector_rest)
         model.add_effector("tip", self.effector_rest, hint=hint)
         for number, triangles in enumerate(mesh.cavities(), start=1):
-            model.add("s", model.cavity(f"cavity_{number}", triangles))
+            cavity = model.cavity(f"cavity_{number}", triangles)
+            model.add("s", model.seal(cavity) if self.sealed else cavity)
         return model
 
     def readings(
@@ -249,14 +259,13 @@ class SensorizedFinger(MeshedRobot):
             ConvergenceError: if there is no equilibrium.
         """
         model = self.build(design)
-        volumes = np.array([sensor.rest_volume for sensor in model.constraints["s"] if isinstance(sensor, Cavity)])
         statics = Statics(model)
-        rest = volumes + statics.solve([0.0]).condensed.delta.s if model.loads.any() else volumes
+        rest = _volumes(model, statics.solve([0.0]).condensed.delta.s if model.loads.any() else np.zeros(self.cavities))
         # One step of the whole pull takes fine meshes through shapes with an indefinite tangent, which costs more.
         increments = 1 if self.tier.element == "linear" else 4
         for share in range(1, increments + 1):
             state = statics.solve([pull * share / increments])
-        pulled = volumes + state.condensed.delta.s
+        pulled = _volumes(model, state.condensed.delta.s)
         tip = state.condensed.delta.e
         change = abs(float(pulled[0] - rest[0]))
         pushed, sensitivity = None, None
@@ -264,7 +273,7 @@ class SensorizedFinger(MeshedRobot):
             point = model.embed(np.array(_LATERAL_POINT) * 1e-3, radius=self.guide_radius)
             np.add.at(model.nodal_loads[:, 0], point.node_ids[0], lateral_force * point.weights[0])
             statics.reset()
-            pushed = volumes + statics.solve([0.0]).condensed.delta.s
+            pushed = _volumes(model, statics.solve([0.0]).condensed.delta.s)
             sensitivity = min(change, abs(float(pushed[0] - rest[0]))) / float(rest[0])
         return SensorReadings(
             volume_change=change,
@@ -278,3 +287,12 @@ class SensorizedFinger(MeshedRobot):
             tension=float(state.effort[0]),
             stable=state.stable,
         )
+
+
+def _volumes(model: MechanicalModel, readings: np.ndarray) -> np.ndarray:
+    """Return the volumes [m3] of the cavities for values of the sensor rows, shape (n_s,)."""
+    found = []
+    for sensor, reading in zip(model.constraints["s"], readings, strict=True):
+        assert isinstance(sensor, Cavity | SealedAir)
+        found.append(sensor.volume_at(float(reading)))
+    return np.array(found)

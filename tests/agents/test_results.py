@@ -172,7 +172,7 @@ def test_a_sweep_refuses_results_of_another(swept, tmp_path):
 def test_stored_results_count_as_finished(path):
     config = load_config(path, TrainConfig)
     # As the page of benchmarks says.
-    fem_goals = {"finger_grasp": 20, "tetrapod_reach_analytic": 50}.get(path.stem, 10)
+    fem_goals = {"finger_grasp": 20, "sensorized_finger_reach": 20, "tetrapod_reach_analytic": 50}.get(path.stem, 10)
     for stored in sorted((ROOT / "agents" / "results" / path.stem).glob("*.json")):
         seed = json.loads(stored.read_text()).get("seed", 0)
         assert sweep._finished(stored, config.model_copy(update={"seed": seed}), goals=100, fem_goals=fem_goals)

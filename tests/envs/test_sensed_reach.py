@@ -32,9 +32,9 @@ def final_distances(agent, env, seeds=2):
     return np.array(found)
 
 
-@pytest.mark.parametrize("cavities", [2, 4])
-def test_the_estimator_reaches_goals_that_the_model_alone_misses(cavities):
-    env = gymnasium.make(ID, robot_options={"cavities": cavities})
+@pytest.mark.parametrize("options", [{"cavities": 2}, {"cavities": 4}, {"cavities": 2, "sealed": True}])
+def test_the_estimator_reaches_goals_that_the_model_alone_misses(options):
+    env = gymnasium.make(ID, robot_options=options)
     estimated = final_distances(make_baseline("qp_estimated"), env)
     blind = final_distances(make_baseline("qp_model"), env)
     assert (estimated < env.unwrapped.task.success_distance).all()
@@ -57,6 +57,23 @@ def test_observations_hold_sensors_and_no_effector():
     np.testing.assert_allclose(env.unwrapped.sensed.sensors, change)
     with pytest.raises(ValueError, match="sensors in place of its effector"):
         spaces.observed_effector(observation)
+
+
+def test_observations_hold_earlier_readings_with_their_commands():
+    single = gymnasium.make(ID, task_options={"window": 1})
+    stacked = gymnasium.make(ID, task_options={"window": 1, "history": 3})
+    blocks = []
+    for step in range(4):
+        action = np.array([0.3 * step])
+        (one, *_), (several, *_) = (env.step(action) if step else env.reset(seed=0) for env in (single, stacked))
+        parts = single.unwrapped.spaces.slices
+        now = one[parts["sensors"]]
+        blocks.insert(0, np.concatenate([one[parts["command"]], now[:2]]))
+        known = (blocks + 2 * blocks[-1:])[1:3]
+        shown = several[stacked.unwrapped.spaces.slices["sensors"]]
+        np.testing.assert_array_equal(shown, np.concatenate([now, *known]))
+    moment = stacked.unwrapped.get_state()
+    np.testing.assert_array_equal(stacked.unwrapped.set_state(moment)[0], several)
 
 
 def test_noise_reaches_the_volumes():
@@ -114,6 +131,8 @@ def test_refusals():
         make_task("sensed_reach", sensorized, force=-1.0)
     with pytest.raises(ValueError, match="window = 0"):
         make_task("sensed_reach", sensorized, window=0)
+    with pytest.raises(ValueError, match="history = 0"):
+        make_task("sensed_reach", sensorized, history=0)
     env = gymnasium.make(ID)
     with pytest.raises(ValueError, match="goal-conditioned"):
         GoalObservation(env)

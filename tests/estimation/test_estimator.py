@@ -16,9 +16,9 @@ GRID = finger_grid()
 TOUCH = np.array([1.3, 0.4, -0.6])  # N, and the place in the cell
 
 
-def finger_estimator(cavities):
-    robot = make_robot("sensorized_finger", cavities=cavities)
-    return Estimator(robot, load=Touch(GRID, (0, 14)), noise=Noise(volume=1e-11))
+def finger_estimator(cavities, **options):
+    robot = make_robot("sensorized_finger", cavities=cavities, **options)
+    return Estimator(robot, load=Touch(GRID, (0, 14)), noise=Noise(volume=1e-11, pressure=1.3))
 
 
 def diamond_estimator():
@@ -29,6 +29,7 @@ CASES = {
     "finger, 2 cavities": (lambda: finger_estimator(2), np.array([0.006]), TOUCH),
     "finger, 4 cavities": (lambda: finger_estimator(4), np.array([0.006]), TOUCH),
     "finger, slack cable": (lambda: finger_estimator(2), np.array([0.0]), TOUCH),
+    "finger, sealed": (lambda: finger_estimator(2, sealed=True), np.array([0.006]), TOUCH),
     "diamond": (diamond_estimator, np.array([0.004, 0.002, 0.006, 0.003]), np.array([0.05])),
 }
 
@@ -64,10 +65,12 @@ def test_readings_without_noise_lead_to_the_truth(case):
     load[1:] = 0.0  # the middle of the cell, which is the most probable place
     near = estimator.linearise(command, load)
     readings, _ = estimator.predict(near, command, load)
-    count = len(estimator.rest_volumes)
+    count = len(estimator.robot.sensor_scale)
     estimator.touch(estimator.load)
     efforts = readings[count:] if len(readings) > count else None
-    found = estimator.update(Readings(command, readings[:count], efforts))
+    sealed = estimator.robot.sealed
+    cavities = {"pressures" if sealed else "volumes": readings[:count]}
+    found = estimator.update(Readings(command, efforts=efforts, **cavities))
     assert found.converged
     if command.any():
         assert found.load[0] == pytest.approx(load[0], rel=0.03)

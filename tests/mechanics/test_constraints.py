@@ -14,7 +14,7 @@ from softgym_envs.mechanics import constraints
 from softgym_envs.mechanics.constraints.averaging import averaged_points
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.cable import Cable
-from softgym_envs.mechanics.constraints.cavity import Cavity, enclosed_volume
+from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir, enclosed_volume
 from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
@@ -77,6 +77,10 @@ def make_cavity(nodes, tetrahedra):
     return Cavity("cavity", surface(oriented(nodes, tetrahedra)), nodes)
 
 
+def make_sealed_air(nodes, tetrahedra):
+    return SealedAir(make_cavity(nodes, tetrahedra), ambient=1.3)
+
+
 def make_quadratic_cavity(nodes, tetrahedra):
     """Four curved triangles between nodes of the mesh: corners 0-3, midside nodes 4-9, in general position."""
     middle = {(0, 1): 4, (1, 2): 5, (0, 2): 6, (0, 3): 7, (1, 3): 8, (2, 3): 9}
@@ -122,6 +126,7 @@ FACTORIES = {
     "Point": make_point,
     "Pose": make_pose,
     "Pose of a turn": make_turn,
+    "SealedAir": make_sealed_air,
     "Servo": make_servo,
     "Slide": make_slide,
 }

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
+from softgym_envs.envs.plant import Plants
 from softgym_envs.errors import DesignError, InfeasibleDesign
-from softgym_envs.mechanics.constraints.cavity import enclosed_volume
+from softgym_envs.mechanics.constraints.cavity import ATMOSPHERE, enclosed_volume
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.geometry import meshing
 from softgym_envs.robots.geometry.finger_shape import check_finger
@@ -111,6 +112,26 @@ def test_sensor_rows_are_changes_of_volume_and_W_is_their_derivative(robot):
     assert np.linalg.eigvalsh(state.condensed.compliance)[0] > 0.0
     # Sensors carry no effort.
     assert not state.condensed.lambda_.s.any()
+
+
+def test_sealed_cavities_show_pressures_and_stiffen_the_finger(robot, readings):
+    sealed = make_robot("sensorized_finger", cavities=robot.cavities, sealed=True)
+    model = sealed.build()
+    statics = Statics(model)
+    assert np.abs(statics.solve([0.0]).condensed.delta.s).max() < 1e-6
+    state = statics.solve([0.010])
+    pressures = state.condensed.delta.s
+    np.testing.assert_allclose(pressures, sealed.sensor_scale, rtol=0.05)
+    found = sealed.readings()
+    np.testing.assert_allclose((ATMOSPHERE + pressures) * found.pulled_volumes, ATMOSPHERE * np.array(found.volumes))
+    assert found.relative_volume_change == pytest.approx(pressures[0] / ATMOSPHERE)
+    assert found.tension > 1.003 * readings.tension
+    step = 1e-3
+    low, high = (statics.solve([state.effort[0] + s * step], "effort").condensed.delta.s for s in (-1, 1))
+    np.testing.assert_allclose(state.condensed.W.sa[:, 0], (high - low) / (2 * step), rtol=1e-4)
+    assert sealed.stiffness_variable is None and sealed.weights_name.endswith("_sealed")
+    with pytest.raises(ValueError, match="sealed air"):
+        Plants.check({"stiffness": 1.2}, sealed, "fem")
 
 
 def test_readings_of_the_baseline(robot, readings):

@@ -201,7 +201,16 @@ class Task(ABC):
         return np.zeros(0)
 
     def feel(self) -> np.ndarray:
-        """Return what the touch sensors show of the last `touch`, in [-1, 1], shape (``sensors`` - s,)."""
+        """Return what the touch sensors show of the last `touch`, in [-1, 1], shape (t,)."""
+        return np.zeros(0)
+
+    def recall(self, reading: np.ndarray, new: bool) -> np.ndarray:
+        """Return earlier readings that observations show besides the present one, shape (``sensors`` - s - t,).
+
+        Args:
+            reading: commands and sensors as observed now, in [-1, 1], shape (n_a + s,).
+            new: whether this is a new reading, and not the last one again.
+        """
         return np.zeros(0)
 
     def measure(self, state: State) -> np.ndarray:

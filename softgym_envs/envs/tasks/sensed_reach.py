@@ -21,6 +21,8 @@ class SensedReach(Reach):
         force: largest force of a touch [N]; each is drawn uniformly. 0 for no touch.
         window: the touch begins at a random step among this many first control steps.
         pitch: size of a cell of the grid [m].
+        history: number of readings that an observation shows, the present one included. Earlier ones come with their
+            commands, the latest first; before the episode, the first reading stands for them.
         **options: options of `Reach`; ``command_low`` is 0.4 here, so that a goal stays reachable under a touch.
     """
 
@@ -34,6 +36,7 @@ class SensedReach(Reach):
         force: float = 1.0,
         window: int = 20,
         pitch: float = 5e-3,
+        history: int = 1,
         command_low: float = 0.4,
         **options: object,
     ) -> None:
@@ -44,16 +47,20 @@ class SensedReach(Reach):
             raise ValueError(f"force = {force} N must be non-negative and finite")
         if window < 1:
             raise ValueError(f"window = {window} must be at least 1")
+        if history < 1:
+            raise ValueError(f"history = {history} must be at least 1")
         self.grid = finger_grid(pitch)
         self.axes = np.abs(np.array(self.grid.normal))
         self.largest_force, self.window = force, window
         self.touches = force > 0.0
-        self.sensors = len(robot.sensor_scale) + 3
+        each = len(robot.actuators) + len(robot.sensor_scale)
+        self.history, self.sensors = history, len(robot.sensor_scale) + 3 + (history - 1) * each
+        self._readings: list[np.ndarray] = []
         self.touched: Cell | None = None
         self._load, self._first = PointForce(np.zeros(3), np.zeros(3)), 0
 
     def begin(self, rng: np.random.Generator) -> None:
-        self.touched = None
+        self.touched, self._readings = None, []
         if self.touches:
             along, across = self.grid.pitch * np.array(self.grid.cells) * rng.random(2)
             point = np.array(self.grid.corner) + along * np.array(self.grid.along) + across * np.array(self.grid.across)
@@ -69,7 +76,7 @@ class SensedReach(Reach):
         return self._load
 
     def sense(self, state: State) -> np.ndarray:
-        """Return the changes of the cavities' volumes over their scale, shape (s,)."""
+        """Return the changes of the cavities' volumes, or their pressures, over their scale, shape (s,)."""
         return state.condensed.delta.s / self.robot.sensor_scale
 
     def feel(self) -> np.ndarray:
@@ -77,3 +84,10 @@ class SensedReach(Reach):
         if self.touched is None:
             return np.array([-1.0, 0.0, 0.0])
         return np.array([1.0, *(2.0 * (np.array(self.touched) + 0.5) / np.array(self.grid.cells) - 1.0)])
+
+    def recall(self, reading: np.ndarray, new: bool) -> np.ndarray:
+        """Return the commands and cavities of the readings before the present one, shape ((history - 1) (n_a + s),)."""
+        if new:
+            known = [reading, *self._readings]
+            self._readings = (known + self.history * known[-1:])[: self.history]
+        return np.concatenate([np.zeros(0), *self._readings[1:]])

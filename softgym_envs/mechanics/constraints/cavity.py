@@ -1,4 +1,4 @@
-"""The volume of a closed cavity."""
+"""The volume of a closed cavity, and the pressure of air that is sealed in one."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import numpy as np
 from numba import njit
 
 from softgym_envs.mechanics.constraints.constraint import Constraint
+
+ATMOSPHERE = 101_325.0
+"""Standard atmospheric pressure [Pa]."""
 
 # The cone of a quadratic triangle (corners a, b, c, midside nodes ab, bc, ca) has the volume sum w det(x_i, x_j, x_k)
 # / 6 over these triples: the integral of x . (x_s x x_t) / 3 with its shape functions, exactly.
@@ -114,6 +117,10 @@ class Cavity(Constraint):
         """Enclosed volume [m3] at node positions ``x`` (n, 3)."""
         return _weighted_volume(x, self._triples, self._weights)
 
+    def volume_at(self, delta: float) -> float:
+        """Return the volume [m3] at a growth ``delta`` [m3]."""
+        return self.rest_volume + delta
+
     def value(self, x: np.ndarray) -> np.ndarray:
         return np.array([self.volume(x) - self.rest_volume])
 
@@ -131,3 +138,58 @@ class Cavity(Constraint):
     def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray:
         _volume_hessian(x, self._triples, self._weights, effort[0], self._entries)
         return np.concatenate([self._entries, self._entries])
+
+
+class SealedAir(Constraint):
+    """Gauge pressure of air sealed in a cavity, by Boyle's law; delta [Pa], conjugate effort [m3].
+
+    The air is at ambient pressure when the body is undeformed, and keeps its temperature: ``p V`` is constant for the
+    absolute pressure p. `EnclosedGas` has the same air's energy; this row only measures it.
+
+    Args:
+        cavity: that holds the air.
+        ambient: absolute pressure around the body, and of the air at rest [Pa].
+
+    Raises:
+        ValueError: if the ambient pressure is not positive and finite.
+    """
+
+    size = 1
+    unit = ("Pa", "m3")
+
+    def __init__(self, cavity: Cavity, ambient: float = ATMOSPHERE) -> None:
+        if not (np.isfinite(ambient) and ambient > 0.0):
+            raise ValueError(f"ambient = {ambient} Pa around cavity '{cavity.name}' must be positive and finite")
+        self.name, self.cavity, self.ambient, self.dofs = cavity.name, cavity, float(ambient), cavity.dofs
+
+    def pressure(self, volume: float) -> tuple[float, float, float]:
+        """Return the gauge pressure [Pa] at a volume [m3], and its first and second derivative by it."""
+        absolute = self.ambient * self.cavity.rest_volume / volume
+        return absolute - self.ambient, -absolute / volume, 2.0 * absolute / volume**2
+
+    def volume_at(self, delta: float) -> float:
+        """Return the volume [m3] at a gauge pressure ``delta`` [Pa]."""
+        return self.ambient * self.cavity.rest_volume / (self.ambient + delta)
+
+    def energy(self, volume: float) -> float:
+        """Return the work [J] that compresses the air from rest to a volume [m3], less that of the ambient pressure."""
+        rest = self.cavity.rest_volume
+        # The difference is small against both terms.
+        strain = (volume - rest) / rest
+        return self.ambient * rest * float(strain - np.log1p(strain))
+
+    def value(self, x: np.ndarray) -> np.ndarray:
+        return np.array([self.pressure(self.cavity.volume(x))[0]])
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        return self.pressure(self.cavity.volume(x))[1] * self.cavity.jacobian(x)
+
+    def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        pairs, own = super().hessian_pattern(), self.cavity.hessian_pattern()
+        return np.concatenate([pairs[0], own[0]]), np.concatenate([pairs[1], own[1]])
+
+    def hessian(self, x: np.ndarray, effort: np.ndarray) -> np.ndarray:
+        _, slope, curvature = self.pressure(self.cavity.volume(x))
+        gradient = self.cavity.jacobian(x)[0]
+        product = effort[0] * curvature * np.outer(gradient, gradient)
+        return np.concatenate([product.ravel(), self.cavity.hessian(x, effort * slope)])
