@@ -48,6 +48,7 @@ class TorchBatch:
     """
 
     def __init__(self, model: SurrogateModel, device: torch.device, dtype: torch.dtype) -> None:
+        self._effectors = model.effectors
         if not isinstance(model, Model):
             raise ValueError(f"network '{model.network}' is not supported; allowed: potential")
 
@@ -112,9 +113,9 @@ class TorchBatch:
 
         As `SurrogateModel.trust`, at displacements ``u`` under commands ``target``, both scaled, shape (B, n).
         """
-        x = self._ensemble.effectors(bodies, u)
+        x = self._ensemble.effectors(bodies, u)[..., : self._effectors]
         mean = x.mean(dim=0)
-        effector = (mean * self._effector_scale + self._effector_mean)[:, :3]
+        effector = (mean * self._effector_scale + self._effector_mean[: self._effectors])[:, :3]
         if self._calibrated:
             square = ((x - mean) ** 2).mean(dim=0).reshape(len(u), -1, 3).sum(dim=2)
             calibration, variance = self._calibration, square.amax(dim=1) * self._effector_scale**2
