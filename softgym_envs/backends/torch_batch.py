@@ -48,14 +48,13 @@ class TorchBatch:
     """
 
     def __init__(self, model: SurrogateModel, device: torch.device, dtype: torch.dtype) -> None:
-        self._effectors = model.effectors
         if not isinstance(model, Model):
             raise ValueError(f"network '{model.network}' is not supported; allowed: potential")
 
         def put(values: np.ndarray, kind: torch.dtype = dtype) -> Tensor:
             return torch.as_tensor(np.array(values, dtype=float), dtype=kind, device=device)
 
-        self.dtype, self.count = dtype, model.count
+        self.dtype, self.count, self._effectors = dtype, model.count, model.effectors
         self.middle, self.half_range = put(model.middle), put(model.half_range)
         self.unilateral = tuple(model.robot.unilateral.tolist())
         self._pulls = torch.tensor(self.unilateral, device=device)
