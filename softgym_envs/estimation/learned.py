@@ -1,0 +1,265 @@
+"""Estimation of a touch on a learned model, which evaluates every place of a cell at once.
+
+The model has force and place of a touch among its inputs (`Robot.under_touch`). So the equilibrium at each place and
+force is its own, not extrapolated from another place: at each place, Gauss-Newton finds the most probable errors of the
+actuators and force, where readings are linearised with the learned ``W``. The sum over places is that of `Mixture`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import norm
+
+from softgym_envs.backends.surrogate import TOLERANCE
+from softgym_envs.errors import ConvergenceError
+from softgym_envs.estimation.estimator import Noise, Readings, checked_readings
+from softgym_envs.estimation.loads import Touch
+from softgym_envs.estimation.places import Mixture, Moments, Places
+from softgym_envs.estimation.posterior import Gaussian
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.model import SurrogateModel
+from softgym_envs.surrogate.pretrained import pretrained_model
+
+PLACES = 5
+"""Places along each edge of a cell: the response is nearly quadratic in a cell, which five describe."""
+
+
+@dataclass(frozen=True)
+class LearnedEstimate:
+    """Where the body is and what touches it: means over all that explains the readings.
+
+    Attributes:
+        displacement: of the actuators [m], shape (n_a,).
+        load: force [N] and place in the cell (-1 to 1), shape (3,); empty without a touch.
+        load_covariance: shape (3, 3).
+        effector: positions [m], shape (n_e,).
+        effector_covariance: [m2], shape (n_e, n_e).
+        misfit: sum of the squared residuals at the most probable place, in standard deviations of the readings.
+        condensed: model of actuators, effectors and sensors at the most probable place.
+        slack: which actuators hang slack there, shape (n_a,).
+    """
+
+    displacement: np.ndarray
+    load: np.ndarray
+    load_covariance: np.ndarray
+    effector: np.ndarray
+    effector_covariance: np.ndarray
+    misfit: float
+    condensed: CondensedModel
+    slack: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Responses:
+    """States of q bodies: sensors (q, k) and effectors (q, n_e), their derivatives by actuators and force."""
+
+    sensors: np.ndarray
+    sensor_slopes: np.ndarray
+    effectors: np.ndarray
+    effector_slopes: np.ndarray
+    condensed: CondensedModel
+    displacement: np.ndarray
+    effort: np.ndarray
+    slack: np.ndarray
+
+
+class LearnedEstimator:
+    """Finds the shape of a body and a touch on it from a stream of readings, on its learned model.
+
+    Readings in a row under one command are explained together by their mean. What they tell about the errors of the
+    actuators stays known when the command or the touch changes. The errors of the learned volumes do not become smaller
+    with the number of readings, so they are added to the noise of their mean.
+
+    Args:
+        robot: the body, whose touch is learned; its cavities are sensors.
+        design: missing variables take their baseline.
+        load: the touch; None while nothing is touched.
+        noise: of sensors and actuators; loads do not drift, and efforts are not read.
+        model: the learned model of ``robot.under_touch()``; default the shipped one.
+        bias: standard deviation of the errors of learned volumes [m3]; default that in the test of the weights.
+        steps: Gauss-Newton steps per reading.
+
+    Attributes:
+        rest_volumes: of the cavities at rest [m3], shape (n_s,).
+
+    Raises:
+        DesignError: for a malformed design.
+        WeightsError: if there are no weights.
+        ValueError: for a robot whose touch is not learned, or noise that is not supported.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        design: Mapping[str, float] | None = None,
+        load: Touch | None = None,
+        noise: Noise | None = None,
+        model: SurrogateModel | None = None,
+        bias: float | None = None,
+        steps: int = 3,
+    ) -> None:
+        self.robot, self.noise, self.steps = robot, noise or Noise(), steps
+        if self.noise.drift or self.noise.effort is not None:
+            raise ValueError(f"the estimator on a learned model supports neither drift nor efforts, got {self.noise}")
+        if robot.under_touch() is robot:
+            raise ValueError(f"no touch of robot '{robot.name}' is learned; use Estimator")
+        self.model = model or pretrained_model(robot.under_touch())
+        self.design = robot.design_space.complete(design)
+        space = self.model.robot.design_space
+        self._body = np.array([{**space.baseline, **self.design}[name] for name in space.names])
+        self._columns = {name: space.names.index(name) for name in self.model.robot.load_variables}
+        rows = robot.build(self.design).constraints["s"]
+        self.rest_volumes = np.array([row.rest_volume for row in rows if isinstance(row, Cavity)])
+        if bias is None:
+            # Of errors with a normal distribution, the standard deviation is 1.25 times the mean.
+            bias = np.sqrt(0.5 * np.pi) * self.model.card["test"]["sensor_mean"] * float(robot.sensor_scale.mean())
+        self.bias = bias
+        n_a = self.model.count
+        self._actuators = np.zeros(n_a), self.noise.displacement**2 * np.eye(n_a)
+        self._before: Mixture | None = None
+        self._mixture: Mixture | None = None
+        self.touch(load)
+
+    def touch(self, load: Touch | None) -> None:
+        """Replace the touch; the errors of actuators stay known."""
+        if self._mixture is not None:
+            self._actuators = _actuators_of(self._mixture)
+        self.load = load
+        mean, covariance = self._actuators
+        unlimited = np.full(len(mean), np.inf)
+        known = Gaussian(mean, covariance, -unlimited, unlimited)
+        if load is None:
+            # A single place with a force that is as good as zero.
+            self._places, size = Places(np.empty((1, 0)), np.zeros((1, 1)), np.ones(1)), 1e-9
+        else:
+            self._places, size = load.places(0, PLACES), load.expected_force
+        self._before = Mixture.before_readings(self._places, known, size)
+        self._mixture = None
+        self._command: np.ndarray | None = None
+
+    def update(self, readings: Readings) -> LearnedEstimate:
+        """Return the estimate after one more reading.
+
+        Raises:
+            ValueError: if readings have a wrong shape or are not finite, as with a lost sensor.
+            ConvergenceError: if the model finds no equilibrium.
+        """
+        command = checked_readings("command", readings.command, self.model.count)
+        volumes = checked_readings("volumes", readings.volumes, len(self.rest_volumes)) - self.rest_volumes
+        if self._command is None or (command != self._command).any():
+            if self._mixture is not None:
+                self._before = self._mixture
+            self._command, self._count, self._mean = command, 0, np.zeros_like(volumes)
+            assert self._before is not None
+            self._at = self._before.means.copy()
+        self._count += 1
+        self._mean = self._mean + (volumes - self._mean) / self._count
+        spread = np.full(len(volumes), np.hypot(self.noise.volume / np.sqrt(self._count), self.bias))
+        before = self._before
+        assert before is not None
+        for _ in range(self.steps if self._count == 1 else 1):
+            at, response = self._at, self.respond(command, self._at)
+            base = response.sensors - np.einsum("qkn,qn->qk", response.sensor_slopes, at)
+            found = before.after(self._mean, spread, base, response.sensor_slopes)
+            self._at = self._limited(found.means)
+        self._mixture = found
+        tips = response.effectors - np.einsum("qon,qn->qo", response.effector_slopes, at)
+        moments = found.moments(tips, response.effector_slopes)
+        best = int(np.argmax(found.logarithms + norm.logcdf(found.means[:, -1] / np.sqrt(found.covariances[:, -1, -1]))))
+        residual = (self._mean - base[best] - response.sensor_slopes[best] @ self._at[best]) / spread
+        return self._estimate(command, moments, float(residual @ residual), response, best)
+
+    def _estimate(
+        self, command: np.ndarray, moments: Moments, misfit: float, response: _Responses, best: int
+    ) -> LearnedEstimate:
+        loaded = slice(0, None if self.load is not None else 0)
+        every = response.condensed
+        kept = np.r_[0 : self.model.count + 3 * len(self.robot.effectors), self.model.size - self.model.sensors : self.model.size]
+        W = every.compliance[best][np.ix_(kept, kept)]
+        delta = every.delta.array[best][kept]
+        effort = np.concatenate([response.effort[best], np.zeros(len(kept) - self.model.count)])
+        roles = tuple((r, 3 * len(self.robot.effectors) if r == "e" else size) for r, size in every.roles)
+        return LearnedEstimate(
+            displacement=command + moments.displacement,
+            load=moments.load[loaded],
+            load_covariance=moments.load_covariance[loaded, loaded],
+            effector=moments.outputs,
+            effector_covariance=moments.output_covariance,
+            misfit=misfit,
+            condensed=CondensedModel(W, delta - W @ effort, effort, roles, tuple(every.rows[k] for k in kept)),
+            slack=response.slack[best],
+        )
+
+    def _limited(self, parameters: np.ndarray) -> np.ndarray:
+        """Return errors and forces (q, n_a + 1) at which the model is evaluated: forces that it has learned."""
+        variable = self.model.robot.design_space["touch_force"]
+        most = variable.high * self._stiffness
+        found = parameters.copy()
+        found[:, -1] = np.clip(found[:, -1], 0.0, most)
+        return found
+
+    @property
+    def _stiffness(self) -> float:
+        """Young's modulus over that of the baseline."""
+        return float(self.model.features.stiffness(self._body[None])[0, 0])
+
+    def respond(self, command: np.ndarray, parameters: np.ndarray) -> _Responses:
+        """Return the states at all places, for errors of the actuators and forces there (q, n_a + 1).
+
+        Raises:
+            ConvergenceError: if the model does not find one of them.
+        """
+        model, n = self.model, self.model.count
+        designs = np.tile(self._body, (len(parameters), 1))
+        if self.load is not None:
+            points = self.load.grid.inside(self.load.cell, self._places.coordinates)
+            for row, (point, force) in enumerate(zip(points, parameters[:, -1], strict=True)):
+                touch = self.robot.touch_design(self.design, point, force * np.array(self.load.grid.normal))
+                for name, column in self._columns.items():
+                    designs[row, column] = touch[name]
+        context = model.context(designs)
+        target = command + parameters[:, :-1]
+        unilateral = self.robot.unilateral
+        displacement, effort, found = model.search(context, target, target, unilateral, TOLERANCE, 25)
+        if not found.all():
+            raise ConvergenceError(f"the learned model finds no equilibrium under displacements {command.tolist()}")
+        slack = unilateral & (displacement > target + 10.0 * TOLERANCE * model.span)
+        effort = np.where(slack, 0.0, effort)
+        condensed = model.condensed(context, displacement)
+        delta, W = condensed.delta.array, condensed.compliance
+        normal = np.array([0.0, 1.0, 0.0]) if self.load is None else np.array(self.load.grid.normal)
+        by_force = W[:, :, n + model.effectors - 3 : n + model.effectors] @ normal
+        taut = ~slack
+        both = taut[:, :, None] & taut[:, None, :]
+        K = np.linalg.inv(np.where(both, W[:, :n, :n], np.eye(n))) * both
+        efforts = np.concatenate([K, -np.matmul(K, by_force[:, :n, None])], axis=2)
+        slopes = np.matmul(W[:, :, :n], efforts)
+        slopes[:, :, -1] += by_force
+        own, sensors = slice(n, n + 3 * len(self.robot.effectors)), slice(n + model.effectors, None)
+        return _Responses(
+            sensors=delta[:, sensors],
+            sensor_slopes=slopes[:, sensors],
+            effectors=delta[:, own],
+            effector_slopes=slopes[:, own],
+            condensed=replace(condensed),
+            displacement=displacement,
+            effort=effort,
+            slack=slack,
+        )
+
+
+def _actuators_of(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean (n_a,) and covariance (n_a, n_a) of the errors of the actuators in a mixture."""
+    inside = norm.logcdf(mixture.means[:, -1] / np.sqrt(mixture.covariances[:, -1, -1]))
+    weights = np.exp(mixture.logarithms + inside - (mixture.logarithms + inside).max())
+    weights /= weights.sum()
+    mean = weights @ mixture.means[:, :-1]
+    away = mixture.means[:, :-1] - mean
+    covariance = np.einsum("q,qij->ij", weights, mixture.covariances[:, :-1, :-1])
+    return mean, covariance + np.einsum("q,qi,qj->ij", weights, away, away)
