@@ -16,7 +16,7 @@ from softgym_envs.control.embedded import PICorrection
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.errors import ConvergenceError, WeightsError
-from softgym_envs.estimation import Estimator, Noise, Readings, Touch
+from softgym_envs.estimation import Estimator, LearnedEstimator, Noise, Readings, Touch
 from softgym_envs.robots.base import Robot
 
 Agent = Callable[[np.ndarray, Any], np.ndarray]
@@ -132,7 +132,7 @@ class EstimatedQPAgent(InverseQPAgent):
 
     def __init__(self) -> None:
         super().__init__()
-        self._estimators: WeakKeyDictionary[Any, Estimator] = WeakKeyDictionary()
+        self._estimators: WeakKeyDictionary[Any, Estimator | LearnedEstimator] = WeakKeyDictionary()
 
     def _begin(self, env: Any) -> None:
         if not env.task.sensors:
@@ -141,7 +141,13 @@ class EstimatedQPAgent(InverseQPAgent):
         # A tenth of a percent stands for the differences between touches of the plant and of the estimator.
         volume = max(env.plant.noise, 1e-3) * float(np.mean(env.robot.sensor_scale))
         noise = Noise(displacement=1e-5, volume=volume)
-        self._estimators[env] = Estimator(env.robot, design=env.design, noise=noise)
+        if isinstance(env.backend, SurrogateBackend):
+            # The plant is the learned model itself, so the errors of its volumes do not count.
+            self._estimators[env] = LearnedEstimator(
+                env.robot, design=env.design, noise=noise, model=env.backend.model, bias=0.0
+            )
+        else:
+            self._estimators[env] = Estimator(env.robot, design=env.design, noise=noise)
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
         estimator, task = self._estimators[env], env.task
@@ -150,9 +156,8 @@ class EstimatedQPAgent(InverseQPAgent):
             estimator.touch(load)
         volumes = estimator.rest_volumes + env.sensed.sensors * env.robot.sensor_scale
         found = estimator.update(Readings(present, volumes))
-        state = found.near.state
-        aim = env.aim + state.condensed.delta.e[:3] - found.effector[:3]
-        return controller.solve(state.condensed, aim, present, state.slack)
+        aim = env.aim + found.condensed.delta.e[:3] - found.effector[:3]
+        return controller.solve(found.condensed, aim, present, found.slack)
 
 
 class OpenLoopGrasp:

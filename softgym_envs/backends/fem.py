@@ -59,6 +59,7 @@ class FEMBackend(Backend):
 
     model: MechanicalModel
     takes_force = True
+    takes_touch = True
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ actuators and force, where readings are linearised with the learned ``W``. The s
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import norm
@@ -171,7 +171,7 @@ class LearnedEstimator:
         self._mixture = found
         tips = response.effectors - np.einsum("qon,qn->qo", response.effector_slopes, at)
         moments = found.moments(tips, response.effector_slopes)
-        best = int(np.argmax(found.logarithms + norm.logcdf(found.means[:, -1] / np.sqrt(found.covariances[:, -1, -1]))))
+        best = int(np.argmax(_logarithms(found)))
         residual = (self._mean - base[best] - response.sensor_slopes[best] @ self._at[best]) / spread
         return self._estimate(command, moments, float(residual @ residual), response, best)
 
@@ -179,8 +179,8 @@ class LearnedEstimator:
         self, command: np.ndarray, moments: Moments, misfit: float, response: _Responses, best: int
     ) -> LearnedEstimate:
         loaded = slice(0, None if self.load is not None else 0)
-        every = response.condensed
-        kept = np.r_[0 : self.model.count + 3 * len(self.robot.effectors), self.model.size - self.model.sensors : self.model.size]
+        every, size = response.condensed, self.model.size
+        kept = np.r_[0 : self.model.count + 3 * len(self.robot.effectors), size - self.model.sensors : size]
         W = every.compliance[best][np.ix_(kept, kept)]
         delta = every.delta.array[best][kept]
         effort = np.concatenate([response.effort[best], np.zeros(len(kept) - self.model.count)])
@@ -247,17 +247,22 @@ class LearnedEstimator:
             sensor_slopes=slopes[:, sensors],
             effectors=delta[:, own],
             effector_slopes=slopes[:, own],
-            condensed=replace(condensed),
+            condensed=condensed,
             displacement=displacement,
             effort=effort,
             slack=slack,
         )
 
 
+def _logarithms(mixture: Mixture) -> np.ndarray:
+    """Return the logarithms of the unnormalised weights of the places, without forces below 0, shape (q,)."""
+    return mixture.logarithms + norm.logcdf(mixture.means[:, -1] / np.sqrt(mixture.covariances[:, -1, -1]))
+
+
 def _actuators_of(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
     """Return mean (n_a,) and covariance (n_a, n_a) of the errors of the actuators in a mixture."""
-    inside = norm.logcdf(mixture.means[:, -1] / np.sqrt(mixture.covariances[:, -1, -1]))
-    weights = np.exp(mixture.logarithms + inside - (mixture.logarithms + inside).max())
+    logarithms = _logarithms(mixture)
+    weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     mean = weights @ mixture.means[:, :-1]
     away = mixture.means[:, :-1] - mean

@@ -86,6 +86,12 @@ class TouchGrid:
             )
         return cell
 
+    def inside(self, cell: Cell, coordinates: np.ndarray) -> np.ndarray:
+        """Return points [m] (q, 3) of a cell, given by two numbers each from -1 to 1 (q, 2)."""
+        first, right, up, _ = self.corners(cell)
+        shares = 0.5 * (np.asarray(coordinates) + 1.0)
+        return first + shares @ np.array([right - first, up - first])
+
     def corners(self, cell: Cell) -> np.ndarray:
         """Return the corners of a cell [m], in the order (0, 0), (1, 0), (0, 1), (1, 1), shape (4, 3)."""
         first, second = self.checked(cell)
@@ -134,9 +140,14 @@ class Touch:
             high=np.array([np.inf, 1.0, 1.0]),
         )
 
-    def places(self, effectors: int) -> Places:
-        """Return the nodes of a Gauss quadrature over the cell: before any reading, all its places are alike."""
-        nodes, weights = np.polynomial.legendre.leggauss(PLACES)
+    def places(self, effectors: int, count: int = PLACES) -> Places:
+        """Return the nodes of a Gauss quadrature over the cell: before any reading, all its places are alike.
+
+        Args:
+            effectors: number of their coordinates.
+            count: nodes along each edge.
+        """
+        nodes, weights = np.polynomial.legendre.leggauss(count)
         coordinates = np.array([[u, v] for v in nodes for u in nodes])
         sizes = np.column_stack([np.ones(len(coordinates)), coordinates])
         directions = np.array([self.forces(parameters, effectors) for parameters in sizes])
