@@ -23,6 +23,7 @@ from pathlib import Path
 
 from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
+from benchmarks.learned_sensors import TABLES as SENSOR_TABLES
 from benchmarks.motion import TABLES as MOTION_TABLES
 from benchmarks.printed import TABLES as PRINTED_TABLES
 from benchmarks.recorded import figure
@@ -37,6 +38,7 @@ TABLES = (
     | CONVERGENCE_TABLES
     | ACCURATE_TABLES
     | MOTION_TABLES
+    | SENSOR_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
 )

@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import log_ndtr
 
 from softgym_envs.backends.surrogate import TOLERANCE
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.estimation.estimator import Noise, Readings, checked_readings
-from softgym_envs.estimation.loads import Touch
+from softgym_envs.estimation.loads import Touch, cell_nodes
 from softgym_envs.estimation.places import Mixture, Moments, Places
 from softgym_envs.estimation.posterior import Gaussian
 from softgym_envs.mechanics.condensation import CondensedModel
@@ -82,7 +82,8 @@ class LearnedEstimator:
         noise: of sensors and actuators; loads do not drift, and efforts are not read.
         model: the learned model of ``robot.under_touch()``; default the shipped one.
         bias: standard deviation of the errors of learned volumes [m3]; default that in the test of the weights.
-        steps: Gauss-Newton steps per reading.
+        steps: largest number of Gauss-Newton steps of the first reading under a command or touch; later ones take one.
+        accuracy: a step ends the search that moves no place by more than this part of its standard deviation.
 
     Attributes:
         rest_volumes: of the cavities at rest [m3], shape (n_s,).
@@ -102,9 +103,11 @@ class LearnedEstimator:
         noise: Noise | None = None,
         model: SurrogateModel | None = None,
         bias: float | None = None,
-        steps: int = 3,
+        steps: int = 5,
+        accuracy: float = 0.2,
     ) -> None:
-        self.robot, self.noise, self.steps = robot, noise or Noise(), steps
+        self.robot, self.noise = robot, noise or Noise()
+        self.steps, self.accuracy = steps, accuracy
         if self.noise.drift or self.noise.effort is not None:
             raise ValueError(f"the estimator on a learned model supports neither drift nor efforts, got {self.noise}")
         if robot.under_touch() is robot:
@@ -113,7 +116,9 @@ class LearnedEstimator:
         self.design = robot.design_space.complete(design)
         space = self.model.robot.design_space
         self._body = np.array([{**space.baseline, **self.design}[name] for name in space.names])
-        self._columns = {name: space.names.index(name) for name in self.model.robot.load_variables}
+        # The first load variable is the force, which the others do not depend on.
+        self._loads = self.model.robot.load_variables
+        self._columns = [space.names.index(name) for name in self._loads]
         rows = robot.build(self.design).constraints["s"]
         self.rest_volumes = np.array([row.rest_volume for row in rows if isinstance(row, Cavity)])
         if bias is None:
@@ -136,9 +141,13 @@ class LearnedEstimator:
         known = Gaussian(mean, covariance, -unlimited, unlimited)
         if load is None:
             # A single place with a force that is as good as zero.
-            self._places, size = Places(np.empty((1, 0)), np.zeros((1, 1)), np.ones(1)), 1e-9
+            self._places, size = Places(np.empty((1, 0)), np.zeros((1, 0)), np.ones(1)), 1e-9
         else:
-            self._places, size = load.places(0, PLACES), load.expected_force
+            coordinates, shares = cell_nodes(PLACES)
+            self._places, size = Places(coordinates, np.zeros((len(shares), 0)), shares), load.expected_force
+            points, normal = load.grid.inside(load.cell, coordinates), np.array(load.grid.normal)
+            touches = [self.robot.touch_design(self.design, point, normal) for point in points]
+            self._touches = np.array([[touch[name] for name in self._loads] for touch in touches])
         self._before = Mixture.before_readings(self._places, known, size)
         self._mixture = None
         self._command: np.ndarray | None = None
@@ -168,11 +177,15 @@ class LearnedEstimator:
             base = response.sensors - np.einsum("qkn,qn->qk", response.sensor_slopes, at)
             found = before.after(self._mean, spread, base, response.sensor_slopes)
             self._at = self._limited(found.means)
+            deviation = np.sqrt(np.einsum("qnn->qn", found.covariances))
+            likely = _logarithms(found) > _logarithms(found).max() - 8.0
+            if (np.abs(self._at - at) <= self.accuracy * deviation)[likely].all():
+                break
         self._mixture = found
         tips = response.effectors - np.einsum("qon,qn->qo", response.effector_slopes, at)
         moments = found.moments(tips, response.effector_slopes)
         best = int(np.argmax(_logarithms(found)))
-        residual = (self._mean - base[best] - response.sensor_slopes[best] @ self._at[best]) / spread
+        residual = (self._mean - base[best] - response.sensor_slopes[best] @ found.means[best]) / spread
         return self._estimate(command, moments, float(residual @ residual), response, best)
 
     def _estimate(
@@ -218,11 +231,8 @@ class LearnedEstimator:
         model, n = self.model, self.model.count
         designs = np.tile(self._body, (len(parameters), 1))
         if self.load is not None:
-            points = self.load.grid.inside(self.load.cell, self._places.coordinates)
-            for row, (point, force) in enumerate(zip(points, parameters[:, -1], strict=True)):
-                touch = self.robot.touch_design(self.design, point, force * np.array(self.load.grid.normal))
-                for name, column in self._columns.items():
-                    designs[row, column] = touch[name]
+            designs[:, self._columns] = self._touches
+            designs[:, self._columns[0]] *= parameters[:, -1]
         context = model.context(designs)
         target = command + parameters[:, :-1]
         unilateral = self.robot.unilateral
@@ -256,7 +266,7 @@ class LearnedEstimator:
 
 def _logarithms(mixture: Mixture) -> np.ndarray:
     """Return the logarithms of the unnormalised weights of the places, without forces below 0, shape (q,)."""
-    return mixture.logarithms + norm.logcdf(mixture.means[:, -1] / np.sqrt(mixture.covariances[:, -1, -1]))
+    return mixture.logarithms + log_ndtr(mixture.means[:, -1] / np.sqrt(mixture.covariances[:, -1, -1]))
 
 
 def _actuators_of(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:

@@ -106,6 +106,12 @@ def finger_grid(pitch: float = 5e-3) -> TouchGrid:
     return TouchGrid(corner, (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (columns, rows), pitch)
 
 
+def cell_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes (count^2, 2) from -1 to 1 and weights of a Gauss quadrature over a cell, whose sum is one."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return np.array([[u, v] for v in nodes for u in nodes]), np.kron(weights, weights) / 4.0
+
+
 @dataclass(frozen=True)
 class Touch:
     """A force along the normal of a grid at an unknown place in one cell.
@@ -140,18 +146,12 @@ class Touch:
             high=np.array([np.inf, 1.0, 1.0]),
         )
 
-    def places(self, effectors: int, count: int = PLACES) -> Places:
-        """Return the nodes of a Gauss quadrature over the cell: before any reading, all its places are alike.
-
-        Args:
-            effectors: number of their coordinates.
-            count: nodes along each edge.
-        """
-        nodes, weights = np.polynomial.legendre.leggauss(count)
-        coordinates = np.array([[u, v] for v in nodes for u in nodes])
+    def places(self, effectors: int) -> Places:
+        """Return the nodes of a Gauss quadrature over the cell: before any reading, all its places are alike."""
+        coordinates, shares = cell_nodes(PLACES)
         sizes = np.column_stack([np.ones(len(coordinates)), coordinates])
         directions = np.array([self.forces(parameters, effectors) for parameters in sizes])
-        return Places(coordinates, directions, np.kron(weights, weights) / 4.0)
+        return Places(coordinates, directions, shares)
 
     def place(self, parameters: np.ndarray) -> np.ndarray:
         """Return the touched point of the undeformed body [m], shape (3,)."""
