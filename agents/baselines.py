@@ -144,7 +144,7 @@ class EstimatedQPAgent(InverseQPAgent):
         if isinstance(env.backend, SurrogateBackend):
             # The plant is the learned model itself, so the errors of its volumes do not count.
             self._estimators[env] = LearnedEstimator(
-                env.robot, design=env.design, noise=noise, model=env.backend.model, bias=0.0
+                env.robot, design=env.design, noise=noise, model=env.backend.model, exact=True
             )
         else:
             self._estimators[env] = Estimator(env.robot, design=env.design, noise=noise)

@@ -2,7 +2,8 @@
 
 The model has force and place of a touch among its inputs (`Robot.under_touch`). So the equilibrium at each place and
 force is its own, not extrapolated from another place: at each place, Gauss-Newton finds the most probable errors of the
-actuators and force, where readings are linearised with the learned ``W``. The sum over places is that of `Mixture`.
+actuators and force. The answer to the actuators is the learned ``W``, the answer to the force is the difference of two
+equilibria of the model: so it is consistent with them. The sum over places is that of `Mixture`.
 """
 
 from __future__ import annotations
@@ -25,8 +26,11 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_model
 
-PLACES = 5
-"""Places along each edge of a cell: the response is nearly quadratic in a cell, which five describe."""
+PLACES = 4
+"""Places along each edge of a cell: the response is nearly quadratic in a cell, which four describe."""
+
+STEP = 0.02
+"""Difference of forces at the baseline's stiffness by which the answer to a force is found [N]."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +85,14 @@ class LearnedEstimator:
         load: the touch; None while nothing is touched.
         noise: of sensors and actuators; loads do not drift, and efforts are not read.
         model: the learned model of ``robot.under_touch()``; default the shipped one.
-        bias: standard deviation of the errors of learned volumes [m3]; default that in the test of the weights.
+        exact: whether the body is the learned model itself, so that its errors in the test of the weights do not count.
         steps: largest number of Gauss-Newton steps of the first reading under a command or touch; later ones take one.
         accuracy: a step ends the search that moves no place by more than this part of its standard deviation.
 
     Attributes:
         rest_volumes: of the cavities at rest [m3], shape (n_s,).
+        volume_error: standard deviation of the errors of learned volumes [m3].
+        tip_error: standard deviation of the errors of a learned effector along each axis [m].
 
     Raises:
         DesignError: for a malformed design.
@@ -102,7 +108,7 @@ class LearnedEstimator:
         load: Touch | None = None,
         noise: Noise | None = None,
         model: SurrogateModel | None = None,
-        bias: float | None = None,
+        exact: bool = False,
         steps: int = 5,
         accuracy: float = 0.2,
     ) -> None:
@@ -121,10 +127,11 @@ class LearnedEstimator:
         self._columns = [space.names.index(name) for name in self._loads]
         rows = robot.build(self.design).constraints["s"]
         self.rest_volumes = np.array([row.rest_volume for row in rows if isinstance(row, Cavity)])
-        if bias is None:
-            # Of errors with a normal distribution, the standard deviation is 1.25 times the mean.
-            bias = np.sqrt(0.5 * np.pi) * self.model.card["test"]["sensor_mean"] * float(robot.sensor_scale.mean())
-        self.bias = bias
+        # Errors with a normal distribution have a standard deviation of 1.25 times their mean size.
+        # In space, the mean length of errors is 1.6 times their deviation along each axis.
+        errors = {"sensor_mean": 0.0, "effector_mean": 0.0} if exact else self.model.card["test"]
+        self.volume_error = np.sqrt(0.5 * np.pi) * errors["sensor_mean"] * float(robot.sensor_scale.mean())
+        self.tip_error = np.sqrt(np.pi / 8.0) * errors["effector_mean"]
         n_a = self.model.count
         self._actuators = np.zeros(n_a), self.noise.displacement**2 * np.eye(n_a)
         self._before: Mixture | None = None
@@ -169,7 +176,7 @@ class LearnedEstimator:
             self._at = self._before.means.copy()
         self._count += 1
         self._mean = self._mean + (volumes - self._mean) / self._count
-        spread = np.full(len(volumes), np.hypot(self.noise.volume / np.sqrt(self._count), self.bias))
+        spread = np.full(len(volumes), np.hypot(self.noise.volume / np.sqrt(self._count), self.volume_error))
         before = self._before
         assert before is not None
         for _ in range(self.steps if self._count == 1 else 1):
@@ -203,7 +210,7 @@ class LearnedEstimator:
             load=moments.load[loaded],
             load_covariance=moments.load_covariance[loaded, loaded],
             effector=moments.outputs,
-            effector_covariance=moments.output_covariance,
+            effector_covariance=moments.output_covariance + self.tip_error**2 * np.eye(len(moments.outputs)),
             misfit=misfit,
             condensed=CondensedModel(W, delta - W @ effort, effort, roles, tuple(every.rows[k] for k in kept)),
             slack=response.slack[best],
@@ -233,24 +240,27 @@ class LearnedEstimator:
         if self.load is not None:
             designs[:, self._columns] = self._touches
             designs[:, self._columns[0]] *= parameters[:, -1]
-        context = model.context(designs)
-        target = command + parameters[:, :-1]
+        # Forces of which each place has a second one, by whose difference the answer to the force is found.
+        more = designs.copy()
+        more[:, self._columns[0]] += STEP
+        step, places = STEP * self._stiffness, len(designs)
+        context = model.context(np.vstack([designs, more]))
+        target = np.tile(command + parameters[:, :-1], (2, 1))
         unilateral = self.robot.unilateral
-        displacement, effort, found = model.search(context, target, target, unilateral, TOLERANCE, 25)
+        reached, effort, found = model.search(context, target, target, unilateral, TOLERANCE, 25)
         if not found.all():
             raise ConvergenceError(f"the learned model finds no equilibrium under displacements {command.tolist()}")
-        slack = unilateral & (displacement > target + 10.0 * TOLERANCE * model.span)
+        passive = np.concatenate([model.effector(context, reached)[0], model.sensed(context, reached)], axis=1)
+        by_force = np.concatenate([np.zeros((places, n)), (passive[places:] - passive[:places]) / step], axis=1)
+        displacement, effort = reached[:places], effort[:places]
+        slack = unilateral & (displacement > target[:places] + 10.0 * TOLERANCE * model.span)
         effort = np.where(slack, 0.0, effort)
-        condensed = model.condensed(context, displacement)
+        condensed = model.condensed(context.rows(np.arange(places)), displacement)
         delta, W = condensed.delta.array, condensed.compliance
-        normal = np.array([0.0, 1.0, 0.0]) if self.load is None else np.array(self.load.grid.normal)
-        by_force = W[:, :, n + model.effectors - 3 : n + model.effectors] @ normal
         taut = ~slack
         both = taut[:, :, None] & taut[:, None, :]
         K = np.linalg.inv(np.where(both, W[:, :n, :n], np.eye(n))) * both
-        efforts = np.concatenate([K, -np.matmul(K, by_force[:, :n, None])], axis=2)
-        slopes = np.matmul(W[:, :, :n], efforts)
-        slopes[:, :, -1] += by_force
+        slopes = np.concatenate([np.matmul(W[:, :, :n], K), by_force[:, :, None]], axis=2)
         own, sensors = slice(n, n + 3 * len(self.robot.effectors)), slice(n + model.effectors, None)
         return _Responses(
             sensors=delta[:, sensors],
