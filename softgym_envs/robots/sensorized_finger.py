@@ -140,7 +140,7 @@ class SensorizedFinger(MeshedRobot):
             shape.append(
                 DesignVariable("split", 0.75 * mm, 3 * mm, 0.75 * mm, "m", "half the wall between paired cavities")
             )
-        touched = []
+        touched: list[DesignVariable] = []
         if touch:
             self.effectors = ("tip", "touched")
             touched = [

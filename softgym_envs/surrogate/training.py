@@ -214,7 +214,7 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
     truth = full_compliance(data["compliance"], n)
     coordinates, sensors = np.split(data["effector"], [model.effectors], axis=1)
     distance = np.linalg.norm((effector - coordinates).reshape(len(effort), -1, 3), axis=2).max(axis=1)
-    shown = {}
+    shown: dict[str, float] = {}
     if model.sensors:
         wrong = (
             np.abs(model.sensed(context, data["displacement"]) - sensors).max(axis=1) / model.robot.sensor_scale.max()
