@@ -97,7 +97,7 @@ class SensorizedFinger(MeshedRobot):
     """
 
     name = "sensorized_finger"
-    effectors = ("tip",)
+    effectors: tuple[str, ...] = ("tip",)
     size = 0.12
     rounded = True
     # "local": elements of 2 mm at the cavities, with which the thesis computed the fingers that were built (fig. 3.10).
