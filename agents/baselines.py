@@ -16,7 +16,8 @@ from softgym_envs.control.embedded import PICorrection
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.errors import ConvergenceError, WeightsError
-from softgym_envs.estimation import Estimator, LearnedEstimator, Noise, Readings, Touch
+from softgym_envs.estimation import Estimator, Noise, Readings, Touch
+from softgym_envs.estimation.learned import LearnedEstimator
 from softgym_envs.robots.base import Robot
 
 Agent = Callable[[np.ndarray, Any], np.ndarray]

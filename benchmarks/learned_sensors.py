@@ -17,7 +17,8 @@ from benchmarks.recorded import results
 from benchmarks.tables import markdown
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.estimation import LearnedEstimator, Noise, Readings, Touch, finger_grid
+from softgym_envs.estimation import Noise, Readings, Touch, finger_grid
+from softgym_envs.estimation.learned import LearnedEstimator
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot

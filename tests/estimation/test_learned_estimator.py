@@ -8,7 +8,8 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.surrogate import SurrogateBackend
-from softgym_envs.estimation import LearnedEstimator, Noise, Readings, Touch, finger_grid
+from softgym_envs.estimation import Noise, Readings, Touch, finger_grid
+from softgym_envs.estimation.learned import LearnedEstimator
 from softgym_envs.mechanics.solvers.statics import Statics
 
 GRID = finger_grid()
