@@ -17,6 +17,7 @@ from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.errors import ConvergenceError, WeightsError
 from softgym_envs.estimation import Estimator, Noise, Touch
+from softgym_envs.estimation.learned import LearnedEstimator
 from softgym_envs.robots.base import Robot
 
 Agent = Callable[[np.ndarray, Any], np.ndarray]
@@ -132,7 +133,7 @@ class EstimatedQPAgent(InverseQPAgent):
 
     def __init__(self) -> None:
         super().__init__()
-        self._estimators: WeakKeyDictionary[Any, Estimator] = WeakKeyDictionary()
+        self._estimators: WeakKeyDictionary[Any, Estimator | LearnedEstimator] = WeakKeyDictionary()
 
     def _begin(self, env: Any) -> None:
         if not env.task.sensors:
@@ -142,7 +143,13 @@ class EstimatedQPAgent(InverseQPAgent):
         level = max(env.plant.noise, 1e-3) * float(np.mean(env.robot.sensor_scale))
         # A body has sensors of one kind; the other level is not used.
         noise = Noise(displacement=1e-5, volume=level, pressure=level)
-        self._estimators[env] = Estimator(env.robot, design=env.design, noise=noise)
+        if isinstance(env.backend, SurrogateBackend):
+            # The plant is the learned model itself, so the errors of its volumes do not count.
+            self._estimators[env] = LearnedEstimator(
+                env.robot, design=env.design, noise=noise, model=env.backend.model, exact=True
+            )
+        else:
+            self._estimators[env] = Estimator(env.robot, design=env.design, noise=noise)
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
         estimator, task = self._estimators[env], env.task
@@ -150,9 +157,8 @@ class EstimatedQPAgent(InverseQPAgent):
         if load != estimator.load:
             estimator.touch(load)
         found = estimator.update(estimator.reading(present, env.sensed.sensors * env.robot.sensor_scale))
-        state = found.near.state
-        aim = env.aim + state.condensed.delta.e[:3] - found.effector[:3]
-        return controller.solve(state.condensed, aim, present, state.slack)
+        aim = env.aim + found.condensed.delta.e[:3] - found.effector[:3]
+        return controller.solve(found.condensed, aim, present, found.slack)
 
 
 class OpenLoopGrasp:

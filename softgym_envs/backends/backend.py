@@ -119,12 +119,14 @@ class Backend(ABC):
         design: the current design.
         state: the current state.
         moving: states have velocities.
-        takes_force: `step` takes a force on the effector, and `touch` one on any point of the body.
+        takes_force: `step` takes a force on the effector.
+        takes_touch: `touch` takes a force on a point of the body.
         cable_friction: coefficient of friction of cables on their guides, 0 where they are not computed.
     """
 
     moving: bool = False
     takes_force: bool = False
+    takes_touch: bool = False
     cable_friction: float = 0.0
     robot: Robot
     design: Design

@@ -18,11 +18,8 @@ from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.base import Robot
+from softgym_envs.robots.base import TOUCH_RADIUS, Robot
 from softgym_envs.surrogate.domain import LOADED
-
-TOUCH_RADIUS = 2.5e-3
-"""Radius over which a touch is spread [m]."""
 
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
@@ -62,6 +59,7 @@ class FEMBackend(Backend):
 
     model: MechanicalModel
     takes_force = True
+    takes_touch = True
 
     def __init__(
         self,

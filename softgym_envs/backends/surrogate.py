@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State
 from softgym_envs.backends.batch import BatchBackend, BatchState
 from softgym_envs.backends.surrogate_motion import MotionState, SurrogateMotion
 from softgym_envs.backends.time_steps import TimeSteps
@@ -134,11 +134,25 @@ class SurrogateBody:
         model: the learned model.
         design: the body.
         motion: what steps it in time; None in statics.
+        effectors: coordinates of effectors that states have, the first ones of the model; default all.
+        touch: values of the model's load variables; default none act.
     """
 
-    def __init__(self, model: SurrogateModel, design: Design, motion: SurrogateMotion | None = None) -> None:
+    def __init__(
+        self,
+        model: SurrogateModel,
+        design: Design,
+        motion: SurrogateMotion | None = None,
+        *,
+        effectors: int | None = None,
+        touch: Mapping[str, float] | None = None,
+    ) -> None:
         self.model, self.design, self._motion = model, design, motion
-        self._context, self._unilateral = model.context(design.array[None]), model.robot.unilateral
+        space = model.robot.design_space
+        # Loads beyond those that were learned are judged as outside the box, not refused.
+        values = np.array([{**space.baseline, **design, **(touch or {})}[name] for name in space.names])
+        self._context, self._unilateral = model.context(values[None]), model.robot.unilateral
+        self._effectors = model.effectors if effectors is None else effectors
         self._inertia = np.zeros((1, 0)) if motion is None else motion.inertia.body(design.array[None])
 
     def rest(self) -> State:
@@ -212,11 +226,11 @@ class SurrogateBody:
             command=command.copy(),
             displacement=displacement,
             effort=effort,
-            effector=effector.reshape(-1, 3),
+            effector=effector[: self._effectors].reshape(-1, 3),
             slack=found.slack[0],
             # W is evaluated on demand, because many agents never read it.
-            condensed=partial(_condensed, self.model, self._context, displacement, effort, effector),
-            velocity=np.zeros((len(effector) // 3, 3)),
+            condensed=partial(_condensed, self.model, self._context, displacement, effort, effector, self._effectors),
+            velocity=np.zeros((self._effectors // 3, 3)),
             memory=None if motion is None else motion.at_rest(self._context, found.displacement, found.effort),
             uncertainty=float(found.uncertainty[0]),
             trusted=bool(found.doubt[0] == 0),
@@ -225,12 +239,25 @@ class SurrogateBody:
 
 
 def _condensed(
-    model: SurrogateModel, context: Context, displacement: np.ndarray, effort: np.ndarray, effector: np.ndarray
+    model: SurrogateModel,
+    context: Context,
+    displacement: np.ndarray,
+    effort: np.ndarray,
+    effector: np.ndarray,
+    effectors: int,
 ) -> CondensedModel:
-    """Condensed model of a state: W of the network, and the state itself, in which slack cables have no effort."""
+    """Condensed model of a state: W of the network, and the state itself, in which slack cables have no effort.
+
+    Of the coordinates of the effectors, it has the first ``effectors``.
+    """
     W = model.compliance(context, displacement[None])[0]
-    full = np.concatenate([effort, np.zeros(len(effector))])
-    return CondensedModel(W, np.concatenate([displacement, effector]) - W @ full, full, model.roles, model.rows)
+    delta = np.concatenate([displacement, effector, model.sensed(context, displacement[None])[0]])
+    n = model.count
+    kept = np.delete(np.arange(len(delta)), np.arange(n + effectors, n + model.effectors))
+    W, delta = W[np.ix_(kept, kept)], delta[kept]
+    full = np.concatenate([effort, np.zeros(len(delta) - n)])
+    roles = tuple((role, effectors if role == "e" else size) for role, size in model.roles)
+    return CondensedModel(W, delta - W @ full, full, roles, tuple(model.rows[k] for k in kept))
 
 
 def _first(motion: SurrogateMotion, state: MotionState) -> CondensedModel:
@@ -297,7 +324,10 @@ class SurrogateBackend(Backend):
                 "backend='fem', or its learned model as part of a gripper (softgym_envs.control.CoupledFingers)"
             )
         self.robot = robot
-        self.model = pretrained_model(robot, weights, members)
+        learned = robot.under_touch()
+        self.takes_touch = learned is not robot
+        self.model = pretrained_model(learned, weights, members)
+        self._touch: PointForce | None = None
         self.steps = TimeSteps(control_step, time_step, mass_damping, stiffness_damping)
         self._motion = _motion_of(self.model, weights, dynamics, self.steps)
         self.moving = dynamics
@@ -307,11 +337,31 @@ class SurrogateBackend(Backend):
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)
         if self._body is None or complete != self.design:
-            body = SurrogateBody(self.model, complete, self._motion)
+            body = SurrogateBody(self.model, complete, self._motion, effectors=3 * len(self.robot.effectors))
             self._rest = body.rest()
-            self._body, self.design = body, complete
+            self._untouched, self.design = body, complete
+        self._touch, self._body = None, self._untouched
         self.state = self._rest
         return self.state
+
+    def touch(self, load: PointForce | None) -> None:
+        if load is self._touch:
+            return
+        if load is None:
+            self._body = self._untouched
+        else:
+            touch = self.robot.touch_design(self.design, load.point, load.force)
+            effectors = 3 * len(self.robot.effectors)
+            self._body = SurrogateBody(self.model, self.design, self._motion, effectors=effectors, touch=touch)
+        self._touch = load
+
+    def _more(self) -> PointForce | None:
+        return self._touch
+
+    def _put_back(self, kept: Snapshot) -> None:
+        self.reset(kept.design)
+        self.touch(kept.more)
+        self.restore(kept.state)
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
         if force is not None and np.any(force):

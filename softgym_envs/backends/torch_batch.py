@@ -54,7 +54,7 @@ class TorchBatch:
         def put(values: np.ndarray, kind: torch.dtype = dtype) -> Tensor:
             return torch.as_tensor(np.array(values, dtype=float), dtype=kind, device=device)
 
-        self.dtype, self.count = dtype, model.count
+        self.dtype, self.count, self._effectors = dtype, model.count, model.effectors
         self.middle, self.half_range = put(model.middle), put(model.half_range)
         self.unilateral = tuple(model.robot.unilateral.tolist())
         self._pulls = torch.tensor(self.unilateral, device=device)
@@ -112,9 +112,9 @@ class TorchBatch:
 
         As `SurrogateModel.trust`, at displacements ``u`` under commands ``target``, both scaled, shape (B, n).
         """
-        x = self._ensemble.effectors(bodies, u)
+        x = self._ensemble.effectors(bodies, u)[..., : self._effectors]
         mean = x.mean(dim=0)
-        effector = (mean * self._effector_scale + self._effector_mean)[:, :3]
+        effector = (mean * self._effector_scale + self._effector_mean[: self._effectors])[:, :3]
         if self._calibrated:
             square = ((x - mean) ** 2).mean(dim=0).reshape(len(u), -1, 3).sum(dim=2)
             calibration, variance = self._calibration, square.amax(dim=1) * self._effector_scale**2

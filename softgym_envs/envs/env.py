@@ -109,7 +109,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.backend: Backend = make_backend(
             setup.backend, self.robot, design=self._fixed_design, **setup.backend_options
         )
-        if (self.task.pushes or self.task.touches) and not self.backend.takes_force:
+        takes = self.backend.takes_force or not self.task.pushes
+        if not takes or (self.task.touches and not self.backend.takes_touch):
             raise ValueError(
                 f"task '{self.task.name}' pushes the robot, but backend '{setup.backend}' takes no forces; "
                 "allowed: 'fem'"

@@ -97,6 +97,16 @@ class Estimate:
     equilibria: int
     near: Linearised
 
+    @property
+    def condensed(self) -> CondensedModel:
+        """The condensed model near which the estimate lies."""
+        return self.near.state.condensed
+
+    @property
+    def slack(self) -> np.ndarray:
+        """Which actuators hang slack there, shape (n_a,)."""
+        return self.near.state.slack
+
 
 def held_response(condensed: CondensedModel, slack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives of all displacements and of the actuators' efforts with held actuators.
@@ -281,14 +291,14 @@ class Estimator:
         """Return a reading together with those before it under the same command."""
         n_a = self._counts[0]
         assert self.belief is not None
-        command = _checked("command", readings.command, n_a)
+        command = checked_readings("command", readings.command, n_a)
         sealed = self._sealed
         cavities = np.zeros(len(sealed))
-        cavities[~sealed] = _checked("volumes", readings.volumes, int((~sealed).sum()))
-        cavities[sealed] = _checked("pressures", readings.pressures, int(sealed.sum()))
+        cavities[~sealed] = checked_readings("volumes", readings.volumes, int((~sealed).sum()))
+        cavities[sealed] = checked_readings("pressures", readings.pressures, int(sealed.sum()))
         parts, noise = [cavities], [np.where(sealed, self.noise.pressure, self.noise.volume)]
         if self.noise.effort is not None:
-            parts.append(_checked("efforts", readings.efforts, n_a))
+            parts.append(checked_readings("efforts", readings.efforts, n_a))
             noise.append(np.full(n_a, self.noise.effort))
         measured, spread, before = np.concatenate(parts), np.concatenate(noise), self._evidence
         if before is None or self._drift.any() or (command != before.command).any():
@@ -426,7 +436,7 @@ class Estimator:
         return bool((np.abs(moved) <= allowed + 1e-9).all())
 
 
-def _checked(name: str, values: np.ndarray | None, count: int) -> np.ndarray:
+def checked_readings(name: str, values: np.ndarray | None, count: int) -> np.ndarray:
     """Return values of one kind of reading as an array (count,), or a ValueError."""
     array = np.asarray([] if values is None else values, dtype=float)
     if array.shape != (count,) or not np.isfinite(array).all():

@@ -9,10 +9,7 @@ import numpy as np
 from softgym_envs.estimation.estimator import held_response
 from softgym_envs.estimation.posterior import Gaussian
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.base import Robot
-
-TOUCH_RADIUS = 2.5e-3
-"""Radius over which a touch acts [m]."""
+from softgym_envs.robots.base import TOUCH_RADIUS, Robot
 
 
 def sensor_information(slope: np.ndarray, noise: np.ndarray, prior: Gaussian) -> float:

@@ -86,6 +86,12 @@ class TouchGrid:
             )
         return cell
 
+    def inside(self, cell: Cell, coordinates: np.ndarray) -> np.ndarray:
+        """Return points [m] (q, 3) of a cell, given by two numbers each from -1 to 1 (q, 2)."""
+        first, right, up, _ = self.corners(cell)
+        shares = 0.5 * (np.asarray(coordinates) + 1.0)
+        return first + shares @ np.array([right - first, up - first])
+
     def corners(self, cell: Cell) -> np.ndarray:
         """Return the corners of a cell [m], in the order (0, 0), (1, 0), (0, 1), (1, 1), shape (4, 3)."""
         first, second = self.checked(cell)
@@ -98,6 +104,12 @@ def finger_grid(pitch: float = 5e-3) -> TouchGrid:
     columns, rows = int(0.015 / pitch + 1e-9), int(0.100 / pitch + 1e-9)
     corner = (-0.5 * columns * pitch, 0.0, -0.015)
     return TouchGrid(corner, (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (columns, rows), pitch)
+
+
+def cell_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes (count^2, 2) from -1 to 1 and weights of a Gauss quadrature over a cell, whose sum is one."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return np.array([[u, v] for v in nodes for u in nodes]), np.kron(weights, weights) / 4.0
 
 
 @dataclass(frozen=True)
@@ -136,11 +148,10 @@ class Touch:
 
     def places(self, effectors: int) -> Places:
         """Return the nodes of a Gauss quadrature over the cell: before any reading, all its places are alike."""
-        nodes, weights = np.polynomial.legendre.leggauss(PLACES)
-        coordinates = np.array([[u, v] for v in nodes for u in nodes])
+        coordinates, shares = cell_nodes(PLACES)
         sizes = np.column_stack([np.ones(len(coordinates)), coordinates])
         directions = np.array([self.forces(parameters, effectors) for parameters in sizes])
-        return Places(coordinates, directions, np.kron(weights, weights) / 4.0)
+        return Places(coordinates, directions, shares)
 
     def place(self, parameters: np.ndarray) -> np.ndarray:
         """Return the touched point of the undeformed body [m], shape (3,)."""

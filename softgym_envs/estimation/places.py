@@ -80,7 +80,7 @@ class Mixture:
         Args:
             measured: readings, shape (k,).
             spread: their standard deviations, shape (k,).
-            base: readings without errors and load, shape (k,).
+            base: readings without errors and load, shape (k,), or at each place (q, k).
             slopes: their derivatives by errors and size at each place, shape (q, k, n_a + 1).
         """
         residuals = measured - base - np.einsum("qkn,qn->qk", slopes, self.means)
@@ -94,7 +94,12 @@ class Mixture:
         return replace(self, logarithms=self.logarithms - 0.5 * cost, means=means, covariances=covariances)
 
     def moments(self, base: np.ndarray, slopes: np.ndarray) -> Moments:
-        """Return means and covariances, also of outputs that depend on errors and size as `after` describes."""
+        """Return means and covariances, also of outputs that depend on errors and size as `after` describes.
+
+        Args:
+            base: outputs without errors and load, shape (o,), or at each place (q, o).
+            slopes: their derivatives by errors and size at each place, shape (q, o, n_a + 1).
+        """
         spread = np.sqrt(self.covariances[:, -1, -1])
         ratio = self.means[:, -1] / spread
         inside = log_ndtr(ratio)

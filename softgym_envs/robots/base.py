@@ -43,8 +43,11 @@ WITHOUT_CONTACT: dict[str, object] = {
 }
 """Options of a robot that touches nothing. They are not part of its key."""
 
-OMITTED: dict[str, object] = WITHOUT_CONTACT | UNIFORM
+OMITTED: dict[str, object] = WITHOUT_CONTACT | UNIFORM | {"touch": False}
 """Values of options that are not part of a robot's key."""
+
+TOUCH_RADIUS = 2.5e-3
+"""Radius of the part of a body on which a touch acts [m]. At a single point, the compliance depends on the mesh."""
 
 _REQUIRED = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
 
@@ -228,6 +231,23 @@ class Robot(ABC):
     def weights_name(self) -> str:
         """Name of the pretrained weights; variants of a robot with different mechanics have different names."""
         return self.name
+
+    @property
+    def load_variables(self) -> tuple[str, ...]:
+        """Design variables that say what acts on the body, not what the body is."""
+        return ()
+
+    def under_touch(self) -> Robot:
+        """Return the robot whose design also says what touches it, as it is learned; itself if no touch is learned."""
+        return self
+
+    def touch_design(self, design: Mapping[str, float], point: np.ndarray, force: np.ndarray) -> dict[str, float]:
+        """Return the `load_variables` of `under_touch` for a force [N] (3,) at a point [m] (3,) of a complete design.
+
+        Raises:
+            ValueError: for a touch that is not learned.
+        """
+        raise ValueError(f"no touch of robot '{self.name}' is learned; use backend='fem'")
 
     def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> Sequence[Obstacle]:
         """Return the rigid objects that are part of an assembled robot, as obstacles that the rest of it touches."""

@@ -20,7 +20,7 @@ from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.base import Actuator, MeshedRobot
+from softgym_envs.robots.base import TOUCH_RADIUS, Actuator, MeshedRobot
 from softgym_envs.robots.geometry.finger_shape import (
     THICKNESS,
     check_finger,
@@ -94,11 +94,14 @@ class SensorizedFinger(MeshedRobot):
         cable_clearance: height of the cable over the bellows [m]: 0.8 mm in the published study, 1 mm as built.
         sealed: whether the cavities are closed. Their air then follows Boyle's law at constant temperature, from
             101,325 Pa in the undeformed body and outside of it.
+        touch: whether a touch on the flat back is part of the design: its force along +y, and its place. The force
+            grows with Young's modulus, so that this still scales all efforts and nothing else. The touched point is a
+            second effector. This is the robot that is learned: to a network, a touch is an input like any other.
         **options: options of `MeshedRobot`.
     """
 
     name = "sensorized_finger"
-    effectors = ("tip",)
+    effectors: tuple[str, ...] = ("tip",)
     size = 0.12
     rounded = True
     # "local": elements of 2 mm at the cavities, with which the thesis computed the fingers that were built (fig. 3.10).
@@ -118,12 +121,13 @@ class SensorizedFinger(MeshedRobot):
         tip_height: float = 0.0,
         cable_clearance: float = 0.8e-3,
         sealed: bool = False,
+        touch: bool = False,
         **options: Any,
     ) -> None:
         if cavities not in (2, 4):
             raise ValueError(f"cavities = {cavities!r} is unknown; allowed: 2, 4")
         super().__init__(mesh=mesh, meshing=meshing, **options)
-        self.cavities = cavities
+        self.cavities, self.touch = cavities, touch
         mm = 1e-3
         shape = [
             DesignVariable(
@@ -141,8 +145,17 @@ class SensorizedFinger(MeshedRobot):
             shape.append(
                 DesignVariable("split", 0.75 * mm, 3 * mm, 0.75 * mm, "m", "half the wall between paired cavities")
             )
+        touched: list[DesignVariable] = []
+        if touch:
+            self.effectors = ("tip", "touched")
+            touched = [
+                DesignVariable("touch_force", 0.0, 2.0, 0.0, "N", "of a touch, at the baseline's stiffness"),
+                DesignVariable("touch_below", 15 * mm, 115 * mm, 65 * mm, "m", "distance of the touch to the flange"),
+                DesignVariable("touch_beside", -7.5 * mm, 7.5 * mm, 0.0, "m", "x of the touch"),
+            ]
         self.design_space = DesignSpace(
             *shape,
+            *touched,
             DesignVariable("young_modulus", 1.0e6, 1.0e7, 3.0e6, "Pa", "stiffness of the silicone", log=True),
             DesignVariable("poisson_ratio", 0.30, 0.499, 0.30, "1", "0.5 is incompressible"),
         )
@@ -161,8 +174,27 @@ class SensorizedFinger(MeshedRobot):
 
     @property
     def weights_name(self) -> str:
-        """``sensorized_finger_2cavities`` or ``sensorized_finger_4cavities``, with ``_sealed`` if they are sealed."""
-        return f"sensorized_finger_{self.cavities}cavities{'_sealed' if self.sealed else ''}"
+        """``sensorized_finger_2cavities`` or ``sensorized_finger_4cavities``; then ``_sealed``, ``_touched`` if they are."""
+        name = f"sensorized_finger_{self.cavities}cavities"
+        return name + "_sealed" * self.sealed + "_touched" * self.touch
+
+    @property
+    def load_variables(self) -> tuple[str, ...]:
+        return ("touch_force", "touch_below", "touch_beside") if self.touch else ()
+
+    def under_touch(self) -> SensorizedFinger:
+        if self.touch:
+            return self
+        return SensorizedFinger(**{**self._options, "touch": True})  # type: ignore[arg-type]
+
+    def touch_design(self, design: Mapping[str, float], point: np.ndarray, force: np.ndarray) -> dict[str, float]:
+        x, y, z = map(float, point)
+        if abs(y) > 1e-6 or force[0] != 0.0 or force[2] != 0.0:
+            raise ValueError(
+                f"a learned touch is a force along y on the back (y = 0), got {list(force)} N at {list(point)} m"
+            )
+        share = self.design_space["young_modulus"].baseline / design["young_modulus"]
+        return {"touch_force": float(force[1]) * share, "touch_below": -z, "touch_beside": x}
 
     # -- shape ------------------------------------------------------------------------------------------------------
 
@@ -237,6 +269,11 @@ class SensorizedFinger(MeshedRobot):
         # Above the height of the joints the effector lies in front of the slanted end, outside the body.
         hint = self.reference_element(mesh, self.effector_rest)
         model.add_effector("tip", self.effector_rest, hint=hint)
+        if self.touch:
+            place = np.array([design["touch_beside"], 0.0, -design["touch_below"]])
+            force = design["touch_force"] * design["young_modulus"] / self.design_space["young_modulus"].baseline
+            touched = model.add_effector("touched", place, radius=TOUCH_RADIUS).embedding
+            np.add.at(model.nodal_loads[:, 1], touched.node_ids[0], force * touched.weights[0])
         for number, triangles in enumerate(mesh.cavities(), start=1):
             cavity = model.cavity(f"cavity_{number}", triangles)
             model.add("s", model.seal(cavity) if self.sealed else cavity)

@@ -458,7 +458,7 @@ def _climb(
         values = torch.tensor(_designs(model, x), requires_grad=True)
         u = torch.tensor((displacement - model.middle) / model.half_range, dtype=torch.float32, requires_grad=True)
         features = model.features.design(values).to(torch.float32).repeat_interleave(S, dim=0)
-        members = ensemble.effectors(ensemble.coefficients(features), u)
+        members = ensemble.effectors(ensemble.coefficients(features), u)[..., : model.effectors]
         spread = ((members - members.mean(dim=0)) ** 2).mean(dim=0).sum(dim=1)
         # Only trusted states count, so that no body leaves the region of trust altogether.
         torch.log(spread)[torch.as_tensor(trusted.ravel())].sum().backward()

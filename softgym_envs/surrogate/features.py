@@ -30,6 +30,10 @@ class Features:
         robot: the robot.
         learned: design variables that are inputs, in order; default all but the stiffness variable.
         bounds: smallest and largest values of design variables by which they are scaled, instead of the robot's.
+
+    Attributes:
+        units: of the rows of W in the network, shape (n,): 1 for actuators and effectors; sensor rows [m3] become
+            lengths.
     """
 
     def __init__(
@@ -41,6 +45,9 @@ class Features:
         self.robot, self.space = robot, robot.design_space.within(bounds or {})
         self.learned = learned_variables(robot) if learned is None else learned
         self.design_size = len(self.learned) + ("poisson_ratio" in self.learned)
+        # A typical reading counts as much as a tenth of the robot's size.
+        sensors = robot.sensor_scale / (0.1 * robot.size)
+        self.units = np.concatenate([np.ones(len(robot.actuators) + 3 * len(robot.effectors)), sensors])
 
     def design(self, values: Array) -> Array:
         """Scale the learned design variables; returns (B, design_size)."""

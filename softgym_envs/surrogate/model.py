@@ -101,7 +101,8 @@ class SurrogateModel(ABC):
         correction: of the efforts, for the error of the mesh that was learned.
         count: number of actuators n_a.
         effectors: number of effector coordinates n_e.
-        size: order of W, n_a + n_e.
+        sensors: number of sensor rows n_s.
+        size: order of W, n_a + n_e + n_s.
         span: a quarter of the actuators' ranges, the unit of steps and tolerances of searches, shape (n_a,).
         domain: where the model may be trusted.
 
@@ -111,6 +112,7 @@ class SurrogateModel(ABC):
 
     network: ClassVar[str]
     ensemble: ClassVar[bool] = False
+    senses: ClassVar[bool] = False
 
     def __init__(
         self, robot: Robot, tensors: Mapping[str, np.ndarray], card: Mapping[str, Any], members: int | None = None
@@ -126,10 +128,16 @@ class SurrogateModel(ABC):
         self.correction = EffortCorrection.of_card(self.card, self.features.design_size)
         self.count = len(robot.actuators)
         self.effectors = 3 * len(robot.effectors)
-        self.size = self.count + self.effectors
+        self.sensors = len(robot.sensor_scale)
+        if self.sensors and not self.senses:
+            raise ValueError(f"a network of kind '{self.network}' does not learn the sensors of '{robot.name}'")
+        self.size = self.count + self.effectors + self.sensors
         self.roles: Roles = (("a", self.count), ("e", self.effectors))
         commanded = [Row(a.name, a.unit, effort_unit(a.unit)) for a in robot.actuators]
         self.rows = (*commanded, *(row for name in robot.effectors for row in point_rows(name)))
+        if self.sensors:
+            self.roles += (("s", self.sensors),)
+            self.rows += tuple(Row(f"sensor {k + 1}", "m3", effort_unit("m3")) for k in range(self.sensors))
         self.span = 0.25 * (robot.upper - robot.lower)
         self.domain = Domain.of_card(self.card, robot)
 
@@ -166,6 +174,10 @@ class SurrogateModel(ABC):
         """Return only the effectors [m] (B, n_e) and their spread [m] (B,), at displacements (B, n_a)."""
         return self._state(context, displacement)[1:]
 
+    def sensed(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        """Return the sensor rows [m3] (B, n_s) at displacements (B, n_a)."""
+        return np.zeros((len(displacement), 0))
+
     def effector_gradient(self, context: Context, displacement: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the gradient (B, n_a) of ``weights . effector`` in the displacements (B, n_a).
 
@@ -178,7 +190,7 @@ class SurrogateModel(ABC):
         """
         n = self.count
         W = self._compliance(context, displacement)
-        pulled = np.matmul(W[:, :n, n:], weights[:, :, None])
+        pulled = np.matmul(W[:, :n, n : n + self.effectors], weights[:, :, None])
         return np.linalg.solve(W[:, :n, :n], pulled)[:, :, 0]
 
     def search(
@@ -304,8 +316,9 @@ class SurrogateModel(ABC):
         """Return the condensed models at displacements (B, n_a)."""
         effort, effector, _ = self.state(context, displacement)
         W = self.compliance(context, displacement)
-        full = np.concatenate([effort, np.zeros_like(effector)], axis=-1)
-        delta = np.concatenate([displacement, effector], axis=-1)
+        passive = np.concatenate([effector, self.sensed(context, displacement)], axis=-1)
+        full = np.concatenate([effort, np.zeros_like(passive)], axis=-1)
+        delta = np.concatenate([displacement, passive], axis=-1)
         return CondensedModel(W, delta - np.einsum("bij,bj->bi", W, full), full, self.roles, self.rows)
 
     @abstractmethod

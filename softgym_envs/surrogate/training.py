@@ -45,6 +45,7 @@ class SplitConfig(Config):
     seed: int = Field(default=0, ge=0)
     boundary: float | None = Field(default=None, ge=0.0, le=1.0)
     share: float = Field(default=1.0, gt=0.0, le=1.0)
+    loads: int = Field(default=1, gt=0)
 
 
 class DataConfig(Config):
@@ -201,7 +202,8 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
     """Return errors of a model on a dataset.
 
     ``effector``: distance between predicted and FEM effector at the same reached displacement [m]; ``compliance``:
-    relative Frobenius error of W; ``effort``: relative to the largest effort in the data.
+    relative Frobenius error of W; ``effort``: relative to the largest effort in the data; ``sensor``: relative to
+    `Robot.sensor_scale`, if there are sensors.
     """
     stable = stable_rows(model.robot, data)
     data = {name: column[stable] for name, column in data.items()}
@@ -210,7 +212,20 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
     W = model.compliance(context, data["displacement"])
     n = model.size
     truth = full_compliance(data["compliance"], n)
-    distance = np.linalg.norm((effector - data["effector"]).reshape(len(effort), -1, 3), axis=2).max(axis=1)
+    coordinates, sensors = np.split(data["effector"], [model.effectors], axis=1)
+    distance = np.linalg.norm((effector - coordinates).reshape(len(effort), -1, 3), axis=2).max(axis=1)
+    shown: dict[str, float] = {}
+    if model.sensors:
+        wrong = (
+            np.abs(model.sensed(context, data["displacement"]) - sensors).max(axis=1) / model.robot.sensor_scale.max()
+        )
+        shown = {
+            "sensor_mean": float(wrong.mean()),
+            "sensor_p99": float(np.quantile(wrong, 0.99)),
+            "sensor_worst": float(wrong.max()),
+        }
+        # Rows in m and in m3 compare only in the scales of the network.
+        W, truth = (matrix / model.features.units[:, None] / model.features.units for matrix in (W, truth))
     relative = np.linalg.norm(W - truth, axis=(1, 2)) / np.linalg.norm(truth, axis=(1, 2))
     effort_error = np.abs(effort - data["effort"]).max(axis=1) / np.abs(data["effort"]).max()
     return {
@@ -223,6 +238,7 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
         "compliance_worst": float(relative.max()),
         "effort_mean": float(effort_error.mean()),
         "effort_worst": float(effort_error.max()),
+        **shown,
         # Rows have units that differ by many orders of magnitude, so the smallest eigenvalues would be round-off.
         "positive_definite": float(definite(0.5 * (W + np.swapaxes(W, 1, 2))).mean()),
         "asymmetry_worst": float(np.abs(W - np.swapaxes(W, 1, 2)).max() / np.abs(W).max()),
@@ -255,7 +271,8 @@ def domain_of(
     context = model.context(data["design"])
     _, effector, spread = model.state(context, data["displacement"])
     if np.isfinite(spread).all():
-        distance = np.linalg.norm((effector - data["effector"]).reshape(len(spread), -1, 3), axis=2).max(axis=1)
+        truth = data["effector"][:, : model.effectors]
+        distance = np.linalg.norm((effector - truth).reshape(len(spread), -1, 3), axis=2).max(axis=1)
         domain["inflation"] = float(np.quantile(distance / np.maximum(spread, 1e-12), 0.95))
         limit = domain["inflation"] * float(np.quantile(spread, 0.98))
         domain["limit"] = min(limit, model.robot.goal_tolerance)
@@ -370,7 +387,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         **card_of(robot, config.network.kind),
         "config": config.model_dump(mode="json", exclude={"executor"}),
         "domain": domain_of(model, every, data["validation"]),
-        "loaded": bool(robot.build().loads.any()),
+        "loaded": bool(robot.build().loads.any() or robot.load_variables),
         "states": {split: len(rows) for split, rows in states.items()},
         "unstable_states_left_out": {split: len(learned[split]["rest"]) - len(rows) for split, rows in states.items()},
         "data_sha256": inputs["data_sha256"],

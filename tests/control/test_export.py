@@ -37,7 +37,8 @@ int qp(double *H, const double *g, const double *low, const double *high, double
 }
 """
 FLAGS = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2"]
-CONVEX = {k: v for k, v in shipped_robots().items() if make_robot(v[0], **v[1]).convex}
+ROBOTS = {k: make_robot(name, **options) for k, (name, options) in shipped_robots().items()}
+CONVEX = {k: v for k, v in shipped_robots().items() if ROBOTS[k].convex and not len(ROBOTS[k].sensor_scale)}
 
 
 def pointers(*arrays):

@@ -133,7 +133,8 @@ def generate_dataset(
             "design": list(body.design_space.names),
             "displacement": [a.name for a in body.actuators],
             "effort": [a.name for a in body.actuators],
-            "effector": [f"{e} {axis}" for e in body.effectors for axis in "xyz"],
+            "effector": [f"{e} {axis}" for e in body.effectors for axis in "xyz"]
+            + [f"sensor {k + 1}" for k in range(len(body.sensor_scale))],
             "compliance": "upper triangle of W over actuators then effectors, row by row",
         },
     }

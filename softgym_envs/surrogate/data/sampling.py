@@ -45,6 +45,8 @@ class SamplingPlan:
         boundary: share of the groups whose designs and commands lie on faces, edges and vertices of their boxes, where
             optimisers end; commands at a vertex leave cables slack (see `pushed`).
         share: part of the ranges of the commands, from their lower ends, that is drawn from.
+        loads: groups in a row that share a body and differ in what acts on it (`Robot.load_variables`): a mesh costs
+            more than the states under one more load.
     """
 
     groups: int
@@ -58,11 +60,12 @@ class SamplingPlan:
     alike: tuple[str, ...] = ()
     boundary: float = 0.0
     share: float = 1.0
+    loads: int = 1
 
     def __post_init__(self) -> None:
         if self.sequence not in SEQUENCES:
             raise ValueError(f"sequence = {self.sequence!r} is unknown; allowed: {', '.join(map(repr, SEQUENCES))}")
-        for name, least in (("groups", 1), ("states", 0), ("seed", 0)):
+        for name, least in (("groups", 1), ("states", 0), ("seed", 0), ("loads", 1)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
                 raise ValueError(f"{name} = {value!r} must be an integer of at least {least}")
@@ -122,6 +125,11 @@ class SamplingPlan:
                 raise DesignError(f"'{name}' is in `alike` but is not drawn; drawn: {', '.join(names) or 'none'}")
         ends = np.array(box).reshape(-1, 2)
         points = self.unit_points(len(names) + bool(self.alike), first, count, self.groups, 0)
+        if self.loads > 1:
+            body = [k for k, name in enumerate(names) if name not in robot.load_variables]
+            for row in range(count):
+                shared = self.unit_points(points.shape[1], (first + row) // self.loads, 1, self.groups, 0)
+                points[row, body] = shared[0, body]
         if self.alike:
             points, part = points[:, :-1], points[:, -1:]
             group = [names.index(name) for name in self.alike]
@@ -214,7 +222,7 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str
         Arrays with one row per solved state: ``design`` (all variables), ``displacement``, ``effort``, ``effector``,
         ``compliance`` (upper triangle of W, row by row) and ``rest`` (1 for the state at rest), or None for a design
         that is infeasible or has no equilibrium at rest; and the number of commands without an equilibrium, which are
-        left out.
+        left out. Sensor rows are the last columns of ``effector``.
     """
     space = robot.design_space
     count = len(robot.actuators)
@@ -255,10 +263,14 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str
         "design": np.tile([design[name] for name in space.names], (len(rows), 1)),
         "displacement": np.stack([r.condensed.delta.a for r in rows]),
         "effort": np.stack([r.condensed.lambda_.a for r in rows]),
-        "effector": np.stack([r.condensed.delta.e for r in rows]),
+        "effector": np.stack([np.concatenate([r.condensed.delta.e, _sensors(r)]) for r in rows]),
         "compliance": np.stack([r.condensed.compliance[upper] for r in rows]),
         "rest": np.arange(len(rows)) == 0,
     }, failed
+
+
+def _sensors(state: Equilibrium) -> np.ndarray:
+    return state.condensed.delta.s if "s" in state.condensed.slices else np.zeros(0)
 
 
 def select_states(data: Mapping[str, np.ndarray], count: int, seed: int = 0) -> np.ndarray:

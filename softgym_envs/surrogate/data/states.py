@@ -19,12 +19,14 @@ GROWTH = 10.0
 class States:
     """Condensed models of N equilibria; efforts and compliances are those at the baseline stiffness.
 
+    Sensor rows are divided by `Features.units`, so that all rows are of similar size.
+
     Attributes:
         design: features of the design, shape (N, d).
         actuation: scaled displacements, shape (N, n_a).
         displacement: reached actuator displacements, shape (N, n_a).
         effort: shape (N, n_a).
-        effector: shape (N, n_e).
+        effector: and sensor rows, shape (N, n_e).
         W: compliance, shape (N, n, n).
         rest_of: row of the state at rest of the same body, shape (N,).
     """
@@ -150,7 +152,9 @@ def training_states(robot: Robot, data: Mapping[str, np.ndarray], features: Feat
         actuation=features.actuation(data["displacement"]),
         displacement=data["displacement"],
         effort=data["effort"] / factor,
-        effector=data["effector"],
-        W=full_compliance(data["compliance"], data["effort"].shape[1] + data["effector"].shape[1]) * factor[:, :, None],
+        effector=data["effector"] / features.units[data["effort"].shape[1] :],
+        W=full_compliance(data["compliance"], len(features.units))
+        * factor[:, :, None]
+        / (features.units[:, None] * features.units),
         rest_of=rest[np.cumsum(data["rest"]) - 1],
     )

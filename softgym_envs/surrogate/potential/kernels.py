@@ -177,8 +177,11 @@ def hessians(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, hessian):
 
 
 @njit(**_FAST)
-def effectors(u, slot, B1, B2, V, d1, d2, x0, slope, effector, spread):
-    """Effector (rows, e) and its spread (rows,) at scaled actuation u (rows, n) of bodies ``slot`` (rows,)."""
+def effectors(u, slot, B1, B2, V, d1, d2, x0, slope, coordinates, effector, spread):
+    """Effector (rows, e) and its spread (rows,) at scaled actuation u (rows, n) of bodies ``slot`` (rows,).
+
+    The first ``coordinates`` rows are points, three each, whose spread counts; sensors follow.
+    """
     members, n, w = B1.shape
     e = V.shape[1]
     one, share = np.float32(1.0), np.float32(1.0 / members)
@@ -220,7 +223,7 @@ def effectors(u, slot, B1, B2, V, d1, d2, x0, slope, effector, spread):
                     value += x[r, m, k]
                 effector[start + r, k] = share * value
             largest = np.float32(0.0)
-            for first in range(0, e, 3):
+            for first in range(0, coordinates, 3):
                 value = np.float32(0.0)
                 for k in range(first, first + 3):
                     for m in range(members):

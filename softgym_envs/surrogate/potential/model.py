@@ -61,13 +61,14 @@ class Model(SurrogateModel):
         middle: middle of the actuators' ranges, shape (n_a,).
         half_range: half of the ranges, shape (n_a,); networks see displacements scaled by both to [-1, 1].
         energy_scale: unit of the networks' energy [J].
-        effector_mean: origin of the networks' effectors [m], shape (n_e,).
+        effector_mean: origin of the networks' effectors and sensors [m], shape (n_e + n_s,).
         effector_scale: unit of the networks' effectors [m].
         held_scale: unit of the networks' held compliance [m/N].
     """
 
     network = "potential"
     ensemble = True
+    senses = True
 
     def __init__(
         self, robot: Robot, tensors: Mapping[str, np.ndarray], card: Mapping[str, Any], members: int | None = None
@@ -86,6 +87,7 @@ class Model(SurrogateModel):
         def kernel(name, *axes):
             return np.ascontiguousarray(np.transpose(tensors[name], axes), dtype=np.float32)
 
+        self.passive = self.effectors + self.sensors
         self.half_range = 0.5 * (robot.upper - robot.lower)
         self.middle = robot.lower + self.half_range
         self.energy_scale = float(tensors["scale.energy"].item())
@@ -108,7 +110,7 @@ class Model(SurrogateModel):
             raise ValueError(f"'rest' has shape {rest.shape}; the robot has {self.count} actuators")
 
     def _prepare(self, design: np.ndarray) -> dict[str, np.ndarray]:
-        rows, n, e, w, M = len(design), self.count, self.effectors, self.width, self.members
+        rows, n, e, w, M = len(design), self.count, self.passive, self.width, self.members
         x = design if design.shape[1] else np.zeros((rows, 1))
         h = np.repeat(x[None].astype(np.float32), M, axis=0)
         for k, (weight, bias) in enumerate(self._layers):
@@ -152,11 +154,22 @@ class Model(SurrogateModel):
         return self._effort(context, displacement), *self.effector(context, displacement)
 
     def effector(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rows, spread = self._passive(context, displacement)
+        return rows[:, : self.effectors], spread
+
+    def sensed(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        if not self.sensors:
+            return super().sensed(context, displacement)
+        rows, units = self._passive(context, displacement)[0], self.features.units
+        return rows[:, self.effectors :] * units[self.count + self.effectors :]
+
+    def _passive(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return effectors and sensors in the network's units [m] (B, n_e + n_s) and the spread of effectors [m]."""
         u, body = self._scaled(displacement), context.arrays
-        effector = np.empty((len(u), self.effectors), dtype=np.float32)
+        effector = np.empty((len(u), self.passive), dtype=np.float32)
         spread = np.empty(len(u), dtype=np.float32)
         coefficients = (body["d1"], body["d2"], body["x0"], body["slope"])
-        kernels.effectors(u, context.slot, *self._shape, *coefficients, effector, spread)
+        kernels.effectors(u, context.slot, *self._shape, *coefficients, self.effectors, effector, spread)
         if self.members < self.trained:
             spread = np.full(len(u), np.inf)
         return effector * self.effector_scale + self.effector_mean, spread * self.effector_scale
@@ -165,7 +178,8 @@ class Model(SurrogateModel):
         u, body = self._scaled(displacement), context.arrays
         gradient = np.empty((len(u), self.count), dtype=np.float32)
         (B1, B2, V), (B1T, B2T) = self._shape, self._shape_transposed
-        scaled = (self.effector_scale * weights).astype(np.float32)
+        scaled = np.zeros((len(u), self.passive), dtype=np.float32)
+        scaled[:, : self.effectors] = self.effector_scale * weights
         coefficients = (body["d1"], body["d2"], body["slope"])
         kernels.effector_gradients(u, context.slot, B1, B1T, B2, B2T, V, *coefficients, scaled, gradient)
         return gradient / self.half_range
@@ -200,7 +214,7 @@ class Model(SurrogateModel):
 
     def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         u, body = self._scaled(displacement), context.arrays
-        rows, n, e = len(u), self.count, self.effectors
+        rows, n, e = len(u), self.count, self.passive
         jacobian = np.empty((rows, e, n), dtype=np.float32)
         held = np.empty((rows, e, e), dtype=np.float32)
         coefficients = (body["d1"], body["d2"], body["slope"], body["held"])
@@ -215,4 +229,6 @@ class Model(SurrogateModel):
         W[:, a, c] = W[:, c, a].swapaxes(1, 2)
         moved = W[:, c, a] @ J.swapaxes(1, 2)
         W[:, c, c] = 0.5 * (moved + moved.swapaxes(1, 2)) + held.astype(float) * self.held_scale
+        if self.sensors:
+            W *= self.features.units[:, None] * self.features.units
         return W

@@ -278,7 +278,7 @@ class TorchModel(nn.Module):
             return torch.as_tensor(values, dtype=dtype)
 
         self._middle, self._half = put(model.middle), put(model.half_range)
-        self._effector_mean = put(model.effector_mean)
+        self._effector_mean, self._units = put(model.effector_mean), put(model.features.units)
 
     def forward(self, design: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Evaluate the condensed model.
@@ -305,6 +305,8 @@ class TorchModel(nn.Module):
         W_ea = moved * half
         W_ee = _symmetric(moved @ J.transpose(-1, -2)) + held
         W = torch.cat([torch.cat([W_aa, W_ea.transpose(-1, -2)], dim=2), torch.cat([W_ea, W_ee], dim=2)], dim=1)
+        W = W * (self._units[:, None] * self._units)
+        effector = effector[:, : model.effectors]
         stiffness = self.features.stiffness(design) * model.correction.factor(features)
         return gradient * (model.energy_scale / half) * stiffness, effector, W / stiffness[:, :, None]
 

@@ -1,0 +1,177 @@
+"""The sensorized finger on its learned model: errors by stratum, and the estimator with a plant of finite elements.
+
+``softgym bench learned_sensors`` records both; ``python -m benchmarks.learned_sensors`` prints them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+import numpy as np
+from scipy.stats import chi2
+
+from benchmarks.estimation import LARGEST_PULL, LENGTH
+from benchmarks.recorded import results
+from benchmarks.tables import markdown
+from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.errors import ConvergenceError
+from softgym_envs.estimation import Noise, Readings, Touch, finger_grid
+from softgym_envs.estimation.learned import LearnedEstimator
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.base import Robot
+from softgym_envs.robots.registry import make_robot
+
+BODIES, STATES, TOUCHES, READINGS, FORCE = 16, 4, 60, 10, 1.0
+VARIED = ("outer_radius", "wall_thickness")
+STRATA = {"untouched": None, "touch, 15 to 65 mm": (0.015, 0.065), "touch, 65 to 115 mm": (0.065, 0.115)}
+
+
+def strata(robot: Robot) -> dict[str, float]:
+    """Errors of tip, volumes and tension under random commands, on bodies that no weights have seen.
+
+    Touches have up to 2 N at the baseline's stiffness. A state counts for its stratum; slack cables are also counted
+    on their own.
+    """
+    rng, learner = np.random.default_rng(7), robot.under_touch()
+    found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in (*STRATA, "slack cable", "bounds")}
+    for number in range(BODIES):
+        at_bounds = number >= BODIES // 2
+        shares = {name: round(rng.random()) if at_bounds else rng.random() for name in VARIED}
+        design: dict[str, float] = {}
+        for name, share in shares.items():
+            variable = robot.design_space[name]
+            design[name] = variable.low + share * (variable.high - variable.low)
+        backend = SurrogateBackend(robot, design)
+        for stratum, place in STRATA.items():
+            below = 0.065 if place is None else float(rng.uniform(*place))
+            force = 0.0 if place is None else float(rng.uniform(0.0, 2.0))
+            load = {"touch_force": force, "touch_below": below, "touch_beside": float(rng.uniform(-0.0075, 0.0075))}
+            statics = Statics(learner.build({**design, **load}))
+            context = backend.model.context(learner.design_space.complete({**design, **load}).array[None])
+            for command in np.sort(rng.uniform(robot.lower[0], robot.upper[0], STATES)):
+                try:
+                    truth = statics.solve([command])
+                except ConvergenceError:
+                    continue
+                target = np.array([[command]])
+                reached, effort, _ = backend.model.search(context, target, target, robot.unilateral, 5e-5, 25)
+                tip = np.linalg.norm(backend.model.effector(context, reached)[0][0, :3] - truth.condensed.delta.e[:3])
+                volumes = np.abs(backend.model.sensed(context, reached)[0] - truth.condensed.delta.s).max()
+                tension = abs(max(float(effort[0, 0]), 0.0) - float(truth.effort[0]))
+                row = (1e3 * float(tip), 1e9 * float(volumes), tension)
+                slack = bool(truth.slack[0])
+                names = ["bounds"] if at_bounds else [stratum, *(["slack cable"] if slack else [])]
+                for name in names:
+                    found[name].append(row)
+    result: dict[str, float] = {}
+    for name, rows in found.items():
+        result[f"{name}: states"] = len(rows)
+        for quantity, values in zip(("tip [mm]", "volume [mm3]", "tension [N]"), np.array(rows).T, strict=True):
+            result[f"{name}: {quantity}, mean"] = float(values.mean())
+            result[f"{name}: {quantity}, worst"] = float(values.max())
+    return result
+
+
+def estimates(robot: Robot, plant: str) -> dict[str, float]:
+    """Errors, coverage and speed of the estimator on the learned model; the plant is finite elements or the model.
+
+    Noise of the volumes is 1 % of their change under the full pull; touches are random points of the 5 mm grid.
+    """
+    rng, grid = np.random.default_rng(3), finger_grid()
+    body = robot.build()
+    change = Statics(body).solve([LARGEST_PULL]).condensed.delta.s
+    noise = Noise(displacement=1e-4, volume=0.01 * float(np.abs(change).mean()))
+    exact = plant != "fem"
+    estimator = LearnedEstimator(robot, noise=noise, exact=exact)
+    names = ("tip", "force", "inside", "force inside", "known", "first", "later")
+    kept: dict[str, list[float]] = {name: [] for name in names}
+    for _ in range(TOUCHES):
+        cell = (int(rng.integers(grid.cells[0])), int(rng.integers(grid.cells[1])))
+        place = rng.uniform(-1.0, 1.0, (1, 2))
+        point = grid.inside(cell, place)[0]
+        command = np.array([rng.uniform(0.001, LARGEST_PULL)])
+        pull = command + noise.displacement * rng.standard_normal(1)
+        force = 0.0
+        while not 0.2 <= force <= 2.0:
+            force = abs(FORCE * float(rng.standard_normal()))
+        load = robot.touch_design(robot.design_space.baseline, point, force * np.array(grid.normal))
+        if plant == "fem":
+            try:
+                state = Statics(robot.under_touch().build(load)).solve(pull)
+            except ConvergenceError:
+                continue
+            volumes, tip = state.condensed.delta.s, state.condensed.delta.e[:3]
+        else:
+            model = estimator.model
+            context = model.context(model.robot.design_space.complete(load).array[None])
+            reached = model.search(context, pull[None], pull[None], robot.unilateral, 5e-5, 25)[0]
+            volumes, tip = model.sensed(context, reached)[0], model.effector(context, reached)[0][0, :3]
+        estimator = LearnedEstimator(robot, noise=noise, exact=exact, model=estimator.model)
+        estimator.touch(Touch(grid, cell, FORCE))
+        for number in range(READINGS):
+            measured = estimator.rest_volumes + volumes + noise.volume * rng.standard_normal(len(volumes))
+            begin = time.process_time()
+            found = estimator.update(Readings(command, measured))
+            kept["later" if number else "first"].append(time.process_time() - begin)
+        error, spread = found.effector - tip, float(np.sqrt(found.load_covariance[0, 0]))
+        values, axes = np.linalg.eigh(found.effector_covariance)
+        known = values > 1e-6 * values[-1]
+        kept["tip"].append(float(np.linalg.norm(error)) / LENGTH)
+        kept["force"].append(abs(float(found.load[0]) - force) / force)
+        inside = float(((axes.T @ error)[known] ** 2 / values[known]).sum()) <= chi2.ppf(0.95, known.sum())
+        kept["inside"].append(float(inside))
+        kept["force inside"].append(float(abs(found.load[0] - force) <= 1.96 * spread))
+        kept["known"].append(float(spread <= 0.1 * found.load[0]))
+    certain = np.array(kept["known"], dtype=bool)
+    sizes = np.array(kept["force"])
+    return {
+        "touches": len(sizes),
+        "tip error, mean [% of length]": 100 * float(np.mean(kept["tip"])),
+        "tip error, 95 % [% of length]": 100 * float(np.percentile(kept["tip"], 95)),
+        "tip error, worst [% of length]": 100 * float(np.max(kept["tip"])),
+        "force error, median [%]": 100 * float(np.median(sizes)),
+        "force error, mean [%]": 100 * float(sizes.mean()),
+        "force told to 10 % [% of touches]": 100 * float(certain.mean()),
+        "coverage, tip [%]": 100 * float(np.mean(kept["inside"])),
+        "coverage, force [%]": 100 * float(np.mean(kept["force inside"])),
+        "first readings of a touch [1/CPU s]": 1.0 / float(np.mean(kept["first"][1:])),
+        "later readings [1/CPU s]": 1.0 / float(np.mean(kept["later"])),
+    }
+
+
+def learned_sensors() -> dict[str, object]:
+    """Errors of the learned sensorized finger by stratum, and of the estimator on it."""
+    robot = make_robot("sensorized_finger")
+    result: dict[str, object] = {f"stratum: {name}": value for name, value in strata(robot).items()}
+    for plant in ("fem", "model"):
+        result |= {f"plant {plant}: {name}": value for name, value in estimates(robot, plant).items()}
+    return result
+
+
+def strata_table() -> str:
+    """Mean and worst errors of each stratum."""
+    found, quantities = results("learned_sensors"), ("tip [mm]", "volume [mm3]", "tension [N]")
+    rows = []
+    for name in (*STRATA, "slack cable", "bounds"):
+        errors = [[found[f"stratum: {name}: {q}, {kind}"] for kind in ("mean", "worst")] for q in quantities]
+        rows.append(
+            [name, str(found[f"stratum: {name}: states"]), *(f"{mean:.2f}, {worst:.2f}" for mean, worst in errors)]
+        )
+    return markdown(["stratum", "states", *(f"{quantity}: mean, worst" for quantity in quantities)], rows, "lrrrr")
+
+
+def estimates_table() -> str:
+    """Results of the estimator with both plants."""
+    found = results("learned_sensors")
+    names = [name.removeprefix("plant fem: ") for name in found if name.startswith("plant fem: ")]
+    rows = [[name, *(f"{found[f'plant {plant}: {name}']:.3g}" for plant in ("fem", "model"))] for name in names]
+    return markdown(["", "plant on finite elements", "plant is the model"], rows, "lrr")
+
+
+TABLES = {"learned_sensors_strata": strata_table, "learned_sensors_estimates": estimates_table}
+"""Tables of pages by name."""
+
+if __name__ == "__main__":
+    json.dump(learned_sensors(), sys.stdout, indent=2)

@@ -1,0 +1,294 @@
+"""Estimation of a touch on a learned model, which evaluates every place of a cell at once.
+
+The model has force and place of a touch among its inputs (`Robot.under_touch`). So the equilibrium at each place and
+force is its own, not extrapolated from another place: at each place, Gauss-Newton finds the most probable errors of the
+actuators and force. The answer to the actuators is the learned ``W``, the answer to the force is the difference of two
+equilibria of the model: so it is consistent with them. The sum over places is that of `Mixture`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from softgym_envs.backends.surrogate import TOLERANCE
+from softgym_envs.errors import ConvergenceError
+from softgym_envs.estimation.estimator import Noise, Readings, checked_readings
+from softgym_envs.estimation.loads import Touch, cell_nodes
+from softgym_envs.estimation.places import Mixture, Moments, Places
+from softgym_envs.estimation.posterior import Gaussian
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.model import SurrogateModel
+from softgym_envs.surrogate.pretrained import pretrained_model
+
+PLACES = 4
+"""Places along each edge of a cell: the response is nearly quadratic in a cell, which four describe."""
+
+STEP = 0.02
+"""Difference of forces at the baseline's stiffness by which the answer to a force is found [N]."""
+
+
+@dataclass(frozen=True)
+class LearnedEstimate:
+    """Where the body is and what touches it: means over all that explains the readings.
+
+    Attributes:
+        displacement: of the actuators [m], shape (n_a,).
+        load: force [N] and place in the cell (-1 to 1), shape (3,); empty without a touch.
+        load_covariance: shape (3, 3).
+        effector: positions [m], shape (n_e,).
+        effector_covariance: [m2], shape (n_e, n_e).
+        misfit: sum of the squared residuals at the most probable place, in standard deviations of the readings.
+        condensed: model of actuators, effectors and sensors at the most probable place.
+        slack: which actuators hang slack there, shape (n_a,).
+    """
+
+    displacement: np.ndarray
+    load: np.ndarray
+    load_covariance: np.ndarray
+    effector: np.ndarray
+    effector_covariance: np.ndarray
+    misfit: float
+    condensed: CondensedModel
+    slack: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Responses:
+    """States of q bodies: sensors (q, k) and effectors (q, n_e), their derivatives by actuators and force."""
+
+    sensors: np.ndarray
+    sensor_slopes: np.ndarray
+    effectors: np.ndarray
+    effector_slopes: np.ndarray
+    condensed: CondensedModel
+    displacement: np.ndarray
+    effort: np.ndarray
+    slack: np.ndarray
+
+
+class LearnedEstimator:
+    """Finds the shape of a body and a touch on it from a stream of readings, on its learned model.
+
+    Readings in a row under one command are explained together by their mean. What they tell about the errors of the
+    actuators stays known when the command or the touch changes. The errors of the learned volumes do not become smaller
+    with the number of readings, so they are added to the noise of their mean.
+
+    Args:
+        robot: the body, whose touch is learned; its cavities are sensors.
+        design: missing variables take their baseline.
+        load: the touch; None while nothing is touched.
+        noise: of sensors and actuators; loads do not drift, and efforts are not read.
+        model: the learned model of ``robot.under_touch()``; default the shipped one.
+        exact: whether the body is the learned model itself, so that its errors in the test of the weights do not count.
+        steps: largest number of Gauss-Newton steps of the first reading under a command or touch; later ones take one.
+        accuracy: a step ends the search that moves no place by more than this part of its standard deviation.
+
+    Attributes:
+        rest_volumes: of the cavities at rest [m3], shape (n_s,).
+        volume_error: standard deviation of the errors of learned volumes [m3].
+        tip_error: standard deviation of the errors of a learned effector along each axis [m].
+
+    Raises:
+        DesignError: for a malformed design.
+        WeightsError: if there are no weights.
+        ValueError: for a robot whose touch is not learned, or noise that is not supported.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        design: Mapping[str, float] | None = None,
+        load: Touch | None = None,
+        noise: Noise | None = None,
+        model: SurrogateModel | None = None,
+        exact: bool = False,
+        steps: int = 5,
+        accuracy: float = 0.2,
+    ) -> None:
+        self.robot, self.noise = robot, noise or Noise()
+        self.steps, self.accuracy = steps, accuracy
+        if self.noise.drift or self.noise.effort is not None:
+            raise ValueError(f"the estimator on a learned model supports neither drift nor efforts, got {self.noise}")
+        if robot.under_touch() is robot:
+            raise ValueError(f"no touch of robot '{robot.name}' is learned; use Estimator")
+        self.model = model or pretrained_model(robot.under_touch())
+        self.design = robot.design_space.complete(design)
+        space = self.model.robot.design_space
+        self._body = np.array([{**space.baseline, **self.design}[name] for name in space.names])
+        # The first load variable is the force, which the others do not depend on.
+        self._loads = self.model.robot.load_variables
+        self._columns = [space.names.index(name) for name in self._loads]
+        rows = robot.build(self.design).constraints["s"]
+        self.rest_volumes = np.array([row.rest_volume for row in rows if isinstance(row, Cavity)])
+        # Errors with a normal distribution have a standard deviation of 1.25 times their mean size.
+        # In space, the mean length of errors is 1.6 times their deviation along each axis.
+        errors = {"sensor_mean": 0.0, "effector_mean": 0.0} if exact else self.model.card["test"]
+        self.volume_error = np.sqrt(0.5 * np.pi) * errors["sensor_mean"] * float(robot.sensor_scale.mean())
+        self.tip_error = np.sqrt(np.pi / 8.0) * errors["effector_mean"]
+        n_a = self.model.count
+        self._actuators = np.zeros(n_a), self.noise.displacement**2 * np.eye(n_a)
+        self._before: Mixture | None = None
+        self._mixture: Mixture | None = None
+        self.touch(load)
+
+    def touch(self, load: Touch | None) -> None:
+        """Replace the touch; the errors of actuators stay known."""
+        if self._mixture is not None:
+            self._actuators = _actuators_of(self._mixture)
+        self.load = load
+        mean, covariance = self._actuators
+        unlimited = np.full(len(mean), np.inf)
+        known = Gaussian(mean, covariance, -unlimited, unlimited)
+        if load is None:
+            # A single place with a force that is as good as zero.
+            self._places, size = Places(np.empty((1, 0)), np.zeros((1, 0)), np.ones(1)), 1e-9
+        else:
+            coordinates, shares = cell_nodes(PLACES)
+            self._places, size = Places(coordinates, np.zeros((len(shares), 0)), shares), load.expected_force
+            points, normal = load.grid.inside(load.cell, coordinates), np.array(load.grid.normal)
+            touches = [self.robot.touch_design(self.design, point, normal) for point in points]
+            self._touches = np.array([[touch[name] for name in self._loads] for touch in touches])
+        self._before = Mixture.before_readings(self._places, known, size)
+        self._mixture = None
+        self._command: np.ndarray | None = None
+
+    def reading(self, command: np.ndarray, change: np.ndarray) -> Readings:
+        """Return the readings for values of the sensor rows of the condensed model, ``delta.s`` (n_s,)."""
+        return Readings(command, self.rest_volumes + change)
+
+    def update(self, readings: Readings) -> LearnedEstimate:
+        """Return the estimate after one more reading.
+
+        Raises:
+            ValueError: if readings have a wrong shape or are not finite, as with a lost sensor.
+            ConvergenceError: if the model finds no equilibrium.
+        """
+        command = checked_readings("command", readings.command, self.model.count)
+        volumes = checked_readings("volumes", readings.volumes, len(self.rest_volumes)) - self.rest_volumes
+        if self._command is None or (command != self._command).any():
+            if self._mixture is not None:
+                self._before = self._mixture
+            self._command, self._count, self._mean = command, 0, np.zeros_like(volumes)
+            assert self._before is not None
+            self._at = self._before.means.copy()
+        self._count += 1
+        self._mean = self._mean + (volumes - self._mean) / self._count
+        spread = np.full(len(volumes), np.hypot(self.noise.volume / np.sqrt(self._count), self.volume_error))
+        before = self._before
+        assert before is not None
+        for _ in range(self.steps if self._count == 1 else 1):
+            at, response = self._at, self.respond(command, self._at)
+            base = response.sensors - np.einsum("qkn,qn->qk", response.sensor_slopes, at)
+            found = before.after(self._mean, spread, base, response.sensor_slopes)
+            self._at = self._limited(found.means)
+            deviation = np.sqrt(np.einsum("qnn->qn", found.covariances))
+            likely = _logarithms(found) > _logarithms(found).max() - 8.0
+            if (np.abs(self._at - at) <= self.accuracy * deviation)[likely].all():
+                break
+        self._mixture = found
+        tips = response.effectors - np.einsum("qon,qn->qo", response.effector_slopes, at)
+        moments = found.moments(tips, response.effector_slopes)
+        best = int(np.argmax(_logarithms(found)))
+        residual = (self._mean - base[best] - response.sensor_slopes[best] @ found.means[best]) / spread
+        return self._estimate(command, moments, float(residual @ residual), response, best)
+
+    def _estimate(
+        self, command: np.ndarray, moments: Moments, misfit: float, response: _Responses, best: int
+    ) -> LearnedEstimate:
+        loaded = slice(0, None if self.load is not None else 0)
+        every, size = response.condensed, self.model.size
+        kept = np.r_[0 : self.model.count + 3 * len(self.robot.effectors), size - self.model.sensors : size]
+        W = every.compliance[best][np.ix_(kept, kept)]
+        delta = every.delta.array[best][kept]
+        effort = np.concatenate([response.effort[best], np.zeros(len(kept) - self.model.count)])
+        roles = tuple((r, 3 * len(self.robot.effectors) if r == "e" else size) for r, size in every.roles)
+        return LearnedEstimate(
+            displacement=command + moments.displacement,
+            load=moments.load[loaded],
+            load_covariance=moments.load_covariance[loaded, loaded],
+            effector=moments.outputs,
+            effector_covariance=moments.output_covariance + self.tip_error**2 * np.eye(len(moments.outputs)),
+            misfit=misfit,
+            condensed=CondensedModel(W, delta - W @ effort, effort, roles, tuple(every.rows[k] for k in kept)),
+            slack=response.slack[best],
+        )
+
+    def _limited(self, parameters: np.ndarray) -> np.ndarray:
+        """Return errors and forces (q, n_a + 1) at which the model is evaluated: forces that it has learned."""
+        variable = self.model.robot.design_space["touch_force"]
+        most = variable.high * self._stiffness
+        found = parameters.copy()
+        found[:, -1] = np.clip(found[:, -1], 0.0, most)
+        return found
+
+    @property
+    def _stiffness(self) -> float:
+        """Young's modulus over that of the baseline."""
+        return float(self.model.features.stiffness(self._body[None])[0, 0])
+
+    def respond(self, command: np.ndarray, parameters: np.ndarray) -> _Responses:
+        """Return the states at all places, for errors of the actuators and forces there (q, n_a + 1).
+
+        Raises:
+            ConvergenceError: if the model does not find one of them.
+        """
+        model, n = self.model, self.model.count
+        designs = np.tile(self._body, (len(parameters), 1))
+        if self.load is not None:
+            designs[:, self._columns] = self._touches
+            designs[:, self._columns[0]] *= parameters[:, -1]
+        # Forces of which each place has a second one, by whose difference the answer to the force is found.
+        more = designs.copy()
+        more[:, self._columns[0]] += STEP
+        step, places = STEP * self._stiffness, len(designs)
+        context = model.context(np.vstack([designs, more]))
+        target = np.tile(command + parameters[:, :-1], (2, 1))
+        unilateral = self.robot.unilateral
+        reached, effort, found = model.search(context, target, target, unilateral, TOLERANCE, 25)
+        if not found.all():
+            raise ConvergenceError(f"the learned model finds no equilibrium under displacements {command.tolist()}")
+        passive = np.concatenate([model.effector(context, reached)[0], model.sensed(context, reached)], axis=1)
+        by_force = np.concatenate([np.zeros((places, n)), (passive[places:] - passive[:places]) / step], axis=1)
+        displacement, effort = reached[:places], effort[:places]
+        slack = unilateral & (displacement > target[:places] + 10.0 * TOLERANCE * model.span)
+        effort = np.where(slack, 0.0, effort)
+        condensed = model.condensed(context.rows(np.arange(places)), displacement)
+        delta, W = condensed.delta.array, condensed.compliance
+        taut = ~slack
+        both = taut[:, :, None] & taut[:, None, :]
+        K = np.linalg.inv(np.where(both, W[:, :n, :n], np.eye(n))) * both
+        slopes = np.concatenate([np.matmul(W[:, :, :n], K), by_force[:, :, None]], axis=2)
+        own, sensors = slice(n, n + 3 * len(self.robot.effectors)), slice(n + model.effectors, None)
+        return _Responses(
+            sensors=delta[:, sensors],
+            sensor_slopes=slopes[:, sensors],
+            effectors=delta[:, own],
+            effector_slopes=slopes[:, own],
+            condensed=condensed,
+            displacement=displacement,
+            effort=effort,
+            slack=slack,
+        )
+
+
+def _logarithms(mixture: Mixture) -> np.ndarray:
+    """Return the logarithms of the unnormalised weights of the places, without forces below 0, shape (q,)."""
+    return mixture.logarithms + log_ndtr(mixture.means[:, -1] / np.sqrt(mixture.covariances[:, -1, -1]))
+
+
+def _actuators_of(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean (n_a,) and covariance (n_a, n_a) of the errors of the actuators in a mixture."""
+    logarithms = _logarithms(mixture)
+    weights = np.exp(logarithms - logarithms.max())
+    weights /= weights.sum()
+    mean = weights @ mixture.means[:, :-1]
+    away = mixture.means[:, :-1] - mean
+    covariance = np.einsum("q,qij->ij", weights, mixture.covariances[:, :-1, :-1])
+    return mean, covariance + np.einsum("q,qi,qj->ij", weights, away, away)

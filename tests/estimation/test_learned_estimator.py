@@ -1,0 +1,85 @@
+"""The estimator on the learned model: derivatives, recovery on the model and on finite elements, and messages."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softgym_envs import make_robot
+from softgym_envs.backends.backend import PointForce
+from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.estimation import Noise, Readings, Touch, finger_grid
+from softgym_envs.estimation.learned import LearnedEstimator
+from softgym_envs.mechanics.solvers.statics import Statics
+
+GRID = finger_grid()
+POINT = np.array([0.001, 0.0, -0.093])
+COMMAND = np.array([0.006])
+NOISE = Noise(displacement=1e-4, volume=6e-10)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return make_robot("sensorized_finger")
+
+
+def touched(robot, exact=True, noise=NOISE):
+    return LearnedEstimator(robot, load=Touch(GRID, GRID.cell(POINT), 1.0), noise=noise, exact=exact)
+
+
+def test_slopes_by_actuators_are_derivatives_of_the_model(robot):
+    estimator = touched(robot)
+    at = np.tile([0.0, 0.6], (16, 1))
+    response = estimator.respond(COMMAND, at)
+    ends = [estimator.respond(COMMAND, at + [step, 0.0]) for step in (1e-4, -1e-4)]
+    for name in ("sensors", "effectors"):
+        slope = getattr(response, f"{name.removesuffix('s')}_slopes")[:, :, 0]
+        difference = (getattr(ends[0], name) - getattr(ends[1], name)) / 2e-4
+        np.testing.assert_allclose(slope, difference, rtol=0, atol=1e-2 * np.abs(slope).max())
+
+
+def test_slopes_by_force_agree_with_differences_of_the_model(robot):
+    estimator = touched(robot)
+    at = np.tile([0.0, 0.6], (16, 1))
+    response = estimator.respond(COMMAND, at)
+    ends = [estimator.respond(COMMAND, at + [0.0, step]) for step in (0.1, -0.1)]
+    slope, difference = response.effector_slopes[:, 1, 1], (ends[0].effectors - ends[1].effectors)[:, 1] / 0.2
+    np.testing.assert_allclose(slope, difference, rtol=0.02)
+
+
+def test_force_and_tip_are_found_on_the_model(robot):
+    plant = SurrogateBackend(robot)
+    plant.touch(PointForce(POINT, np.array([0.0, 0.8, 0.0])))
+    state = plant.step(COMMAND)
+    estimator = touched(robot, noise=Noise(displacement=1e-5, volume=1e-10))
+    volumes = estimator.rest_volumes + state.condensed.delta.s
+    for _ in range(3):
+        found = estimator.update(Readings(COMMAND, volumes))
+    assert found.load[0] == pytest.approx(0.8, abs=0.15)
+    assert np.abs(found.effector - state.effector[0]).max() < 1e-3
+    assert found.condensed.roles == (("a", 1), ("e", 3), ("s", 2))
+    estimator.touch(None)
+    plant.touch(None)
+    state = plant.step(COMMAND)
+    found = estimator.update(Readings(COMMAND, estimator.rest_volumes + state.condensed.delta.s))
+    assert not len(found.load)
+    assert np.abs(found.effector - state.effector[0]).max() < 1e-3
+
+
+def test_errors_of_the_model_keep_the_truth_of_finite_elements_likely(robot):
+    load = robot.touch_design(robot.design_space.baseline, POINT, np.array([0.0, 0.8, 0.0]))
+    state = Statics(robot.under_touch().build(load)).solve(COMMAND)
+    estimator = touched(robot, exact=False)
+    assert estimator.volume_error > 0.0 and estimator.tip_error > 0.0
+    found = estimator.update(Readings(COMMAND, estimator.rest_volumes + state.condensed.delta.s))
+    assert abs(found.load[0] - 0.8) < 4.0 * np.sqrt(found.load_covariance[0, 0])
+    assert np.abs(found.effector - state.condensed.delta.e[:3]).max() < 5e-3
+
+
+def test_wrong_inputs_are_named(robot):
+    with pytest.raises(ValueError, match="no touch of robot 'finger' is learned"):
+        LearnedEstimator(make_robot("finger"))
+    with pytest.raises(ValueError, match="drift"):
+        LearnedEstimator(robot, noise=Noise(drift=0.1))
+    with pytest.raises(ValueError, match="volumes"):
+        touched(robot).update(Readings(COMMAND, np.array([1.0])))
