@@ -174,7 +174,7 @@ class SensorizedFinger(MeshedRobot):
 
     @property
     def weights_name(self) -> str:
-        """``sensorized_finger_2cavities`` or ``sensorized_finger_4cavities``; then ``_sealed``, ``_touched`` if they are."""
+        """``sensorized_finger_2cavities`` or ``..._4cavities``, then ``_sealed`` and ``_touched`` if they are."""
         name = f"sensorized_finger_{self.cavities}cavities"
         return name + "_sealed" * self.sealed + "_touched" * self.touch
 
