@@ -457,6 +457,51 @@ def grown_shapes_table() -> str:
     return markdown(head, rows, "rrrrrr")
 
 
+def draw() -> np.ndarray:
+    """Return a picture (h, w, 3): examples, what becomes of them, samples, and what both searches found."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    found, model = json.loads(KEPT.read_text()), Autoencoder(examples(2000, 1))
+    baseline = Judged(**found["baseline"])
+    shown = examples(300, 2)[:4]
+    sampled = model.decode(np.random.default_rng(5).normal(size=(4, LATENT)))
+    columns = {"example": shown, "decoded again": model.decode(model.encode(shown)), "sample": sampled}
+    shapes = {"seven parameters": seven_parameters, "latent space": lambda x: model.decode(x)[0]}
+    for name, shape in shapes.items():
+        best = []
+        for entry in found["searches"]:
+            if entry["space"] == name:
+                bodies = [body for body in entry["bodies"] if 2.0 * body["stiffness"] > baseline.stiffness]
+                best.append(shape(np.array(max(bodies, key=lambda body: body["reach"])["x"])))
+        columns[f"{name}:\nbest reach"] = np.array(best)
+    figure = Figure(figsize=(11.0, 5.4), layout="constrained", dpi=110)
+    canvas = FigureCanvasAgg(figure)
+    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 1.3))
+    grid = above.subplots(4, len(columns))
+    for column, (name, bodies) in enumerate(columns.items()):
+        grid[0, column].set_title(name, fontsize=9)
+        for row in range(4):
+            grid[row, column].axis("off")
+            if row < len(bodies):
+                grid[row, column].contourf(ALONG, ACROSS, bodies[row], [-99.0, 0.0], colors=["#10776d"])
+                grid[row, column].set_aspect("equal")
+    for seed, axes in zip(SEEDS, below.subplots(1, len(SEEDS), sharey=True), strict=True):
+        for name, colour in (("seven parameters", "tab:blue"), ("latent space", "tab:red")):
+            bodies = next(e["bodies"] for e in found["searches"] if (e["space"], e["seed"]) == (name, seed))
+            reach, stiffness = (np.array([body[key] for body in bodies]) for key in ("reach", "stiffness"))
+            axes.plot(1e3 * reach, stiffness, ".", color=colour, label=name, markersize=4)
+        axes.plot(1e3 * baseline.reach, baseline.stiffness, "k*", label="baseline")
+        axes.set_yscale("log")
+        axes.set_title(f"seed {seed}", fontsize=9)
+        axes.set_xlabel("the tip moves [mm]", fontsize=8)
+        axes.tick_params(labelsize=7, which="both")
+    below.axes[0].set_ylabel("stiffness of the tip [N/m]", fontsize=8)
+    below.axes[0].legend(fontsize=7)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
 TABLES = {"grown_shapes": grown_shapes_table}
 """Tables of pages by name."""
 

@@ -23,6 +23,8 @@ from pathlib import Path
 
 from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
+from benchmarks.grown_shapes import TABLES as GROWN_TABLES
+from benchmarks.modular import TABLES as MODULE_TABLES
 from benchmarks.motion import TABLES as MOTION_TABLES
 from benchmarks.printed import TABLES as PRINTED_TABLES
 from benchmarks.recorded import figure
@@ -39,6 +41,8 @@ TABLES = (
     | MOTION_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
+    | GROWN_TABLES
+    | MODULE_TABLES
 )
 ROOT = Path(__file__).resolve().parents[1]
 MARKER = re.compile(r"(<!-- bench: (?P<key>.+?) -->)(?P<text>.*?)(<!-- /bench -->)", re.DOTALL)

@@ -26,10 +26,11 @@ CELLS: dict[str, tuple[str, np.ndarray]] = {
     "leaf_x": ("leaf_spring", np.eye(3)),
     "leaf_y": ("leaf_spring", _QUARTER_TURN),
     "block": ("solid_block", np.eye(3)),
+    "tube": ("torsion_tube", np.eye(3)),
 }
 """What a cell may be: a module, and the axes in which it stands. A ``leaf_x`` bends towards x."""
 
-KINDS = (*CELLS, "none")
+KINDS = ("leaf_x", "leaf_y", "block", "none")
 """What a cell may be whose kind is part of the design, by the whole part of its variable ``kind``."""
 
 SHARES = {"leaf_spring": ("leaf_length", "width", "thickness"), "solid_block": ("length", "width", "depth")}

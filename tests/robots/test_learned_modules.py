@@ -8,7 +8,7 @@ import pytest
 
 from softgym_envs.errors import DesignError, WeightsError
 from softgym_envs.robots.modules import MODULES, learned_module
-from softgym_envs.robots.modules.energy import TERMS, ModuleEnergy
+from softgym_envs.robots.modules.energy import LARGEST_SPREAD, TERMS, ModuleEnergy
 from softgym_envs.robots.modules.learned import load_module
 from softgym_envs.robots.modules.learning import RECIPES, Recipe, errors, fit
 from softgym_envs.robots.modules.states import ModuleStates, solve_states
@@ -73,6 +73,25 @@ def test_a_learned_module_follows_finite_elements_under_a_load(name):
     states = solve_states(module, design, tuple(learned.box), rotation=learned.rotation, rays=1, rng=rng)
     assert len(states) > 1
     assert errors(learned, states)["strain_max"] < 0.03
+
+
+def test_members_differ_where_nothing_was_learned():
+    """Beyond the loads and the dimensions that were learned. Errors there are of the size of the spread."""
+    tube = learned_module("torsion_tube")
+    middle = {name: 0.5 * (low + high) for name, (low, high) in tube.box.items()}
+    strains = np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.1])
+    energy = tube.energy(middle)
+    assert energy.spread(0.0 * strains) == 0.0
+    assert energy.spread(strains) < LARGEST_SPREAD < energy.spread(4.0 * strains)
+    far = {"length": 0.012, "radius": 0.014, "wall": 0.0012}
+    outside = tube.energy(far, beyond=True)
+    gentle = 0.9 / outside.load(strains) * strains
+    assert outside.load(gentle) < 1.0
+    assert not outside.knows(gentle)
+    with pytest.raises(DesignError, match="'torsion_tube' was learned for length"):
+        tube.energy(far)
+    with pytest.raises(DesignError, match="'solid_block' was learned for length"):
+        learned_module("solid_block").energy({"length": 0.05}, beyond=True)  # it has no members
 
 
 def test_bodies_that_were_not_learned_are_named():

@@ -22,6 +22,15 @@ def test_the_modular_arm_follows_finite_elements_of_the_whole_body():
     assert np.linalg.norm(found["superelements"].delta.e - found["solid"].delta.e) < 0.01 * np.linalg.norm(moved)
 
 
+def test_a_tube_twists_and_bends_like_its_finite_elements():
+    found = {}
+    for body in ("superelements", "solid"):
+        robot = make_robot("modular_arm", cells=["tube", "leaf_x"], body=body)
+        found[body] = Statics(robot.build()).solve(np.array([0.0015, 0.0005])).condensed
+    moved = found["solid"].delta.e - robot.effector_rest
+    assert np.linalg.norm(found["superelements"].delta.e - found["solid"].delta.e) < 0.02 * np.linalg.norm(moved)
+
+
 def test_superelements_of_the_arm_have_no_weight():
     with pytest.raises(ValueError, match="superelements have no mass"):
         make_robot("modular_arm", gravity=(0.0, 0.0, -9.81))

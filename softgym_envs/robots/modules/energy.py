@@ -14,10 +14,14 @@ becomes shorter as it bends, at no cost of energy.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
 from numba import njit
+
+LARGEST_SPREAD = 0.02
+"""Spread of the members from which on an energy is not trusted: an error of 2 % of the rotation that was learned."""
 
 _SIGNS = np.array([[-1, 1, 1, 1, -1, -1], [1, -1, 1, -1, 1, -1], [-1, -1, 1, 1, 1, -1]])
 """Sign of each strain under the reflections in the planes normal to x, y and z; the last one swaps the ports."""
@@ -82,17 +86,27 @@ class ModuleEnergy:
         corrections: ``c`` of `TERMS`, shape (len(TERMS),).
         rotation: the largest load that was learned, as the angle by which it would turn the softest rotation [rad];
             see `softgym_envs.robots.modules.states.solve_states`. Default any load.
+        members: ``(stiffness, corrections)`` of further energies that were learned from parts of the bodies.
 
     Raises:
         ValueError: for a stiffness that is not positive.
     """
 
-    def __init__(self, length: float, stiffness: np.ndarray, corrections: np.ndarray, rotation: float = np.inf) -> None:
+    def __init__(
+        self,
+        length: float,
+        stiffness: np.ndarray,
+        corrections: np.ndarray,
+        rotation: float = np.inf,
+        members: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+    ) -> None:
         self.stiffness = np.array(stiffness, dtype=float)
         self.corrections = np.array(corrections, dtype=float)
         if not (self.stiffness > 0.0).all():
             raise ValueError(f"the stiffness of a module must be positive, got {self.stiffness.tolist()} J")
         self._scale = np.array([1.0 / length] * 3 + [1.0] * 3)
+        self._rotation = rotation
+        self._members = [ModuleEnergy(length, k, c) for k, c in members]
         moment = rotation * self.stiffness[3:].min()
         self._largest = np.array([2.0 * moment / length] * 3 + [moment] * 3)
 
@@ -106,6 +120,19 @@ class ModuleEnergy:
         """Return the load at strains (6,) over the largest one that was learned."""
         return float(np.linalg.norm(self.evaluate(strains)[1] / self._largest))
 
+    def spread(self, strains: np.ndarray) -> float:
+        """Return by how much the members differ at strains (6,), an estimate of the error; 0 without members.
+
+        It is the root mean square of the strains that the differences of the members' loads would cause, over the
+        rotation that was learned.
+        """
+        if not self._members:
+            return 0.0
+        _, gradient, hessian = self.evaluate(strains)
+        apart = np.array([member.evaluate(strains)[1] - gradient for member in self._members])
+        moved = np.linalg.solve(hessian, apart.T) * self._scale[:, None]
+        return float(np.sqrt((moved**2).sum(axis=0).mean())) / self._rotation
+
     def knows(self, strains: np.ndarray) -> bool:
-        """Whether the load at strains (6,) is at most the largest one that was learned."""
-        return self.load(strains) <= 1.0
+        """Whether at strains (6,) the load is at most the largest one that was learned, and the members agree."""
+        return self.load(strains) <= 1.0 and self.spread(strains) <= LARGEST_SPREAD

@@ -21,6 +21,8 @@ from softgym_envs.robots.modules.energy import TERMS, ModuleEnergy
 from softgym_envs.robots.modules.registry import MODULES
 
 FORMAT = 1
+MEMBER_DEGREES = (2, 1)
+"""Degrees of the polynomials of members: a cubic of too few bodies says nothing about the others."""
 FOLDER = Path(__file__).parent / "energies"
 
 
@@ -45,6 +47,8 @@ class LearnedModule:
         corrections: weights of ``c``, shape (q, len(TERMS)).
         errors: those on bodies that were not used, as `learning.errors` returns them.
         degrees: of the polynomials of ``stiffness`` and ``corrections``.
+        members: ``(stiffness, corrections)`` of fits to parts of the bodies, whose differences tell where the energy is
+            not known; none in files of older modules. Their polynomials have `MEMBER_DEGREES`.
     """
 
     module: str
@@ -55,22 +59,28 @@ class LearnedModule:
     corrections: np.ndarray
     errors: Mapping[str, Mapping[str, float]]
     degrees: tuple[int, int]
+    members: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
 
     def unit(self, designs: np.ndarray) -> np.ndarray:
         """Map dimensions (n, v) to [-1, 1] on a logarithmic scale."""
         low, high = np.log(np.array(list(self.box.values()))).T
         return (2.0 * np.log(designs) - low - high) / (high - low)
 
-    def energy(self, design: Mapping[str, float] | None = None) -> ModuleEnergy:
+    def energy(self, design: Mapping[str, float] | None = None, *, beyond: bool = False) -> ModuleEnergy:
         """Return the energy of a body; missing variables take their baseline.
 
+        Args:
+            design: the body.
+            beyond: allow dimensions outside the box; the spread of the members says what the energy is worth there.
+
         Raises:
-            DesignError: for a malformed design, or one outside the box.
+            DesignError: for a malformed design, or one outside the box; with ``beyond``, if there are no members.
         """
         module: Module = MODULES[self.module]()
         complete = module.design_space.complete(design)
         for name, (low, high) in self.box.items():
-            if not low * (1.0 - 1e-6) <= complete[name] <= high * (1.0 + 1e-6):
+            inside = low * (1.0 - 1e-6) <= complete[name] <= high * (1.0 + 1e-6)
+            if not inside and not (beyond and self.members):
                 raise DesignError(
                     f"superelement '{self.module}' was learned for {name} from {low:g} to {high:g} m, "
                     f"got {complete[name]:g} m"
@@ -82,17 +92,23 @@ class LearnedModule:
                 )
         unit = self.unit(np.array([[complete[name] for name in self.box]]))
         length = module.length(complete)
+
+        def numbers(
+            stiffness: np.ndarray, corrections: np.ndarray, degrees: tuple[int, int]
+        ) -> tuple[np.ndarray, np.ndarray]:
+            k = complete["young_modulus"] * length**3 * np.exp(polynomials(unit, degrees[0]) @ stiffness)[0]
+            return k, (polynomials(unit, degrees[1]) @ corrections)[0]
+
+        members = [numbers(*member, MEMBER_DEGREES) for member in self.members]
         return ModuleEnergy(
-            length,
-            complete["young_modulus"] * length**3 * np.exp(polynomials(unit, self.degrees[0]) @ self.stiffness)[0],
-            (polynomials(unit, self.degrees[1]) @ self.corrections)[0],
-            self.rotation,
+            length, *numbers(self.stiffness, self.corrections, self.degrees), self.rotation, members=members
         )
 
     def save(self, path: str | Path) -> None:
         """Write the superelement as JSON, for `load_module`."""
         record = {"format": FORMAT, **asdict(self)}
         record |= {name: np.round(getattr(self, name), 8).tolist() for name in ("stiffness", "corrections")}
+        record["members"] = [[np.round(part, 5).tolist() for part in member] for member in self.members]
         Path(path).write_text(json.dumps(record) + "\n")
 
 
@@ -111,8 +127,10 @@ def load_module(path: str | Path) -> LearnedModule:
         record["degrees"] = tuple(record["degrees"])
         for name in ("stiffness", "corrections"):
             record[name] = np.array(record[name], dtype=float)
-        if record["corrections"].shape[-1] != len(TERMS):
-            raise ValueError(f"it has {record['corrections'].shape[-1]} corrections, needed {len(TERMS)}")
+        record["members"] = tuple((np.array(k), np.array(c)) for k, c in record.get("members", ()))
+        for corrections in (record["corrections"], *(c for _, c in record["members"])):
+            if corrections.shape[-1] != len(TERMS):
+                raise ValueError(f"it has {corrections.shape[-1]} corrections, needed {len(TERMS)}")
         return LearnedModule(**record)
     except FileNotFoundError:
         raise WeightsError(f"superelement '{path}' does not exist; learn it with `learn_module`") from None

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from softgym_envs.robots.modules.energy import TERMS
-from softgym_envs.robots.modules.learned import LearnedModule, polynomials
+from softgym_envs.robots.modules.learned import MEMBER_DEGREES, LearnedModule, polynomials
 from softgym_envs.robots.modules.registry import MODULES
 from softgym_envs.robots.modules.states import ModuleStates, solve_states
 
@@ -29,6 +29,9 @@ GUESS_RIDGE = 1e-4
 
 MARGIN = 1.1
 """Bodies are drawn from a box that is wider by this factor than the one that users may use."""
+
+MEMBERS = 8
+"""Number of fits to parts of the bodies."""
 
 _ROWS, _COLUMNS = np.triu_indices(6)
 
@@ -55,6 +58,9 @@ class Recipe:
 RECIPES = {
     "leaf_spring": Recipe({"leaf_length": (0.010, 0.025), "width": (0.008, 0.020), "thickness": (0.001, 0.0025)}, 0.4),
     "solid_block": Recipe({"length": (0.010, 0.030), "width": (0.008, 0.020), "depth": (0.008, 0.020)}, 0.3),
+    "torsion_tube": Recipe(
+        {"length": (0.015, 0.040), "radius": (0.006, 0.012), "wall": (0.0015, 0.003)}, 0.3, bodies=14, unloaded=20
+    ),
 }
 """What is learned, by the name of the module. The form of the energy needs modules that three planes mirror."""
 
@@ -257,6 +263,19 @@ def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
     return {name: float(value) for name, value in values.items()}
 
 
+def members(
+    recipe: Recipe, module: str, states: ModuleStates, others: Mapping[str, float]
+) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Return `MEMBERS` fits, each to all bodies but a group that the others keep; arguments as for `fit`."""
+    _, body = np.unique(states.designs, axis=0, return_inverse=True)
+    group = np.random.default_rng(0).permutation(body.max() + 1)[body.ravel()] % MEMBERS
+    fits = [
+        fit(recipe, module, states.rows(np.flatnonzero(group != left_out)), others, degrees=MEMBER_DEGREES)
+        for left_out in range(MEMBERS)
+    ]
+    return tuple((each.stiffness, each.corrections) for each in fits)
+
+
 def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
     """Return the superelement of a module, learned from finite elements; this takes some minutes.
 
@@ -289,7 +308,11 @@ def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
     tests = {"corners": solved(corners, 1, 3), "inside": solved(drawn(2, 4), 1, 4)}
     others = {v.name: v.baseline for v in made.design_space if v.name not in names and v.name != "young_modulus"}
     model = fit(recipe, module, states, others)
-    return replace(model, errors={name: errors(model, each) for name, each in tests.items()})
+    return replace(
+        model,
+        errors={name: errors(model, each) for name, each in tests.items()},
+        members=members(recipe, module, states, others),
+    )
 
 
 if __name__ == "__main__":
