@@ -440,21 +440,41 @@ def run(folder: Path, budget: int) -> dict[str, Any]:
 
 
 def grown_shapes_table() -> str:
-    """Hypervolumes of both spaces by seed, and the share of the latent space's over the parameters'."""
+    """Hypervolumes of both spaces by seed and their means, and how much larger that of the latent space is."""
     if not KEPT.is_file():
         raise DataError(
             f"'{KEPT}' does not exist; make it with 'python -m benchmarks.grown_shapes results/grown_shapes'"
         )
     found = json.loads(KEPT.read_text())
+    spaces = ("seven parameters", "latent space")
+    entries = [[e for e in found["searches"] if e["space"] == space] for space in spaces]
+    volumes = np.array([[entry["hypervolume"] for entry in each] for each in entries])
+    unused = [[f"{entry['failed']} of {found['budget']}" for entry in each] + [""] for each in entries]
     rows = []
-    for seed in SEEDS:
-        by = {entry["space"]: entry for entry in found["searches"] if entry["seed"] == seed}
-        one, two = by["seven parameters"], by["latent space"]
-        gain = 100.0 * (two["hypervolume"] / one["hypervolume"] - 1.0)
-        unused = [f"{entry['failed']} of {found['budget']}" for entry in (one, two)]
-        rows.append([str(seed), f"{one['hypervolume']:.3f}", f"{two['hypervolume']:.3f}", f"{gain:+.1f} %", *unused])
-    head = ["seed", "seven parameters", "latent space", "difference", "parameters: unusable", "latent: unusable"]
-    return markdown(head, rows, "rrrrrr")
+    names = [*(f"seed {entry['seed']}" for entry in entries[0]), "mean"]
+    for k, (one, two) in enumerate(np.column_stack([volumes, volumes.mean(axis=1)]).T):
+        gain = f"{100.0 * (two / one - 1.0):+.1f} %"
+        rows.append([names[k], f"{one:.3f}", f"{two:.3f}", gain, unused[0][k], unused[1][k]])
+    return markdown(["", *spaces, "difference", *(f"{space}: not solved" for space in spaces)], rows, "lrrrrr")
+
+
+def grown_quality_table() -> str:
+    """What the autoencoder makes of examples that it has not seen, and of samples."""
+    if not KEPT.is_file():
+        raise DataError(
+            f"'{KEPT}' does not exist; make it with 'python -m benchmarks.grown_shapes results/grown_shapes'"
+        )
+    found = json.loads(KEPT.read_text())["quality"]
+    rows = [
+        ["error of the signed distance within 3 mm of the surface", f"{found['error near the surface [mm]']:.2f} mm"],
+        ["common area of example and decoded example, over their union", f"{100.0 * found['overlap']:.0f} %"],
+        [
+            f"share of {found['decoded samples']} samples of the latent space that mesh and solve",
+            f"{100.0 * found['share that meshes and solves']:.0f} %",
+        ],
+        ["training", f"{found['training [CPU s]']:.0f} CPU s"],
+    ]
+    return markdown(["quantity", "value"], rows, "lr")
 
 
 def draw() -> np.ndarray:
@@ -502,7 +522,7 @@ def draw() -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-TABLES = {"grown_shapes": grown_shapes_table}
+TABLES = {"grown_shapes": grown_shapes_table, "grown_quality": grown_quality_table}
 """Tables of pages by name."""
 
 if __name__ == "__main__":
