@@ -455,7 +455,7 @@ def grown_shapes_table() -> str:
     for k, (one, two) in enumerate(np.column_stack([volumes, volumes.mean(axis=1)]).T):
         gain = f"{100.0 * (two / one - 1.0):+.1f} %"
         rows.append([names[k], f"{one:.3f}", f"{two:.3f}", gain, unused[0][k], unused[1][k]])
-    return markdown(["", *spaces, "difference", *(f"{space}: not solved" for space in spaces)], rows, "lrrrrr")
+    return markdown(["search", *spaces, "difference", *(f"{space}: not solved" for space in spaces)], rows, "lrrrrr")
 
 
 def grown_quality_table() -> str:

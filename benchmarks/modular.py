@@ -6,10 +6,7 @@ import time
 
 import numpy as np
 
-from benchmarks.tables import markdown
 from softgym_envs.mechanics.condensation import RoleMatrix
-from softgym_envs.robots.modules.learned import learned_module
-from softgym_envs.robots.modules.learning import RECIPES
 
 ARMS = {
     "four leaves": (("leaf_x", "leaf_y") * 2, ((0.004, 0.0), (0.006, -0.005))),
@@ -21,24 +18,6 @@ ARMS = {
 """Cells of each arm, and commands of its wires [m]."""
 
 RANDOM_BODIES = 2
-
-
-def learned_modules_table() -> str:
-    """Errors of the learned energies on bodies that were not learned, as their files state them."""
-    rows = []
-    for name in RECIPES:
-        for place in ("inside", "corners"):
-            found = learned_module(name).errors[place]
-            cells = [
-                f"{100.0 * found[f'{kind}_mean']:.1f} %, {100.0 * found[f'{kind}_max']:.1f} %"
-                for kind in ("strain", "stiffness")
-            ]
-            rows.append([f"`{name}`", place, *cells])
-    return markdown(["module", "bodies", "strains: mean, largest", "stiffness: mean, largest"], rows, "llrr")
-
-
-TABLES = {"learned_modules": learned_modules_table}
-"""Tables of pages by name."""
 
 
 def _held(W: RoleMatrix) -> np.ndarray:

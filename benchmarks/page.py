@@ -24,7 +24,7 @@ from pathlib import Path
 from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
 from benchmarks.grown_shapes import TABLES as GROWN_TABLES
-from benchmarks.modular import TABLES as MODULE_TABLES
+from benchmarks.learned_modules import TABLES as MODULE_TABLES
 from benchmarks.motion import TABLES as MOTION_TABLES
 from benchmarks.printed import TABLES as PRINTED_TABLES
 from benchmarks.recorded import figure
