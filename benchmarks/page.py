@@ -25,6 +25,7 @@ from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
 from benchmarks.contact_sets import TABLES as SET_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
 from benchmarks.grasp_codesign import TABLES as GRASP_TABLES
+from benchmarks.grown_shapes import TABLES as GROWN_TABLES
 from benchmarks.learned_sensors import TABLES as SENSOR_TABLES
 from benchmarks.modular import TABLES as MODULAR_TABLES
 from benchmarks.motion import TABLES as MOTION_TABLES
@@ -47,6 +48,7 @@ TABLES = (
     | SENSOR_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
+    | GROWN_TABLES
 )
 ROOT = Path(__file__).resolve().parents[1]
 MARKER = re.compile(r"(<!-- bench: (?P<key>.+?) -->)(?P<text>.*?)(<!-- /bench -->)", re.DOTALL)

@@ -23,7 +23,7 @@ import numpy as np
 from PIL import Image, ImageSequence
 from site_writing import DOCS, environment_pages
 
-from benchmarks import convergence_tables, structures
+from benchmarks import convergence_tables, grown_shapes, structures
 from softgym_envs import make_robot
 from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.backends import make_backend
@@ -228,6 +228,7 @@ def main(names: list[str]) -> None:
     """Draw the named pictures, or all but the report."""
     table: dict[str, Callable[[], np.ndarray]] = {"codesign": draw_codesign, "arm": draw_arm, "grasp": draw_grasp}
     table |= {"convergence": convergence_tables.draw, "modules": draw_modules, "structures": draw_structures}
+    table |= {"grown_shapes": grown_shapes.draw}
     table |= {"benchmark_regret": plots.draw_regret, "benchmark_winners": plots.draw_winners}
     table |= {name: partial(draw_robot, name) for name in ROBOTS}
     table |= {name: partial(draw_environment, name) for name in environment_pages()}
