@@ -241,7 +241,8 @@ def summary(runs: list[StoredRuns]) -> list[Summary]:
 
 
 def _listed(learners: Iterable[str]) -> str:
-    return " and ".join(LEARNERS[name] for name in learners)
+    *first, last = (LEARNERS[name] for name in learners)
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _grid(runs: Sequence[StoredRuns], cell: Callable[[StoredRuns, str], str]) -> str:
