@@ -306,25 +306,40 @@ class CloningConfig(GradientConfig):
     )
 
 
+class EvolutionConfig(Config):
+    """Hyperparameters of the evolution of weights (`softgym_envs.agents.learners.evolution`)."""
+
+    step_size: float = Field(default=0.2, gt=0, description="first standard deviation of each weight")
+    net_arch: list[int] = Field(default=[], description="widths of hidden layers; none for a linear policy")
+
+    @field_validator("net_arch")
+    @classmethod
+    def _layers(cls, value: list[int]) -> list[int]:
+        return check_layers(value)
+
+
 class LearnerConfig(Config):
     """A learning method and its hyperparameters.
 
     Attributes:
-        learner: ``"sac"`` or ``"ppo"``, model-free, for every environment; or, model-based and on the surrogate only,
-            ``"analytic"``, which follows derivatives of the reward, or ``"cloning"``, which imitates the inverse QP.
+        learner: ``"sac"``, ``"ppo"`` or ``"evolution"``, model-free, for every environment; or, model-based and on the
+            surrogate only, ``"analytic"``, which follows derivatives of the reward, or ``"cloning"``, which imitates
+            the inverse QP.
         sac: hyperparameters of SAC.
         ppo: hyperparameters of PPO.
         analytic: hyperparameters of the analytic policy gradient.
         cloning: hyperparameters of the imitation.
-        num_envs: number of sub-environments.
+        evolution: hyperparameters of the evolution of weights.
+        num_envs: number of sub-environments; for ``"evolution"`` the size of a generation.
         seed: seed of everything random.
     """
 
-    learner: Literal["sac", "ppo", "analytic", "cloning"] = "sac"
+    learner: Literal["sac", "ppo", "analytic", "cloning", "evolution"] = "sac"
     sac: SACConfig = Field(default_factory=SACConfig)
     ppo: PPOConfig = Field(default_factory=PPOConfig)
     analytic: AnalyticConfig = Field(default_factory=AnalyticConfig)
     cloning: CloningConfig = Field(default_factory=CloningConfig)
+    evolution: EvolutionConfig = Field(default_factory=EvolutionConfig)
     num_envs: int = Field(default=16, gt=0)
     seed: int = Field(default=0, ge=0)
 

@@ -22,7 +22,13 @@ if TYPE_CHECKING:
 RESULTS = Path(__file__).parent / "results"
 """Stored runs of the configurations in ``configs/agents``."""
 
-LEARNERS = {"sac": "SAC", "ppo": "PPO", "analytic": "analytic gradient", "cloning": "cloning"}
+LEARNERS = {
+    "sac": "SAC",
+    "ppo": "PPO",
+    "evolution": "evolution",
+    "analytic": "analytic gradient",
+    "cloning": "cloning",
+}
 """Titles of the learners."""
 
 MODEL_BASED = ("analytic", "cloning")
@@ -45,6 +51,7 @@ _COLOURS = {
     "ppo": ("#a9bff0", "#1d4ed8"),
     "analytic": ("#f3c49a", "#c2570c"),
     "cloning": ("#d3b5ea", "#7e22ce"),
+    "evolution": ("#e3a3b5", "#be123c"),
 }
 
 
@@ -235,7 +242,8 @@ def summary(runs: list[StoredRuns]) -> list[Summary]:
 
 
 def _listed(learners: Iterable[str]) -> str:
-    return " and ".join(LEARNERS[name] for name in learners)
+    *first, last = (LEARNERS[name] for name in learners)
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _grid(runs: Sequence[StoredRuns], cell: Callable[[StoredRuns, str], str]) -> str:
@@ -314,7 +322,8 @@ def draw_curves(runs: list[StoredRuns], path: str | Path, columns: int = 4) -> P
     """Draw the learning curves of every seed and their mean, in a panel for each configuration.
 
     The curves are mean returns of the evaluations during training, green for SAC, blue for PPO, orange for the analytic
-    gradient and violet for cloning; the dashed line is the inverse QP on the goals of the final evaluation.
+    gradient, violet for cloning and red for evolution; the dashed line is the inverse QP on the goals of the final
+    evaluation.
 
     Args:
         runs: the runs.

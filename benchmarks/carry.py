@@ -14,7 +14,8 @@ import gymnasium
 import numpy as np
 
 DATA = Path(__file__).parent / "data" / "tetrapod_swing.json"
-POLICY = "tetrapod_carry"
+POLICIES = {"SAC": "tetrapod_carry", "evolution": "tetrapod_carry_evolution"}
+"""Shipped policies, by learner; both were trained with 1 kg."""
 PAYLOADS = (0.0, 1.0)
 KNOTS = 4
 STEPS = 100
@@ -96,7 +97,7 @@ def carry() -> dict[str, object]:
         env = make(payload)
         agents = {"quasi-static QP": make_agent("qp_static"), "one-step dynamic QP": make_agent("qp")}
         agents["optimised swing"] = swing(swings[payload])
-        agents["SAC, trained with 1 kg"] = make_agent(policy_path(POLICY))
+        agents |= {f"{name}, trained with 1 kg": make_agent(policy_path(policy)) for name, policy in POLICIES.items()}
         for name, act in agents.items():
             farthest, last, total = episode(env, act)
             results[f"{payload:g} kg, {name}: farthest, end [mm], return"] = f"{farthest:.1f}, {last:.1f}, {total:.2f}"

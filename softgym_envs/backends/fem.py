@@ -225,6 +225,11 @@ class FEMBackend(Backend):
         return (self._dynamics or self._statics).tolerance
 
     @property
+    def cuts(self) -> int:
+        """How often a time step that cannot be solved is halved; 0 in statics."""
+        return 0 if self._dynamics is None else self._dynamics.max_cuts
+
+    @property
     def beams(self) -> BeamMotion | None:
         """Compiled solver of the present body; None for a body that needs the general one."""
         return (self._dynamics or self._statics).beam_solver()

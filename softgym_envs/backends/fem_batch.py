@@ -100,7 +100,7 @@ class FEMBatch(BatchBackend):
             targets = self._targets(first.steps.ramp(self.command, command).swapaxes(0, 1))
         else:
             targets = self._targets(command[:, None])
-        solved = self._beams.march(
+        solved, stable = self._beams.march(
             self._numbers,
             present,
             targets,
@@ -111,8 +111,9 @@ class FEMBatch(BatchBackend):
             mass_damping=step["mass_damping"] if self.moving else 0.0,
             stiffness_damping=step["stiffness_damping"] if self.moving else 0.0,
             tolerance=first.tolerance,
+            cuts=first.cuts,
         )
-        self._stable[:] = True
+        self._stable[:] = stable
         self._converged = solved.copy()
         for i in np.flatnonzero(~solved).tolist():
             self._converged[i] = self._step_alone(i, command[i])
@@ -193,7 +194,7 @@ class FEMBatch(BatchBackend):
             states = self._balanced
             for name in ("x", "effort"):
                 getattr(states, name)[~self._is_balanced] = getattr(self._present, name)[~self._is_balanced]
-            self._is_balanced = self._beams.march(
+            self._is_balanced, _ = self._beams.march(
                 self._numbers,
                 states,
                 self._targets(self.command[:, None]),

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.config import EvolutionConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
 from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.learners.analytic import AnalyticLearner
 from softgym_envs.agents.learners.cloning import CloningLearner
+from softgym_envs.agents.learners.evolution import EvolutionLearner
 from softgym_envs.agents.learners.ppo import PPOLearner
 from softgym_envs.agents.policy import Policy, read_tensors
 from softgym_envs.agents.residual import BatchQP
@@ -63,6 +64,9 @@ QUICK = {
     "analytic": SHORT,
     "cloning": SHORT.model_copy(update={"learner": "cloning"}),
     "ppo": TrainConfig.model_validate({**SHORT.model_dump(), "learner": "ppo", "ppo": {"n_steps": 2, "n_epochs": 2}}),
+    "evolution": TrainConfig.model_validate(
+        {**SHORT.model_dump(), "learner": "evolution", "num_envs": 8, "evolution": {"net_arch": [3]}}
+    ),
 }
 
 
@@ -103,6 +107,40 @@ def test_policy_of_ppo_is_its_mean_action_and_weights_return(tmp_path):
     assert np.abs(Policy(path)(observation) - expected).max() < 1e-5
     assert np.abs(expected).max() > 1e-3
     learner.close()
+
+
+def test_evolution_finds_a_linear_policy_that_reaches_goals():
+    config = QUICK["evolution"].model_copy(update={"steps": 16_000, "num_envs": 16, "evolution": EvolutionConfig()})
+    learner = EvolutionLearner(config)
+    first = learner._episode(learner._unpacked(np.zeros((16, 32), dtype=np.float32)), lambda steps: None)
+    assert np.ptp(first[0]) == 0.0 and first[1] == 50  # every candidate has the same goal
+    learner.learn(config.steps, lambda steps: None)
+    assert learner.weights()["actor.mu.weight"].shape == (2, 15)
+    last = learner._episode({name: np.stack([value] * 16) for name, value in learner.weights().items()}, print)
+    assert last[0].mean() > 2.0 * first[0].mean()
+    learner.close()
+
+
+def test_evolution_acts_as_its_policy_and_needs_a_generation(tmp_path):
+    config = QUICK["evolution"]
+    path = train(config, tmp_path / "evolution", progress=False)
+    learner = EvolutionLearner(config)
+    observation = learner._reset()
+    assert (observation == observation[0]).all()
+    seen = []
+    monkey = learner.env.step
+
+    def step(actions):
+        seen.append(actions)
+        return monkey(actions)
+
+    learner.env.step = step
+    tensors = read_tensors(path)
+    learner._episode({name: np.stack([value] * 8) for name, value in tensors.items()}, lambda steps: None)
+    assert np.abs(seen[0] - Policy(path)(observation)).max() < 1e-6
+    learner.close()
+    with pytest.raises(ValueError, match="num_envs = 3 is too small"):
+        EvolutionLearner(config.model_copy(update={"num_envs": 3}))
 
 
 def test_rates_fall_over_the_whole_training(tmp_path):

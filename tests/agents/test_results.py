@@ -222,7 +222,7 @@ def test_the_table_and_the_curves(swept, tmp_path):
     qp = next(line for line in text.splitlines() if line.startswith("| tiny |")).split("|")[3]
     scores = 1e3 * runs[0].scores("qp", "own", "distances")
     assert float(qp.split("[")[0]) == pytest.approx(interquartile_mean(scores), rel=0.5)
-    assert "seeds (2)" in text and "SAC and PPO are model-free" in text
+    assert "seeds (2)" in text and "SAC, PPO and evolution are model-free" in text
     assert "| SAC | QP |" in text  # learners without results have no column
     picture = draw_curves(runs, tmp_path / "curves.png")
     assert picture.read_bytes().startswith(b"\x89PNG")

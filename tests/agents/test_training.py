@@ -328,7 +328,10 @@ def test_goals_repeat_and_belong_to_the_body():
     assert sample_goals(track, 2, seed=0).shape == (2, 25, 3)
 
 
-@pytest.mark.parametrize("name", ["finger_reach", "finger_reach_designs", "tetrapod_carry", "tetrapod_reach_analytic"])
+@pytest.mark.parametrize(
+    "name",
+    ["finger_reach", "finger_reach_designs", "tetrapod_carry", "tetrapod_carry_evolution", "tetrapod_reach_analytic"],
+)
 def test_shipped_policies_were_made_by_the_shipped_configs(name):
     config = load_config(CONFIGS / "agents" / f"{name}.yaml", TrainConfig)
     card = Policy(name).card

@@ -80,7 +80,8 @@ class BeamBatch:
         mass_damping: float,
         stiffness_damping: float,
         tolerance: float,
-    ) -> np.ndarray:
+        cuts: int = 0,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Take the time steps of `BeamMotion.march` for each of B states, in place.
 
         Args:
@@ -94,11 +95,12 @@ class BeamBatch:
             mass_damping: Rayleigh's alpha [1/s].
             stiffness_damping: Rayleigh's beta [s].
             tolerance: largest remaining correction of any row [m].
+            cuts: how often a time step that cannot be solved is halved.
 
         Returns:
-            Which states reached their last target, shape (B,).
+            Which states reached their last target, and which of them are stable, shapes (B,).
         """
-        solved = np.zeros(len(bodies), dtype=bool)
+        solved, stable = np.zeros(len(bodies), dtype=bool), np.zeros(len(bodies), dtype=bool)
         _march_all(
             self._bodies,
             self._loads,
@@ -119,9 +121,11 @@ class BeamBatch:
             mass_damping,
             stiffness_damping,
             tolerance,
+            cuts,
             solved,
+            stable,
         )
-        return solved
+        return solved, stable
 
 
 def _stacked(parts: Sequence[Any]) -> Any:
@@ -172,10 +176,12 @@ def _march_all(
     alpha,
     beta,
     tolerance,
+    cuts,
     solved,
+    stable,
 ):
-    """Do what `BeamBatch.march` says and mark the states that reached their last target in ``solved`` (B,)."""
-    totals, delta = np.zeros(5), np.zeros(efforts.shape[1])
+    """Do what `BeamBatch.march` says; ``solved`` and ``stable`` (B,) are what it returns."""
+    totals, delta = np.zeros(7), np.zeros(efforts.shape[1])
     for k in range(numbers.shape[0]):
         x, velocity, effort = xs[k].copy(), velocities[k].copy(), efforts[k].copy()
         taken = drive(
@@ -196,10 +202,11 @@ def _march_all(
             alpha,
             beta,
             tolerance,
+            cuts,
             totals,
         )
         if taken == targets.shape[1]:
-            solved[k] = True
+            solved[k], stable[k] = True, totals[5] == 0.0
             xs[k] = x
             velocities[k] = velocity
             efforts[k] = effort

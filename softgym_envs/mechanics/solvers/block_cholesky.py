@@ -1,7 +1,8 @@
 """Cholesky factors of sparse symmetric matrices made of small dense blocks: the six motions of each frame of a beam.
 
-The upper triangle is kept, ``A = U^T U``, so that the innermost loops run along rows. The order of elimination and the
-blocks that fill in are found once; factorisation and solution are compiled and allocate nothing.
+The upper triangle is kept, ``A = U^T S U``, so that the innermost loops run along rows. The signs ``S`` of the pivots
+are all positive if the matrix is positive definite. The order of elimination and the blocks that fill in are found
+once; factorisation and solution are compiled.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ from numba import njit
 
 SIZE = 6
 """Rows of a block."""
+SMALL = 1e-7
+"""Pivots of an indefinite matrix that are smaller than this part of their diagonal entry, or larger than its inverse,
+lose too many digits: there is no pivoting."""
 
 
 class BlockPattern(NamedTuple):
@@ -81,21 +85,30 @@ def analyse(count: int, pairs: Iterable[tuple[int, int]]) -> tuple[np.ndarray, B
 
 
 @njit(cache=True, error_model="numpy")
-def _invert_factor(D):
-    """Replace a block by the inverse of its Cholesky factor (lower triangle); False if it is not positive definite."""
+def _invert_factor(D, diagonal, sign, negative):
+    """Replace a block by the inverse of its factor (lower triangle), and fill the signs (6,) of its pivots.
+
+    ``diagonal`` (6,) are the entries before the elimination, and ``negative`` the number of negative pivots so far.
+    Returns their number, or -1 for a pivot that is too small or too large.
+    """
     for j in range(SIZE):
         pivot = D[j, j]
         for m in range(j):
-            pivot -= D[j, m] * D[j, m]
+            pivot -= sign[m] * D[j, m] * D[j, m]
         if not pivot > 0.0:
-            return False
-        root = 1.0 / np.sqrt(pivot)
+            negative += 1
+        if negative:
+            part = abs(pivot / diagonal[j])
+            if not (part > SMALL and part * SMALL < 1.0):
+                return -1
+        sign[j] = 1.0 if pivot > 0.0 else -1.0
+        root = 1.0 / np.sqrt(abs(pivot))
         D[j, j] = root
         for i in range(j + 1, SIZE):
             value = D[i, j]
             for m in range(j):
-                value -= D[i, m] * D[j, m]
-            D[i, j] = value * root
+                value -= sign[m] * D[i, m] * D[j, m]
+            D[i, j] = sign[j] * value * root
     # The diagonal holds the inverses of the pivots.
     for j in range(SIZE):
         for i in range(j + 1, SIZE):
@@ -104,18 +117,26 @@ def _invert_factor(D):
                 value -= D[i, m] * D[m, j]
             D[i, j] = value * D[i, i]
             D[j, i] = 0.0
-    return True
+    return negative
 
 
 @njit(cache=True, error_model="numpy")
-def factorise(A, pointers, targets):
-    """Factorise a matrix in place; False if it is not positive definite. Diagonal blocks become inverses of factors."""
-    count, t = pointers.shape[0] - 1, 0
-    product = np.empty((SIZE, SIZE))
+def factorise(A, pointers, targets, signs):
+    """Factorise a matrix in place and fill the signs (b, 6) of the pivots; diagonal blocks become inverses of factors.
+
+    Returns the number of negative pivots, that of negative eigenvalues; or -1 if elimination without pivoting breaks
+    down.
+    """
+    count, t, negative = pointers.shape[0] - 1, 0, 0
+    product, diagonal = np.empty((SIZE, SIZE)), np.empty((count, SIZE))
     for k in range(count):
-        D = A[k]
-        if not _invert_factor(D):
-            return False
+        for i in range(SIZE):
+            diagonal[k, i] = A[k, i, i]
+    for k in range(count):
+        D, sign = A[k], signs[k]
+        negative = _invert_factor(D, diagonal[k], sign, negative)
+        if negative < 0:
+            return -1
         for p in range(pointers[k], pointers[k + 1]):
             B = A[count + p]
             for i in range(SIZE):
@@ -126,21 +147,24 @@ def factorise(A, pointers, targets):
                         product[i, j] += D[i, m] * B[m, j]
             for i in range(SIZE):
                 for j in range(SIZE):
-                    B[i, j] = product[i, j]
+                    B[i, j] = sign[i] * product[i, j]
             for q in range(pointers[k], p + 1):
                 C, L = A[targets[t]], A[count + q]
                 for i in range(SIZE):
                     for m in range(SIZE):
-                        factor = L[m, i]
+                        factor = sign[m] * L[m, i]
                         for j in range(SIZE):
                             C[i, j] -= factor * B[m, j]
                 t += 1
-    return True
+    return negative
 
 
 @njit(cache=True, error_model="numpy")
 def solve_lower(A, pointers, columns, y):
-    """Solve with the lower factor ``U^T`` in place, for one vector ``y`` (b, 6). Leading zeros are passed over."""
+    """Solve with the lower factor ``U^T`` in place, for one vector ``y`` (b, 6). Leading zeros are passed over.
+
+    The result is to be multiplied by the signs before `solve_upper`.
+    """
     count = pointers.shape[0] - 1
     v = np.empty(SIZE)
     for k in range(count):

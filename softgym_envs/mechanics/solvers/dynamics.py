@@ -297,6 +297,7 @@ class Dynamics(Statics):
             mass_damping=self.mass_damping,
             stiffness_damping=self.stiffness_damping,
             tolerance=self.tolerance,
+            cuts=self.max_cuts,
         )
         if not found.taken:
             return 0, None
@@ -314,13 +315,20 @@ class Dynamics(Statics):
             found.delta,
             found.compliance,
             slack_rows(found.effort, found.delta, targets[-1], np.flatnonzero(is_driven), self.unilateral),
-            stable=True,  # the factorisation fails otherwise
+            stable=found.stable,
             iterations=found.iterations,
         )
         potential = found.elastic - float(np.vdot(loads, found.x - self.model.nodes))
         velocity = found.velocity.copy()
         return found.taken, Motion(
-            equilibrium, velocity, self.time, found.kinetic, potential, self._work, self._dissipated, substeps=1
+            equilibrium,
+            velocity,
+            self.time,
+            found.kinetic,
+            potential,
+            self._work,
+            self._dissipated,
+            substeps=found.parts,
         )
 
     def _displacement_rows(self, mode: str | Sequence[str]) -> np.ndarray:

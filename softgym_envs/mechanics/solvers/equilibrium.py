@@ -15,6 +15,8 @@ from softgym_envs.mechanics.solvers.cable_friction import CableMemory
 
 SATURATED = 1.0 - 1e-9
 """Part of its largest effort from which an actuator counts as saturated: round-off."""
+CAUTIOUS = 0.25
+"""Increments of displacements longer than this part of a step are divided where they meet an indefinite tangent."""
 
 
 @dataclass(frozen=True)

@@ -27,16 +27,19 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.cable_friction import CableMemory
 from softgym_envs.mechanics.solvers.complementarity import complementary_step
-from softgym_envs.mechanics.solvers.equilibrium import Equilibrium, RowLayout, checked, checked_modes, slack_rows
+from softgym_envs.mechanics.solvers.equilibrium import (
+    CAUTIOUS,
+    Equilibrium,
+    RowLayout,
+    checked,
+    checked_modes,
+    slack_rows,
+)
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.mechanics.solvers.prediction import LARGEST_BEND, Bend
 
 SHORT_STEP, MOST_SHORT_STEPS = 0.05, 6
 """In contact, an increment is divided after this number of steps in a row of less than this part of Newton's."""
-
-
-CAUTIOUS = 0.25
-"""Increments of displacements longer than this part of a step are divided where they meet an indefinite tangent."""
 
 
 class NewtonFailure(Exception):
