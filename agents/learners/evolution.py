@@ -100,7 +100,7 @@ class EvolutionLearner(Learner):
         """Begin an episode, the same for all sub-environments, that depends on seed and step only."""
         env, count = self.env, self.config.num_envs
         seed = int(np.random.default_rng([self.config.seed, self.step]).integers(2**31))
-        observation, _ = env.reset(seed=[seed] * count)
+        observation, _ = env.reset(seed=[seed] * count)  # type: ignore[arg-type]
         batch = env.unwrapped
         if isinstance(batch, SoftRobotVectorEnv):  # its rows draw in turn from one generator
             options: dict[str, Any] = {"goal": batch.paths[0]}
