@@ -43,7 +43,7 @@ WITHOUT_CONTACT: dict[str, object] = {
 }
 """Options of a robot that touches nothing. They are not part of its key."""
 
-OMITTED: dict[str, object] = WITHOUT_CONTACT | UNIFORM | {"touch": False}
+OMITTED: dict[str, object] = WITHOUT_CONTACT | UNIFORM | {"sealed": False, "touch": False}
 """Values of options that are not part of a robot's key."""
 
 TOUCH_RADIUS = 2.5e-3
@@ -335,7 +335,7 @@ class Robot(ABC):
 
         The options are the arguments of the constructor, defaults included. If the robot has an attribute of the
         same name, for example because a default depends on other options, the attribute's value is used. Options of
-        contact and of meshes are left out at their simplest values (`OMITTED`).
+        contact, of meshes and of single robots are left out at their simplest values (`OMITTED`).
         """
         values = {name: vars(self).get(name, value) for name, value in self._options.items()}
         # These follow from the name of the mesh, but may change in a later version.
