@@ -34,7 +34,7 @@ def final_distances(agent, env, seeds=2):
 
 @pytest.mark.parametrize("options", [{"cavities": 2}, {"cavities": 4}, {"cavities": 2, "sealed": True}])
 def test_the_estimator_reaches_goals_that_the_model_alone_misses(options):
-    env = gymnasium.make(ID, robot_options=options)
+    env = gymnasium.make(ID, robot_options=options, task_options={"force": 1.5})
     estimated = final_distances(make_baseline("qp_estimated"), env)
     blind = final_distances(make_baseline("qp_model"), env)
     assert (estimated < env.unwrapped.task.success_distance).all()
