@@ -400,7 +400,8 @@ class MechanicalModel:
             if not stiffness:
                 raise ValueError("a body without elastic parts needs the 'stiffness' [Pa] of its contact")
             settings = replace(settings, stiffness=stiffness)
-        self.contact = Contact(surface_of(self.nodes, self.blocks, self.skins, excluded), obstacles, settings)
+        skins = [skin for skin in self.skins if skin.touches]
+        self.contact = Contact(surface_of(self.nodes, self.blocks, skins, excluded), obstacles, settings)
         return self.contact
 
     # -- loads ------------------------------------------------------------------------------------------------------

@@ -22,11 +22,13 @@ class Skin:
         points: the vertices, as points of frames (v of them).
         triangles: vertex indices, seen counter-clockwise from outside, shape (t, 3).
         rigid: whether it is a rigid object rather than a part of the soft body.
+        touches: whether it takes part in contact; surfaces that are only drawn do not.
     """
 
     points: EmbeddedPoints
     triangles: np.ndarray
     rigid: bool = False
+    touches: bool = True
 
 
 def tube_skin(beam: Beam, nodes: np.ndarray, outline: np.ndarray) -> Skin:
@@ -57,7 +59,7 @@ def _swept_triangles(count: int, k: int) -> np.ndarray:
 
 
 def bridge_skin(first: int, second: int, half_widths: Sequence[float], axes: np.ndarray, nodes: np.ndarray) -> Skin:
-    """Return a bar between two frames, which bends with them as a beam does: tangent to both, by cubic polynomials.
+    """Return a bar between two frames, to be drawn, which bends with them as a beam does: tangent to both.
 
     Args:
         first: first row of the frame where it begins, with the third director along the bar.
@@ -77,7 +79,7 @@ def bridge_skin(first: int, second: int, half_widths: Sequence[float], axes: np.
     columns = (near * ends, (1.0 - s) * x, (1.0 - s) * y, rise * ends, far * ends, s * x, s * y, fall * ends)
     weights = np.stack([np.broadcast_to(c, ends.shape).ravel() for c in columns], axis=1)
     ids = np.tile(np.concatenate([first + np.arange(4), second + np.arange(4)]), (len(weights), 1))
-    return Skin(EmbeddedPoints.from_weights(ids, weights, nodes), _swept_triangles(len(s), k))
+    return Skin(EmbeddedPoints.from_weights(ids, weights, nodes), _swept_triangles(len(s), k), touches=False)
 
 
 def box_skin(row: int, half_extents: Sequence[float], nodes: np.ndarray, *, divisions: int = 1) -> Skin:

@@ -10,9 +10,10 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.equilibrium import NewtonFailure
 from softgym_envs.mechanics.solvers.linear import CholmodSolver, SuperLUSolver, make_solver
 from softgym_envs.mechanics.solvers.split import SplitCholesky
-from softgym_envs.mechanics.solvers.statics import NewtonFailure, Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 
 # -- reference ------------------------------------------------------------------------------------------------------
 

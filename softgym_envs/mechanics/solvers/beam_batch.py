@@ -21,7 +21,8 @@ from softgym_envs.mechanics.solvers.beam_body import (
     Servos,
 )
 from softgym_envs.mechanics.solvers.beam_equations import make_equations
-from softgym_envs.mechanics.solvers.beam_motion import drive, make_factor
+from softgym_envs.mechanics.solvers.beam_motion import drive
+from softgym_envs.mechanics.solvers.beam_newton import make_factor
 from softgym_envs.mechanics.solvers.block_cholesky import BlockPattern
 
 

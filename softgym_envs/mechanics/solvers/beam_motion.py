@@ -29,58 +29,11 @@ from softgym_envs.mechanics.solvers.beam_equations import (
     multiply_mass,
     point_strains,
 )
-from softgym_envs.mechanics.solvers.block_cholesky import SIZE, factorise, solve_lower, solve_upper
-from softgym_envs.mechanics.solvers.complementarity import solve_row
-from softgym_envs.mechanics.solvers.equilibrium import CAUTIOUS, SATURATED
+from softgym_envs.mechanics.solvers.beam_newton import approach, factorise_tangent, make_factor, solve
+from softgym_envs.mechanics.solvers.equilibrium import SATURATED
 
-MAX_ITERATIONS, MAX_SEARCHES = 20, 30
-"""Newton iterations with whole steps, and with shortened ones, after which they fail."""
-SHORTEST, SMALLEST_INCREMENT = 1e-3, 0.25
-"""Smallest part of a step of Newton's method, and of the way to a target within one time step."""
-SLOW, STEEP = 0.1, 0.75
-"""A step longer than this part of the last one calls for a new factor; or in dynamics for shorter steps."""
-LONG, TOO_LONG = 0.01, 1.0
-"""Steps that turn a frame by more [rad], or move it as far, call for a new factor in statics; or the general solver."""
 INCREMENTS = 4
 """In statics, a step that is too long for Newton's method is divided once into this number of increments."""
-REMAINING, SMALLEST = 0.01, 1e-13
-"""The next step must be shorter than this part of the tolerance, or than this length [m], which is near rounding.
-Errors of a time step act on the next one through the velocities."""
-
-
-class Factor(NamedTuple):
-    """A factorised tangent with what follows from it, and work arrays.
-
-    Attributes:
-        half: ``L^-1 H``, shape (size, b, 6).
-        compliance: ``W``, shape (size, size).
-        driven: inverse of its part of the driven rows, shape (d, d).
-        signs: of the pivots, shape (b, 6).
-        step: of the equations, shape (b, 6).
-        efforts: step of the efforts, shape (size,).
-        turned: work array of `move`, shape (3, 3).
-    """
-
-    half: np.ndarray
-    compliance: np.ndarray
-    driven: np.ndarray
-    signs: np.ndarray
-    step: np.ndarray
-    efforts: np.ndarray
-    turned: np.ndarray
-
-
-def make_factor(blocks: int, size: int) -> Factor:
-    """Return arrays for a body with ``blocks`` movable frames and ``size`` constraint rows."""
-    return Factor(
-        half=np.zeros((size, blocks, SIZE)),
-        compliance=np.zeros((size, size)),
-        driven=np.zeros((size, size)),
-        signs=np.ones((blocks, SIZE)),
-        step=np.zeros((blocks, SIZE)),
-        efforts=np.zeros(size),
-        turned=np.zeros((3, 3)),
-    )
 
 
 class MarchedSteps(NamedTuple):
@@ -117,245 +70,6 @@ class MarchedSteps(NamedTuple):
     iterations: int
     stable: bool
     parts: int
-
-
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _dot(a, b, signs):
-    """Return the sum of the products of two vectors with signs, all of shape (b, 6)."""
-    value = 0.0
-    for k in range(a.shape[0]):
-        for i in range(SIZE):
-            value += signs[k, i] * a[k, i] * b[k, i]
-    return value
-
-
-@njit(cache=True, error_model="numpy")
-def _factorise(body, equations, factor, rows):
-    """Factorise the tangent and fill ``half`` and ``W`` of constraint rows; the number of its negative eigenvalues.
-
-    Returns -1 if there is no factor.
-    """
-    negative = factorise(equations.tangent, body.pattern.pointers, body.pattern.targets, factor.signs)
-    if negative < 0:
-        return -1
-    for i in range(rows.shape[0]):
-        half = factor.half[rows[i]]
-        half[:] = equations.H[rows[i]]
-        solve_lower(equations.tangent, body.pattern.pointers, body.pattern.columns, half)
-        for j in range(i + 1):
-            value = _dot(half, factor.half[rows[j]], factor.signs)
-            factor.compliance[rows[i], rows[j]] = value
-            factor.compliance[rows[j], rows[i]] = value
-    return negative
-
-
-@njit(cache=True, error_model="numpy")
-def _correct(body, equations, factor, effort, target, driven, forced, one_way):
-    """Solve the linearised equations for the steps of the motions and of the efforts, as `Statics` does.
-
-    Returns the largest displacement of the step; NaN if no set of taut actuators is consistent.
-    """
-    step, change, W = factor.step, factor.efforts, factor.compliance
-    step[:] = equations.residual
-    solve_lower(equations.tangent, body.pattern.pointers, body.pattern.columns, step)
-    for i in range(forced.shape[0]):
-        change[forced[i]] = target[forced[i]] - effort[forced[i]]
-    count = driven.shape[0]
-    gap = np.empty(count)
-    for i in range(count):
-        row = driven[i]
-        gap[i] = equations.delta[row] - target[row] - _dot(factor.half[row], step, factor.signs)
-        for j in range(forced.shape[0]):
-            gap[i] += W[row, forced[j]] * change[forced[j]]
-    if one_way.any():
-        among = np.empty((count, count))
-        for i in range(count):
-            for j in range(count):
-                among[i, j] = W[driven[i], driven[j]]
-                gap[i] -= among[i, j] * effort[driven[j]]
-        total = np.empty(count)
-        if not solve_row(among, gap, one_way, total, np.empty((count, count + 1)), np.empty(count, dtype=np.int64)):
-            return np.nan
-        for i in range(count):
-            change[driven[i]] = total[i] - effort[driven[i]]
-    else:
-        for i in range(count):
-            value = 0.0
-            for j in range(count):
-                value -= factor.driven[i, j] * gap[j]
-            change[driven[i]] = value
-    for k in range(step.shape[0]):
-        for i in range(SIZE):
-            step[k, i] = -step[k, i]
-    for c in range(change.shape[0]):
-        if change[c] != 0.0:
-            half = factor.half[c]
-            for k in range(step.shape[0]):
-                for i in range(SIZE):
-                    step[k, i] += change[c] * half[k, i]
-    for k in range(step.shape[0]):
-        for i in range(SIZE):
-            step[k, i] *= factor.signs[k, i]
-    solve_upper(equations.tangent, body.pattern.pointers, body.pattern.columns, step)
-    largest, scale = 0.0, body.components.scale
-    for k in range(step.shape[0]):
-        for i in range(SIZE):
-            largest = max(largest, abs(step[k, i]) * scale[k, i])
-    return largest
-
-
-@njit(cache=True, error_model="numpy")
-def _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, definite):
-    """Assemble and factorise at rows ``x``; the number of negative eigenvalues, or -1 if there is no factor.
-
-    Only positive definite tangents count if ``definite``, or if there are ``one_way`` rows, whose complementarity needs
-    them.
-    """
-    assemble(body, x, effort, step, equations, True)
-    negative = _factorise(body, equations, factor, rows)
-    if negative < 0 or (negative and (definite or one_way.any())):
-        return -1
-    if not one_way.any():
-        count = driven.shape[0]
-        among = np.empty((count, count))
-        for i in range(count):
-            for j in range(count):
-                among[i, j] = factor.compliance[driven[i], driven[j]]
-        factor.driven[:count, :count] = np.linalg.inv(among)
-    return negative
-
-
-@njit(cache=True, error_model="numpy")
-def _solve(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance, fresh):
-    """Solve the equations in place, starting at the predicted rows ``x``; the iterations, or -1 on failure.
-
-    It starts with the factor of the last solution unless ``fresh``, and fails where a step with a new factor is longer
-    than the last of them; in dynamics, where any step is not much shorter than the last one. ``one_way`` (d,) are
-    driven rows that cannot push.
-    """
-    rows = np.concatenate((driven, forced))
-    definite = step.h == np.inf
-    before = last = np.inf
-    kept = not fresh
-    radian = body.components.scale[:, 3:].max()
-    long = LONG * radian if step.h == np.inf else np.inf
-    enough = min(tolerance, max(REMAINING * tolerance, SMALLEST))
-    for iteration in range(1, MAX_ITERATIONS + 1):
-        if not fresh:
-            assemble(body, x, effort, step, equations, False)
-        elif _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, definite) < 0:
-            return -1
-        length = _correct(body, equations, factor, effort, target, driven, forced, one_way)
-        if not length <= TOO_LONG * radian:  # also true for NaN
-            return -1
-        ratio = length / before
-        if step.h < np.inf and ratio > STEEP and length > tolerance:
-            return -1
-        if fresh:
-            if length > last:
-                return -1
-            last = length
-        elif ratio > 1.0:
-            fresh = True  # this step is not taken
-            continue
-        move(body.frames, x, factor.step, factor.turned)
-        for c in range(effort.shape[0]):
-            effort[c] += factor.efforts[c]
-        # Two steps in a row with one factor, or the last new factor, tell how much shorter the next step will be.
-        known = iteration > 1 and (fresh or kept)
-        if length <= enough or (known and length * ratio <= enough):
-            return iteration
-        kept = not fresh
-        fresh = length > long or (iteration > 1 and ratio > SLOW)
-        before = length
-    return -1
-
-
-@njit(cache=True, error_model="numpy")
-def _search(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance, definite):
-    """Do in place what `Statics` does at one load level; the iterations, or -1 on failure.
-
-    Steps are shortened until the next one with the same factor would be shorter. The equations are linearised at rows
-    ``x``, and at those of the solution on success.
-    """
-    rows = np.concatenate((driven, forced))
-    begin, begin_effort, stride, pull = x.copy(), effort.copy(), factor.step.copy(), factor.efforts.copy()
-    norm = _correct(body, equations, factor, effort, target, driven, forced, one_way)
-    part = 1.0
-    for iteration in range(1, MAX_SEARCHES + 1):
-        if not np.isfinite(norm):
-            return -1
-        begin[:] = x
-        begin_effort[:] = effort
-        stride[:] = factor.step
-        pull[:] = factor.efforts
-        while True:
-            x[:] = begin
-            for k in range(stride.shape[0]):
-                for i in range(SIZE):
-                    factor.step[k, i] = part * stride[k, i]
-            move(body.frames, x, factor.step, factor.turned)
-            for c in range(effort.shape[0]):
-                effort[c] = begin_effort[c] + part * pull[c]
-            assemble(body, x, effort, step, equations, False)
-            remaining = _correct(body, equations, factor, effort, target, driven, forced, one_way)
-            if remaining <= (1.0 - 0.25 * part) * norm or remaining <= tolerance:
-                break
-            part *= 0.5
-            if part < SHORTEST:
-                return -1
-        if part == 1.0 and remaining > tolerance and norm > 0.0 and remaining * remaining / norm <= 0.1 * tolerance:
-            move(body.frames, x, factor.step, factor.turned)
-            for c in range(effort.shape[0]):
-                effort[c] += factor.efforts[c]
-        if _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, definite) < 0:
-            return -1
-        norm = _correct(body, equations, factor, effort, target, driven, forced, one_way)
-        if part == 1.0 and norm <= tolerance:
-            return iteration
-        part = min(1.0, 2.0 * part)
-    return -1
-
-
-@njit(cache=True, error_model="numpy")
-def _approach(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance):
-    """Solve the equations in place in increments, as `Statics` does; the iterations, or -1 on failure."""
-    rows = np.concatenate((driven, forced))
-    negative = _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, False)
-    if negative < 0:
-        return -1
-    held = driven.shape[0] == body.servos.number.shape[0] + body.chambers.number.shape[0]
-    start, goal = effort.copy(), np.empty(effort.shape[0])
-    for i in range(driven.shape[0]):
-        start[driven[i]] = equations.delta[driven[i]]
-    kept, kept_effort = x.copy(), effort.copy()
-    done, size, iterations = 0.0, 1.0, 0
-    while done < 1.0:
-        level = min(1.0, done + size)
-        for c in range(goal.shape[0]):
-            goal[c] = start[c] + level * (target[c] - start[c])
-        kept[:] = x
-        kept_effort[:] = effort
-        definite = held and level - done > CAUTIOUS and negative == 0
-        found = _search(body, x, effort, goal, driven, forced, one_way, step, equations, factor, tolerance, definite)
-        if found < 0:
-            x[:] = kept
-            effort[:] = kept_effort
-            size = 0.5 * (level - done)
-            if size < SMALLEST_INCREMENT:
-                return -1
-            negative = _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, False)
-            if negative < 0:
-                return -1
-            continue
-        iterations += found
-        negative = 0
-        for k in range(factor.signs.shape[0]):
-            for i in range(SIZE):
-                negative += factor.signs[k, i] < 0.0
-        done = level
-        size *= 1.5
-    return iterations
 
 
 @njit(cache=True, error_model="numpy")
@@ -399,21 +113,21 @@ def _advance(
     iterations = -1
     if easy:
         system = (driven, forced, one_way, step, equations, factor, tolerance)
-        iterations = _solve(body, x, effort, target, *system, fresh)
+        iterations = solve(body, x, effort, target, *system, fresh)
         if iterations < 0 and h < np.inf and not fresh:
             x[:] = predicted
             effort[:] = kept_effort
-            iterations = _solve(body, x, effort, target, *system, True)
+            iterations = solve(body, x, effort, target, *system, True)
     if iterations < 0 and thorough:
         x[:] = predicted
         effort[:] = kept_effort
-        iterations = _approach(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance)
+        iterations = approach(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance)
     if iterations < 0:
         return False
     # At the end of the step: all compliances where they are asked for, else values and energies alone.
     if finish:
         assemble(body, x, effort, step, equations, True)
-        negative = _factorise(body, equations, factor, np.arange(size))
+        negative = factorise_tangent(body, equations, factor, np.arange(size))
         totals[5] = negative
         if negative < 0 or (negative and h == np.inf):
             return False

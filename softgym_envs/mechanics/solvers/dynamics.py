@@ -27,9 +27,9 @@ from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.cable_friction import CableFriction, CableMemory
-from softgym_envs.mechanics.solvers.equilibrium import AppliedLoads, Equilibrium, slack_rows
+from softgym_envs.mechanics.solvers.equilibrium import AppliedLoads, Equilibrium, NewtonFailure, slack_rows
 from softgym_envs.mechanics.solvers.schemes import SCHEMES, GeneralisedAlpha, ImplicitEuler, StartingAcceleration
-from softgym_envs.mechanics.solvers.statics import NewtonFailure, Statics
+from softgym_envs.mechanics.solvers.statics import Statics
 
 
 @dataclass(frozen=True)

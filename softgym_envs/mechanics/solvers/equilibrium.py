@@ -19,6 +19,10 @@ CAUTIOUS = 0.25
 """Increments of displacements longer than this part of a step are divided where they meet an indefinite tangent."""
 
 
+class NewtonFailure(Exception):
+    """Newton's method did not converge on one increment; solvers catch it."""
+
+
 @dataclass(frozen=True)
 class Equilibrium:
     """A solved state.

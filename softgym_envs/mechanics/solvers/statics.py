@@ -30,6 +30,7 @@ from softgym_envs.mechanics.solvers.complementarity import complementary_step
 from softgym_envs.mechanics.solvers.equilibrium import (
     CAUTIOUS,
     Equilibrium,
+    NewtonFailure,
     RowLayout,
     checked,
     checked_modes,
@@ -40,10 +41,6 @@ from softgym_envs.mechanics.solvers.prediction import LARGEST_BEND, Bend
 
 SHORT_STEP, MOST_SHORT_STEPS = 0.05, 6
 """In contact, an increment is divided after this number of steps in a row of less than this part of Newton's."""
-
-
-class NewtonFailure(Exception):
-    """Newton's method did not converge on one increment; solvers catch it."""
 
 
 class Statics:
