@@ -28,7 +28,7 @@ WEIGHTS = {
 }
 """Readable names of the robots, by name of the shipped weights."""
 
-HEADLINES = ("finger", "diamond", "trunk", "cable_trunk", "tetrapod")
+HEADLINES = ("finger_reach", "diamond_reach", "trunk_reach", "cable_trunk_reach", "tetrapod_reach")
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "") -> str:
@@ -93,7 +93,7 @@ def codesign_goals() -> str:
     for study in results("codesign").values():
         for index, row in enumerate(study["rows"]):
             shares = [row.get(f"goals reached by the {who} [%]") for who in ("baseline", "winner")]
-            reached = ["" if shares[0] is None else f"{shares[0]}%", "" if shares[1] is None else f"→ {shares[1]}%"]
+            reached = ["" if shares[0] is None else f"{shares[0]:g}%", "" if shares[1] is None else f"→ {shares[1]:g}%"]
             time = row.get("CPU with FEM check [min]")
             cells = [row["controller"], *reached, str(row["test goals"]), f"{time:.1f} min" if time else ""]
             rows.append(["" if index else study["title"], *cells])
