@@ -21,7 +21,8 @@ from functools import cache
 from itertools import combinations_with_replacement
 
 import numpy as np
-from numba import njit
+
+from softgym_envs.mechanics.compilation import njit
 
 _SIGNS = {"x": (-1, 1, 1, 1, -1, -1), "y": (1, -1, 1, -1, 1, -1), "z": (-1, -1, 1, 1, 1, -1)}
 """Sign of each strain when an axis through the middle of the module is reversed; the last one swaps the ports."""
