@@ -204,9 +204,7 @@ def force_goal(
     return _press(ContactControl(fem, controller, friction=modelled), "rod", force, steps)
 
 
-def hold(
-    friction: float = 0.85, force: float = 1.0, steps: int = 15, *, modelled: bool = False
-) -> dict[str, object]:
+def hold(friction: float = 0.85, force: float = 1.0, steps: int = 15, *, modelled: bool = False) -> dict[str, object]:
     """Contact-aided finger of measured design 203 that touches itself and holds a plane; see `force_goal`."""
     plane = Plane((0.0631, 0.0, 0.0), (-1.0, 0.0, 0.0), name="object", friction=friction)
     robot = make_robot("contact_aided_finger", obstacles=[plane], self_contact=True)
@@ -218,16 +216,18 @@ def hold(
 
 
 def _press(loop: ContactControl, name: str, force: float, steps: int) -> dict[str, object]:
-    forces = []
+    forces, predicted = [], []
     for _ in range(steps):
         state = loop.step(None, forces=[ForceGoal({name: 1.0}, force)])
         assert state.contacts is not None
         forces.append(float(state.contacts.pressing.sum()))
+        predicted.append(float(loop.controller.contact_force.sum()))
     errors = np.abs(np.array(forces) / force - 1.0)
     within = np.flatnonzero(errors > 0.01)
     return {
         "force_N": forces[-1],
         "relative_error": float(errors[-1]),
+        "largest_error_of_a_prediction_N": float(np.abs(np.array(forces) - predicted).max()),
         "steps_to_1_percent": int(within[-1]) + 2 if len(within) else 1,
     }
 

@@ -14,12 +14,21 @@ from dataclasses import replace
 import click
 import numpy as np
 
-from benchmarks.contact_control import Problem, enumerated_optimum, random_problem
-from softgym_envs.control import ContactQP
+from benchmarks.contact_control import (
+    Problem,
+    enumerated_optimum,
+    force_goal,
+    hold,
+    random_problem,
+    reach_along_wall,
+)
+from softgym_envs import make_robot
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.control import ContactControl, ContactQP, InverseQP
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import ContactModel, Row
 
-SIZES = {1: 250, 2: 250, 3: 250, 4: 150, 5: 100}
+SIZES = {1: 300, 2: 300, 3: 300, 4: 80, 5: 20}
 """Random problems by their number of contacts."""
 
 
@@ -124,3 +133,73 @@ def random_problems(sizes: dict[int, int] | None = None, directions: int = 1, se
         "p95_ms": float(np.percentile(every_time, 95)),
     }
     return results
+
+
+def carry(controller: str, goals: int = 6, calls: int = 3, friction: float = 0.6) -> dict[str, object]:
+    """Three fingers that hold a cube by friction and carry its centre along a circle of radius 1 mm.
+
+    Args:
+        controller: ``"friction"``, which knows stick and slide; or ``"inverse QP"`` on the compliance of the grip as it
+            is, with no lower limit of the cables' forces or, as ``"inverse QP, 1 N"``, with one.
+        goals: on the circle; four more lead there.
+        calls: of the controller for each goal.
+        friction: coefficient between cube and fingers.
+    """
+    robot = make_robot("three_finger_friction_gripper", friction=friction)
+    fem = FEMBackend(robot)
+    for pull in np.linspace(0.5e-3, 2e-3, 4):
+        state = fem.step(np.full(6, pull))
+    rates = np.full(6, 4e-4)
+    loop = ContactControl(fem, ContactQP.for_robot(robot, rates=rates), friction=True)
+    least = np.ones(6) if controller.endswith("1 N") else None
+    plain = InverseQP.for_robot(robot, rates=rates, min_effort=least)
+    circle = robot.reference_path(goals)
+    errors, smallest, seconds, steps, end = [], np.inf, 0.0, 0, "held"
+    try:
+        for goal in np.vstack([np.linspace(state.effector[0], circle[0], 5)[1:], circle]):
+            for _ in range(calls):
+                started = time.process_time()
+                if controller == "friction":
+                    state = loop.step(goal)
+                else:
+                    state = fem.step(plain.solve(state.condensed, goal, state.command, state.slack))
+                seconds, steps = seconds + time.process_time() - started, steps + 1
+                assert state.contacts is not None
+                smallest = min(smallest, float(state.contacts.pressing.sum()))
+            errors.append(1e6 * float(np.linalg.norm(state.effector[0] - goal)))
+    except ConvergenceError:
+        end = "lost"
+    return {
+        "goals": len(errors[4:]),
+        "end": end,
+        "mean_um": float(np.mean(errors[4:])) if errors[4:] else np.nan,
+        "largest_um": float(np.max(errors[4:], initial=0.0)),
+        "smallest_sum_of_normal_forces_N": smallest,
+        "cpu_s_per_step": seconds / max(1, steps),
+    }
+
+
+def contact_friction() -> dict[str, object]:
+    """Inverse control with contact and friction: random problems against enumeration, and loops on finite elements."""
+    known, unknown = {"modelled": True}, {"modelled": False}
+    return {
+        "one_direction": random_problems(),
+        "two_directions": random_problems({1: 100, 2: 100, 3: 10}, 2),
+        "force_goal": {"friction": force_goal(0.5, **known), "no friction": force_goal(0.5, **unknown)},
+        "hold_with_contact_aided_finger": {"friction": hold(**known), "no friction": hold(**unknown)},
+        "reach_along_wall": {
+            "friction": reach_along_wall(0.3, **known),
+            "no friction": reach_along_wall(0.3, **unknown),
+        },
+        "carry_cube": {name: carry(name) for name in ("friction", "inverse QP", "inverse QP, 1 N")},
+    }
+
+
+@click.command(help=__doc__)
+def main() -> None:
+    """Print the results."""
+    click.echo(json.dumps(contact_friction(), indent=2))
+
+
+if __name__ == "__main__":
+    main()

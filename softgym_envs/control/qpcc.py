@@ -141,8 +141,9 @@ def solve_qpcc(
     """Return the global optimum, or the best point found with ``max_programs`` quadratic programs.
 
     The sets of ``start`` are improved first: while a pair of which both sides are zero pulls, it is changed. The result
-    is a local optimum, and it bounds what follows. The search then goes depth first. It branches on the pair with the largest product ``y w`` and first takes the side that
-    the relaxed optimum is closer to, so it descends at once to a good set.
+    is a local optimum, and it bounds what follows. The search then goes depth first. It branches on the pair with the
+    largest product ``y w`` and first takes the side that the relaxed optimum is closer to, so it descends at once to a
+    good set.
 
     Args:
         problem: the problem.
