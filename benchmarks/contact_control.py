@@ -8,14 +8,17 @@ from __future__ import annotations
 import itertools
 import json
 import time
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import click
 import numpy as np
+from scipy.optimize import nnls
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.control import ContactControl, ContactQP, ForceGoal, InverseQP
+from softgym_envs.control.inverse_qp import UNBOUNDED
 from softgym_envs.control.qpcc import ComplementarityQP
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics import CondensedModel
@@ -74,40 +77,60 @@ def random_problem(rng: np.random.Generator, contacts: int, actuators: int | Non
     return Problem(controller, model, delta[a : a + 3] + rng.normal(scale=4e-3, size=3), command, forces)
 
 
-def enumerated_optimum(problem: ComplementarityQP) -> float:
-    """Return the smallest objective over all sets of closed contacts, with other solvers; inf if no set is feasible.
+def enumerated_optimum(problem: ComplementarityQP, sets: Iterable[Sequence[bool]] | None = None) -> float:
+    """Return the smallest objective over sets of closed pairs, by another method; inf if no set is feasible.
 
-    ProxQP does not tell infeasible sets reliably from feasible ones, so HiGHS does this first.
+    Each set leaves a strictly convex program. Without its equations it is a least-distance problem, which Lawson and
+    Hanson (Solving Least Squares Problems, 1974, ch. 23) solve by non-negative least squares.
 
-    Raises:
-        RuntimeError: if ProxQP does not solve a feasible set.
+    Args:
+        problem: the problem.
+        sets: closed pairs (k,) of each set; default all sets.
     """
-    from proxsuite import proxqp
-    from scipy.optimize import linprog
-
     n, k = len(problem.gradient), len(problem.pairs)
     force = np.eye(n)[problem.pairs]
-    best = np.inf
-    for closed in itertools.product((False, True), repeat=k):
-        zero = np.array(closed)
-        equal = np.where(zero[:, None], problem.pair_rows, force)
-        to = np.where(zero, -problem.pair_offset, 0.0)
-        rows = np.concatenate([problem.rows, np.where(zero[:, None], force, problem.pair_rows)])
-        low = np.concatenate([problem.rows_lower, np.where(zero, 0.0, -problem.pair_offset)])
-        high = np.concatenate([problem.rows_upper, np.full(k, 1e6)])
-        box = np.column_stack([problem.lower, problem.upper])
-        limits = (np.concatenate([rows, -rows]), np.concatenate([high, -low]))
-        if linprog(np.zeros(n), *limits, equal, to, box).status == 2:
-            continue
-        qp = proxqp.dense.QP(n, k, len(rows), True)
-        qp.settings.eps_abs, qp.settings.eps_rel, qp.settings.max_iter = 1e-11, 0.0, 10000
-        qp.settings.eps_primal_inf = 1e-14
-        qp.init(problem.hessian, problem.gradient, equal, to, rows, low, high, problem.lower, problem.upper)
-        qp.solve()
-        if qp.results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
-            raise RuntimeError(f"ProxQP stopped with {qp.results.info.status}")
-        best = min(best, problem.value(qp.results.x))
-    return best
+    values = [np.inf]
+    for closed in itertools.product((False, True), repeat=k) if sets is None else sets:
+        zero = np.array(closed, dtype=bool)
+        fixed, tied = problem.lower == problem.upper, problem.rows_lower == problem.rows_upper
+        equal = [np.where(zero[:, None], problem.pair_rows, force), np.eye(n)[fixed], problem.rows[tied]]
+        to = [np.where(zero, -problem.pair_offset, 0.0), problem.lower[fixed], problem.rows_lower[tied]]
+        other = np.where(zero[:, None], force, problem.pair_rows)
+        sides = [problem.rows[~tied], -problem.rows[~tied], np.eye(n)[~fixed], -np.eye(n)[~fixed], other]
+        ends = [problem.rows_lower[~tied], -problem.rows_upper[~tied], problem.lower[~fixed], -problem.upper[~fixed]]
+        ends.append(np.where(zero, 0.0, -problem.pair_offset))
+        least = np.concatenate(ends)
+        real = least > -0.5 * UNBOUNDED
+        found = _least(problem, np.concatenate(equal), np.concatenate(to), np.concatenate(sides)[real], least[real])
+        if found is not None:
+            values.append(problem.value(found))
+    return min(values)
+
+
+def _least(
+    problem: ComplementarityQP, equal: np.ndarray, to: np.ndarray, sides: np.ndarray, least: np.ndarray
+) -> np.ndarray | None:
+    """Return the optimum with ``equal z = to`` and ``sides z >= least``; None if no point is feasible."""
+    _, sizes, vectors = np.linalg.svd(equal)
+    free = vectors[int((sizes > 1e-10 * sizes[0]).sum()) :].T
+    point = np.linalg.lstsq(equal, to, rcond=1e-10)[0]
+    if np.abs(equal @ point - to).max() > 1e-8:
+        return None
+    slopes, least = sides @ free, least - sides @ point
+    some = np.linalg.norm(slopes, axis=1) > 1e-10
+    if (least[~some] > 1e-8).any():
+        return None
+    root = np.linalg.cholesky(free.T @ problem.hessian @ free)
+    shift = np.linalg.solve(root, free.T @ (problem.gradient + problem.hessian @ point))
+    slopes = np.linalg.solve(root, slopes[some].T)
+    system = np.vstack([slopes, least[some] + shift @ slopes])
+    norms = np.linalg.norm(system, axis=0)
+    goal = np.append(np.zeros(len(shift)), 1.0)
+    residual = (system / norms) @ nnls(system / norms, goal, maxiter=1000)[0] - goal
+    if abs(residual[-1]) < 1e-12:
+        return None
+    z = point + free @ np.linalg.solve(root.T, -residual[:-1] / residual[-1] - shift)
+    return z if (sides @ (z - point) >= least - 1e-7).all() else None
 
 
 def random_problems(count: int = 1000, most: int = 5, seed: int = 0) -> dict[str, object]:
@@ -130,7 +153,7 @@ def random_problems(count: int = 1000, most: int = 5, seed: int = 0) -> dict[str
             programs.append(case.controller.optimum.programs)
             closures += int((case.controller.optimum.closed != before).any())
         seconds.append(time.perf_counter() - started)
-        problem, *_ = case.controller.problem(case.model, case.goal, case.command, forces=case.forces)
+        problem = case.controller.problem(case.model, case.goal, case.command, forces=case.forces).program
         best = enumerated_optimum(problem)
         infeasible += int(np.isinf(best))
         hits += int(found == best or found <= best + 1e-6 * abs(best) + 1e-9)
@@ -163,36 +186,48 @@ def many_contacts(counts: tuple[int, ...] = (8, 12, 16), problems: int = 20, see
     return results
 
 
-def force_goal(friction: float = 0.0, force: float = 1.0, steps: int = 15) -> dict[str, object]:
-    """Soft Finger that starts 25 mm from a rod and presses on it with a given force."""
+def force_goal(
+    friction: float = 0.0, force: float = 1.0, steps: int = 15, *, modelled: bool = False
+) -> dict[str, object]:
+    """Soft Finger that starts 25 mm from a rod and presses on it with a given force.
+
+    Args:
+        friction: coefficient.
+        force: wanted [N].
+        steps: of the loop.
+        modelled: whether the controller knows friction.
+    """
     rod = Cylinder((0.0, 0.055, -0.10), (1.0, 0.0, 0.0), 0.01, name="rod", friction=friction)
     robot = make_robot("finger", obstacles=[rod])
     fem = FEMBackend(robot)
-    return _press(ContactControl(fem, ContactQP.for_robot(robot, rates=np.full(2, 0.004))), "rod", force, steps)
+    controller = ContactQP.for_robot(robot, rates=np.full(2, 0.004))
+    return _press(ContactControl(fem, controller, friction=modelled), "rod", force, steps)
 
 
-def hold(friction: float = 0.85, force: float = 1.0, steps: int = 15) -> dict[str, object]:
-    """Contact-aided finger of measured design 203 that touches itself and holds a plane with a given force."""
+def hold(friction: float = 0.85, force: float = 1.0, steps: int = 15, *, modelled: bool = False) -> dict[str, object]:
+    """Contact-aided finger of measured design 203 that touches itself and holds a plane; see `force_goal`."""
     plane = Plane((0.0631, 0.0, 0.0), (-1.0, 0.0, 0.0), name="object", friction=friction)
     robot = make_robot("contact_aided_finger", obstacles=[plane], self_contact=True)
     lengths = [14.7, 3.2, 9.7, 12.2, 17.3, 13.1, 15.1, 18.1, 28.0, 20.9, 9.0, 18.3, 19.3, 10.6, 18.1]  # mm
     names = ["e1", "e2", "e3", *(f"d{k}" for k in range(12))]
     fem = FEMBackend(robot, {name: 1e-3 * length for name, length in zip(names, lengths, strict=True)})
     controller = ContactQP.for_robot(robot, rates=np.full(1, np.radians(3.0)))
-    return _press(ContactControl(fem, controller), "object", force, steps)
+    return _press(ContactControl(fem, controller, friction=modelled), "object", force, steps)
 
 
 def _press(loop: ContactControl, name: str, force: float, steps: int) -> dict[str, object]:
-    forces = []
+    forces, predicted = [], []
     for _ in range(steps):
         state = loop.step(None, forces=[ForceGoal({name: 1.0}, force)])
         assert state.contacts is not None
         forces.append(float(state.contacts.pressing.sum()))
+        predicted.append(float(loop.controller.contact_force.sum()))
     errors = np.abs(np.array(forces) / force - 1.0)
     within = np.flatnonzero(errors > 0.01)
     return {
         "force_N": forces[-1],
         "relative_error": float(errors[-1]),
+        "largest_error_of_a_prediction_N": float(np.abs(np.array(forces) - predicted).max()),
         "steps_to_1_percent": int(within[-1]) + 2 if len(within) else 1,
     }
 
@@ -206,7 +241,9 @@ def _pull(length: float) -> np.ndarray:
     return np.where(np.arange(8) == 3, length, -0.03)
 
 
-def reach_along_wall(friction: float = 0.0, steps: int = 20, layers: int = 24) -> dict[str, object]:
+def reach_along_wall(
+    friction: float = 0.0, steps: int = 20, layers: int = 24, *, modelled: bool = False
+) -> dict[str, object]:
     """Trunk that slides its tip along a wall to a goal which it cannot reach without the wall.
 
     Only the long cable towards the wall pulls, and the others are paid out, so without the wall the tip stays on one
@@ -224,7 +261,7 @@ def reach_along_wall(friction: float = 0.0, steps: int = 20, layers: int = 24) -
         fem = FEMBackend(make_robot("cable_trunk", obstacles=obstacles, layers=layers))
         state = fem.step(_pull(0.0))
         plain = InverseQP.for_robot(fem.robot, **limits)
-        loop = ContactControl(fem, ContactQP.for_robot(fem.robot, **limits))
+        loop = ContactControl(fem, ContactQP.for_robot(fem.robot, **limits), friction=modelled)
         distances = []
         for _ in range(steps):
             if obstacles:

@@ -171,10 +171,13 @@ class Backend(ABC):
         """
         raise ValueError(f"{type(self).__name__} takes no forces")
 
-    def contact_model(self) -> CondensedModel:
+    def contact_model(self, *, friction: bool = False) -> CondensedModel:
         """Return the condensed model at the current state, with openings of contacts as further rows ``c``.
 
         The openings and the normal forces on them are complementary, see `Statics.contact_model`.
+
+        Args:
+            friction: with slips and friction forces as rows ``t``; otherwise friction forces stay as they are.
 
         Raises:
             ConvergenceError: if the body has no equilibrium without its contacts.

@@ -213,7 +213,9 @@ class ChainBackend(Backend):
         self.state = self._body.solve(command, mode, self.state)
         return self.state
 
-    def contact_model(self) -> CondensedModel:
+    def contact_model(self, *, friction: bool = False) -> CondensedModel:
+        if friction:
+            raise ValueError("the contact model of a learned chain leaves friction out: friction=False, or backend='fem'")
         return self._body.contact_model(self.state)
 
     def restore(self, state: State) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State
 from softgym_envs.backends.time_steps import TimeSteps
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.condensation import ContactModel
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
@@ -199,10 +199,10 @@ class FEMBackend(Backend):
         finally:
             self._go_back(kept)
 
-    def contact_model(self) -> CondensedModel:
+    def contact_model(self, *, friction: bool = False) -> ContactModel:
         if self.moving:
             raise ValueError("contact_model() is that of an equilibrium; make the backend with dynamics=False")
-        return self._statics.contact_model()
+        return self._statics.contact_model(friction=friction)
 
     def restore(self, state: State) -> None:
         """Go back to a state; in dynamics with its velocities, but with time, work and the scheme's history reset.

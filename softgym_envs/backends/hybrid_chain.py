@@ -107,14 +107,14 @@ class HybridChainBackend(Backend):
             self.state = replace(fem, memory=Followed(chain, fem, ()))
         return self.state
 
-    def contact_model(self) -> CondensedModel:
+    def contact_model(self, *, friction: bool = False) -> CondensedModel:
         known = self._known
         if known.path or known.fem is None:
             self.learned.restore(known.chain)
-            return self.learned.contact_model()
+            return self.learned.contact_model(friction=friction)
         assert self._fem is not None
         self._fem.restore(known.fem)
-        return self._fem.contact_model()
+        return self._fem.contact_model(friction=friction)
 
     def restore(self, state: State) -> None:
         """Go back to a state of this backend.

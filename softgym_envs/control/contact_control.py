@@ -25,24 +25,27 @@ LARGEST_RATIO = 4.0
 class ContactControl:
     """Quasi-static loop: linearise with contacts, solve for the next command, apply it.
 
-    The linear model does not know how contacts move along a surface, which points touch next, and how friction changes.
-    So steps are limited: a step after which the error is larger than before halves the next ones, down to a 64th of
-    the controller's rates; others let them grow again. And the change of a force that is asked for is divided by the
-    ratio of measured to predicted change in the last step, as the secant method does: where friction is large, forces
-    can change by several times what the model predicts.
+    The linear model does not know how contacts move along a surface, which points touch next and, without ``friction``,
+    how friction changes. So steps are limited: a step after which the error is larger than before halves the next ones,
+    down to a 64th of the controller's rates; others let them grow again. And the change of a force that is asked for is
+    divided by the ratio of measured to predicted change in the last step, as the secant method does: where friction is
+    large, forces can change by several times what a model without friction predicts.
 
     Args:
         backend: of a robot whose model can touch something, quasi-static.
         controller: its rates are those of the largest steps.
+        friction: whether the linear model knows friction. Without, friction forces stay as they are during a step, and
+            an object that only friction holds cannot be controlled.
 
     Attributes:
         size: of the next step over the controller's rates.
         error: before the last step [m], see `ContactQP.error`; inf before the first one.
     """
 
-    def __init__(self, backend: Backend, controller: ContactQP) -> None:
+    def __init__(self, backend: Backend, controller: ContactQP, *, friction: bool = False) -> None:
         self.backend = backend
         self.controller = controller
+        self.friction = friction
         self.reset()
 
     def reset(self) -> None:
@@ -65,7 +68,7 @@ class ContactControl:
             ConvergenceError: if there is no equilibrium even after the smallest step, or the controller finds no step;
                 the backend's state is unchanged.
         """
-        condensed = self.backend.contact_model()
+        condensed = self.backend.contact_model(friction=self.friction)
         if self._last is not None:
             before, last_goal, last_forces = self._last
             now = self.controller.error(condensed, last_goal, last_forces, reference=before)

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from softgym_envs.control.inverse_qp import UNBOUNDED, InverseQP, StepLimits
 from softgym_envs.control.qpcc import ComplementarityQP, Optimum, solve_qpcc
 from softgym_envs.errors import ConvergenceError, unknown_name
-from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.condensation import CondensedModel, ContactModel
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,18 @@ class ContactQP(InverseQP):
 
     The energy terms of the objective include the contact forces: ``(effort, f)^T W (effort, f)``.
 
-    Friction: the model of `Statics.contact_model` holds the friction forces of its state. So the result is right where
-    nothing changes any more, and friction that follows the step counts in the next one. `ContactControl` corrects the
-    changes of forces for it.
+    Friction: a `ContactModel` may have rows ``t``, with friction forces ``g`` and slips ``s`` along directions of the
+    surface. Then, for each of them,
+
+        -coefficient f <= g <= coefficient f,
+        s > 0 only where g = -coefficient f,    s < 0 only where g = coefficient f,
+
+    so points stick or slide as Coulomb's law says, along two directions that do not know of each other: friction of
+    both at once can be larger by up to the root of two. The first direction is that of the friction force. Without such
+    rows, friction forces stay as they are. So the result is right where nothing changes any more, and friction that
+    follows the step counts in the next one; `ContactControl` corrects the changes of forces for it.
+
+    Where friction leaves several states possible for the same commands, the result is the best of them.
 
     The problem has one local optimum for each set of closed contacts, and the best of them is found by branch and bound
     (`solve_qpcc`). A condensed model without contacts gives the result of `InverseQP`.
@@ -78,13 +88,17 @@ class ContactQP(InverseQP):
         displacement: actuator displacements that the model predicts for the last result, shape (n_a,).
         effort: actuator efforts that it predicts, shape (n_a,).
         contact_force: normal contact forces that it predicts [N], shape (k,).
+        friction_force: friction forces that it predicts [N], shape (t,).
         opening: openings of the contacts that it predicts [m], shape (k,).
+        slip: slips that it predicts [m], shape (t,).
         effector: effector coordinates that it predicts [m], shape (n_e,).
         optimum: the solution of the scaled problem, which says whether it is proven to be the best.
     """
 
     contact_force: np.ndarray
+    friction_force: np.ndarray
     opening: np.ndarray
+    slip: np.ndarray
     effector: np.ndarray
     optimum: Optimum
 
@@ -105,7 +119,7 @@ class ContactQP(InverseQP):
 
         Args:
             condensed: model at the current state; the rows of role ``c`` are openings of contacts [m], not negative,
-                and their efforts normal forces [N].
+                and their efforts normal forces [N]; those of role ``t`` are slips and friction forces.
             goal: desired effector coordinates [m], shape (n_e,) or (k, 3), or None if only forces matter.
             command: current command, shape (n_a,).
             slack: actuators that are slack, shape (n_a,); default none.
@@ -116,19 +130,22 @@ class ContactQP(InverseQP):
             ValueError: if goal, command or model has a wrong shape or is not finite, or for an unknown contact.
             ConvergenceError: if no set of closed contacts allows a step within the limits.
         """
-        problem, scale, limits = self.problem(condensed, goal, command, slack, forces=forces, size=size)
-        a, c = len(self.rates), len(problem.pairs)
-        start = _closed_at_present_efforts(problem, a)
-        self.optimum = solve_qpcc(problem, start, max_programs=self.max_programs)
-        step = scale * self.optimum.z[: a + c]
+        found = self.problem(condensed, goal, command, slack, forces=forces, size=size)
+        problem, rubs = found.program, found.rubbing
+        a, t, h = len(self.rates), len(rubs.owner), len(rubs.held)
+        c = len(problem.pairs) - 2 * t
         before = _efforts(condensed)
-        step[a:] -= before[a:]
+        start = _present_sets(condensed, c, rubs, before) if t else _closed_at_present_efforts(problem, a)
+        self.optimum = solve_qpcc(problem, start, max_programs=self.max_programs)
+        step = found.base @ self.optimum.z[: a + c + t + h]
+        step[a : a + c + t] -= before[a:]
         W, delta = _blocks(condensed)
-        moved = delta + W[:, : a + c] @ step
+        n = a + c + t
+        moved = delta + W[:, :n] @ step[:n] + rubs.columns(W) @ step[n:]
         self.effort = before[:a] + step[:a]
-        self.contact_force = before[a:] + step[a:]
-        self.displacement, self.opening, self.effector = moved[:a], moved[a : a + c], moved[a + c :]
-        return self.command(limits)
+        self.contact_force, self.friction_force = np.split(before[a:] + step[a:n], [c])
+        self.displacement, self.opening, self.slip, self.effector = np.split(moved, [a, a + c, n])
+        return self.command(found.limits)
 
     def error(
         self,
@@ -182,11 +199,8 @@ class ContactQP(InverseQP):
         *,
         forces: Sequence[ForceGoal] = (),
         size: float = 1.0,
-    ) -> tuple[ComplementarityQP, np.ndarray, StepLimits]:
-        """Return the scaled problem of `solve`, the scale of actuator and contact efforts (n_a + k,), and the limits.
-
-        Its variables are the changes of the actuator efforts, the contact forces, and how far force goals are above
-        their lower limits.
+    ) -> ContactProblem:
+        """Return the scaled problem of `solve`.
 
         Raises:
             ValueError: as `solve`.
@@ -197,6 +211,8 @@ class ContactQP(InverseQP):
         n = len(delta) - wanted.size
         before = _efforts(condensed)
         limits = self.limits(condensed, command, slack, size)
+        rubs = _Rubbing.of(condensed, a)
+        t = len(rubs.owner)
 
         # Lengths that count as one: the rates of actuators, and for contacts the motion that they cause.
         # An open contact of a point that cannot move has no compliance; it stays open whatever its scale.
@@ -210,15 +226,16 @@ class ContactQP(InverseQP):
         length = np.append(length, np.full(n - a, reach))
         scale = length * stiffness
 
-        # Errors are linear in the changes of actuator efforts, the contact forces, and the excess over lower limits.
-        errors = [root[:, None] * W[n:, :n]]
+        # Errors are linear in the changes of actuator efforts, the forces, and the excess over lower limits.
+        every = np.concatenate([W[:, :n], rubs.columns(W)], axis=1)
+        errors = [root[:, None] * every[n:]]
         offsets = [root * (delta[n:] - wanted)]
         names = self.contact_names(condensed)
         excess = np.zeros(len(forces))
         columns = np.zeros((wanted.size + len(forces), len(forces)))
         for number, force in enumerate(forces):
             row, offset, width = _force_error(force, names, a, W, delta, before)
-            errors.append(row[None])
+            errors.append(np.append(row, np.zeros(len(rubs.held)))[None])
             offsets.append(np.array([offset]))
             columns[wanted.size + number, number] = -reach
             excess[number] = min(width / reach, UNBOUNDED)
@@ -234,48 +251,135 @@ class ContactQP(InverseQP):
         epsilon = np.linalg.norm(sensitive.T @ sensitive) / np.linalg.norm(compliance)
         energies, modes = np.linalg.eigh(0.5 * epsilon * (energy + energy.T))
         quadratic = (modes * np.abs(energies)) @ modes.T
-        J = np.concatenate([J * scale, columns], axis=1)
-        hessian = J.T @ J
-        hessian[:n, :n] += (self.effort_weight + self.step_weight) * quadratic
-        gradient = J.T @ error
-        gradient[:n] += self.effort_weight * quadratic @ (before / scale)
+
+        # Variables: see `ContactProblem`. So far, forces were changes.
+        base = rubs.base(scale)
+        start = np.concatenate([np.zeros(a), before[a:] / scale[a:], np.zeros(len(rubs.held))])
+        if t:
+            start[n - t : n] += rubs.coefficient * before[rubs.contact] / scale[n - t : n]
+        count = base.shape[1]
+        extra = np.zeros((len(J), len(forces) + t))
+        extra[:, : len(forces)] = columns
+        J = np.concatenate([J @ base, extra], axis=1)
+        efforts = np.concatenate([base[:n] / scale[:, None], np.zeros((n, extra.shape[1]))], axis=1)
+        start = np.concatenate([start, np.zeros(extra.shape[1])])
+        hessian = J.T @ J + (self.effort_weight + self.step_weight) * efforts.T @ quadratic @ efforts
+        gradient = J.T @ error + self.effort_weight * efforts.T @ (quadratic @ (before / scale))
         norm = float(np.trace(hessian)) or 1.0
         # DAQP needs a definite matrix, also where weights are zero or forces of several contacts have the same effect.
         hessian[range(len(hessian)), range(len(hessian))] += 1e-9 * norm / len(hessian)
-
-        # So far the variables are changes; contact forces themselves are complementary to openings.
-        start = np.concatenate([np.zeros(a), before[a:] / scale[a:], np.zeros(len(forces))])
         gradient -= hessian @ start
+
         rows = np.zeros((n, len(start)))
-        rows[:, :n] = W[:n, :n] * scale / length[:, None]
+        rows[:, :count] = every[:n] @ base / length[:, None]
         shift = rows @ start
         low, high = (np.clip(b / length[:a], -UNBOUNDED, UNBOUNDED) + shift[:a] for b in limits.displacement)
         effort_low, effort_high = (np.clip(b / scale[:a], -UNBOUNDED, UNBOUNDED) for b in limits.effort)
+        ties = np.zeros((len(rubs.held), len(start)))
+        ties[:, :count] = rubs.ties(every) @ base / length[rubs.held, None]
+        tied = ties @ start
+        # Slips along the directions of friction, and the distances of friction from its limits.
+        slips, other = rows[n - t :].copy(), np.zeros((t, len(start)))
+        sliding = len(start) - t + np.arange(t)
+        slips[range(t), sliding] = 1.0
+        other[range(t), rubs.contact] = 2.0 * rubs.coefficient * scale[rubs.contact] / scale[n - t : n]
+        other[range(t), n - t + np.arange(t)] = -1.0
+        free = np.full(len(rubs.held), -UNBOUNDED), np.full(len(rubs.held), UNBOUNDED)
+        lower = [effort_low, np.zeros(n - a), free[0], np.zeros(len(forces) + t)]
+        upper = [np.maximum(effort_high, effort_low), np.full(n - a, UNBOUNDED), free[1], excess, np.full(t, UNBOUNDED)]
         problem = ComplementarityQP(
             hessian=hessian / norm,
             gradient=gradient / norm,
-            lower=np.concatenate([effort_low, np.zeros(n - a + len(forces))]),
-            upper=np.concatenate([np.maximum(effort_high, effort_low), np.full(n - a, UNBOUNDED), excess]),
-            rows=rows[:a],
-            rows_lower=low,
-            rows_upper=high,
-            pairs=np.arange(a, n),
-            pair_rows=rows[a:],
-            pair_offset=delta[a:n] / length[a:] - shift[a:],
+            lower=np.concatenate(lower),
+            upper=np.concatenate(upper),
+            rows=np.concatenate([rows[:a], ties]),
+            rows_lower=np.concatenate([low, tied]),
+            rows_upper=np.concatenate([high, tied]),
+            pairs=np.concatenate([np.arange(a, n), sliding]),
+            pair_rows=np.concatenate([rows[a : n - t], slips, other]),
+            pair_offset=np.concatenate([delta[a:n] / length[a:] - shift[a:], np.zeros(t)]),
         )
-        return problem, scale, limits
+        return ContactProblem(problem, base, limits, rubs)
+
+
+class ContactProblem(NamedTuple):
+    """The scaled problem of a step, and what turns its solution into efforts.
+
+    Its variables are the changes of the actuator efforts; the contact forces; for each direction of friction, by how
+    much the friction force is above its lower limit ``-coefficient * f``; forces of springs that hold the body in the
+    model; how far force goals are above their lower limits; and how far points slip against the directions of friction.
+
+    Attributes:
+        program: the problem.
+        base: changes of actuator efforts, forces of contacts and friction, and forces of springs (n_a + k + t + h) by
+            the first variables, a square matrix.
+        limits: of the step.
+        rubbing: directions of friction, and springs.
+    """
+
+    program: ComplementarityQP
+    base: np.ndarray
+    limits: StepLimits
+    rubbing: _Rubbing
+
+
+class _Rubbing(NamedTuple):
+    """Directions of friction among the efforts of actuators, contacts and friction, and springs that hold the body.
+
+    Attributes:
+        owner: number of the contact of each direction, shape (t,).
+        contact: its place among the efforts, shape (t,).
+        coefficient: of friction of each direction, shape (t,).
+        held: places of the rows with springs among the efforts, shape (h,).
+        compliance: of these springs [m/N], shape (h,).
+    """
+
+    owner: np.ndarray
+    contact: np.ndarray
+    coefficient: np.ndarray
+    held: np.ndarray
+    compliance: np.ndarray
+
+    @classmethod
+    def of(cls, condensed: CondensedModel, actuators: int) -> _Rubbing:
+        if not isinstance(condensed, ContactModel):
+            nothing = np.zeros(0, dtype=np.int64)
+            return cls(nothing, nothing, np.zeros(0), nothing, np.zeros(0))
+        held = np.flatnonzero(condensed.hold)
+        owner = condensed.owner
+        return cls(owner, actuators + owner, condensed.coefficient[owner], actuators + held, condensed.hold[held])
+
+    def base(self, scale: np.ndarray) -> np.ndarray:
+        """Return `ContactProblem.base` for the scale of the efforts (n,)."""
+        n, t = len(scale), len(self.owner)
+        base = np.diag(np.append(scale, scale[self.held]))
+        base[n - t + np.arange(t), self.contact] = -self.coefficient * scale[self.contact]
+        return base
+
+    def columns(self, W: np.ndarray) -> np.ndarray:
+        """Return the compliance of all rows to forces of the springs, shape (n + n_e, h)."""
+        columns = W[:, self.held].copy()
+        columns[self.held, range(len(self.held))] -= self.compliance
+        return columns
+
+    def ties(self, every: np.ndarray) -> np.ndarray:
+        """Return the rows that are zero where springs have the forces of their stretch, shape (h, n + h)."""
+        ties = every[self.held].copy()
+        ties[range(len(self.held)), self.held] -= self.compliance
+        ties[:, every.shape[1] - len(self.held) :] -= np.diag(self.compliance)
+        return ties
 
 
 def _blocks(condensed: CondensedModel) -> tuple[np.ndarray, np.ndarray]:
-    """Compliance and displacements of actuators, contacts and effectors, in this order."""
+    """Compliance and displacements of actuators, contacts, friction and effectors, in this order."""
     numbers, slices = np.arange(condensed.free.size), condensed.slices
-    order = np.concatenate([numbers[slices[role]] for role in "ace" if role in slices])
+    order = np.concatenate([numbers[slices[role]] for role in "acte" if role in slices])
     return condensed.compliance[np.ix_(order, order)], condensed.delta.array[order]
 
 
 def _efforts(condensed: CondensedModel) -> np.ndarray:
-    """Efforts of actuators and contacts, in this order."""
-    return np.concatenate([condensed.effort[condensed.slices[r]] for r in "ac" if r in condensed.slices])
+    """Efforts of actuators, contacts and friction, in this order."""
+    return np.concatenate([condensed.effort[condensed.slices[r]] for r in "act" if r in condensed.slices])
 
 
 def _force_error(
@@ -323,3 +427,20 @@ def _closed_at_present_efforts(problem: ComplementarityQP, actuators: int) -> np
     except ConvergenceError:
         return None
     return None if forces is None else forces[None] > 0.0
+
+
+def _present_sets(condensed: CondensedModel, contacts: int, rubs: _Rubbing, before: np.ndarray) -> np.ndarray:
+    """Closed pairs of states that need no change of actuators, shape (2, k + 2 t): all points stick; or slide on.
+
+    A point that slides on keeps the direction of its friction force.
+    """
+    a = len(before) - contacts - len(rubs.owner)
+    pressing = before[a : a + contacts] > 0.0
+    friction, limit = before[a + contacts :], rubs.coefficient * before[rubs.contact]
+    at_limit = np.abs(friction) >= (1.0 - 1e-6) * limit
+    # Of an open contact, both limits of friction are zero, and points slip either way.
+    touching = pressing[rubs.owner]
+    stick = np.concatenate([pressing, touching, ~touching])
+    up, down = touching & at_limit & (friction > 0.0), touching & at_limit & (friction <= 0.0)
+    slide = np.concatenate([pressing, touching & ~down, ~touching | up])
+    return np.array([stick, slide])

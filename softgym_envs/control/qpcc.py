@@ -82,20 +82,34 @@ class ComplementarityQP:
         Raises:
             ConvergenceError: if DAQP stops for any other reason.
         """
+        found = self.solve_set(closed, opened)
+        return None if found is None else found[0]
+
+    def solve_set(self, closed: np.ndarray, opened: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the optimum as `minimise` does, and the pull of each pair.
+
+        The pull is by how much the objective falls for each unit by which the zero of a pair, ``w`` if it is closed and
+        ``y`` if it is open, grows. Where the other one is zero as well, the pair can be changed to gain from it.
+
+        Raises:
+            ConvergenceError: as `minimise`.
+        """
         lower, upper, matrix = self._bounds
         upper = upper.copy()
         sense = np.full(len(upper), _INEQUALITY, dtype=np.int32)
+        sense[len(self.lower) + np.flatnonzero(self.rows_lower == self.rows_upper)] = _EQUALITY
         fixed = np.concatenate([self.pairs[opened], len(upper) - len(self.pairs) + np.flatnonzero(closed)])
         upper[fixed] = lower[fixed]
         sense[fixed] = _EQUALITY
-        z, _, status, _ = daqp.solve(
+        z, _, status, info = daqp.solve(
             self.hessian, self.gradient, matrix, upper, lower, sense, primal_tol=1e-10, dual_tol=1e-11
         )
         if status == _INFEASIBLE:
             return None
         if status != _SOLVED:
             raise ConvergenceError(f"DAQP stopped with exit code {status}")
-        return z
+        multipliers = info["lam"]
+        return z, np.where(closed, multipliers[len(multipliers) - len(self.pairs) :], multipliers[self.pairs])
 
 
 @dataclass(frozen=True)
@@ -126,9 +140,10 @@ def solve_qpcc(
 ) -> Optimum:
     """Return the global optimum, or the best point found with ``max_programs`` quadratic programs.
 
-    The search goes depth first. It branches on the pair with the largest product ``y w`` and first takes the side that
-    the relaxed optimum is closer to, so it descends at once to a good set; the sets of ``start`` bound it from above
-    before that.
+    The sets of ``start`` are improved first: while a pair of which both sides are zero pulls, it is changed. The result
+    is a local optimum, and it bounds what follows. The search then goes depth first. It branches on the pair with the
+    largest product ``y w`` and first takes the side that the relaxed optimum is closer to, so it descends at once to a
+    good set.
 
     Args:
         problem: the problem.
@@ -142,15 +157,16 @@ def solve_qpcc(
     """
     k = len(problem.pairs)
     best: Optimum | None = None
-    value, programs = np.inf, 0
+    value, programs, pull = np.inf, 0, np.zeros(k)
 
     def visit(closed: np.ndarray, opened: np.ndarray) -> np.ndarray | None:
         """Solve one program; return its optimum if a set below it can be better than the best so far."""
-        nonlocal best, value, programs
+        nonlocal best, value, programs, pull
         programs += 1
-        z = problem.minimise(closed, opened)
-        if z is None:
+        found = problem.solve_set(closed, opened)
+        if found is None:
             return None
+        z, pull = found
         bound = problem.value(z)
         if not bound < value - tolerance * (1.0 + abs(bound)):
             return None
@@ -159,8 +175,21 @@ def solve_qpcc(
             return None
         return z
 
+    def improve(closed: np.ndarray) -> None:
+        """Change pairs of a set, all that pull and then the strongest one alone, while that makes it better."""
+        before = value
+        visit(closed, ~closed)
+        while value < before and programs < max_programs:
+            before = value
+            assert best is not None
+            other = np.where(best.closed, best.z[problem.pairs], problem.gaps(best.z))
+            gain = np.where(np.abs(other) <= tolerance, pull, 0.0)
+            for change in (gain > tolerance, gain == max(float(gain.max(initial=0.0)), tolerance)):
+                if change.any() and not value < before:
+                    visit(best.closed ^ change, ~(best.closed ^ change))
+
     for row in np.zeros((0, k), dtype=bool) if start is None else np.atleast_2d(start):
-        visit(row, ~row)
+        improve(row)
     nobody = np.zeros(k, dtype=bool)
     stack = [(nobody, nobody)]
     while stack and programs < max_programs:

@@ -11,7 +11,7 @@ the equilibrium,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ import numpy as np
 Roles = tuple[tuple[str, int], ...]
 """Role letters and sizes in order, e.g. ``(("a", 2), ("e", 3))``: actuators, effectors, contacts."""
 
-_ROLE_NAMES = {"a": "actuator", "e": "effector", "c": "contact", "s": "sensor"}
+_ROLE_NAMES = {"a": "actuator", "e": "effector", "c": "contact", "t": "friction", "s": "sensor"}
 _EFFORT_UNITS = {"m": "N", "m3": "Pa", "rad": "N m", "1": "N m"}
 
 
@@ -193,3 +193,27 @@ class CondensedModel:
     def __repr__(self) -> str:
         batch = self.free.shape[:-1]
         return f"CondensedModel({', '.join(row.name for row in self.labels)}{f'; batch {batch}' if batch else ''})"
+
+
+@dataclass(frozen=True, repr=False)
+class ContactModel(CondensedModel):
+    """Condensed model whose rows ``c`` are openings of contacts, and rows ``t`` their slips.
+
+    Efforts of rows ``c`` are normal forces, those of rows ``t`` friction forces along fixed directions. ``W`` is that
+    of the body without its contacts, so it is symmetric whether points stick or slide. Slips count from the present
+    state.
+
+    A body that nothing but its contacts holds has no compliance without them. Springs along some rows then hold it in
+    the model: they are relaxed at the present state, and their force is ``y / hold`` for a motion ``y`` along the row.
+    Who uses the model adds opposite forces, so the springs do not matter in the end.
+
+    Attributes:
+        coefficient: of friction of each contact, shape (n_c,).
+        owner: number of the contact of each row ``t``, shape (n_t,).
+        hold: compliance of the springs along rows ``c`` and ``t`` [m/N], shape (n_c + n_t,); zero without a spring.
+            It is also the part of ``W`` on the diagonal that barrier and friction springs add.
+    """
+
+    coefficient: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    owner: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    hold: np.ndarray = field(default_factory=lambda: np.zeros(0))

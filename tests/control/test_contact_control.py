@@ -59,7 +59,7 @@ class Spring(Backend):
         delta = np.array([command[0], 0.0, max(0.0, self.wall - float(command[0]))])
         return CondensedModel(W, delta - W @ effort, effort, (("a", 1), ("e", 1), ("c", 1)))
 
-    def contact_model(self):
+    def contact_model(self, *, friction=False):
         return self.state.condensed
 
     def step(self, command, mode="displacement", *, force=None):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -115,3 +117,50 @@ def test_one_contact_by_hand():
     assert free.z == pytest.approx([0.5, 0.0], abs=1e-5)
     # Beyond the wall more effort does not help, so there is no force either.
     assert pressed.z == pytest.approx([1.0, 0.0], abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_pulls_of_pairs_are_the_derivatives_of_the_optimum(seed):
+    """The multipliers of Karush, Kuhn and Tucker: by how much the objective falls as the zero of a pair grows."""
+    problem, step, seen = random_problem(seed, 3), 1e-5, 0
+    for number in range(8):
+        closed = np.array([bool(number >> k & 1) for k in range(3)])
+        found = problem.solve_set(closed, ~closed)
+        if found is None:
+            continue
+        z, pull = found
+        for k in range(3):
+            values = []
+            for shift in (step, -step):
+                offset, lower = problem.pair_offset.copy(), problem._bounds[0].copy()
+                moved = replace(problem, pair_offset=offset)
+                if closed[k]:
+                    offset[k] -= shift
+                else:
+                    lower[problem.pairs[k]] = shift
+                    moved.__dict__["_bounds"] = (lower, *problem._bounds[1:])
+                there = moved.solve_set(closed, ~closed)
+                values.append(np.nan if there is None else moved.value(there[0]))
+            if np.isfinite(values).all():
+                seen += 1
+                assert pull[k] == pytest.approx((values[1] - values[0]) / (2.0 * step), rel=1e-4, abs=1e-6)
+    assert seen >= 3
+
+
+def test_the_start_is_improved_until_no_pair_of_zeros_pulls():
+    """Without any search by branches, the result is a local optimum: single changes of its pairs do not improve it."""
+    improved = 0
+    for seed in range(30):
+        problem = random_problem(seed, 5)
+        start = np.zeros(5, dtype=bool)
+        first = problem.minimise(start, ~start)
+        if first is None:
+            continue
+        found = solve_qpcc(problem, start, max_programs=12)
+        improved += found.value < problem.value(first) - 1e-9
+        y, w = found.z[problem.pairs], problem.gaps(found.z)
+        for k in np.flatnonzero((np.abs(y) < 1e-9) & (np.abs(w) < 1e-9)) if found.programs < 12 else ():
+            other = found.closed ^ (np.arange(5) == k)
+            there = problem.minimise(other, ~other)
+            assert there is None or problem.value(there) >= found.value - 1e-9
+    assert improved > 3

@@ -102,6 +102,11 @@ class ContactRow(NamedTuple):
         force: sum of the normal forces [N].
         gradient: derivative of the gap by the equations, shape (N,).
         compliance: of the barrier [m/N]; zero while open.
+        coefficient: of friction.
+        slips: derivatives of the motion along two directions of the surface, shape (N, 2).
+        rubbing: friction forces on the body along them [N], shape (2,).
+        yielding: compliance of the friction springs [m/N]; zero while open.
+        free: whether the obstacle is an object that moves with a frame.
     """
 
     name: str
@@ -109,6 +114,11 @@ class ContactRow(NamedTuple):
     force: float
     gradient: np.ndarray
     compliance: float
+    coefficient: float
+    slips: np.ndarray
+    rubbing: np.ndarray
+    yielding: float
+    free: bool
 
 
 @dataclass(frozen=True)
@@ -368,8 +378,8 @@ class ContactState:
         )
 
     def forces_held(self, x: np.ndarray) -> csr_matrix:
-        """Return the tangent (N, N) at rows ``x`` (n, 3) if the normal forces of obstacles did not change."""
-        touches = [pair.touch(x, None, held=True) for pair in self.pairs]
+        """Return the tangent (N, N) at rows ``x`` (n, 3) if the forces of obstacles did not change."""
+        touches = [pair.touch(x, anchors, held=True) for pair, anchors in zip(self.pairs, self._anchors, strict=True)]
         return self._tangent(x, touches, np.zeros(self._shape))
 
     def _tangent(
@@ -385,7 +395,9 @@ class ContactState:
                 tangent = tangent + self._to_equations(curvature)
         return tangent.tocsr()
 
-    def rows(self, x: np.ndarray, motions: np.ndarray, *, each_point: bool = False) -> list[ContactRow]:
+    def rows(
+        self, x: np.ndarray, motions: np.ndarray, *, each_point: bool = False, friction: bool = False
+    ) -> list[ContactRow]:
         """Return the openings: one for each obstacle, or for each point that presses.
 
         Args:
@@ -393,13 +405,18 @@ class ContactState:
             motions: of the equations, shape (N, k); of an obstacle that nothing presses on, the point that they bring
                 there first counts.
             each_point: see above.
+            friction: an object that moves with a frame then has an opening for each point that presses on it, because
+                together they hold it against turning.
         """
         found = []
         names = self._names()
-        for name, pair in zip([names[k] for k in self._numbers(meshed=False)], self.pairs, strict=True):
-            touch = pair.touch(x, None)
+        numbers = self._numbers(meshed=False)
+        for name, pair, anchors in zip([names[k] for k in numbers], self.pairs, self._anchors, strict=True):
+            touch = pair.touch(x, anchors)
+            free = pair.obstacle.frame is not None
+            several = each_point or (friction and free)
             loaded, opening = bool(touch.pressing.any()), 0.0
-            if loaded and not each_point:
+            if loaded and not several:
                 shares = [touch.pressing / touch.pressing.sum()]
             elif loaded:
                 shares = list(np.eye(len(touch.points))[touch.pressing > 0.0])
@@ -409,16 +426,24 @@ class ContactState:
                 opening, shares = gap - self.contact.distance, [np.ones(1)]
             else:
                 shares = []
+            moved = touch.jacobian @ motions if friction else motions[:0]
             for number, share in enumerate(shares):
                 used = share > 0.0
-                compliance = float((share[used] ** 2 / touch.stiffness[used]).sum()) if loaded else 0.0
+                slips, rubbing = np.empty((touch.jacobian.shape[1], 0)), np.empty(0)
+                if friction:
+                    slips, rubbing = _along_surface(pair, x, touch, share, moved)
                 found.append(
                     ContactRow(
-                        f"{name} point {number + 1}" if each_point else name,
+                        f"{name} point {number + 1}" if several and loaded else name,
                         opening,
                         float(touch.pressing[used].sum()) if loaded else 0.0,
                         touch.jacobian.T @ (share[:, None] * touch.gaps).ravel(),
-                        compliance,
+                        float((share[used] ** 2 / touch.stiffness[used]).sum()) if loaded else 0.0,
+                        pair.obstacle.friction,
+                        slips,
+                        rubbing,
+                        float((share[used] ** 2 / pair.stick[touch.points[used]]).sum()) if loaded else 0.0,
+                        free,
                     )
                 )
         return found
@@ -484,3 +509,42 @@ class ContactState:
             mesh_force=mesh_force,
             smallest_gap=smallest,
         )
+
+
+def _along_surface(
+    pair: ObstacleContact, x: np.ndarray, touch: Touch, share: np.ndarray, moved: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the motion along two directions of the surface (N, 2), and the friction forces along them [N] (2,).
+
+    The first is that of the friction force or, without any, that in which the actuators move the points most.
+
+    Args:
+        pair: model and obstacle.
+        x: rows (n, 3).
+        touch: points near it.
+        share: of the points in the row, shape (k,).
+        moved: motions of points and frame by the actuators, shape (m k, n_a).
+    """
+    used = np.flatnonzero(share > 0.0)
+    force = touch.rubbing[used].sum(axis=0)
+    if not force.any():
+        frames = np.stack([pair.along(x, touch, np.tile(axis, (len(share), 1))) for axis in np.eye(3)])
+        motions = np.einsum("k,aki,kin->an", share, frames, moved.reshape(*touch.gaps.shape, -1))
+        mean = share @ touch.normal
+        across = motions - np.outer(mean, mean @ motions) / (mean @ mean)
+        vectors, sizes, _ = np.linalg.svd(across, full_matrices=False)
+        force = vectors[:, 0] if len(sizes) and sizes[0] > 0.0 else np.zeros(3)
+    # Where actuators move nothing along the surface, any direction serves.
+    normal = touch.normal
+    for start in (force, *np.eye(3)):
+        first = start - (normal @ start)[:, None] * normal
+        length = np.linalg.norm(first, axis=1)
+        if (length[used] > 1e-3 * max(float(np.linalg.norm(start)), 1e-300)).all():
+            break
+    first = first / np.where(length > 0.0, length, 1.0)[:, None]
+    slips, rubbing = [], []
+    for axes in (first, np.cross(normal, first)):
+        derivative = share[:, None] * pair.along(x, touch, axes)
+        slips.append(touch.jacobian.T @ derivative.ravel())
+        rubbing.append(float((touch.rubbing[used] * axes[used]).sum()))
+    return np.column_stack(slips), np.array(rubbing)

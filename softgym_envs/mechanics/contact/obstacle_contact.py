@@ -168,7 +168,7 @@ class ObstacleContact:
             x: rows.
             anchors: of friction [m], shape (p, 3), or None without friction.
             convex: leave out the terms that can make the tangent indefinite.
-            held: the tangent is that of normal forces which do not change.
+            held: the tangent is that of forces which do not change.
             points: numbers of the points, by default those within the distance of contact.
         """
         local = self.local(x)
@@ -193,24 +193,15 @@ class ObstacleContact:
             rubbing, sliding = -found.force, found.sliding
             elastic = -rubbing / self._stick[points][:, None]
             pull = pull + found.force
-            tangent = tangent + found.tangent
+            tangent = tangent + (0.0 if held else found.tangent)
             direction = np.where(sliding[:, None], found.direction, 0.0)
             loading = np.where(sliding[:, None], -coefficient * second[:, None] * normal, 0.0)
         force = -pull
         jacobian = self._mapping.jacobian(points)
         gaps = normal
-        frame = self.obstacle.frame
-        if frame is not None:
-            assert self._frame is not None
-            axes = x[frame + 1 : frame + 4]
-            arm = (self.weights[points] @ x) - x[frame]
-            force = force @ axes
-            # Coordinates l_k = d_k . (p - o) by p, o and the directors d_k.
-            chain = np.zeros((count, 3, 15))
-            chain[:, :, 0:3] = axes
-            chain[:, :, 3:6] = -axes
-            for k in range(3):
-                chain[:, k, 6 + 3 * k : 9 + 3 * k] = arm
+        chain = self._chain(x, points)
+        if chain is not None:
+            force = force @ chain[0, :, :3] if count else force
             tangent = np.einsum("kai,kab,kbj->kij", chain, tangent, chain)
             if not convex:
                 for k in range(3):
@@ -227,6 +218,29 @@ class ObstacleContact:
             points, gap, normal, -first, rubbing, sliding, elastic, force, jacobian, pull, tangent, direction, loading,
             gaps, second,
         )  # fmt: skip
+
+    def _chain(self, x: np.ndarray, points: np.ndarray) -> np.ndarray | None:
+        """Derivatives of local coordinates ``l_k = d_k . (p - o)`` by p, o and the directors d_k, shape (k, 3, 15)."""
+        frame = self.obstacle.frame
+        if frame is None:
+            return None
+        chain = np.zeros((len(points), 3, 15))
+        chain[:, :, 0:3] = x[frame + 1 : frame + 4]
+        chain[:, :, 3:6] = -x[frame + 1 : frame + 4]
+        arm = (self.weights[points] @ x) - x[frame]
+        for k in range(3):
+            chain[:, k, 6 + 3 * k : 9 + 3 * k] = arm
+        return chain
+
+    def along(self, x: np.ndarray, touch: Touch, axes: np.ndarray) -> np.ndarray:
+        """Return the derivative of the motion of touching points along fixed axes (k, 3), shape (k, m)."""
+        chain = self._chain(x, touch.points)
+        return axes if chain is None else np.einsum("ka,kai->ki", axes, chain)
+
+    @property
+    def stick(self) -> np.ndarray:
+        """Stiffness of the friction springs of all points [N/m], shape (p,)."""
+        return self._stick
 
     def limits(self, touch: Touch) -> np.ndarray:
         """Return the largest friction force of each point [N], shape (p,)."""

@@ -199,7 +199,7 @@ class Linearisation:
         return slice(first, first + self._slips)
 
     def without_contact(
-        self, x: np.ndarray, effort: np.ndarray, columns: np.ndarray
+        self, x: np.ndarray, effort: np.ndarray, columns: np.ndarray, springs: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the compliance of the constraints and of further rows if obstacles had no stiffness.
 
@@ -207,13 +207,16 @@ class Linearisation:
             x: rows at an equilibrium, shape (n, 3).
             effort: efforts of the constraints, shape (size,).
             columns: gradients of the further rows, shape (N, k).
+            springs: stiffness of springs that hold the body along the further rows [N/m], shape (k,); zero for none.
 
         Returns:
             Compliance (size + k, size + k) and values of the constraints (size,); None if the tangent is singular.
         """
         assert self.contact is not None
         assembled = self.assemble(x, effort)
-        if assembled is None or not self._tangent.factorise(assembled.tangent, self.contact.forces_held(x)):
+        held = csc_matrix(columns[:, springs > 0.0])
+        extra = self.contact.forces_held(x) + (held.multiply(springs[springs > 0.0]) @ held.T).tocsr()
+        if assembled is None or not self._tangent.factorise(assembled.tangent, extra):
             return None
         gram, _ = self._tangent.solver.condense(np.asfortranarray(np.hstack([assembled.gradients, columns])))
         return (gram, assembled.delta) if np.isfinite(gram).all() else None

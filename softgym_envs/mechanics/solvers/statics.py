@@ -21,12 +21,13 @@ import numpy as np
 
 from softgym_envs.errors import ConvergenceError, no_equilibrium
 from softgym_envs.mechanics.assembly import Assembled
-from softgym_envs.mechanics.condensation import CondensedModel, Row
+from softgym_envs.mechanics.condensation import ContactModel
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.cable_friction import CableMemory
 from softgym_envs.mechanics.solvers.complementarity import complementary_step
+from softgym_envs.mechanics.solvers.contact_rows import ContactRows
 from softgym_envs.mechanics.solvers.equilibrium import (
     CAUTIOUS,
     Equilibrium,
@@ -490,15 +491,18 @@ class Statics:
                 found = replace(found, memory=self._accept())
         return found
 
-    def contact_model(self, *, each_point: bool = False) -> CondensedModel:
+    def contact_model(self, *, each_point: bool = False, friction: bool = False) -> ContactModel:
         """Return the condensed model with the openings of contacts as further rows ``c``.
 
         The opening of a contact is zero while it presses, and otherwise the gap less the distance of contact. So
         forces ``0 <= effort.c`` and openings ``0 <= delta.c`` are complementary, and they predict how contacts close
         and open. Each obstacle has one row: the mean over the points that press, weighted with their forces, or the
         point that actuators bring there first. Or each point that presses has one; eliminating these gives back ``W``.
-        ``W.cc`` includes the compliance of the barrier. Friction is left out, and contacts between surfaces of the body
-        stay as they are.
+        ``W.cc`` includes the compliance of the barrier. Contacts between surfaces of the body stay as they are.
+
+        With ``friction``, each contact with a coefficient of friction has two rows ``t`` more: how far it slips along
+        the surface, in the direction of its friction force and across. An object that nothing else holds then has rows
+        for each point that presses on it. Without, friction forces stay as they are.
 
         Raises:
             ConvergenceError: if the body has no equilibrium without its contacts, e.g. because they alone hold it.
@@ -507,37 +511,13 @@ class Statics:
         contact = self.linearisation.contact
         if contact is None:
             raise ValueError("the model has no contact; call its 'set_contact' before making the solver")
-        rows = contact.rows(self.x, self._motions_of_actuators(), each_point=each_point)
-        gradients = [np.empty((self.model.equations, 0)), *(row.gradient[:, None] for row in rows)]
-        found = self.linearisation.without_contact(self.x, self.effort, np.hstack(gradients))
+        found = contact.rows(self.x, self._motions_of_actuators(), each_point=each_point, friction=friction)
+        rows = ContactRows.of(found, self.model.equations, friction)
+        solved = self.linearisation.without_contact(self.x, self.effort, rows.gradients, rows.springs)
         self.linearisation.current = False
-        if found is None:
+        if solved is None:
             raise ConvergenceError("the body has no stable equilibrium without its contacts", fraction=0.0)
-        W, delta = found
-        bonds = self._bonds
-        size = len(self.effort)
-        keep = np.delete(np.arange(size + len(rows)), bonds)
-        if len(bonds):
-            W = W - W[:, bonds] @ np.linalg.solve(W[np.ix_(bonds, bonds)], W[bonds])
-        effort = np.concatenate([self.effort, [row.force for row in rows]])
-        delta = np.concatenate([delta, [row.opening for row in rows]])
-        W[range(size, len(effort)), range(size, len(effort))] += [row.compliance for row in rows]
-        # Rows of contacts come before those of sensors.
-        sensors = dict(self.model.roles).get("s", 0)
-        first = size - len(bonds) - sensors
-        order = np.concatenate([keep[:first], keep[first + sensors :], keep[first : first + sensors]])
-        labels = list(self._layout.labels)
-        labels[first:first] = [Row(row.name, "m", "N") for row in rows]
-        sizes = dict(self._layout.roles)
-        sizes["c"] = sizes.get("c", 0) + len(rows)
-        W = W[np.ix_(order, order)]
-        return CondensedModel(
-            compliance=0.5 * (W + W.T),
-            free=delta[order] - W @ effort[order],
-            effort=effort[order],
-            roles=tuple((role, sizes[role]) for role in "aecs" if role in sizes),
-            rows=tuple(labels),
-        )
+        return rows.condensed(*solved, self.effort, self._layout, self._bonds)
 
     def _motions_of_actuators(self) -> np.ndarray:
         """Motions (N, n_a) of the equations that each actuator's effort causes, with a largest component of one."""

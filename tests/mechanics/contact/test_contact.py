@@ -292,3 +292,43 @@ def test_rows_of_contacts_predict_pressing_and_opening():
     assert after.contacts.total[0, 2] - found.contacts.total[0, 2] == pytest.approx(
         predicted - rows.lambda_.c[0], rel=0.05
     )
+
+
+@pytest.mark.parametrize("friction", [20.0, 0.4], ids=["sticking", "sliding"])
+def test_rows_of_friction_give_back_the_compliance_of_sticking_and_sliding(friction):
+    """Eliminating all points, with their slips or limits of friction, gives back W and predicts the next increment."""
+    plane = Plane((0.0, 0.0, -4e-4), (0.0, 0.0, 1.0), friction=friction)
+    statics = Statics(clamped_block([plane]), tolerance=1e-12)
+    statics.solve([], effector_force=[0.0, 0.0, -2.0])
+    found = statics.solve([], effector_force=[1.5, 0.0, -2.0])
+    model = statics.contact_model(each_point=True, friction=True)
+    k, t = len(model.coefficient), len(model.owner)
+    assert (k, t) == (found.contacts.count, 2 * found.contacts.count) and not model.hold.any()
+    forces, rubbing = model.lambda_.c, model.lambda_.t
+    np.testing.assert_allclose(forces.sum(), found.contacts.pressing.sum(), rtol=1e-9)
+    np.testing.assert_allclose(np.hypot(*rubbing.reshape(-1, 2).T).max(), np.abs(rubbing).max(), rtol=1e-9)
+    slides = np.abs(rubbing) > (1.0 - 1e-6) * model.coefficient[model.owner] * forces[model.owner]
+    assert slides.sum() == found.contacts.sliding.sum() and (slides.any() == (friction < 1.0))
+    # Openings do not change, nor do slips; friction of points that slide follows the normal forces in place of that.
+    W = model.W
+    ours = np.block([[W.cc, W.ct], [W.tc, W.tt]])
+    outside = np.vstack([W.ce, W.te])
+    for j in np.flatnonzero(slides):
+        ours[k + j] = 0.0
+        ours[k + j, k + j] = 1.0
+        ours[k + j, model.owner[j]] = -np.sign(rubbing[j]) * model.coefficient[model.owner[j]]
+        outside[k + j] = 0.0
+    eliminated = W.ee - np.hstack([W.ec, W.et]) @ np.linalg.solve(ours, outside)
+    if not slides.any():
+        exact = found.condensed.compliance
+        np.testing.assert_allclose(eliminated, exact, atol=1e-6 * np.abs(exact).max())
+        return
+    # The next increment starts from springs that have caught up, so it is compared with that.
+    step = np.array([1e-4, 0.0, 0.0])
+    after = statics.solve([], effector_force=[1.5, 0.0, -2.0] + step)
+    change = after.delta - found.delta
+    np.testing.assert_allclose(eliminated @ step, change, atol=0.01 * np.abs(change).max())
+    sticking = W.ee - np.hstack([W.ec, W.et]) @ np.linalg.solve(
+        np.block([[W.cc, W.ct], [W.tc, W.tt]]), np.vstack([W.ce, W.te])
+    )
+    assert np.abs(sticking @ step - change).max() > 0.1 * np.abs(change).max()
