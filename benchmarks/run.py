@@ -14,7 +14,7 @@ import click
 
 from benchmarks import (
     accuracy,
-    accurate_finger,
+    accurate_meshes,
     beams,
     carry,
     codesign_scale,
@@ -107,7 +107,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "strategies": strategies.strategies,
     "codesign_kills": codesign_scale.kills,
     "codesign_profile": codesign_scale.profile,
-    **accurate_finger.BENCHMARKS,
+    **accurate_meshes.BENCHMARKS,
     **convergence.BENCHMARKS,
     **robustness.BENCHMARKS,
 }

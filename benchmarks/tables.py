@@ -30,6 +30,12 @@ WEIGHTS = {
 
 HEADLINES = ("finger", "diamond", "trunk", "cable_trunk", "tetrapod")
 
+ACCURATE_HEADLINES = {
+    "finger": "Soft Finger, accurate mesh; inverse QP",
+    "diamond": "Diamond, accurate mesh; policy trained for each body",
+}
+"""Rows of studies on accurate meshes, behind those of the same robots."""
+
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "") -> str:
     """Return a Markdown table; ``align`` has one of ``l`` and ``r`` for each column, default ``l``."""
@@ -63,10 +69,10 @@ def headlines() -> str:
         row = study["rows"][0]
         name = f"{study['title']}; {row['controller'].partition(',')[0]}"
         rows.append([name, *_ends(row), f"`{study['command']}`"])
-    accurate = results("accurate_study")
-    means = {f"{body} [mm]": np.mean(accurate[f"{body}: accurate: distance [mm]"]) for body in ("baseline", "winner")}
-    command = "`softgym codesign --config finger_reach_accurate`"
-    rows.insert(1, ["Soft Finger, accurate mesh; inverse QP", *_ends(means), command])
+        if key in ACCURATE_HEADLINES and f"accurate_study_{key}" in records():
+            found = results(f"accurate_study_{key}")
+            ends = {f"{who} [mm]": np.mean(found[f"{who}: accurate: distance [mm]"]) for who in ("baseline", "winner")}
+            rows.append([ACCURATE_HEADLINES[key], *_ends(ends), f"`softgym codesign --config {key}_reach_accurate`"])
     return markdown(["robot; controller", "baseline", "winner", "command"], rows, "lrrl")
 
 
@@ -246,7 +252,7 @@ def calibrated() -> str:
     return markdown(TRUST_HEAD, rows, "llrrrrrrr")
 
 
-CALIBRATED = WEIGHTS | {"finger_2cables_accurate": "finger, 2 cables, accurate mesh"}
+CALIBRATED = WEIGHTS | {f"{name}_accurate": f"{title}, accurate mesh" for name, title in WEIGHTS.items()}
 FACTORS = {"mean": 1e3, "worst": 1e3, "worst_trusted": 1e3, "coverage": 100.0, "trusted": 100.0}
 """From metres and shares to millimetres and percent."""
 TRUST_HEAD = [
