@@ -68,7 +68,6 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "motion": motion.motion,
     "printed": printed.printed,
     "test_set": accuracy.test_set,
-    "trust": trust.trust,
     "trajectories": accuracy.trajectories,
     "slack": accuracy.slack_states,
     "mesh_motion": accuracy.mesh_motion,
@@ -110,6 +109,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     **accurate_meshes.BENCHMARKS,
     **convergence.BENCHMARKS,
     **robustness.BENCHMARKS,
+    **trust.BENCHMARKS,
 }
 """Registry of benchmarks."""
 

@@ -228,15 +228,16 @@ def test_set() -> str:
 
 
 def trust() -> str:
-    """Errors, coverage and trust of calibrated weights, by stratum.
+    """Errors, coverage and trust of calibrated weights on states that the calibration has not seen, by stratum.
 
     Intervals of the coverage are those of a share of independent states (Clopper and Pearson, 95 %).
     """
     rows = []
     for name, title in CALIBRATED.items():
-        found = {k.removeprefix(f"{name}: "): v for k, v in results("trust").items() if k.startswith(f"{name}: ")}
-        strata = {k: v for k, v in found.items() if isinstance(v, dict)}
-        rows += _trust_rows(title, strata, found["goal tolerance [mm]"])
+        if f"trust_{name}" in records():
+            found = results(f"trust_{name}")
+            strata = {k: v for k, v in found.items() if isinstance(v, dict)}
+            rows += _trust_rows(title, strata, found["goal tolerance [mm]"])
     return markdown(TRUST_HEAD, rows, "llrrrrrrr")
 
 
