@@ -62,7 +62,7 @@ ROBOTS = {
         "convergence_diamond",
         {"accurate": {"mesh": "accurate"}, "published": {}},
         "diamond_reach_accurate",
-        {"accurate": (17e-3, 20), "refined": (10.2e-3, 8)},
+        {"accurate": (17e-3, 12), "refined": (10.2e-3, 6)},
         proportional=False,
     ),
 }
@@ -70,7 +70,7 @@ ROBOTS = {
 
 BODIES = ("baseline", "winner")
 
-LAST_STEPS = 5
+LAST_STEPS = 4
 """Control steps of a policy on finite elements, from the command at which it ended on the weights."""
 
 
