@@ -62,7 +62,7 @@ ROBOTS = {
         "convergence_diamond",
         {"accurate": {"mesh": "accurate"}, "published": {}},
         "diamond_reach_accurate",
-        {"accurate": (17e-3, 12), "refined": (10.2e-3, 6)},
+        {"accurate": (17e-3, 12), "refined": (10.2e-3, 3)},
         proportional=False,
     ),
 }
