@@ -21,7 +21,7 @@ import re
 import sys
 from pathlib import Path
 
-from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
+from benchmarks.accurate_meshes import TABLES as ACCURATE_TABLES
 from benchmarks.contact_sets import TABLES as SET_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
 from benchmarks.grasp_codesign import TABLES as GRASP_TABLES

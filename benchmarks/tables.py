@@ -30,6 +30,12 @@ WEIGHTS = {
 
 HEADLINES = ("finger_reach", "diamond_reach", "trunk_reach", "cable_trunk_reach", "tetrapod_reach")
 
+ACCURATE_HEADLINES = {
+    "finger": "Soft Finger, accurate mesh; inverse QP",
+    "diamond": "Diamond, accurate mesh; policy trained for each body",
+}
+"""Rows of studies on accurate meshes, behind those of the same robots."""
+
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "") -> str:
     """Return a Markdown table; ``align`` has one of ``l`` and ``r`` for each column, default ``l``."""
@@ -63,10 +69,10 @@ def headlines() -> str:
         row = study["rows"][0]
         name = f"{study['title']}; {row['controller'].partition(',')[0]}"
         rows.append([name, *_ends(row), f"`{study['command']}`"])
-    accurate = results("accurate_study")
-    means = {f"{body} [mm]": np.mean(accurate[f"{body}: accurate: distance [mm]"]) for body in ("baseline", "winner")}
-    command = "`softgym codesign --config finger_reach_accurate`"
-    rows.insert(1, ["Soft Finger, accurate mesh; inverse QP", *_ends(means), command])
+        if key in ACCURATE_HEADLINES and f"accurate_study_{key}" in records():
+            found = results(f"accurate_study_{key}")
+            ends = {f"{who} [mm]": np.mean(found[f"{who}: accurate: distance [mm]"]) for who in ("baseline", "winner")}
+            rows.append([ACCURATE_HEADLINES[key], *_ends(ends), f"`softgym codesign --config {key}_reach_accurate`"])
     return markdown(["robot; controller", "baseline", "winner", "command"], rows, "lrrl")
 
 
@@ -222,15 +228,16 @@ def test_set() -> str:
 
 
 def trust() -> str:
-    """Errors, coverage and trust of calibrated weights, by stratum.
+    """Errors, coverage and trust of calibrated weights on states that the calibration has not seen, by stratum.
 
     Intervals of the coverage are those of a share of independent states (Clopper and Pearson, 95 %).
     """
     rows = []
     for name, title in CALIBRATED.items():
-        found = {k.removeprefix(f"{name}: "): v for k, v in results("trust").items() if k.startswith(f"{name}: ")}
-        strata = {k: v for k, v in found.items() if isinstance(v, dict)}
-        rows += _trust_rows(title, strata, found["goal tolerance [mm]"])
+        if f"trust_{name}" in records():
+            found = results(f"trust_{name}")
+            strata = {k: v for k, v in found.items() if isinstance(v, dict)}
+            rows += _trust_rows(title, strata, found["goal tolerance [mm]"])
     return markdown(TRUST_HEAD, rows, "llrrrrrrr")
 
 
@@ -246,7 +253,7 @@ def calibrated() -> str:
     return markdown(TRUST_HEAD, rows, "llrrrrrrr")
 
 
-CALIBRATED = WEIGHTS | {"finger_2cables_accurate": "finger, 2 cables, accurate mesh"}
+CALIBRATED = WEIGHTS | {f"{name}_accurate": f"{title}, accurate mesh" for name, title in WEIGHTS.items()}
 FACTORS = {"mean": 1e3, "worst": 1e3, "worst_trusted": 1e3, "coverage": 100.0, "trusted": 100.0}
 """From metres and shares to millimetres and percent."""
 TRUST_HEAD = [

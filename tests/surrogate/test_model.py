@@ -550,7 +550,7 @@ def test_fit_of_three_fidelities(tmp_path):
     model = load_model(tmp_path / "model", robot)
     more = load_dataset(tmp_path / "data" / "more" / "train")
     train = load_dataset(tmp_path / "data" / "train")
-    images = 1 if robot.mirror is None else 2
+    images = 1 + len(robot.symmetries)
     assert model.card["states"]["train"] == images * (len(train["rest"]) + len(more["rest"]))
     assert model.card["states"]["pretraining/train"] > 150 and model.card["correction"]["states"] == 3
     features = model.features.design(levels[1]["design"])
