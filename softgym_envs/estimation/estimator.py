@@ -464,9 +464,7 @@ class Estimator:
         slack = near.state.slack
         margins = np.where(slack, delta[:n_a] - evidence.command, effort)
         slopes = at_places(np.where(slack[:, None], beyond, by_effort))
-        return _Branch(
-            mixture, delta[effectors], at_places(by_displacement[effectors]), unilateral, margins, slopes
-        )
+        return _Branch(mixture, delta[effectors], at_places(by_displacement[effectors]), unilateral, margins, slopes)
 
     def _turned(self, estimate: Estimate, evidence: _Evidence, turned: np.ndarray) -> Linearised | None:
         """Return the body near its most probable state if some cables (n_a,) are slack in place of tight or vice versa.

@@ -119,7 +119,7 @@ class Mixture:
         return replace(self, logarithms=self.logarithms - 0.5 * cost, means=means, covariances=covariances)
 
     def cut(self, offset: np.ndarray | float, slope: np.ndarray) -> Mixture:
-        """Return the distribution where ``offset + slope (errors, size)`` is at least 0, with exact means and covariances.
+        """Return the distribution where ``offset + slope (errors, size)`` is at least 0, as one with its exact moments.
 
         Args:
             offset: for all places, or at each (q,).
@@ -177,9 +177,11 @@ def joint_moments(parts: Sequence[tuple[Mixture, np.ndarray, np.ndarray]], bend:
         if bend is not None:
             outputs, scatter = bend.apply(outputs, scatter)
         loads = np.column_stack([positive.means[:, -1], mixture.places.coordinates])
-        columns = (positive.logarithms, positive.means[:, :-1], loads, positive.covariances[:, -1, -1])
-        found.append((*columns, outputs, scatter))
-    logarithms, errors, loads, within, outputs, scatter = (np.concatenate(column) for column in zip(*found, strict=True))
+        sizes = positive.covariances[:, -1, -1]
+        found.append((positive.logarithms, positive.means[:, :-1], loads, sizes, outputs, scatter))
+    logarithms, errors, loads, within, outputs, scatter = (
+        np.concatenate(column) for column in zip(*found, strict=True)
+    )
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     covariance = np.cov(loads.T, aweights=weights, bias=True).reshape(loads.shape[1], -1)
