@@ -185,7 +185,7 @@ class Policy:
                 whose actions depend on the episode: use `begin`.
         """
         if self.memory is not None:
-            raise ValueError(f"policy '{self.path.name}' has a memory: call begin() for each episode and what it returns")
+            raise ValueError(f"policy '{self.path.name}' has a memory: call what begin() returns, in each episode")
         x = self._checked(observation)
         for weight, bias in self.hidden:
             x = np.maximum(x @ weight + bias, 0.0)
