@@ -85,6 +85,8 @@ def strata(robot: Robot) -> dict[str, float]:
     result: dict[str, float] = {}
     for name, rows in found.items():
         result[f"{name}: states"] = len(rows)
+        if not rows:
+            continue
         for quantity, values in zip(("tip [mm]", "volume [mm3]", "tension [N]"), np.array(rows).T, strict=True):
             result[f"{name}: {quantity}, mean"] = float(values.mean())
             result[f"{name}: {quantity}, worst"] = float(values.max())
@@ -172,6 +174,8 @@ def strata_table() -> str:
     found, quantities = results("learned_sensors"), ("tip [mm]", "volume [mm3]", "tension [N]")
     rows = []
     for name in (*STRATA, "slack cable", "vertices", "new mesh"):
+        if not found[f"stratum: {name}: states"]:
+            continue
         errors = [[found[f"stratum: {name}: {q}, {kind}"] for kind in ("mean", "worst")] for q in quantities]
         rows.append(
             [name, str(found[f"stratum: {name}: states"]), *(f"{mean:.2f}, {worst:.2f}" for mean, worst in errors)]
