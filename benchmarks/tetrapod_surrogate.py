@@ -17,6 +17,8 @@ import numpy as np
 
 from benchmarks.beams import batch_speeds, environment
 from benchmarks.motion import TEST, TRAINING, errors, lifted, lstm, on_surrogate, trajectories
+from benchmarks.recorded import results
+from benchmarks.tables import markdown
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.surrogate.inertia import write_inertia
 from softgym_envs.surrogate.inertia_training import fit_inertia
@@ -88,6 +90,21 @@ def tetrapod_surrogate() -> dict[str, object]:
         result[f"{name}: error in open loop, largest [%]"] = float(error.max())
     return result | speeds()
 
+
+MODELS = ("learned inertia", "surrogate in equilibrium", "LSTM", "lifted linear model")
+
+
+def motion_table() -> str:
+    """Mean and largest error of each model in open loop."""
+    found = results("tetrapod_surrogate")
+    keys = [(model, kind) for model in MODELS for kind in ("mean", "largest")]
+    values = {key: f"{found[f'{key[0]}: error in open loop, {key[1]} [%]']:.1f}" for key in keys}
+    rows = [[model, values[model, "mean"], values[model, "largest"]] for model in MODELS]
+    return markdown(["error in open loop [%]", "mean", "largest"], rows, "lrr")
+
+
+TABLES = {"tetrapod_surrogate": motion_table}
+"""Tables of pages by name."""
 
 if __name__ == "__main__":
     json.dump(tetrapod_surrogate(), sys.stdout, indent=2)
