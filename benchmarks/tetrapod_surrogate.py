@@ -29,12 +29,12 @@ CONFIG = FitConfig.model_validate(
     {
         "robot": "tetrapod",
         "data": {
-            "train": {"groups": 500, "states": 12, "sequence": "halton"},
+            "train": {"groups": 300, "states": 12, "sequence": "halton"},
             "validation": {"groups": 30, "states": 12},
             "test": {"groups": 50, "states": 12},
             "groups_per_shard": 100,
         },
-        "network": {"kind": "potential", "members": 1, "steps": 3000},
+        "network": {"kind": "potential", "members": 1, "steps": 2000},
         "workers": 1,
     }
 )
@@ -72,7 +72,7 @@ def tetrapod_surrogate() -> dict[str, object]:
         "statics: effector error, worst [mm]": 1e3 * static["effector_worst"],
         "statics: torque error, mean [% of largest]": 100 * static["effort_mean"],
     }
-    inertia = fit_inertia(robot, bodies=512, states=4, degree=2)
+    inertia = fit_inertia(robot, bodies=256, states=4, degree=2)
     write_inertia(inertia, FOLDER)
     for kind in ("mean", "largest"):
         result[f"frequency error, {kind} [%]"] = 100 * float(inertia.card[f"{kind}_frequency_error"])
