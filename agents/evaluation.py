@@ -194,7 +194,15 @@ def make_agent(agent: str | Path, seed: int = 0) -> Agent:
 
 
 def _acting(policy: Policy) -> Agent:
-    return lambda observation, env: policy(observation)
+    act = policy.begin()
+
+    def agent(observation: Any, env: Any) -> np.ndarray:
+        nonlocal act
+        if env.steps == 0:
+            act = policy.begin()
+        return act(observation)
+
+    return agent
 
 
 def evaluate(
@@ -323,14 +331,14 @@ def _evaluate_batch(
     """Run all episodes at once on the batched environment, with a policy or, without one, the inverse QP."""
     count = len(goals)
     env = environment.make_vec(count, sample_design=False)
-    control = None if policy is not None else BatchQP(env.unwrapped)  # type: ignore[arg-type]
+    control, act = (None, policy.begin()) if policy is not None else (BatchQP(env.unwrapped), None)  # type: ignore[arg-type]
     columns = {name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "length")}
     ends = np.zeros((count, 3))
     running = np.ones(count, dtype=bool)
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
         while running.any():
-            action = policy(observation) if control is None else control()  # type: ignore[misc]
+            action = act(observation) if control is None else control()
             observation, reward, terminated, truncated, info = env.step(action)
             last = info.get("final_info", info)
             columns["distance"] = np.where(running, last["distance"], columns["distance"])

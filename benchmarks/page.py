@@ -31,8 +31,10 @@ from benchmarks.modular import TABLES as MODULAR_TABLES
 from benchmarks.motion import TABLES as MOTION_TABLES
 from benchmarks.printed import TABLES as PRINTED_TABLES
 from benchmarks.recorded import figure
+from benchmarks.robustness import TABLES as ROBUSTNESS_TABLES
 from benchmarks.structures import TABLES as STRUCTURE_TABLES
 from benchmarks.tables import TABLES as OTHER_TABLES
+from benchmarks.tetrapod_surrogate import TABLES as TETRAPOD_TABLES
 from benchmarks.zigzag_tables import ZIGZAG_TABLES
 from softgym_envs.errors import DataError
 
@@ -46,6 +48,8 @@ TABLES = (
     | MODULAR_TABLES
     | MOTION_TABLES
     | SENSOR_TABLES
+    | ROBUSTNESS_TABLES
+    | TETRAPOD_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
     | GROWN_TABLES

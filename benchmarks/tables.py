@@ -391,27 +391,6 @@ def _path_errors(benchmark: str, head: str) -> str:
     return markdown([head, "largest error [mm]", "mean [mm]"], rows, "lrr")
 
 
-def robustness() -> str:
-    """Controllers on plants unlike their model, of every robot that was run: goals reached and mean final distance."""
-    from benchmarks.robustness import BENCHMARKS, CONTROLLERS, PLANTS
-
-    rows = []
-    for group in (name for name in BENCHMARKS if name in records()):
-        found = results(group)
-        for plant in PLANTS:
-            keys = [f"{name}, {plant}" for name in CONTROLLERS]
-            if f"{keys[0]}: goals reached [%]" in found:
-                cells = [
-                    figure(group, f"{key}: goals reached [%]", ".0f")
-                    + " %, "
-                    + figure(group, f"{key}: mean distance [mm]", ".2f")
-                    + " mm"
-                    for key in keys
-                ]
-                rows.append([group.removeprefix("robustness_").capitalize(), plant, *cells])
-    return markdown(["robot", "plant", *CONTROLLERS], rows, "llrrr")
-
-
 def side_by_side() -> str:
     """The same problems in several codes."""
     rows = []
@@ -592,7 +571,7 @@ TABLES: dict[str, Callable[[], str]] = {
         design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, sealed_stiffness,
         sealed_estimates, side_by_side, stiff_flop,
-        validation, contact, surrogate_speed, fem_speed, deployed, robustness, provenance,
+        validation, contact, surrogate_speed, fem_speed, deployed, provenance,
     )
 }  # fmt: skip
 """Tables by the name in a marked place."""

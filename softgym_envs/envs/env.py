@@ -163,6 +163,11 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         return self.task.goals(self._path[None], np.array([len(self._path)]), np.array([step]))[0]
 
     @property
+    def steps(self) -> int:
+        """Steps of the present episode so far."""
+        return self._step
+
+    @property
     def path(self) -> np.ndarray:
         """All goals of the episode [m], shape (p, 3)."""
         return self._path

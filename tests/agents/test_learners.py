@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from softgym_envs.agents.config import EvolutionConfig, TrainConfig
+from softgym_envs.agents.config import EvolutionConfig, RecurrentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
+from softgym_envs.agents.export import spaces_of
 from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.learners.analytic import AnalyticLearner
 from softgym_envs.agents.learners.cloning import CloningLearner
 from softgym_envs.agents.learners.evolution import EvolutionLearner
 from softgym_envs.agents.learners.ppo import PPOLearner
-from softgym_envs.agents.policy import Policy, read_tensors
+from softgym_envs.agents.learners.recurrent import RecurrentLearner
+from softgym_envs.agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.agents.residual import BatchQP
 from softgym_envs.agents.training import train
 from softgym_envs.errors import DataError, WeightsError
@@ -64,6 +66,9 @@ QUICK = {
     "analytic": SHORT,
     "cloning": SHORT.model_copy(update={"learner": "cloning"}),
     "ppo": TrainConfig.model_validate({**SHORT.model_dump(), "learner": "ppo", "ppo": {"n_steps": 2, "n_epochs": 2}}),
+    "recurrent": TrainConfig.model_validate(
+        {**SHORT.model_dump(), "learner": "recurrent", "num_envs": 1, "recurrent": {"gradient_steps": 1}}
+    ),
     "evolution": TrainConfig.model_validate(
         {**SHORT.model_dump(), "learner": "evolution", "num_envs": 8, "evolution": {"net_arch": [3]}}
     ),
@@ -164,6 +169,38 @@ def test_a_clone_does_what_the_qp_does():
         observation, *_ = env.step(action)
     assert np.mean(errors) < 0.2 * np.mean(sizes)
     learner.close()
+
+
+def test_a_memory_is_that_of_torch_and_learns_the_answers_of_the_qp(tmp_path):
+    config = QUICK["recurrent"].model_copy(update={"recurrent": RecurrentConfig(gradient_steps=8, batch_size=8)})
+    learner = RecurrentLearner(config)
+    learner.learn(1, lambda steps: None)
+    seen, answers = learner._observations[:1], learner._answers[0]
+
+    def actions():
+        with torch.no_grad():
+            return torch.tanh(learner._mean(learner._unit(torch.from_numpy(seen))[0])).numpy()[0]
+
+    first = np.abs(actions() - answers).mean()
+    for _ in range(80):
+        learner._imitate(np.zeros(4, dtype=np.int64))
+    assert np.abs(actions() - answers).mean() < 0.5 * first
+
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, learner.weights(), {"config": config.model_dump(mode="json")})
+    policy = Policy(path)
+    for act in (policy.begin(), policy.begin()):  # each episode begins without memory
+        found = np.array([act(row) for row in seen[0]])
+        np.testing.assert_allclose(found, actions(), atol=1e-5)
+    together = policy.begin()
+    np.testing.assert_allclose([together(np.stack([row, row]))[1] for row in seen[0]], found, atol=1e-6)
+    with pytest.raises(ValueError, match="has a memory: call what begin"):
+        policy(seen[0, 0])
+    with pytest.raises(ValueError, match="has a memory and cannot be exported"):
+        spaces_of(policy)
+    learner.close()
+    with pytest.raises(ValueError, match="learner 'recurrent' needs num_envs = 1"):
+        RecurrentLearner(config.model_copy(update={"num_envs": 2}))
 
 
 def test_training_starts_from_a_policy_of_the_same_widths(trained, tmp_path):
