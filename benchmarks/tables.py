@@ -69,10 +69,11 @@ def headlines() -> str:
         row = study["rows"][0]
         name = f"{study['title']}; {row['controller'].partition(',')[0]}"
         rows.append([name, *_ends(row), f"`{study['command']}`"])
-        if key in ACCURATE_HEADLINES and f"accurate_study_{key}" in records():
-            found = results(f"accurate_study_{key}")
+        robot = key.removesuffix("_reach")
+        if robot in ACCURATE_HEADLINES and f"accurate_study_{robot}" in records():
+            found = results(f"accurate_study_{robot}")
             ends = {f"{who} [mm]": np.mean(found[f"{who}: accurate: distance [mm]"]) for who in ("baseline", "winner")}
-            rows.append([ACCURATE_HEADLINES[key], *_ends(ends), f"`softgym codesign --config {key}_reach_accurate`"])
+            rows.append([ACCURATE_HEADLINES[robot], *_ends(ends), f"`softgym codesign --config {key}_accurate`"])
     return markdown(["robot; controller", "baseline", "winner", "command"], rows, "lrrl")
 
 
