@@ -52,7 +52,7 @@ class RecurrentLearner(NetworkLearner):
         torch.nn.init.zeros_(self._mean.weight)  # the untrained policy keeps still
         torch.nn.init.zeros_(self._mean.bias)
         named = {f"actor.memory.{n.removesuffix('_l0')}": value for n, value in self._unit.named_parameters()}
-        self._begin(named | {"actor.mu.weight": self._mean.weight, "actor.mu.bias": self._mean.bias}, options)
+        self._begin(named | dict(self._mean.named_parameters("actor.mu")), options)
         steps = environment.row.max_episode_steps
         # An episode begins before the last step and may end after it.
         self._observations = np.zeros((config.steps, steps, inputs), dtype=np.float32)

@@ -293,15 +293,15 @@ def _reduce(frames, x, forces, out):
 
     The forces on rows that follow a frame are replaced by those on its own rows.
     """
-    for c in range(frames.mounted.shape[0]):
-        row, owner, arm = frames.mounted[c], frames.owner[c], frames.arm[c]
+    for k in range(frames.mounted.shape[0]):
+        row, owner, arm = frames.mounted[k], frames.owner[k], frames.arm[k]
         p, q, r = forces[row, 0], forces[row, 1], forces[row, 2]
-        moves, a, b, g = frames.moves[c], arm[0], arm[1], arm[2]
-        for d, f in ((0, p), (1, q), (2, r)):
-            forces[owner, d] += moves * f
-            forces[owner + 1, d] += a * f
-            forces[owner + 2, d] += b * f
-            forces[owner + 3, d] += g * f
+        moves, a, b, g = frames.moves[k], arm[0], arm[1], arm[2]
+        for d, force in ((0, p), (1, q), (2, r)):
+            forces[owner, d] += moves * force
+            forces[owner + 1, d] += a * force
+            forces[owner + 2, d] += b * force
+            forces[owner + 3, d] += g * force
             forces[row, d] = 0.0
     for f in range(frames.rows.shape[0]):
         row, target = frames.rows[f], out[frames.block[f]]
