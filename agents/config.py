@@ -322,9 +322,9 @@ class LearnerConfig(Config):
     """A learning method and its hyperparameters.
 
     Attributes:
-        learner: ``"sac"``, ``"ppo"`` or ``"evolution"``, model-free, for every environment; or, model-based and on the
-            surrogate only, ``"analytic"``, which follows derivatives of the reward, or ``"cloning"``, which imitates
-            the inverse QP.
+        learner: ``"sac"``, ``"ppo"`` or ``"evolution"``, model-free, for every environment; or, model-based,
+            ``"analytic"``, which follows derivatives of the reward and needs the surrogate, or ``"cloning"``, which
+            imitates the inverse QP.
         sac: hyperparameters of SAC.
         ppo: hyperparameters of PPO.
         analytic: hyperparameters of the analytic policy gradient.

@@ -168,8 +168,8 @@ class ModularArm(Robot):
         if not isinstance(self.cells, int):
             return self.cells
         complete = self.design_space.complete(design)
-        numbers = [int(complete[f"kind_{number}"]) for number in range(1, self.cells + 1)]
-        return tuple(self._kinds[min(number, len(self._kinds) - 1)] for number in numbers)
+        names = [f"kind_{number}" for number in range(1, self.cells + 1)]
+        return tuple(self.design_space[name].choice(complete[name]) for name in names)
 
     def _modules(self, design: Mapping[str, float]) -> Iterator[_Cell]:
         """Yield the cells of a complete design from the base to the tip."""
@@ -252,7 +252,8 @@ def _free_cells(count: int, kinds: Sequence[str]) -> Iterator[DesignVariable]:
         described = (
             f"what the cell is: {', '.join(f'{k} from {place}' for place, k in enumerate(kinds))} (cell {number})"
         )
-        yield DesignVariable(f"kind_{number}", 0.0, float(len(kinds)), kind + 0.5, "-", described)
+        bounds = 0.0, float(len(kinds))
+        yield DesignVariable(f"kind_{number}", *bounds, kind + 0.5, "-", described, choices=tuple(kinds))
         for name, dimension in zip(("length", "width", "depth"), SHAPES[module].dimensions, strict=True):
             low, high = box[dimension]
             share = (_typical(module, dimension) - low) / (high - low)

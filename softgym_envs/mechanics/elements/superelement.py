@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numba import njit
 
 from softgym_envs.mechanics.elements.beams import warp_lines
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
@@ -76,6 +77,43 @@ def _strain_forms() -> np.ndarray:
 _FORMS = _strain_forms()
 
 
+@njit(cache=True, error_model="numpy")
+def _slopes(forms, z, slopes):
+    """Write the derivatives of the strains by the rows ``z`` (8, 3), shape (6, 8, 3)."""
+    for i in range(6):
+        for a in range(8):
+            for d in range(3):
+                total = 0.0
+                for b in range(8):
+                    total += forms[i, a, b] * z[b, d]
+                slopes[i, a, d] = total
+
+
+@njit(cache=True, error_model="numpy")
+def _add_tangent(forms, slopes, force, stiffness, scatter, values):
+    """Add the tangent of an energy with derivatives (6,) and (6, 6) by the strains where ``scatter`` (300,) says."""
+    entry = 0
+    row = np.empty(6)
+    for r in range(24):
+        a, d = r // 3, r % 3
+        for q in range(6):
+            row[q] = 0.0
+            for p in range(6):
+                row[q] += slopes[p, a, d] * stiffness[p, q]
+        for s in range(r + 1):
+            target = scatter[entry]
+            entry += 1
+            if target < 0:
+                continue
+            b, e = s // 3, s % 3
+            total = 0.0
+            for q in range(6):
+                total += row[q] * slopes[q, b, e]
+                if d == e:
+                    total += force[q] * forms[q, a, b]
+            values[target] += total
+
+
 class Superelement(ElementBlock):
     """An elastic part between two frames.
 
@@ -119,7 +157,7 @@ class Superelement(ElementBlock):
             ports[slot, slot] = 1.0
             ports[slot, slot + 1 : slot + 4] = directors @ (middle - nodes[row])
             ports[slot + 1 : slot + 4, slot + 1 : slot + 4] = (directors @ axes).T
-        self._forms = ports.T @ _FORMS @ ports
+        self._forms = np.ascontiguousarray(ports.T @ _FORMS @ ports)
         matrix = np.zeros((8, 8)) if inertia is None else np.asarray(inertia, dtype=float)
         self._inertia = ports.T @ matrix @ ports
         # The axes of each port share the inertia of its own motion; middles move by their weights in every point.
@@ -140,7 +178,9 @@ class Superelement(ElementBlock):
     def strains(self, x: np.ndarray) -> np.ndarray:
         """Return the strains (6,) at rows ``x`` (n, 3)."""
         z = x[self.nodes_used]
-        return 0.5 * np.einsum("iab,ad,bd->i", self._forms, z, z, optimize=True) - self._rest
+        slopes = np.empty((6, 8, 3))
+        _slopes(self._forms, z, slopes)
+        return 0.5 * (slopes.reshape(6, 24) @ z.ravel()) - self._rest
 
     def knows(self, x: np.ndarray) -> bool:
         return self.energy.knows(self.strains(x))
@@ -152,8 +192,9 @@ class Superelement(ElementBlock):
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
         z = x[self.nodes_used]
-        slopes = self._forms @ z  # of the strains by the rows, (6, 8, 3)
-        strains = 0.5 * np.einsum("iad,ad->i", slopes, z) - self._rest
+        slopes = np.empty((6, 8, 3))
+        _slopes(self._forms, z, slopes)
+        strains = 0.5 * (slopes.reshape(6, 24) @ z.ravel()) - self._rest
         if not (np.abs(strains[3:]) <= LARGEST_ROTATION).all():
             return np.inf, 1
         energy, force, stiffness = self.energy.evaluate(strains)
@@ -170,15 +211,9 @@ class Superelement(ElementBlock):
         scatter: list[np.ndarray] | None,
     ) -> None:
         """Add forces and tangent for the derivatives of an energy by the strains, (6,) and (6, 6)."""
-        gradient[self.nodes_used] += np.tensordot(force, slopes, 1)
-        if values is None or scatter is None:
-            return
-        flat = slopes.reshape(6, 24)
-        matrix = flat.T @ stiffness @ flat + np.kron(np.tensordot(force, self._forms, 1), np.eye(3))
-        r, s = np.tril_indices(24)
-        target = scatter[0].ravel()
-        kept = target >= 0
-        np.add.at(values, target[kept], matrix[r[kept], s[kept]])
+        gradient[self.nodes_used] += (force @ slopes.reshape(6, 24)).reshape(8, 3)
+        if values is not None and scatter is not None:
+            _add_tangent(self._forms, slopes, force, stiffness, scatter[0].ravel(), values)
 
     def add_damping(
         self,
