@@ -11,12 +11,15 @@ from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import InfeasibleDesign, unknown_name
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.cable import Cable
+from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.elements.closed_superelement import ClosedSuperelement, PortCavity
+from softgym_envs.mechanics.elements.superelement import point_masses
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin, bridge_skin
 from softgym_envs.robots.base import Actuator, Robot
-from softgym_envs.robots.modules.base import Module
+from softgym_envs.robots.modules.base import DENSITY, Module
 from softgym_envs.robots.modules.learned import learned_module
 from softgym_envs.robots.modules.registry import MODULES
 
@@ -30,6 +33,7 @@ CELLS: dict[str, tuple[str, np.ndarray]] = {
     "notch_y": ("notch_hinge", _QUARTER_TURN),
     "tube": ("torsion_tube", np.eye(3)),
     "accordion": ("accordion", np.eye(3)),
+    "bellows": ("bellows", np.eye(3)),
 }
 """What a cell may be: a module, and the axes in which it stands. A ``leaf_x`` bends towards x."""
 
@@ -58,6 +62,7 @@ SHAPES = {
     "notch_hinge": _Shape(("radius", "width", "neck"), lambda d: (0.5 * d["neck"], 0.5 * d["width"])),
     "torsion_tube": _Shape(("length", "radius", "wall"), lambda d: (d["radius"], d["radius"])),
     "accordion": _Shape(("pitch", "width", "amplitude"), lambda d: (d["amplitude"], 0.5 * d["width"])),
+    "bellows": _Shape(("pitch", "radius", "amplitude"), lambda d: (d["radius"], d["radius"])),
 }
 """By the name of the module. A tube is drawn as a square bar around it, an accordion as one around its folds."""
 
@@ -98,10 +103,12 @@ class ModularArm(Robot):
             the whole body, by which designs are judged.
         stroke: largest displacement of a wire either way [m].
         max_effort: largest force of a wire [N].
+        largest_volume: by which the cavity of a bellows may grow or shrink [m3].
+        max_pressure: in a bellows, either way [Pa].
         **options: options of `Robot`.
 
     Raises:
-        ValueError: for an unknown cell, kind or body, or gravity on superelements, which have no mass.
+        ValueError: for an unknown cell, kind or body, or bellows as a kind: their number is that of the actuators.
     """
 
     name = "modular_arm"
@@ -116,6 +123,8 @@ class ModularArm(Robot):
         body: str = "superelements",
         stroke: float = 0.006,
         max_effort: float = 1.0,
+        largest_volume: float = 2.0e-7,
+        max_pressure: float = 2.0e4,
         **options: Any,
     ) -> None:
         if isinstance(cells, int) and not isinstance(cells, bool):
@@ -129,11 +138,11 @@ class ModularArm(Robot):
             raise ValueError(f"kinds must be a list of names, got {kinds!r}; allowed: {', '.join(CELLS)}")
         if unknown := [kind for kind in kinds if kind not in CELLS]:
             raise ValueError(unknown_name("kind", unknown[0], CELLS))
+        if closed := [kind for kind in kinds if MODULES.class_of(CELLS[kind][0]).closed]:
+            raise ValueError(f"kinds must not contain '{closed[0]}', which is an actuator; allowed: in a list of cells")
         if body not in BODIES:
             raise ValueError(unknown_name("body", body, BODIES))
         super().__init__(**options)
-        if body == "superelements" and any(self.gravity):
-            raise ValueError("superelements have no mass: use body = 'solid' with gravity")
         self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.cells = cells if isinstance(cells, int) else tuple(cells)
         self._kinds = (*kinds, NONE)
@@ -146,11 +155,19 @@ class ModularArm(Robot):
             DesignVariable("young_modulus", 1.0e7, 4.0e7, 2.0e7, "Pa", "stiffness of the printed material", log=True),
         )
         self.effector_rest = np.array([0.0, 0.0, self._height(self.design_space.baseline)])
-        self.effort_scale = np.full(2, 0.2)
-        self.actuators = tuple(
-            Actuator(name, -self.stroke, self.stroke, self.stroke / 10.0, unilateral=False, max_effort=self.max_effort)
-            for name in WIRES
+        volume = float(largest_volume)
+        closed = [] if isinstance(self.cells, int) else [n for n, cell in enumerate(cells, 1) if cell == "bellows"]
+        self.actuators = (
+            *(
+                Actuator(name, -self.stroke, self.stroke, self.stroke / 10.0, "m", False, self.max_effort)
+                for name in WIRES
+            ),
+            *(
+                Actuator(f"pressure_{n}", -volume, volume, volume / 10.0, "m3", False, float(max_pressure))
+                for n in closed
+            ),
         )
+        self.effort_scale = np.array([0.2] * len(WIRES) + [0.2 * float(max_pressure)] * len(closed))
 
     def _dimensions(self) -> Iterator[DesignVariable]:
         if isinstance(self.cells, int):
@@ -205,28 +222,38 @@ class ModularArm(Robot):
             raise InfeasibleDesign("all cells of the arm are left out; allowed: at least one that is not 'none'")
         builder = ModelBuilder(gravity=self.gravity)
         ports = [builder.add_frame(np.zeros(3), fixed=True, fixed_spin=True)]
+        cavities = []
         for part in self._modules(design):
             origin = np.array([0.0, 0.0, part.height])
             if self.body == "solid":
-                far = part.module.add_to(builder, part.design, near=ports[-1], origin=origin, rotation=part.axes)
-            else:
-                far = builder.add_frame(origin + [0.0, 0.0, part.length])
-                energy = learned_module(part.kind).energy(part.design)
-                builder.add_superelement(
-                    ports[-1],
-                    far,
-                    energy,
-                    length=part.length,
-                    rotation=part.axes,
-                    young_modulus=part.design["young_modulus"],
-                )
+                placed = part.module.add_to(builder, part.design, near=ports[-1], origin=origin, rotation=part.axes)
+                ports.append(placed.far)
+                cavities += [] if placed.cavity is None else [placed.cavity]
+                continue
+            learned = learned_module(part.kind)
+            far = builder.add_frame(origin + [0.0, 0.0, part.length])
+            builder.add_superelement(
+                ports[-1],
+                far,
+                learned.energy(part.design),
+                length=part.length,
+                rotation=part.axes,
+                young_modulus=part.design["young_modulus"],
+                inertia=point_masses(DENSITY * learned.volume(part.design)),
+                cavity=learned.cavity(part.design) if part.module.closed else None,
+            )
             ports.append(far)
         model = builder.build()
         rows = np.array(ports[1:])[:, None] + np.arange(4)
-        for actuator, direction in zip(self.actuators, WIRES.values(), strict=True):
+        for actuator, direction in zip(self.actuators, WIRES.values(), strict=False):
             guide = design["wire_radius"] * np.array([*direction, 0.0])
             points = EmbeddedPoints.from_weights(rows, np.tile([1.0, *guide], (len(rows), 1)), model.nodes)
             model.add("a", Cable(actuator.name, points, guide, unilateral=actuator.unilateral))
+        closed = [block for block in model.blocks if isinstance(block, ClosedSuperelement)]
+        for actuator, cavity in zip(self.actuators[len(WIRES) :], cavities or closed, strict=True):
+            name = actuator.name
+            solid = isinstance(cavity, np.ndarray)
+            model.add("a", Cavity(name, cavity, model.nodes) if solid else PortCavity(name, cavity))
         model.add("e", Point("tip", EmbeddedPoints.in_frame(ports[-1], np.zeros(3), model.nodes)))
         if self.body == "superelements":
             half = design["wire_radius"]

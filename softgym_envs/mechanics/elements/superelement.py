@@ -40,6 +40,9 @@ class PortEnergy(Protocol):
     def knows(self, strains: np.ndarray) -> bool:
         """Whether the energy is known at strains (6,)."""
 
+    def spread(self, strains: np.ndarray) -> np.ndarray:
+        """Return how its gradient may be wrong at strains (6,), an error in each row: shape (k, 6) [N, N m]."""
+
 
 @dataclass(frozen=True)
 class QuadraticEnergy:
@@ -59,6 +62,9 @@ class QuadraticEnergy:
 
     def knows(self, strains: np.ndarray) -> bool:
         return True
+
+    def spread(self, strains: np.ndarray) -> np.ndarray:
+        return np.empty((0, 6))
 
 
 def _strain_forms() -> np.ndarray:
@@ -114,6 +120,14 @@ def _add_tangent(forms, slopes, force, stiffness, scatter, values):
             values[target] += total
 
 
+def point_masses(mass: float) -> np.ndarray:
+    """Return the inertia (8, 8) of a part whose mass [kg] is in the middles of both ports, half in each.
+
+    Its weight is exact, with its centre in the middle between the ports; its motion in time is not.
+    """
+    return np.diag([0.5 * mass, 0.0, 0.0, 0.0] * 2)
+
+
 class Superelement(ElementBlock):
     """An elastic part between two frames.
 
@@ -167,6 +181,7 @@ class Superelement(ElementBlock):
         self.mass = float(weights @ matrix @ weights)
         self._rest = np.zeros(6)
         self._rest = self.strains(nodes)
+        self.learned = len(energy.spread(np.zeros(6))) > 0
         self._viscous = energy.evaluate(np.zeros(6))[2]
         self.stiffness = float(np.trace(self._viscous[:3, :3]) / 3.0)
         self._line = (np.array([[first, last]]), np.array([[0.5, 0.5]]), np.array([[[-1.0, 1.0]]]) / length)
@@ -178,12 +193,31 @@ class Superelement(ElementBlock):
     def strains(self, x: np.ndarray) -> np.ndarray:
         """Return the strains (6,) at rows ``x`` (n, 3)."""
         z = x[self.nodes_used]
+        return 0.5 * (self.strain_slopes(x) @ z.ravel()) - self._rest
+
+    def strain_slopes(self, x: np.ndarray) -> np.ndarray:
+        """Return the derivatives (6, 24) of the strains by the rows `nodes_used` at rows ``x`` (n, 3)."""
         slopes = np.empty((6, 8, 3))
-        _slopes(self._forms, z, slopes)
-        return 0.5 * (slopes.reshape(6, 24) @ z.ravel()) - self._rest
+        _slopes(self._forms, x[self.nodes_used], slopes)
+        return slopes.reshape(6, 24)
+
+    def strain_hessian(self, x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:
+        """Return the second derivatives (24, 24) by the rows of a function of the strains.
+
+        Args:
+            x: rows, shape (n, 3).
+            gradient: of the function, shape (6,).
+            hessian: of the function, shape (6, 6).
+        """
+        flat = self.strain_slopes(x)
+        return flat.T @ hessian @ flat + np.kron(np.tensordot(gradient, self._forms, 1), np.eye(3))
 
     def knows(self, x: np.ndarray) -> bool:
         return self.energy.knows(self.strains(x))
+
+    def possible_errors(self, x: np.ndarray, fields: np.ndarray) -> np.ndarray:
+        rates = fields[:, self.nodes_used].reshape(len(fields), 24) @ self.strain_slopes(x).T
+        return self.energy.spread(self.strains(x)) @ rates.T
 
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
         return [lower_pairs((3 * self.nodes_used[:, None] + np.arange(3)).reshape(1, 24))]

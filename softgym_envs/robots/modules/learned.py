@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import combinations_with_replacement
 from pathlib import Path
@@ -17,11 +17,14 @@ import numpy as np
 
 from softgym_envs.errors import DesignError, WeightsError
 from softgym_envs.robots.modules.base import Module
-from softgym_envs.robots.modules.energy import ModuleEnergy, terms
+from softgym_envs.robots.modules.energy import CavityVolume, ModuleEnergy, terms
 from softgym_envs.robots.modules.registry import MODULES
 
 FORMAT = 1
-_ARRAYS = ("stiffness", "corrections", "largest_strains")
+_ARRAYS = (
+    "stiffness", "corrections", "largest_strains", "member_stiffness", "member_corrections", "swelling", "bulge",
+    "material",
+)  # fmt: skip
 FOLDER = Path(__file__).parent / "energies"
 
 
@@ -47,6 +50,14 @@ class LearnedModule:
         largest_strains: size of each strain of the states, the first three over the length, shape (6,).
         errors: those on bodies that were not used, as `learning.errors` returns them.
         degrees: of the polynomials of ``stiffness`` and ``corrections``.
+        member_stiffness: ``stiffness`` of the members of an ensemble, each learned without some of the bodies, shape
+            (n, p, 6).
+        member_corrections: their ``corrections``, shape (n, q, len(terms)).
+        factor: by which the differences of the members are multiplied to bound 95 % of the errors on bodies that they
+            have not seen; see `learning.calibrated`.
+        material: weights of the logarithm of the volume of the body over the cube of the length, shape (p,).
+        swelling: weights of the coefficients of `energy.CavityVolume`, shape (p, m); none if the module is not closed.
+        bulge: weights of the logarithm of its ``bulge``, shape (p,); likewise.
     """
 
     module: str
@@ -58,6 +69,12 @@ class LearnedModule:
     largest_strains: np.ndarray
     errors: Mapping[str, Mapping[str, float]]
     degrees: tuple[int, int]
+    member_stiffness: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 6)))
+    member_corrections: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 0)))
+    factor: float = 1.0
+    material: np.ndarray = field(default_factory=lambda: np.empty(0))
+    swelling: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    bulge: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     @property
     def terms(self) -> np.ndarray:
@@ -76,6 +93,44 @@ class LearnedModule:
         Raises:
             DesignError: for a malformed design, or one outside the box.
         """
+        length, modulus, unit = self._body(design)
+        modulus *= length**3
+        P, Q = (polynomials(unit, degree)[0] for degree in self.degrees)
+        members = None
+        if len(self.member_stiffness):
+            members = modulus * np.exp(P @ self.member_stiffness), Q @ self.member_corrections
+        return ModuleEnergy(
+            length,
+            modulus * np.exp(P @ self.stiffness),
+            Q @ self.corrections,
+            MODULES[self.module].symmetry,  # type: ignore[attr-defined]
+            self.rotation,
+            self.largest_strains,
+            members,
+            self.factor,
+        )
+
+    def volume(self, design: Mapping[str, float] | None = None) -> float:
+        """Return the volume of the material of a body [m3]; see `energy`."""
+        length, _, unit = self._body(design)
+        return length**3 * float(np.exp(polynomials(unit, self.degrees[0])[0] @ self.material))
+
+    def cavity(self, design: Mapping[str, float] | None = None) -> CavityVolume:
+        """Return how the volume of the cavity of a body grows; see `energy`.
+
+        Raises:
+            ValueError: if the module has no closed cavity.
+        """
+        if not len(self.swelling):
+            raise ValueError(f"module '{self.module}' has no closed cavity")
+        length, modulus, unit = self._body(design)
+        P = polynomials(unit, self.degrees[0])[0]
+        bulge = length**3 / modulus * float(np.exp(P @ self.bulge))
+        symmetry = MODULES[self.module].symmetry  # type: ignore[attr-defined]
+        return CavityVolume(length, length**3 * (P @ self.swelling), bulge, symmetry)
+
+    def _body(self, design: Mapping[str, float] | None) -> tuple[float, float, np.ndarray]:
+        """Return the length [m] and Young's modulus [Pa] of a body, and its dimensions in [-1, 1], shape (1, v)."""
         module: Module = MODULES[self.module]()
         complete = module.design_space.complete(design)
         for name, (low, high) in self.box.items():
@@ -90,20 +145,13 @@ class LearnedModule:
                     f"superelement '{self.module}' was learned for {name} = {value:g} only, got {complete[name]:g}"
                 )
         unit = self.unit(np.array([[complete[name] for name in self.box]]))
-        length = module.length(complete)
-        return ModuleEnergy(
-            length,
-            complete["young_modulus"] * length**3 * np.exp(polynomials(unit, self.degrees[0]) @ self.stiffness)[0],
-            (polynomials(unit, self.degrees[1]) @ self.corrections)[0],
-            module.symmetry,
-            self.rotation,
-            self.largest_strains,
-        )
+        return module.length(complete), complete["young_modulus"], unit
 
     def save(self, path: str | Path) -> None:
         """Write the superelement as JSON, for `load_module`."""
         record = {"format": FORMAT, **asdict(self)}
-        record |= {name: np.round(getattr(self, name), 8).tolist() for name in _ARRAYS}
+        digits = {name: 5 if name.startswith("member") else 8 for name in _ARRAYS}
+        record |= {name: np.round(getattr(self, name), digits[name]).tolist() for name in _ARRAYS}
         Path(path).write_text(json.dumps(record) + "\n")
 
 
@@ -120,10 +168,11 @@ def load_module(path: str | Path) -> LearnedModule:
             raise ValueError(f"it does not have format {FORMAT}")
         record["box"] = {name: (float(low), float(high)) for name, (low, high) in record["box"].items()}
         record["degrees"] = tuple(record["degrees"])
-        # Files of earlier versions do not limit strains.
+        # Files of earlier versions do not limit strains, and have no ensemble.
         record.setdefault("largest_strains", [np.inf] * 6)
         for name in _ARRAYS:
-            record[name] = np.array(record[name], dtype=float)
+            if name in record:
+                record[name] = np.array(record[name], dtype=float)
         found = LearnedModule(**record)
         if found.corrections.shape[-1] != len(found.terms):
             raise ValueError(f"it has {found.corrections.shape[-1]} corrections, needed {len(found.terms)}")

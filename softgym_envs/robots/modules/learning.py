@@ -16,6 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import qmc
 
+from softgym_envs.robots.modules.base import Module
+from softgym_envs.robots.modules.energy import volume_terms
 from softgym_envs.robots.modules.learned import LearnedModule, polynomials
 from softgym_envs.robots.modules.registry import MODULES
 from softgym_envs.robots.modules.states import ModuleStates, solve_states
@@ -28,6 +30,9 @@ GUESS_RIDGE = 1e-4
 
 MARGIN = 1.1
 """Bodies are drawn from a box that is wider by this factor than the one that users may use."""
+
+MEMBERS = 4
+"""Members of the ensemble of an energy."""
 
 _ROWS, _COLUMNS = np.triu_indices(6)
 
@@ -60,6 +65,9 @@ RECIPES = {
         {"radius": (0.003, 0.006), "width": (0.008, 0.014), "neck": (0.0018, 0.0035)}, 0.3, 16, 16, 2, (2, 1)
     ),
     "torsion_tube": Recipe({"length": (0.015, 0.040), "radius": (0.006, 0.010), "wall": (0.0015, 0.003)}, 0.3),
+    "bellows": Recipe(
+        {"pitch": (0.007, 0.010), "radius": (0.007, 0.010), "amplitude": (0.0012, 0.0024)}, 0.3, 14, 16, 2, (2, 1)
+    ),
     "accordion": Recipe(
         {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)}, 0.4, 14, 16, 2, (2, 1)
     ),
@@ -167,12 +175,30 @@ def _guess(model: LearnedModule, states: ModuleStates, products: _Products, Q: n
     return found
 
 
+def _guess_at_rest(model: LearnedModule, states: ModuleStates, P: np.ndarray, Q: np.ndarray) -> LearnedModule:
+    """Return a model whose stiffness at rest fits that of the states; ``P`` and ``Q`` are their polynomials.
+
+    At rest the stiffness is ``L D L^T``: ``D`` is k, and a correction of first degree is an entry of ``L``.
+    """
+    rest = (states.strain == 0.0).all(axis=1)
+    lower = np.linalg.cholesky(states.hessian[rest])
+    root = np.einsum("nii->ni", lower)
+    terms = model.terms
+    corrections = np.zeros((Q.shape[1], len(terms)))
+    for t in np.flatnonzero(terms[:, 2] < 0):
+        i, j = terms[t, :2]
+        corrections[:, t] = np.linalg.lstsq(Q[rest], lower[:, j, i] / root[:, i], rcond=None)[0]
+    stiffness = np.linalg.lstsq(P[rest], 2.0 * np.log(root), rcond=None)[0]
+    return replace(model, stiffness=stiffness, corrections=corrections)
+
+
 def fit(
     recipe: Recipe,
     module: str,
     states: ModuleStates,
     others: Mapping[str, float],
     steps: int = 30,
+    start: LearnedModule | None = None,
 ) -> LearnedModule:
     """Return the superelement that fits states best.
 
@@ -182,6 +208,7 @@ def fit(
         states: to learn from.
         others: the values of the variables that were not varied.
         steps: largest number of steps of the search.
+        start: where the search begins; by default at a guess from the states.
     """
     model = LearnedModule(
         module,
@@ -196,19 +223,7 @@ def fit(
     )
     unit = model.unit(states.designs)
     P, Q = polynomials(unit, recipe.degrees[0]), polynomials(unit, recipe.degrees[1])
-    rest = (states.strain == 0.0).all(axis=1)
-    # At rest the stiffness is L D L^T: D is k, and a correction of first degree is an entry of L.
-    lower = np.linalg.cholesky(states.hessian[rest])
-    root = np.einsum("nii->ni", lower)
-    start = np.linalg.lstsq(P[rest], 2.0 * np.log(root), rcond=None)[0]
-    terms = model.terms
-    target = terms[:, 0]
-    corrections = np.zeros((Q.shape[1], len(terms)))
-    for t in np.flatnonzero(terms[:, 2] < 0):
-        i, j = terms[t, :2]
-        corrections[:, t] = np.linalg.lstsq(Q[rest], lower[:, j, i] / root[:, i], rcond=None)[0]
-    model = replace(model, stiffness=start, corrections=corrections)
-    products, weights = _products(states.strain, terms), _weights(states, recipe.rotation)
+    products, weights = _products(states.strain, model.terms), _weights(states, recipe.rotation)
 
     def errors_of(trial: LearnedModule) -> tuple[_Corrected, np.ndarray]:
         found = _corrected(trial, states, products)
@@ -217,11 +232,15 @@ def fit(
     def cost_of(trial: LearnedModule, residual: np.ndarray) -> float:
         return float((residual**2).sum() + RIDGE * (trial.corrections**2).sum())
 
-    # The guesses do not always come closer: the search begins at the best of them.
-    trials = [model]
-    for _ in range(5):
-        trials.append(replace(model, corrections=_guess(trials[-1], states, products, Q)))
-    model = min(trials, key=lambda trial: cost_of(trial, errors_of(trial)[1]))
+    if start is not None:
+        model = replace(model, stiffness=start.stiffness, corrections=start.corrections)
+    else:
+        # The guesses do not always come closer: the search begins at the best of them.
+        trials = [_guess_at_rest(model, states, P, Q)]
+        for _ in range(5):
+            trials.append(replace(model, corrections=_guess(trials[-1], states, products, Q)))
+        model = min(trials, key=lambda trial: cost_of(trial, errors_of(trial)[1]))
+    target = model.terms[:, 0]
     state, residual = errors_of(model)
     cost, damping = cost_of(model, residual), 1e-3
     for _ in range(steps):
@@ -276,7 +295,8 @@ def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
     Returns:
         ``strain_mean`` and ``strain_max``: error of the strains under the load of a state over the largest strain of
         the states, to first order; ``stiffness_mean`` and ``stiffness_max``: largest relative error of the stiffness
-        over all directions of motion.
+        over all directions of motion; with an ensemble ``loaded``, the number of states under load, and ``covered``,
+        the share of them whose strains are wrong by less than the bound.
     """
     found = _corrected(model, states, _products(states.strain, model.terms))
     weights = _weights(states, 1.0)
@@ -286,7 +306,83 @@ def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
     stiffness = np.abs(np.linalg.eigvalsh(relative)).max(axis=1)
     values = {"strain_mean": strain.mean(), "strain_max": strain.max()}
     values |= {"stiffness_mean": stiffness.mean(), "stiffness_max": stiffness.max()}
+    if len(model.member_stiffness):
+        moved = states.rows((states.strain != 0.0).any(axis=1))
+        wrong = _strain_errors(_gradients(model, moved) - moved.gradient, moved)
+        values |= {"loaded": len(moved), "covered": np.mean(wrong <= model.factor * _bounds(model, moved))}
     return {name: float(value) for name, value in values.items()}
+
+
+def with_volumes(model: LearnedModule, states: ModuleStates) -> LearnedModule:
+    """Return a model with the volume of the material and, of a closed module, that of the cavity, by least squares."""
+    P = polynomials(model.unit(states.designs), model.degrees[0])
+    material = np.linalg.lstsq(P, np.log(states.material), rcond=None)[0]
+    model = replace(model, material=material)
+    module: type[Module] = MODULES[model.module]
+    if not module.closed:
+        return model
+    slopes = _products(states.strain, np.insert(volume_terms(module.symmetry), 0, 0, axis=1)).first
+    columns = np.einsum("nti,np->nipt", slopes, P)
+    shape = columns.shape
+    columns = columns.reshape(shape[0] * shape[1], -1)
+    ridge = RIDGE * np.sqrt((columns**2).mean()) * np.eye(columns.shape[1])
+    wanted = np.concatenate([states.swelling.ravel(), np.zeros(len(ridge))])
+    swelling = np.linalg.lstsq(np.vstack([columns, ridge]), wanted, rcond=None)[0].reshape(shape[2:])
+    return replace(model, swelling=swelling, bulge=np.linalg.lstsq(P, np.log(states.bulge), rcond=None)[0])
+
+
+def _strain_errors(gradient: np.ndarray, states: ModuleStates) -> np.ndarray:
+    """Return the sizes (n,) of the strains by which wrong gradients (n, 6) are off, to first order."""
+    return np.linalg.norm(np.linalg.solve(states.hessian, gradient[:, :, None])[:, :, 0], axis=1)
+
+
+def _gradients(model: LearnedModule, states: ModuleStates) -> np.ndarray:
+    """Return the gradients (n, 6) of a model's energy at states."""
+    return _corrected(model, states, _products(states.strain, model.terms)).gradient()
+
+
+def _bounds(model: LearnedModule, states: ModuleStates) -> np.ndarray:
+    """Return the root of the mean square of the members' differences from the model, as strains, shape (n,)."""
+    middle = _gradients(model, states)
+    squares = [
+        _strain_errors(_gradients(replace(model, stiffness=k, corrections=c), states) - middle, states) ** 2
+        for k, c in zip(model.member_stiffness, model.member_corrections, strict=True)
+    ]
+    return np.sqrt(np.mean(squares, axis=0))
+
+
+def calibrated(recipe: Recipe, model: LearnedModule, states: ModuleStates, seed: int = 0) -> LearnedModule:
+    """Return a model with an ensemble, and the factor that makes its differences a bound on 95 % of its errors.
+
+    Each of `MEMBERS` members learns without its share of the bodies. The factor is taken from the errors that each
+    member makes on the bodies which it has not seen.
+
+    Args:
+        recipe: what was learned.
+        model: learned from all states.
+        states: those that it was learned from.
+        seed: of the draw that divides the bodies.
+    """
+    _, body = np.unique(states.designs, axis=0, return_inverse=True)
+    loaded = np.bincount(body.ravel()) > 1
+    share = np.empty(len(loaded), dtype=int)
+    rng = np.random.default_rng(seed)
+    for kind in (loaded, ~loaded):  # each member learns from as many bodies under load as any other
+        share[kind] = rng.permutation(kind.sum()) % MEMBERS
+    left_out = share[body.ravel()]
+    members = [fit(recipe, model.module, states.rows(left_out != k), model.others, start=model) for k in range(MEMBERS)]
+    model = replace(
+        model,
+        member_stiffness=np.array([member.stiffness for member in members]),
+        member_corrections=np.array([member.corrections for member in members]),
+    )
+    moved = (states.strain != 0.0).any(axis=1)
+    ratios = []
+    for k, member in enumerate(members):
+        unseen = states.rows((left_out == k) & moved)
+        errors = _strain_errors(_gradients(member, unseen) - unseen.gradient, unseen)
+        ratios.append(errors / _bounds(model, unseen))
+    return replace(model, factor=float(np.quantile(np.concatenate(ratios), 0.95)))
 
 
 def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
@@ -320,7 +416,7 @@ def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=float)[:, : len(names)]
     tests = {"corners": solved(corners, 1, 3), "inside": solved(drawn(2, 4), 1, 4)}
     others = {v.name: v.baseline for v in made.design_space if v.name not in names and v.name != "young_modulus"}
-    model = fit(recipe, module, states, others)
+    model = with_volumes(calibrated(recipe, fit(recipe, module, states, others), states), states)
     return replace(model, errors={name: errors(model, each) for name, each in tests.items()})
 
 
