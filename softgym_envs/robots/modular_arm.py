@@ -103,6 +103,7 @@ class ModularArm(Robot):
             the whole body, by which designs are judged.
         stroke: largest displacement of a wire either way [m].
         max_effort: largest force of a wire [N].
+        refine: divides the edges of the finite elements of a solid body.
         largest_volume: by which the cavity of a bellows may grow or shrink [m3].
         max_pressure: in a bellows, either way [Pa].
         **options: options of `Robot`.
@@ -123,6 +124,7 @@ class ModularArm(Robot):
         body: str = "superelements",
         stroke: float = 0.006,
         max_effort: float = 1.0,
+        refine: float = 1.0,
         largest_volume: float = 2.0e-7,
         max_pressure: float = 2.0e4,
         **options: Any,
@@ -147,6 +149,7 @@ class ModularArm(Robot):
         self.cells = cells if isinstance(cells, int) else tuple(cells)
         self._kinds = (*kinds, NONE)
         self.body = body
+        self.refine = float(refine)
         self.stroke = float(stroke)
         self.max_effort = float(max_effort)
         self.design_space = DesignSpace(
@@ -226,7 +229,9 @@ class ModularArm(Robot):
         for part in self._modules(design):
             origin = np.array([0.0, 0.0, part.height])
             if self.body == "solid":
-                placed = part.module.add_to(builder, part.design, near=ports[-1], origin=origin, rotation=part.axes)
+                placed = part.module.add_to(
+                    builder, part.design, near=ports[-1], origin=origin, rotation=part.axes, refine=self.refine
+                )
                 ports.append(placed.far)
                 cavities += [] if placed.cavity is None else [placed.cavity]
                 continue
