@@ -31,6 +31,7 @@ from benchmarks.modular import TABLES as MODULAR_TABLES
 from benchmarks.motion import TABLES as MOTION_TABLES
 from benchmarks.printed import TABLES as PRINTED_TABLES
 from benchmarks.recorded import figure
+from benchmarks.structure_policy import TABLES as POLICY_TABLES
 from benchmarks.structures import TABLES as STRUCTURE_TABLES
 from benchmarks.tables import TABLES as OTHER_TABLES
 from benchmarks.zigzag_tables import ZIGZAG_TABLES
@@ -48,6 +49,7 @@ TABLES = (
     | SENSOR_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
+    | POLICY_TABLES
     | GROWN_TABLES
 )
 ROOT = Path(__file__).resolve().parents[1]

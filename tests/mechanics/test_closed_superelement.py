@@ -73,15 +73,15 @@ def test_the_compliance_with_a_cavity_is_the_derivative_of_its_equilibria():
     model, ports = chain(energies, volume(rng))
     for component in range(6):
         model.add("a", Pose(f"tip {component}", ports[-1], component, model.nodes))
-    solver = Statics(model)
+    solver = Statics(model, tolerance=1e-13)
     effort = np.array([2e4, -1e4, 0.2, 0.1, 0.3, 0.01, 0.01, 0.005])
     W = solver.solve(effort, "effort").condensed.W.array
     for k in range(len(effort)):
-        step = 1e-4 * abs(effort[k]) * np.eye(len(effort))[k]
+        step = 1e-3 * abs(effort[k]) * np.eye(len(effort))[k]
         up, down = (solver.solve(effort + s * step, "effort").delta for s in (1.0, -1.0))
         slope = (up - down) / (2.0 * step[k])
         scale = np.sqrt(np.diag(W) * W[k, k])
-        np.testing.assert_allclose(slope / scale, W[:, k] / scale, atol=1e-5)
+        np.testing.assert_allclose(slope / scale, W[:, k] / scale, atol=3e-5)
 
 
 def test_possible_errors_are_how_far_other_energies_put_the_tip():

@@ -41,6 +41,7 @@ class ClosedSuperelement(Superelement):
     def __init__(self, nodes: np.ndarray, ends: np.ndarray, *, cavity: PortVolume, **options: object) -> None:
         super().__init__(nodes, ends[:2], **options)  # type: ignore[arg-type]
         self.cavity, self.bulge = cavity, int(ends[2])
+        self.nodes_used = np.append(self.rows, self.bulge)
         self.bulge_scale = self.length**2
         self._spring = self.bulge_scale**2 / cavity.bulge  # [N/m]
 
@@ -72,7 +73,7 @@ class PortCavity(Constraint):
 
     def __init__(self, name: str, element: ClosedSuperelement) -> None:
         self.name, self._element = name, element
-        rows = (3 * element.nodes_used[:, None] + np.arange(3)).ravel()
+        rows = (3 * element.rows[:, None] + np.arange(3)).ravel()
         self.dofs = np.append(rows, 3 * element.bulge)
 
     def value(self, x: np.ndarray) -> np.ndarray:

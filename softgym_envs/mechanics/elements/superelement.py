@@ -144,6 +144,8 @@ class Superelement(ElementBlock):
     """
 
     volume = 0.0
+    rows: np.ndarray
+    """Rows of both ports, shape (8,)."""
 
     def __init__(
         self,
@@ -164,7 +166,8 @@ class Superelement(ElementBlock):
         start = nodes[first] if origin is None else np.asarray(origin, dtype=float)
         self.energy, self.length = energy, float(length)
         self._young_modulus = float(young_modulus)
-        self.nodes_used = np.concatenate([first + np.arange(4), last + np.arange(4)])
+        self.rows = np.concatenate([first + np.arange(4), last + np.arange(4)])
+        self.nodes_used = self.rows
         ports = np.zeros((8, 8))
         for slot, row, middle in ((0, first, start), (4, last, start + length * axes[:, 2])):
             directors = nodes[row + 1 : row + 4]
@@ -192,13 +195,13 @@ class Superelement(ElementBlock):
 
     def strains(self, x: np.ndarray) -> np.ndarray:
         """Return the strains (6,) at rows ``x`` (n, 3)."""
-        z = x[self.nodes_used]
+        z = x[self.rows]
         return 0.5 * (self.strain_slopes(x) @ z.ravel()) - self._rest
 
     def strain_slopes(self, x: np.ndarray) -> np.ndarray:
-        """Return the derivatives (6, 24) of the strains by the rows `nodes_used` at rows ``x`` (n, 3)."""
+        """Return the derivatives (6, 24) of the strains by the rows `rows` at rows ``x`` (n, 3)."""
         slopes = np.empty((6, 8, 3))
-        _slopes(self._forms, x[self.nodes_used], slopes)
+        _slopes(self._forms, x[self.rows], slopes)
         return slopes.reshape(6, 24)
 
     def strain_hessian(self, x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:
@@ -216,16 +219,16 @@ class Superelement(ElementBlock):
         return self.energy.knows(self.strains(x))
 
     def possible_errors(self, x: np.ndarray, fields: np.ndarray) -> np.ndarray:
-        rates = fields[:, self.nodes_used].reshape(len(fields), 24) @ self.strain_slopes(x).T
+        rates = fields[:, self.rows].reshape(len(fields), 24) @ self.strain_slopes(x).T
         return self.energy.spread(self.strains(x)) @ rates.T
 
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        return [lower_pairs((3 * self.nodes_used[:, None] + np.arange(3)).reshape(1, 24))]
+        return [lower_pairs((3 * self.rows[:, None] + np.arange(3)).reshape(1, 24))]
 
     def add(
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
-        z = x[self.nodes_used]
+        z = x[self.rows]
         slopes = np.empty((6, 8, 3))
         _slopes(self._forms, z, slopes)
         strains = 0.5 * (slopes.reshape(6, 24) @ z.ravel()) - self._rest
@@ -245,7 +248,7 @@ class Superelement(ElementBlock):
         scatter: list[np.ndarray] | None,
     ) -> None:
         """Add forces and tangent for the derivatives of an energy by the strains, (6,) and (6, 6)."""
-        gradient[self.nodes_used] += (force @ slopes.reshape(6, 24)).reshape(8, 3)
+        gradient[self.rows] += (force @ slopes.reshape(6, 24)).reshape(8, 3)
         if values is not None and scatter is not None:
             _add_tangent(self._forms, slopes, force, stiffness, scatter[0].ravel(), values)
 
@@ -263,18 +266,18 @@ class Superelement(ElementBlock):
         change = self.strains(rates.middle + half) - self.strains(rates.middle - half)
         viscosity = rates.damping * factor * self._viscous
         force = viscosity @ change
-        self._spread(self._forms @ x[self.nodes_used], force, viscosity, gradient, values, scatter)
+        self._spread(self._forms @ x[self.rows], force, viscosity, gradient, values, scatter)
         return factor * float(change @ force)
 
     def nodal_masses(self, count: int) -> np.ndarray:
         masses = np.zeros(count)
-        masses[self.nodes_used] = self._weights
+        masses[self.rows] = self._weights
         return masses
 
     def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Entries between all rows of both ports: there is no lumped mass of a superelement."""
         i, j = np.tril_indices(8)
-        return self.nodes_used[i], self.nodes_used[j], self._inertia[i, j]
+        return self.rows[i], self.rows[j], self._inertia[i, j]
 
     def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
         warp_lines(x, step, *self._line, np.array([[self.length]]), out)
