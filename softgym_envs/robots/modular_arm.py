@@ -19,7 +19,7 @@ from softgym_envs.mechanics.elements.superelement import point_masses
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin, bridge_skin
 from softgym_envs.robots.base import Actuator, Robot
-from softgym_envs.robots.modules.base import DENSITY, Module
+from softgym_envs.robots.modules.base import Module
 from softgym_envs.robots.modules.learned import learned_module
 from softgym_envs.robots.modules.registry import MODULES
 
@@ -244,7 +244,7 @@ class ModularArm(Robot):
                 length=part.length,
                 rotation=part.axes,
                 young_modulus=part.design["young_modulus"],
-                inertia=point_masses(DENSITY * learned.volume(part.design)),
+                inertia=point_masses(part.module.mass(part.design)) if any(self.gravity) else None,
                 cavity=learned.cavity(part.design) if part.module.closed else None,
             )
             ports.append(far)

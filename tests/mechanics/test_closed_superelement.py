@@ -84,30 +84,51 @@ def test_the_compliance_with_a_cavity_is_the_derivative_of_its_equilibria():
         np.testing.assert_allclose(slope / scale, W[:, k] / scale, atol=3e-5)
 
 
-def test_possible_errors_are_how_far_other_energies_put_the_tip():
-    """Each member in turn as the energy: the tip moves by what the ensemble says, to first order."""
+def test_possible_errors_bound_how_far_wrong_strains_put_the_tip():
+    """The tip moves by at most the bound, and for the worst of many errors of the bound's size nearly by it."""
     rng = np.random.default_rng(2)
     k, c = np.array([2.0, 3.0, 4.0, 0.5, 0.3, 0.2]), 0.2 * rng.normal(size=len(terms()))
-    small = 1e-4
-    members = k * (1.0 + small * rng.normal(size=(3, 6))), c + small * rng.normal(size=(3, len(c)))
-    known = ModuleEnergy(LENGTH, k, c)
-    learned = ModuleEnergy(LENGTH, k, c, members=members, factor=2.0)
+    known, learned = ModuleEnergy(LENGTH, k, c), ModuleEnergy(LENGTH, k, c, error=1e-4)
     force = np.array([1.0, -2.0, 0.5])
 
-    def tip(first, held):
-        model, ports = chain([first, known])
+    def solve(energy, held):
+        model, ports = chain([energy, known])
         model.add("a", Pose("tip x", ports[-1], 0, model.nodes))
-        solver, command = Statics(model), np.array([0.004 if held else 0.0])
+        solver, command = Statics(model, tolerance=1e-13), np.array([0.004 if held else 0.0])
         state = solver.solve(command, "displacement" if held else "effort", effector_force=force)
-        return solver, state.condensed.delta.e
+        return solver, state
+
+    class Wrong:
+        """The energy with a constant error of its force."""
+
+        def __init__(self, load):
+            self.load = load
+
+        def evaluate(self, strains):
+            energy, gradient, hessian = known.evaluate(strains)
+            return energy + self.load @ strains, gradient + self.load, hessian
+
+        def knows(self, strains):
+            return True
+
+        def possible_errors(self, strains):
+            return np.empty((0, 6))
 
     for held in (False, True):
-        solver, middle = tip(learned, held)
-        found = solver.possible_errors(np.array([held]))
-        moves = [tip(ModuleEnergy(LENGTH, *member), held)[1] - middle for member in zip(*members, strict=True)]
-        expected = 2.0 * np.sqrt(np.mean(np.square(moves), axis=0))
-        np.testing.assert_allclose(found, expected, rtol=0.02, atol=1e-3 * expected.max())
-        assert not tip(known, held)[0].possible_errors(np.array([held])).any()
+        solver, middle = solve(learned, held)
+        bound = solver.possible_errors(np.array([held]))
+        block = solver.model.blocks[0]
+        errors = learned.possible_errors(block.strains(middle.x))
+        directions = rng.normal(size=(60, 6))
+        directions /= np.linalg.norm(directions, axis=1)[:, None]
+        moves = np.array(
+            [solve(Wrong(d @ errors), held)[1].condensed.delta.e - middle.condensed.delta.e for d in directions]
+        )
+        free = bound > 1e-12
+        assert free.tolist() == [not held, True, True]
+        largest = np.abs(moves).max(axis=0)
+        assert (largest[free] <= 1.01 * bound[free]).all() and (largest[free] > 0.5 * bound[free]).all()
+        assert not solve(known, held)[0].possible_errors(np.array([held])).any()
 
 
 def test_half_of_the_weight_hangs_at_each_port():

@@ -84,9 +84,8 @@ def test_a_fit_finds_the_energy_that_made_the_states(name):
     strain = 0.05 * rng.normal(size=(120, 6))
     strain[:12] = 0.0
     rows = [ModuleEnergy(1.0, k * d[0], c, symmetry).evaluate(e) for d, e in zip(designs, strain, strict=True)]
-    none = np.zeros(len(strain))
     gradient, hessian = np.array([r[1] for r in rows]), np.array([r[2] for r in rows])
-    states = ModuleStates(designs, strain, gradient, hessian, np.zeros((len(strain), 6)), none, none)
+    states = ModuleStates(designs, strain, gradient, hessian, np.zeros((len(strain), 6)), np.zeros(len(strain)))
     stable = np.linalg.eigvalsh(states.hessian)[:, 0] > 0.0
     found = fit(Recipe(box, 0.5), name, states.rows(stable), {})
     error = errors(found, states.rows(stable))["stiffness_mean"]
@@ -130,33 +129,19 @@ def test_bodies_are_drawn_from_the_box_in_any_order_of_its_dimensions(monkeypatc
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_learned_modules_know_how_wrong_they_may_be(name):
-    """No error at rest, where the force is exactly zero; it grows with the strains, and scales with the modulus."""
-    learned = learned_module(name)
-    assert 1.0 < learned.factor < 20.0 and len(learned.member_stiffness) == learning.MEMBERS
-    strains = 0.3 * learned.largest_strains * np.sign(np.arange(6) - 2.5)
-    strains[:3] *= MODULES[name]().length(MODULES[name].design_space.baseline)
-    soft, stiff = (learned.energy({"young_modulus": modulus}) for modulus in (1e7, 2e7))
-    assert not soft.spread(np.zeros(6)).any()
-    sizes = [np.linalg.norm(soft.spread(share * strains)) for share in (0.25, 0.5, 1.0)]
-    assert 0.0 < sizes[0] < sizes[1] < sizes[2] < 0.3 * np.linalg.norm(soft.evaluate(strains)[1])
-    np.testing.assert_allclose(stiff.spread(strains), 2.0 * soft.spread(strains))
-
-
-def test_bounds_of_an_ensemble_hold_for_bodies_that_it_has_not_seen():
-    """Energies outside the learned form: 95 % of the errors were within the bounds where the factor was found."""
-    rng = np.random.default_rng(3)
-    designs = rng.uniform(0.01, 0.03, size=(24, 1))
-    strain = np.concatenate([np.zeros((24, 6)), 0.1 * rng.normal(size=(48, 6))])
-    designs = np.concatenate([designs, designs, designs])
-    k = np.array([2.0, 3.0, 4.0, 0.5, 0.3, 0.2]) * (1.0 + 0.3 * np.sin(300.0 * designs))
-    gradient = k * strain * (1.0 + strain**2)
-    hessian = (k * (1.0 + 3.0 * strain**2))[:, :, None] * np.eye(6)
-    none = np.zeros(len(strain))
-    states = ModuleStates(designs, strain, gradient, hessian, np.zeros((len(strain), 6)), none, none)
-    recipe = Recipe({"length": (0.01, 0.03)}, 0.3, degrees=(2, 1))
-    found = learning.calibrated(recipe, fit(recipe, "solid_block", states, {}), states)
-    assert found.factor > 0.0
-    assert errors(found, states)["covered"] >= 0.95  # the whole model is better than members that have not seen a body
+    """Nothing at rest, where the force is exactly zero; more at the corners of the box, and for larger strains."""
+    learned, module = learned_module(name), MODULES[name]()
+    middle = {each: (low * high) ** 0.5 for each, (low, high) in learned.box.items()}
+    corner = {each: high for each, (_, high) in learned.box.items()}
+    inside, outside = (learned.energy({**design, "young_modulus": 1e7}) for design in (middle, corner))
+    assert inside.error == pytest.approx(learned.errors["inside"]["relative_max"])
+    assert outside.error >= learned.errors["corners"]["relative_max"] and 0.0 < inside.error <= outside.error < 0.1
+    scale = np.array([module.length(module.design_space.complete(middle))] * 3 + [1.0] * 3)
+    strains = 0.3 * scale * learned.largest_strains * np.sign(np.arange(6) - 2.5)
+    assert not inside.possible_errors(np.zeros(6)).any()
+    compliance = np.linalg.inv(inside.evaluate(strains)[2])
+    off = np.array([compliance @ row / scale for row in inside.possible_errors(strains)])
+    np.testing.assert_allclose(off, inside.error * np.linalg.norm(strains / scale) * np.eye(6), atol=1e-9)
 
 
 def test_strains_that_were_not_learned_are_not_known():

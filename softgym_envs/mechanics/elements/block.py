@@ -45,7 +45,7 @@ class ElementBlock(ABC):
         volume: rest volume [m3].
         mass: mass [kg].
         stiffness: a typical stiffness against displacements [N/m], for scaling.
-        learned: whether the energy is learned by an ensemble, so that `possible_errors` has rows.
+        learned: whether the energy is learned, so that `possible_errors` has rows.
         elasticity_version: increases with every change of the elasticity, so that solvers can detect it.
     """
 
@@ -73,7 +73,7 @@ class ElementBlock(ABC):
             fields: motions per unit, shape (m, n, 3).
 
         Returns:
-            A row for each member of an ensemble, shape (k, m); no rows where the energy is exact.
+            A row for each of k independent errors, shape (k, m); no rows where the energy is exact.
         """
         return np.empty((0, len(fields)))
 

@@ -40,8 +40,8 @@ class PortEnergy(Protocol):
     def knows(self, strains: np.ndarray) -> bool:
         """Whether the energy is known at strains (6,)."""
 
-    def spread(self, strains: np.ndarray) -> np.ndarray:
-        """Return how its gradient may be wrong at strains (6,), an error in each row: shape (k, 6) [N, N m]."""
+    def possible_errors(self, strains: np.ndarray) -> np.ndarray:
+        """Return independent errors that its gradient may have at strains (6,), as rows (k, 6) [N, N m]."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class QuadraticEnergy:
     def knows(self, strains: np.ndarray) -> bool:
         return True
 
-    def spread(self, strains: np.ndarray) -> np.ndarray:
+    def possible_errors(self, strains: np.ndarray) -> np.ndarray:
         return np.empty((0, 6))
 
 
@@ -184,7 +184,7 @@ class Superelement(ElementBlock):
         self.mass = float(weights @ matrix @ weights)
         self._rest = np.zeros(6)
         self._rest = self.strains(nodes)
-        self.learned = len(energy.spread(np.zeros(6))) > 0
+        self.learned = len(energy.possible_errors(np.zeros(6))) > 0
         self._viscous = energy.evaluate(np.zeros(6))[2]
         self.stiffness = float(np.trace(self._viscous[:3, :3]) / 3.0)
         self._line = (np.array([[first, last]]), np.array([[0.5, 0.5]]), np.array([[[-1.0, 1.0]]]) / length)
@@ -220,7 +220,7 @@ class Superelement(ElementBlock):
 
     def possible_errors(self, x: np.ndarray, fields: np.ndarray) -> np.ndarray:
         rates = fields[:, self.rows].reshape(len(fields), 24) @ self.strain_slopes(x).T
-        return self.energy.spread(self.strains(x)) @ rates.T
+        return self.energy.possible_errors(self.strains(x)) @ rates.T
 
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
         return [lower_pairs((3 * self.rows[:, None] + np.arange(3)).reshape(1, 24))]

@@ -549,7 +549,7 @@ class Statics:
             held: actuators whose displacement is held, not their effort, shape (n_a,).
 
         Returns:
-            Root of the sum of squares over all energies, of the mean over each ensemble, shape (n_e,) [m].
+            Root of the sum of squares over all independent errors, shape (n_e,) [m].
         """
         linear, rows, x = self.linearisation, np.flatnonzero(held), self.x
         efforts = np.zeros((len(self._effectors), self._assembly.size))
@@ -561,7 +561,7 @@ class Statics:
         total = np.zeros(len(efforts))
         for block in self.model.blocks:
             if block.learned:
-                total += (block.possible_errors(x, fields) ** 2).mean(axis=0)
+                total += (block.possible_errors(x, fields) ** 2).sum(axis=0)
         return np.sqrt(total)
 
     def _motions_of_actuators(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles
-from softgym_envs.mechanics.elements.tetrahedra import SolidOptions
+from softgym_envs.mechanics.elements.tetrahedra import SolidOptions, Tetrahedra
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.mechanics.surfaces import cavity_around
@@ -163,6 +163,11 @@ class Module(ABC):
         if placed.cavity is not None:
             model.add("a", Cavity("cavity", placed.cavity, model.nodes))
         return model
+
+    def mass(self, design: Mapping[str, float] | None = None) -> float:
+        """Return the mass of a body [kg], from its mesh; for the exceptions see `body`."""
+        mesh = self.body(design)
+        return DENSITY * float(Tetrahedra(mesh.nodes, mesh.tetrahedra).volume)
 
     def write(self, path: str | Path, design: Mapping[str, float] | None = None) -> Path:
         """Write the exact shape as ``.step`` or ``.stl`` [mm] and return the path.

@@ -161,17 +161,6 @@ def _energy(e, terms, k, c, gradient, hessian):
     return energy
 
 
-@njit(cache=True, error_model="numpy")
-def _spread(e, terms, k, c, others_k, others_c, out):
-    """Write by how much the gradients of other energies differ at strains (6,), shape (members, 6)."""
-    gradient, hessian = np.empty(6), np.empty((6, 6))
-    _energy(e, terms, k, c, gradient, hessian)
-    for m in range(len(others_k)):
-        _energy(e, terms, others_k[m], others_c[m], out[m], hessian)
-        for i in range(6):
-            out[m, i] -= gradient[i]
-
-
 class ModuleEnergy:
     """Energy of a symmetric module, for `softgym_envs.mechanics.elements.superelement.Superelement`.
 
@@ -183,8 +172,8 @@ class ModuleEnergy:
         rotation: the largest load that was learned, as the angle by which it would turn the softest rotation [rad];
             see `softgym_envs.robots.modules.states.solve_states`. Default any load.
         largest_strains: size of each strain that was learned, the first three over the length, shape (6,). Default any.
-        members: ``k`` (n, 6) and ``c`` (n, m) of other energies for the same module, an ensemble. Default none.
-        factor: by which their differences are multiplied to bound 95 % of the errors.
+        error: bound on the error of the strains under a load, relative to their size, the first three over the length.
+            Default none.
 
     Raises:
         ValueError: for a stiffness that is not positive.
@@ -198,11 +187,9 @@ class ModuleEnergy:
         symmetry: tuple[str, ...] = MIRRORED,
         rotation: float = np.inf,
         largest_strains: np.ndarray | float = np.inf,
-        members: tuple[np.ndarray, np.ndarray] | None = None,
-        factor: float = 1.0,
+        error: float = 0.0,
     ) -> None:
-        self._members = members
-        self._factor = float(factor)
+        self.error = float(error)
         self.stiffness = np.array(stiffness, dtype=float)
         self.corrections = np.array(corrections, dtype=float)
         if not (self.stiffness > 0.0).all():
@@ -219,16 +206,13 @@ class ModuleEnergy:
         energy = _energy(self._scale * strains, self._terms, self.stiffness, self.corrections, gradient, hessian)
         return energy, self._scale * gradient, self._scale[:, None] * hessian * self._scale
 
-    def spread(self, strains: np.ndarray) -> np.ndarray:
-        """Return how the gradient [N, N m] may be wrong at strains (6,) [m, 1], by each member: shape (n, 6).
+    def possible_errors(self, strains: np.ndarray) -> np.ndarray:
+        """Return the errors of the gradient at strains (6,) that wrong strains cause, by axis: shape (6, 6) [N, N m].
 
-        The mean of their squares bounds 95 % of the errors.
+        Row i is that of strains which are off along their axis i by the bound. So the root of the sum of squares of the
+        work of all rows along a motion is the largest work of all errors within the bound.
         """
-        if self._members is None:
-            return np.empty((0, 6))
-        out = np.empty((len(self._members[0]), 6))
-        _spread(self._scale * strains, self._terms, self.stiffness, self.corrections, *self._members, out)
-        return self._factor * self._scale * out
+        return self.error * np.linalg.norm(self._scale * strains) / self._scale[:, None] * self.evaluate(strains)[2]
 
     def load(self, strains: np.ndarray) -> float:
         """Return the load at strains (6,) over the largest one that was learned."""

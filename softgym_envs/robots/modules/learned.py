@@ -20,11 +20,11 @@ from softgym_envs.robots.modules.base import Module
 from softgym_envs.robots.modules.energy import CavityVolume, ModuleEnergy, terms
 from softgym_envs.robots.modules.registry import MODULES
 
+EDGE = 0.5
+"""A dimension counts as being at its bound within this part of half its range, linearly from 0 to 1."""
+
 FORMAT = 1
-_ARRAYS = (
-    "stiffness", "corrections", "largest_strains", "member_stiffness", "member_corrections", "swelling", "bulge",
-    "material",
-)  # fmt: skip
+_ARRAYS = ("stiffness", "corrections", "largest_strains", "swelling", "bulge")
 FOLDER = Path(__file__).parent / "energies"
 
 
@@ -50,12 +50,6 @@ class LearnedModule:
         largest_strains: size of each strain of the states, the first three over the length, shape (6,).
         errors: those on bodies that were not used, as `learning.errors` returns them.
         degrees: of the polynomials of ``stiffness`` and ``corrections``.
-        member_stiffness: ``stiffness`` of the members of an ensemble, each learned without some of the bodies, shape
-            (n, p, 6).
-        member_corrections: their ``corrections``, shape (n, q, len(terms)).
-        factor: by which the differences of the members are multiplied to bound 95 % of the errors on bodies that they
-            have not seen; see `learning.calibrated`.
-        material: weights of the logarithm of the volume of the body over the cube of the length, shape (p,).
         swelling: weights of the coefficients of `energy.CavityVolume`, shape (p, m); none if the module is not closed.
         bulge: weights of the logarithm of its ``bulge``, shape (p,); likewise.
     """
@@ -69,10 +63,6 @@ class LearnedModule:
     largest_strains: np.ndarray
     errors: Mapping[str, Mapping[str, float]]
     degrees: tuple[int, int]
-    member_stiffness: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 6)))
-    member_corrections: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 0)))
-    factor: float = 1.0
-    material: np.ndarray = field(default_factory=lambda: np.empty(0))
     swelling: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     bulge: np.ndarray = field(default_factory=lambda: np.empty(0))
 
@@ -96,9 +86,6 @@ class LearnedModule:
         length, modulus, unit = self._body(design)
         modulus *= length**3
         P, Q = (polynomials(unit, degree)[0] for degree in self.degrees)
-        members = None
-        if len(self.member_stiffness):
-            members = modulus * np.exp(P @ self.member_stiffness), Q @ self.member_corrections
         return ModuleEnergy(
             length,
             modulus * np.exp(P @ self.stiffness),
@@ -106,14 +93,18 @@ class LearnedModule:
             MODULES[self.module].symmetry,  # type: ignore[attr-defined]
             self.rotation,
             self.largest_strains,
-            members,
-            self.factor,
+            self.error(unit[0]),
         )
 
-    def volume(self, design: Mapping[str, float] | None = None) -> float:
-        """Return the volume of the material of a body [m3]; see `energy`."""
-        length, _, unit = self._body(design)
-        return length**3 * float(np.exp(polynomials(unit, self.degrees[0])[0] @ self.material))
+    def error(self, unit: np.ndarray) -> float:
+        """Return the bound on the error of the strains relative to their size, of a body (v,) in [-1, 1].
+
+        It is the largest error on bodies that were not learned: inside the box, and at its corners. Between these, its
+        logarithm is linear in the share of dimensions at their bounds, as in `softgym_envs.surrogate.domain`.
+        """
+        inside, corners = (self.errors.get(place, {}).get("relative_max", 0.0) for place in ("inside", "corners"))
+        share = np.clip((np.abs(unit) - 1.0) / EDGE + 1.0, 0.0, 1.0).mean()
+        return float(max(inside, 1e-300) ** (1.0 - share) * max(corners, inside, 1e-300) ** share)
 
     def cavity(self, design: Mapping[str, float] | None = None) -> CavityVolume:
         """Return how the volume of the cavity of a body grows; see `energy`.
@@ -150,8 +141,7 @@ class LearnedModule:
     def save(self, path: str | Path) -> None:
         """Write the superelement as JSON, for `load_module`."""
         record = {"format": FORMAT, **asdict(self)}
-        digits = {name: 5 if name.startswith("member") else 8 for name in _ARRAYS}
-        record |= {name: np.round(getattr(self, name), digits[name]).tolist() for name in _ARRAYS}
+        record |= {name: np.round(getattr(self, name), 8).tolist() for name in _ARRAYS}
         Path(path).write_text(json.dumps(record) + "\n")
 
 
@@ -168,7 +158,7 @@ def load_module(path: str | Path) -> LearnedModule:
             raise ValueError(f"it does not have format {FORMAT}")
         record["box"] = {name: (float(low), float(high)) for name, (low, high) in record["box"].items()}
         record["degrees"] = tuple(record["degrees"])
-        # Files of earlier versions do not limit strains, and have no ensemble.
+        # Files of earlier versions do not limit strains.
         record.setdefault("largest_strains", [np.inf] * 6)
         for name in _ARRAYS:
             if name in record:

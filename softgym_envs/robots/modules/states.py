@@ -34,7 +34,6 @@ class ModuleStates:
             for modules that are not closed.
         bulge: growth of that volume under a pressure with the ports held, times Young's modulus over the cube of the
             length, shape (n,).
-        material: volume of the body over the cube of the length, shape (n,).
     """
 
     designs: np.ndarray
@@ -43,7 +42,6 @@ class ModuleStates:
     hessian: np.ndarray
     swelling: np.ndarray
     bulge: np.ndarray
-    material: np.ndarray
 
     def __len__(self) -> int:
         return len(self.strain)
@@ -90,11 +88,10 @@ def solve_states(
     for row in designs:
         design = dict(zip(names, row, strict=True)) | dict(more or {}) | {"young_modulus": MODULUS}
         length = module.length(module.design_space.complete(design))
-        model = module.model(design, refine=refine)
-        solver, material = Statics(model), model.volume / length**3
+        solver = Statics(module.model(design, refine=refine))
         # A closed module has no pressure, which would be its seventh effort.
         rest = solver.solve(np.zeros(6 + module.closed), "effort").condensed
-        kept.append((row, *_in_strains(rest, length), material))
+        kept.append((row, *_in_strains(rest, length)))
         moment = rotation / np.diag(rest.W.aa)[3:6].max()
         scale = np.array([2.0 * moment / length] * 3 + [moment] * 3)
         for _ in range(rays):
@@ -111,7 +108,7 @@ def solve_states(
                     break
                 if np.linalg.norm(found.condensed.delta.a[3:6]) > LARGEST_SINE:
                     break
-                kept.append((row, *_in_strains(found.condensed, length), material))
+                kept.append((row, *_in_strains(found.condensed, length)))
     return ModuleStates(*(np.array(column) for column in zip(*kept, strict=True)))
 
 
@@ -125,7 +122,7 @@ def pose_rows(pose: np.ndarray, length: float) -> np.ndarray:
 
 
 def _in_strains(state: CondensedModel, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-    """Turn a state over a far port's pose into one over strains: the fields of `ModuleStates` but the material."""
+    """Turn a state over a far port's pose into one over strains: the fields of `ModuleStates`."""
     pose, effort, W = state.delta.a[:6], state.lambda_.a[:6], state.W.aa
     tangent = np.linalg.inv(W[:6, :6])
     scale = np.array([length] * 3 + [1.0] * 3)
