@@ -230,7 +230,7 @@ def fit(
     # The guesses do not always come closer: the search begins at the best of them.
     trials = [_guess_at_rest(model, states, P, Q)]
     for _ in range(5):
-        trials.append(replace(model, corrections=_guess(trials[-1], states, products, Q)))
+        trials.append(replace(trials[0], corrections=_guess(trials[-1], states, products, Q)))
     model = min(trials, key=lambda trial: cost_of(trial, errors_of(trial)[1]))
     target = model.terms[:, 0]
     state, residual = errors_of(model)

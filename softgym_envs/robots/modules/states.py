@@ -123,7 +123,8 @@ def pose_rows(pose: np.ndarray, length: float) -> np.ndarray:
 
 def _in_strains(state: CondensedModel, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
     """Turn a state over a far port's pose into one over strains: the fields of `ModuleStates`."""
-    pose, effort, W = state.delta.a[:6], state.lambda_.a[:6], state.W.aa
+    effort, W = state.lambda_.a[:6], state.W.aa
+    pose = state.delta.a[:6] if effort.any() else np.zeros(6)  # at rest without round-off
     tangent = np.linalg.inv(W[:6, :6])
     scale = np.array([length] * 3 + [1.0] * 3)
     rest = pose_rows(np.zeros(6), length)
