@@ -33,14 +33,14 @@ def test_the_modular_arm_follows_finite_elements_of_the_whole_body(cells, comman
 
 
 def test_the_arm_sinks_under_its_weight_as_finite_elements_do():
-    """Gravity across an arm that is much heavier than its leaves; half the weight of each module hangs at each port."""
+    """Weight across a leaf that carries a block, within the loads that were learned."""
     found = {}
     for body in ("superelements", "solid"):
-        robot = make_robot("modular_arm", cells=["leaf_x", "block"], body=body, gravity=(9.81, 0.0, 0.0))
-        solver = Statics(robot.build({"young_modulus": 1e7}))
+        robot = make_robot("modular_arm", cells=["leaf_x", "block"], body=body, gravity=(4.0, 0.0, 0.0))
+        solver = Statics(robot.build())
         found[body] = solver.solve(np.zeros(2), "effort").condensed.delta.e - robot.effector_rest
     assert found["solid"][0] > 5e-4
-    assert found["superelements"][0] == pytest.approx(found["solid"][0], rel=0.03)
+    assert found["superelements"][0] == pytest.approx(found["solid"][0], rel=0.02)
 
 
 def test_the_arm_knows_how_far_its_tip_may_be_off():
