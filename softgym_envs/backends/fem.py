@@ -17,6 +17,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
+from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import TOUCH_RADIUS, Robot
 from softgym_envs.surrogate.domain import LOADED, SPREAD
@@ -342,7 +343,7 @@ class FEMBackend(Backend):
         uncertainty = 0.0
         if motion is None and any(block.learned for block in self.model.blocks):
             held = np.abs(equilibrium.effort[slices["a"]]) < self.largest_efforts * SATURATED
-            uncertainty = float(np.linalg.norm(self._statics.possible_errors(held)[:3]))
+            uncertainty = float(np.linalg.norm(possible_errors(self._statics, held)[:3]))
             doubt |= SPREAD if uncertainty > self.robot.goal_tolerance else 0
         return State(
             command=np.array(command, dtype=float),

@@ -539,31 +539,6 @@ class Statics:
             rows=tuple(labels),
         )
 
-    def possible_errors(self, held: np.ndarray) -> np.ndarray:
-        """Return how far learned energies may put the effectors off at the present equilibrium.
-
-        An error of the forces moves an effector by its work along the motion that a unit force on the effector causes
-        (Maxwell and Betti), with the displacements of some actuators held.
-
-        Args:
-            held: actuators whose displacement is held, not their effort, shape (n_a,).
-
-        Returns:
-            Root of the sum of squares over all independent errors, shape (n_e,) [m].
-        """
-        linear, rows, x = self.linearisation, np.flatnonzero(held), self.x
-        efforts = np.zeros((len(self._effectors), self._assembly.size))
-        efforts[np.arange(len(efforts)), self._effectors] = 1.0
-        if len(rows):
-            efforts[:, rows] = -np.linalg.solve(linear.W[np.ix_(rows, rows)], linear.W[np.ix_(rows, self._effectors)]).T
-        kinematics = self.model.kinematics
-        fields = np.stack([kinematics.row_velocity(x, linear.response(effort)) for effort in efforts])
-        total = np.zeros(len(efforts))
-        for block in self.model.blocks:
-            if block.learned:
-                total += (block.possible_errors(x, fields) ** 2).sum(axis=0)
-        return np.sqrt(total)
-
     def _motions_of_actuators(self) -> np.ndarray:
         """Motions (N, n_a) of the equations that each actuator's effort causes, with a largest component of one."""
         linear = self.linearisation
