@@ -333,9 +333,9 @@ class LearnerConfig(Config):
     """A learning method and its hyperparameters.
 
     Attributes:
-        learner: ``"sac"``, ``"ppo"`` or ``"evolution"``, model-free, for every environment; or, model-based and on the
-            surrogate only, ``"analytic"``, which follows derivatives of the reward, or ``"cloning"``, which imitates
-            the inverse QP; or ``"recurrent"``, which imitates it with a memory, for every environment with positions.
+        learner: ``"sac"``, ``"ppo"`` or ``"evolution"``, model-free, for every environment; or, model-based,
+            ``"analytic"``, which follows derivatives of the reward and needs the surrogate, ``"cloning"``, which
+            imitates the inverse QP, or ``"recurrent"``, which imitates it with a memory where goals are positions.
         sac: hyperparameters of SAC.
         ppo: hyperparameters of PPO.
         analytic: hyperparameters of the analytic policy gradient.

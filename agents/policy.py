@@ -213,7 +213,7 @@ def _meaning(environment: EnvironmentConfig, any_task: bool) -> dict[str, tuple[
     scales = (
         [(actuator.name, actuator.low, actuator.high, actuator.rate) for actuator in robot.actuators],
         (robot.size, robot.workspace_scale, robot.effort_scale.tolist()),
-        [(variable.low, variable.high, variable.log) for variable in variables],
+        [(variable.low, variable.high, variable.log, variable.choices) for variable in variables],
     )
     return {
         "id": (

@@ -32,6 +32,7 @@ from benchmarks.motion import TABLES as MOTION_TABLES
 from benchmarks.printed import TABLES as PRINTED_TABLES
 from benchmarks.recorded import figure
 from benchmarks.robustness import TABLES as ROBUSTNESS_TABLES
+from benchmarks.structure_policy import TABLES as POLICY_TABLES
 from benchmarks.structures import TABLES as STRUCTURE_TABLES
 from benchmarks.tables import TABLES as OTHER_TABLES
 from benchmarks.tetrapod_surrogate import TABLES as TETRAPOD_TABLES
@@ -52,6 +53,7 @@ TABLES = (
     | TETRAPOD_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
+    | POLICY_TABLES
     | GROWN_TABLES
 )
 ROOT = Path(__file__).resolve().parents[1]

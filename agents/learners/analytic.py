@@ -15,11 +15,14 @@ import numpy as np
 
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.gradient import GradientLearner
+from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.envs.gradients import StepGradient
 
 
 class AnalyticLearner(GradientLearner):
     """Analytic policy gradient, one step deep."""
+
+    env: SoftRobotVectorEnv
 
     def __init__(self, config: TrainConfig) -> None:
         super().__init__(config, config.analytic)

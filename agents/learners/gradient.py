@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from softgym_envs.agents.config import GradientConfig, TrainConfig
 from softgym_envs.agents.learners.network import NetworkLearner
@@ -24,26 +25,33 @@ class GradientLearner(NetworkLearner):
         options: learning rates, widths and members.
 
     Attributes:
-        env: the batched environment.
+        needs_batch: whether the method needs the batched environment; else it takes others too, which this process
+            steps one after the other.
+        env: the environments.
 
     Raises:
-        ValueError: for an environment that is not batched, or a correction of the QP.
+        ValueError: for an environment that is not batched if the method needs it, or a correction of the QP.
     """
+
+    needs_batch: ClassVar[bool] = True
 
     def __init__(self, config: TrainConfig, options: GradientConfig) -> None:
         import torch
 
         environment = config.environment
-        if not environment.batched or environment.residual_scale:
+        if (self.needs_batch and not environment.batched) or environment.residual_scale:
             raise ValueError(
                 f"learner '{config.learner}' needs environment.backend = surrogate, or fem for robots of beams, and no "
                 f"residual_scale, got {environment.backend} and {environment.residual_scale:g}; allowed: learner 'sac' "
                 "or 'ppo'"
             )
         super().__init__(config)
-        members = {"members": options.members} if options.members and environment.backend == "surrogate" else {}
-        env = environment.make_vec(config.num_envs, backend_options={**environment.backend_options, **members})
-        self.env: SoftRobotVectorEnv = env.unwrapped  # type: ignore[assignment]
+        if environment.batched:
+            members = {"members": options.members} if options.members and environment.backend == "surrogate" else {}
+            env = environment.make_vec(config.num_envs, backend_options={**environment.backend_options, **members})
+        else:
+            env = SyncVectorEnv([environment.make] * config.num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+        self.env: VectorEnv = env.unwrapped
         generator = torch.Generator().manual_seed(config.seed)
         sizes = [self.env.single_observation_space.shape[0], *options.net_arch]  # type: ignore[index]
         actions = self.env.single_action_space.shape[0]  # type: ignore[index]
@@ -65,7 +73,8 @@ class GradientLearner(NetworkLearner):
         rng = np.random.default_rng([config.seed, self.step])
         observation, _ = env.reset(seed=int(rng.integers(2**31)))
         # Episodes end at different times, so that a batch holds states of all ages.
-        env.steps = rng.integers(0, env.max_episode_steps, env.num_envs)
+        if isinstance(env, SoftRobotVectorEnv):
+            env.steps = rng.integers(0, env.max_episode_steps, env.num_envs)
         while self.step < target:
             self._slow_down()
             observation = self.advance(observation, rng)
