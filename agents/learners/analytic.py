@@ -15,8 +15,8 @@ import numpy as np
 
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.gradient import GradientLearner
-from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.envs.gradients import StepGradient
+from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 
 class AnalyticLearner(GradientLearner):
