@@ -211,19 +211,40 @@ def freeze(names: tuple[str, ...]) -> None:
 
 @benchmark.command()
 @click.argument("name")
-@click.option("--bodies", type=click.IntRange(min=1), default=100_000, show_default=True)
-@click.option("--qp-bodies", type=click.IntRange(min=0), default=1_000, show_default=True)
+@click.option(
+    "--judge",
+    "judges",
+    multiple=True,
+    metavar="JUDGE=N",
+    default=("rest=100000", "qp=1000"),
+    show_default=True,
+    help="Judge and how many bodies it scores: rest, qp, shared, trained, fem or fem_accurate; several with several.",
+)
+@click.option(
+    "--longest",
+    type=click.FloatRange(min=0.0, max=1.0, min_open=True),
+    default=0.1,
+    show_default=True,
+    help="Largest step towards rest, relative to the range of a command.",
+)
 @click.option("--output", type=options.PATH, help="Parquet file (default: the shipped table of the problem).")
 @results
-def tabulate(name: str, bodies: int, qp_bodies: int, output: Path | None, folder: Path) -> None:
-    """Score many bodies of a problem and write them as a table.
+def tabulate(name: str, judges: tuple[str, ...], longest: float, output: Path | None, folder: Path) -> None:
+    """Score many bodies of a problem by several judges and write them as a table.
 
-    The shared policy scores all bodies, the inverse QP the first of them. An interrupted call continues.
+    Each judge scores the first bodies of one Sobol sequence. An interrupted call continues where it stopped, and a call
+    with more bodies adds to what is there.
     """
     from softgym_envs.codesign.benchmark.table import tabulate as run
 
+    counts = {}
+    for each in judges:
+        judge, _, count = each.partition("=")
+        if not count.isdigit() or int(count) < 1:
+            raise ValueError(f"--judge {each}: give a judge and a number of bodies, such as rest=100000")
+        counts[judge] = int(count)
     with options.resumable():
-        click.echo(f"wrote {run(name, bodies, qp_bodies, folder, output)}")
+        click.echo(f"wrote {run(name, counts, folder, output, longest)}")
 
 
 def _scores(bodies: Sequence[Sequence[float]]) -> str:
