@@ -18,6 +18,7 @@ EXTRAS = {
     "minari": ("minari", "h5py", "jax"),
     "design": ("SALib",),
     "benchmark": ("pyarrow",),
+    "optimisers": ("botorch", "ribs", "smac"),
 }
 """Extra in pyproject.toml -> modules that it installs."""
 

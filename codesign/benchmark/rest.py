@@ -40,13 +40,13 @@ def settle(env: SoftRobotVectorEnv, goals: np.ndarray, longest: float = LONGEST)
     """
     span = env.robot.upper - env.robot.lower
     controller = InverseQP.for_robot(env.robot, goal_weights=env.task.axes, rates=longest * span)
-    for step in range(1, MOST_STEPS + 1):
+    for steps in range(1, MOST_STEPS + 1):  # noqa: B007 - returned
         command = controller.solve_batch(env.condensed, goals, env.command, env.slack)
         change = np.abs(command - env.command).max(axis=0) / span
         env.backend.step(command)
         if change.max() < SETTLED:
             break
-    return command, step
+    return command, steps
 
 
 def outcome(env: SoftRobotVectorEnv, goals: np.ndarray) -> np.ndarray:

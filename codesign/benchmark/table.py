@@ -119,7 +119,7 @@ class TableSearch(Search):
         search.table = table
         return search
 
-    def evaluate(self, design: Mapping[str, float], budget: float = 1.0) -> Score:
+    def evaluate(self, design: Mapping[str, float], budget: float = 1.0, **training: Path | None) -> Score:
         """Return the score of the nearest listed body, on all goals."""
         definition = self.problem.definition
         design = definition.checked(design)
@@ -158,7 +158,8 @@ class Tabulation:
         learned = definition.environment.batched and definition.environment.backend == "surrogate"
         if definition.objective != "mean_distance" or not learned:
             raise ValueError(
-                f"problem '{self.problem.name}' cannot be tabulated: it needs the objective mean_distance on a surrogate"
+                f"problem '{self.problem.name}' cannot be tabulated: "
+                "it needs the objective mean_distance on a surrogate"
             )
 
     @property
