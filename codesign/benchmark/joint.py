@@ -50,8 +50,8 @@ class JointOptimiser:
     """Trains one policy together with the bodies first, and then asks for the bodies that it found most promising.
 
     These are the strategies ``"critic"`` (Luck et al. 2019) and ``"distribution"`` (Schaff et al. 2019) of studies; the
-    search's judge scores the bodies. The steps of the training, its learning curve included, count in the ledger. The
-    bodies of the sequence end after 32; random ones follow.
+    search's judge scores the bodies. The steps of the training, its learning curve included, count in the ledger. After
+    the at most 32 different bodies of the training, random ones follow.
 
     Args:
         problem: the problem, whose policies observe the body.
@@ -123,7 +123,9 @@ class JointOptimiser:
         found = read_json(folder.path / "training" / "bodies.json")
         self._charge = steps + whole, time.process_time() - began
         order = [found["names"].index(name) for name in self._problem.variables]
-        return [self._problem.design(np.array(body)[order]) for body in found["bodies"]]
+        # A search by the critic ends in a corner of the box again and again.
+        points = dict.fromkeys(tuple(np.round(np.array(body)[order], 4)) for body in found["bodies"])
+        return [self._problem.design(point) for point in points]
 
 
 class InheritanceOptimiser:

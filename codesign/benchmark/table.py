@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -103,6 +104,23 @@ class Table:
     def lookup(self, points: np.ndarray, judge: str) -> np.ndarray:
         """Return `COLUMNS` [SI] of the nearest listed bodies, shape (k, 3), for points (k, n) of the unit box."""
         return self.values[judge][self.nearest(points, judge)]
+
+    def agreement(self, first: str, second: str) -> tuple[int, float, float]:
+        """Return on how many bodies two judges can be compared, Kendall's tau of their mean distances, and the bias.
+
+        The bias is the mean of the distances [m] of the second judge minus those of the first.
+        """
+        from scipy.stats import kendalltau
+
+        a, b = self.values[first][:, 0], self.values[second][:, 0]
+        both = np.isfinite(a) & np.isfinite(b)
+        tau = float(kendalltau(a[both], b[both]).statistic) if both.sum() > 2 else np.nan
+        return int(both.sum()), tau, float(np.mean(b[both] - a[both])) if both.any() else np.nan
+
+
+def shipped_tables() -> list[str]:
+    """Return the names of the problems with a shipped table."""
+    return sorted(path.stem for path in (DATA / "tables").glob("*.parquet"))
 
 
 class TableSearch(Search):
@@ -275,7 +293,7 @@ def tabulate(
         values[judge] = np.full((bodies, len(COLUMNS)), np.nan)
         for start in range(0, count, chunk):
             rows = slice(start, min(start + chunk, count))
-            values[judge][rows] = _chunk(tabulation, judge, points[rows], start, folder)
+            values[judge][rows] = tabulated(tabulation, judge, points[rows], folder, start)
     return _write(problem, points, values, output or DATA / "tables" / f"{name}.parquet", longest)
 
 
@@ -286,10 +304,22 @@ def _points(dimension: int, count: int) -> np.ndarray:
     return np.round(2.0 * qmc.Sobol(dimension, rng=np.random.default_rng(0)).random(whole)[:count] - 1.0, 6)
 
 
-def _chunk(tabulation: Tabulation, judge: str, points: np.ndarray, start: int, folder: Path) -> np.ndarray:
+def tabulated(
+    tabulation: Tabulation, judge: str, points: np.ndarray, folder: Path, start: int | None = None
+) -> np.ndarray:
+    """Return `COLUMNS` of points (k, n) of the unit box under a judge; computed once and kept in a folder.
+
+    Args:
+        tabulation: how bodies are scored.
+        judge: key of `TABLE_JUDGES`.
+        points: points of the unit box, shape (k, n).
+        folder: where results are kept.
+        start: place of the first point in the sequence of a table, which names the file; default a hash names it.
+    """
     problem = tabulation.problem
     way = judge if judge in ("qp", "shared", "trained") else f"{judge}-{tabulation.longest:g}"
-    path = folder / "tables" / problem.name / problem.hash[:12] / f"{way}-{start:07d}-{len(points)}.npz"
+    place = sha256(np.round(points, 6).tobytes()).hexdigest()[:16] if start is None else f"{start:07d}"
+    path = folder / "tables" / problem.name / problem.hash[:12] / f"{way}-{place}-{len(points)}.npz"
     if path.is_file():
         return read_npz(path, ("values",))["values"]
     values = TABLE_JUDGES[judge].score(tabulation, points)

@@ -131,9 +131,10 @@ def judges(name: str, bodies: int, folder: Path) -> None:
 @click.option(
     "--every", multiple=True, help="Check the winners of all seeds of this method; several with several options."
 )
+@click.option("--rest", is_flag=True, help="Compare states at rest in place of whole episodes (a tenth of the time).")
 @click.option("--store", is_flag=True, help="Add the winners to the stored ones (source checkout).")
 @results
-def winners(names: tuple[str, ...], every: tuple[str, ...], store: bool, folder: Path) -> None:
+def winners(names: tuple[str, ...], every: tuple[str, ...], rest: bool, store: bool, folder: Path) -> None:
     """Check the winners of the stored searches of problems NAMES on finite elements.
 
     They are those of each method's median seed under the inverse QP, on the search goals, with the budget `small`.
@@ -143,7 +144,7 @@ def winners(names: tuple[str, ...], every: tuple[str, ...], store: bool, folder:
 
     for name in names:
         with options.resumable():
-            rows = module.check(folder, name, every)
+            rows = module.check(folder, name, every, rest=rest)
         for row in rows:
             exact = "no equilibrium" if row.fem is None else f"{row.fem:.4g}"
             click.echo(

@@ -122,6 +122,10 @@ def test_tables(tiny, tmp_path):
     assert table.lookup(table.points[1:2], "fem")[0, 0] == pytest.approx(exact, abs=1e-7)
     with pytest.raises(ValueError, match=r"unknown judge of tables 'rst'; did you mean 'rest'"):
         tabulate("tiny-v1", {"rst": 1}, tmp_path, output)
+    count, tau, bias = table.agreement("rest", "fem")
+    assert count == 2 and np.isnan(tau) and abs(bias) < 1e-4
+    distances = {"rest": np.array([[1.0], [2.0], [3.0], [np.nan]]), "qp": np.array([[2.0], [4.0], [3.0], [1.0]])}
+    assert Table(tiny, table.points[:4], distances).agreement("rest", "qp") == (3, pytest.approx(1 / 3), 1.0)
     search = TableSearch.on(table, "small", "shared")
     solve(search, make_optimiser("tpe", tiny, 0))
     assert len(search.ledger) == 7 and search.best is not None

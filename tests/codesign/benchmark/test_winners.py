@@ -16,6 +16,9 @@ def test_winners_are_scored_on_both_models_and_stored(tiny, tmp_path):
     assert [row.seed for row in every] == [0, 1, 2] and [row for row in every if row.median] == [median]
     assert sorted(row.surrogate for row in every)[1] == median.surrogate
     assert abs(median.exploitation) < 0.1 * abs(median.fem)
+    (settled,) = winners.check(tmp_path, "tiny-v1", data=tmp_path, rest=True)
+    assert settled.rest and settled.fem == pytest.approx(median.fem, abs=2e-6)
+    assert settled.surrogate == pytest.approx(median.surrogate, abs=1e-6)
     winners.store([median], tmp_path)
     winners.store(every, tmp_path)
     assert winners.stored_winners(tmp_path) == every
