@@ -202,12 +202,19 @@ def board_() -> None:
 
 @benchmark.command()
 @click.argument("names", nargs=-1, required=True)
-def freeze(names: tuple[str, ...]) -> None:
-    """Freeze problems NAMES: draw their goals, and store these with the hashes (source checkout)."""
+@click.option("--keep", is_flag=True, help="Keep stored results, if stored winners still have the same scores.")
+def freeze(names: tuple[str, ...], keep: bool) -> None:
+    """Freeze problems NAMES: draw their goals, and store these with the hashes (source checkout).
+
+    A change that cannot change scores, such as another calibration of the uncertainty of weights, changes the hash too.
+    With --keep some stored winners are scored again; if nothing differs, the stored results get the new hash.
+    """
     from softgym_envs.codesign.benchmark import frozen
+    from softgym_envs.codesign.benchmark.refreeze import refreeze
 
     for name in names:
-        click.echo(f"wrote {frozen.freeze(name)}")
+        for path in refreeze(name) if keep else [frozen.freeze(name)]:
+            click.echo(f"wrote {path}")
 
 
 @benchmark.command()
