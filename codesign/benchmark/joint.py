@@ -8,6 +8,7 @@ import time
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -118,7 +119,8 @@ class JointOptimiser:
         environment = definition.environment.model_copy(update=update)
         config = TrainConfig(environment=environment, **joint.model_dump(exclude={"keep", "options"}))
         folder = _Folder()
-        proposer = PROPOSERS[self._proposer](warmup=min(WARM_UP, steps // 4))
+        options: dict[str, Any] = {"warmup": min(WARM_UP, steps // 4)}
+        proposer = PROPOSERS[self._proposer](**options)
         train(config, folder.path / "training", proposer=proposer, progress=False)
         found = read_json(folder.path / "training" / "bodies.json")
         self._charge = steps + whole, time.process_time() - began

@@ -86,6 +86,7 @@ class QualityDiversityOptimiser:
         self._problem, size = problem, len(problem.variables)
         archive = GridArchive(solution_dim=size, dims=[CELLS, CELLS], ranges=[(-1.0, 1.0)] * 2, seed=seed)
         shared: dict[str, Any] = {"bounds": [(-1.0, 1.0)] * size, "batch_size": BATCH, "seed": seed}
+        made: Any
         if emitter == "cma_me":
             made = EvolutionStrategyEmitter(archive, x0=np.zeros(size), sigma0=0.5, ranker="2imp", **shared)
         else:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from softgym_envs.codesign.benchmark.frozen import freeze, load_definition, load_problem
-from softgym_envs.codesign.benchmark.problem import Score
+from softgym_envs.codesign.benchmark.problem import Judge
 from softgym_envs.codesign.benchmark.runs import stored_runs
 from softgym_envs.codesign.benchmark.scoring import DATA
 from softgym_envs.errors import DataError
@@ -46,7 +47,7 @@ def refreeze(name: str, bodies: int = 5, data: Path = DATA) -> list[Path]:
         raise DataError(f"problem '{name}': no winner is stored that could be scored again; freeze it without --keep")
     places = np.unique(np.linspace(0, len(winners) - 1, min(bodies, len(winners))).astype(int))
     for run, design, scores in (winners[place] for place in places):
-        found: Score = problem.evaluate(design, judge=run.judge, seed=run.seed)  # type: ignore[arg-type]
+        found = problem.evaluate(design, judge=cast("Judge", run.judge), seed=run.seed)
         if not found.feasible or not np.allclose(found.scores, scores, rtol=SAME, atol=0.0):
             raise DataError(
                 f"problem '{name}': a winner of {run.method}, seed {run.seed}, had the scores {scores} and now has "
