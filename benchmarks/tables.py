@@ -32,7 +32,6 @@ HEADLINES = ("finger_reach", "diamond_reach", "trunk_reach", "cable_trunk_reach"
 
 ACCURATE_HEADLINES = {
     "finger": "Soft Finger, accurate mesh; inverse QP",
-    "diamond": "Diamond, accurate mesh; policy trained for each body",
 }
 """Rows of studies on accurate meshes, behind those of the same robots."""
 
