@@ -44,7 +44,6 @@ from benchmarks import (
     side_by_side,
     speed,
     strategies,
-    tetrapod_surrogate,
     trust,
     validation,
 )
@@ -104,7 +103,6 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "contact": contact.contact,
     "dynamics": dynamics.dynamics,
     "learned_sensors": learned_sensors.learned_sensors,
-    "tetrapod_surrogate": tetrapod_surrogate.tetrapod_surrogate,
     "learners": learners.learners,
     "strategies": strategies.strategies,
     "codesign_kills": codesign_scale.kills,
