@@ -106,14 +106,12 @@ def trajectories(robot: Robot, folder: Path, workers: int = 2) -> Trajectories:
     return Trajectories(*(np.stack([part[name] for part in parts]) for name in Trajectories.__dataclass_fields__))
 
 
-def on_surrogate(
-    robot: Robot, data: Trajectories, *, dynamics: bool, weights: Path | None = None
-) -> tuple[np.ndarray, float]:
+def on_surrogate(robot: Robot, data: Trajectories, *, dynamics: bool) -> tuple[np.ndarray, float]:
     """Return the effectors (N, STEPS + 1, n_e) of the surrogate, and the median CPU time of a control step alone."""
     from softgym_envs.backends.surrogate import SurrogateBackend
 
     found, seconds = [], []
-    backend = SurrogateBackend(robot, weights=weights, dynamics=dynamics)
+    backend = SurrogateBackend(robot, dynamics=dynamics)
     names = robot.design_space.names
     for design, commands in zip(data.design, data.command, strict=True):
         places = [backend.reset(dict(zip(names, design.tolist(), strict=True))).effector.ravel()]

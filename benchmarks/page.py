@@ -35,7 +35,6 @@ from benchmarks.robustness import TABLES as ROBUSTNESS_TABLES
 from benchmarks.structure_policy import TABLES as POLICY_TABLES
 from benchmarks.structures import TABLES as STRUCTURE_TABLES
 from benchmarks.tables import TABLES as OTHER_TABLES
-from benchmarks.tetrapod_surrogate import TABLES as TETRAPOD_TABLES
 from benchmarks.zigzag_tables import ZIGZAG_TABLES
 from softgym_envs.errors import DataError
 
@@ -50,7 +49,6 @@ TABLES = (
     | MOTION_TABLES
     | SENSOR_TABLES
     | ROBUSTNESS_TABLES
-    | TETRAPOD_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
     | POLICY_TABLES

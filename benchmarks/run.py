@@ -45,7 +45,6 @@ from benchmarks import (
     side_by_side,
     speed,
     strategies,
-    tetrapod_surrogate,
     trust,
     validation,
 )
@@ -105,7 +104,6 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "contact": contact.contact,
     "dynamics": dynamics.dynamics,
     "learned_sensors": learned_sensors.learned_sensors,
-    "tetrapod_surrogate": tetrapod_surrogate.tetrapod_surrogate,
     "learners": learners.learners,
     "strategies": strategies.strategies,
     "codesign_kills": codesign_scale.kills,
