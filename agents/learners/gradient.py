@@ -34,6 +34,7 @@ class GradientLearner(NetworkLearner):
     """
 
     needs_batch: ClassVar[bool] = True
+    env: VectorEnv
 
     def __init__(self, config: TrainConfig, options: GradientConfig) -> None:
         import torch
@@ -51,7 +52,7 @@ class GradientLearner(NetworkLearner):
             env = environment.make_vec(config.num_envs, backend_options={**environment.backend_options, **members})
         else:
             env = SyncVectorEnv([environment.make] * config.num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
-        self.env: VectorEnv = env.unwrapped
+        self.env = env.unwrapped
         generator = torch.Generator().manual_seed(config.seed)
         sizes = [self.env.single_observation_space.shape[0], *options.net_arch]  # type: ignore[index]
         actions = self.env.single_action_space.shape[0]  # type: ignore[index]

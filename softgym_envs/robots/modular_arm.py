@@ -159,7 +159,8 @@ class ModularArm(Robot):
         )
         self.effector_rest = np.array([0.0, 0.0, self._height(self.design_space.baseline)])
         volume = float(largest_volume)
-        closed = [] if isinstance(self.cells, int) else [n for n, cell in enumerate(cells, 1) if cell == "bellows"]
+        listed = () if isinstance(self.cells, int) else self.cells
+        closed_cells = [number for number, cell in enumerate(listed, start=1) if cell == "bellows"]
         self.actuators = (
             *(
                 Actuator(name, -self.stroke, self.stroke, self.stroke / 10.0, "m", False, self.max_effort)
@@ -167,10 +168,10 @@ class ModularArm(Robot):
             ),
             *(
                 Actuator(f"pressure_{n}", -volume, volume, volume / 10.0, "m3", False, float(max_pressure))
-                for n in closed
+                for n in closed_cells
             ),
         )
-        self.effort_scale = np.array([0.2] * len(WIRES) + [0.2 * float(max_pressure)] * len(closed))
+        self.effort_scale = np.array([0.2] * len(WIRES) + [0.2 * float(max_pressure)] * len(closed_cells))
 
     def _dimensions(self) -> Iterator[DesignVariable]:
         if isinstance(self.cells, int):
@@ -225,7 +226,7 @@ class ModularArm(Robot):
             raise InfeasibleDesign("all cells of the arm are left out; allowed: at least one that is not 'none'")
         builder = ModelBuilder(gravity=self.gravity)
         ports = [builder.add_frame(np.zeros(3), fixed=True, fixed_spin=True)]
-        cavities = []
+        cavities: list[np.ndarray | ClosedSuperelement] = []
         for part in self._modules(design):
             origin = np.array([0.0, 0.0, part.height])
             if self.body == "solid":
@@ -254,11 +255,12 @@ class ModularArm(Robot):
             guide = design["wire_radius"] * np.array([*direction, 0.0])
             points = EmbeddedPoints.from_weights(rows, np.tile([1.0, *guide], (len(rows), 1)), model.nodes)
             model.add("a", Cable(actuator.name, points, guide, unilateral=actuator.unilateral))
-        closed = [block for block in model.blocks if isinstance(block, ClosedSuperelement)]
-        for actuator, cavity in zip(self.actuators[len(WIRES) :], cavities or closed, strict=True):
-            name = actuator.name
-            solid = isinstance(cavity, np.ndarray)
-            model.add("a", Cavity(name, cavity, model.nodes) if solid else PortCavity(name, cavity))
+        cavities += [block for block in model.blocks if isinstance(block, ClosedSuperelement)]
+        for actuator, cavity in zip(self.actuators[len(WIRES) :], cavities, strict=True):
+            if isinstance(cavity, ClosedSuperelement):
+                model.add("a", PortCavity(actuator.name, cavity))
+            else:
+                model.add("a", Cavity(actuator.name, cavity, model.nodes))
         model.add("e", Point("tip", EmbeddedPoints.in_frame(ports[-1], np.zeros(3), model.nodes)))
         if self.body == "superelements":
             half = design["wire_radius"]

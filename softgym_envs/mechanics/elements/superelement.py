@@ -19,7 +19,7 @@ Rows are transformed first, so ports may be turned and shifted against the frame
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numba import njit
@@ -39,6 +39,11 @@ class PortEnergy(Protocol):
 
     def knows(self, strains: np.ndarray) -> bool:
         """Whether the energy is known at strains (6,)."""
+
+
+@runtime_checkable
+class LearnedEnergy(PortEnergy, Protocol):
+    """Energy of a superelement that knows how wrong it may be."""
 
     def possible_errors(self, strains: np.ndarray) -> np.ndarray:
         """Return independent errors that its gradient may have at strains (6,), as rows (k, 6) [N, N m]."""
@@ -62,9 +67,6 @@ class QuadraticEnergy:
 
     def knows(self, strains: np.ndarray) -> bool:
         return True
-
-    def possible_errors(self, strains: np.ndarray) -> np.ndarray:
-        return np.empty((0, 6))
 
 
 def _strain_forms() -> np.ndarray:
@@ -184,7 +186,7 @@ class Superelement(ElementBlock):
         self.mass = float(weights @ matrix @ weights)
         self._rest = np.zeros(6)
         self._rest = self.strains(nodes)
-        self.learned = len(energy.possible_errors(np.zeros(6))) > 0
+        self.learned = isinstance(energy, LearnedEnergy)
         self._viscous = energy.evaluate(np.zeros(6))[2]
         self.stiffness = float(np.trace(self._viscous[:3, :3]) / 3.0)
         self._line = (np.array([[first, last]]), np.array([[0.5, 0.5]]), np.array([[[-1.0, 1.0]]]) / length)
@@ -219,6 +221,8 @@ class Superelement(ElementBlock):
         return self.energy.knows(self.strains(x))
 
     def possible_errors(self, x: np.ndarray, fields: np.ndarray) -> np.ndarray:
+        if not isinstance(self.energy, LearnedEnergy):
+            return super().possible_errors(x, fields)
         rates = fields[:, self.rows].reshape(len(fields), 24) @ self.strain_slopes(x).T
         return self.energy.possible_errors(self.strains(x)) @ rates.T
 

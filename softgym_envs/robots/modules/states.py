@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -84,7 +85,7 @@ def solve_states(
         more: other variables of all designs.
         refine: see `Module.body`.
     """
-    kept: list[tuple[np.ndarray, ...]] = []
+    kept: list[tuple[Any, ...]] = []
     for row in designs:
         design = dict(zip(names, row, strict=True)) | dict(more or {}) | {"young_modulus": MODULUS}
         length = module.length(module.design_space.complete(design))
