@@ -119,8 +119,8 @@ class JointOptimiser:
         environment = definition.environment.model_copy(update=update)
         config = TrainConfig(environment=environment, **joint.model_dump(exclude={"keep", "options"}))
         folder = _Folder()
-        options: dict[str, Any] = {"warmup": min(WARM_UP, steps // 4)}
-        proposer = PROPOSERS[self._proposer](**options)
+        settings: dict[str, Any] = {"warmup": min(WARM_UP, steps // 4)}
+        proposer = PROPOSERS[self._proposer](**settings)
         train(config, folder.path / "training", proposer=proposer, progress=False)
         found = read_json(folder.path / "training" / "bodies.json")
         self._charge = steps + whole, time.process_time() - began
