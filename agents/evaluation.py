@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict
@@ -331,14 +331,19 @@ def _evaluate_batch(
     """Run all episodes at once on the batched environment, with a policy or, without one, the inverse QP."""
     count = len(goals)
     env = environment.make_vec(count, sample_design=False)
-    control, act = (None, policy.begin()) if policy is not None else (BatchQP(env.unwrapped), None)  # type: ignore[arg-type]
+    act: Callable[[np.ndarray], np.ndarray]
+    if policy is not None:
+        act = policy.begin()
+    else:
+        control = BatchQP(env.unwrapped)  # type: ignore[arg-type]
+        act = lambda _: control()  # noqa: E731 - the QP reads the environment
     columns = {name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "length")}
     ends = np.zeros((count, 3))
     running = np.ones(count, dtype=bool)
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
         while running.any():
-            action = act(observation) if control is None else control()
+            action = act(observation)
             observation, reward, terminated, truncated, info = env.step(action)
             last = info.get("final_info", info)
             columns["distance"] = np.where(running, last["distance"], columns["distance"])
