@@ -167,12 +167,13 @@ class Policy:
         """Return a function like `__call__` for one episode, or a batch of episodes that begin together."""
         if self.memory is None:
             return self
-        memory = np.zeros(len(self.memory[1][0]), dtype=np.float32)
+        read, recall = self.memory
+        memory = np.zeros(len(recall[0]), dtype=np.float32)
 
         def act(observation: np.ndarray) -> np.ndarray:
             nonlocal memory
             x = self._checked(observation)
-            memory = remember(np.broadcast_to(memory, (*x.shape[:-1], memory.shape[-1])), x, *self.memory)  # type: ignore[misc]
+            memory = remember(np.broadcast_to(memory, (*x.shape[:-1], memory.shape[-1])), x, read, recall)
             return np.tanh(memory @ self.mean[0] + self.mean[1])
 
         return act
