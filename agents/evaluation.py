@@ -340,28 +340,14 @@ def _evaluate_batch(
     """Run all episodes at once on the batched environment, with a policy or, without one, the inverse QP."""
     count = len(goals)
     env = environment.make_vec(count, sample_design=False)
-<<<<<<< HEAD
     act = _inverse_qp(env) if policy is None else policy.begin()
-=======
-    act: Callable[[np.ndarray], np.ndarray]
-    if policy is not None:
-        act = policy.begin()
-    else:
-        control = BatchQP(env.unwrapped)  # type: ignore[arg-type]
-        act = lambda _: control()  # noqa: E731 - the QP reads the environment
->>>>>>> sense
     columns = {name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "length")}
     ends = np.zeros((count, 3))
     running = np.ones(count, dtype=bool)
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
         while running.any():
-<<<<<<< HEAD
             observation, reward, terminated, truncated, info = env.step(act(observation))
-=======
-            action = act(observation)
-            observation, reward, terminated, truncated, info = env.step(action)
->>>>>>> sense
             last = info.get("final_info", info)
             columns["distance"] = np.where(running, last["distance"], columns["distance"])
             ends = np.where(running[:, None], last["effector"], ends)
