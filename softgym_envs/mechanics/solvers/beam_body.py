@@ -289,7 +289,7 @@ def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
             rest=np.array([c.area * c.rest_length for c, _ in chambers], dtype=float),
             chamber=np.repeat([start for _, start in chambers], [len(c.ids) for c, _ in chambers]).astype(np.int64),
             area=np.repeat([c.area for c, _ in chambers], [len(c.ids) for c, _ in chambers]).astype(float),
-            frames=lines,
+            frames=np.ascontiguousarray(lines),  # of one type with bodies in a batch: one compilation serves both
             weights=np.concatenate([np.empty((0, 12)), *(c.weights for c, _ in chambers)]).reshape(-1, 3, 4),
             place=_element_places(block[lines], pattern),
         ),
