@@ -245,7 +245,8 @@ def bodies_table() -> str:
                 rows.append([*cells, "-", "-"])
                 continue
             _, tau, bias = table.agreement("rest", judge)
-            rows.append([*cells, f"{tau:.3f}", f"{unit.scale * bias:+.4f}"])
+            ranked = "-" if np.isnan(tau) else f"{tau:.3f}"  # of two bodies
+            rows.append([*cells, ranked, f"{unit.scale * bias:+.4f}"])
     if not rows:
         return "No tables are shipped."
     return _table(["problem", "judge", "about", "bodies", "Kendall's tau with `rest`", "mean difference [mm]"], rows)
