@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -51,6 +52,14 @@ def number(value: Any, form: str) -> str:
     return re.sub(r"e([+-])0*(\d)", lambda m: f"e{m[1].strip('+')}{m[2]}", text)
 
 
+def _named(values: dict[str, Any], group: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield results and groups of results by name, those inside a group as ``"group: name"``."""
+    for name, value in values.items():
+        yield group + name, value
+        if isinstance(value, dict):
+            yield from _named(value, f"{group}{name}: ")
+
+
 def figure(benchmark: str, name: str, form: str = "") -> str:
     """Return one result as text.
 
@@ -62,10 +71,7 @@ def figure(benchmark: str, name: str, form: str = "") -> str:
     Raises:
         DataError: if no result, or more than one, has this name.
     """
-    found = dict(results(benchmark))
-    for group, values in results(benchmark).items():
-        if isinstance(values, dict):
-            found |= {f"{group}: {inner}": value for inner, value in values.items()}
+    found = dict(_named(results(benchmark)))
     how = FORMAT.fullmatch(form.strip())
     assert how is not None
     pattern = re.compile(re.escape(name).replace(r"\*", ".*"))
