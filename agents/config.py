@@ -306,6 +306,17 @@ class CloningConfig(GradientConfig):
     )
 
 
+class RecurrentConfig(GradientConfig):
+    """Hyperparameters of the imitation by a network with memory (`softgym_envs.agents.learners.recurrent`)."""
+
+    net_arch: list[int] = Field(default=[64], min_length=1, max_length=1, description="width of the memory")
+    batch_size: int = Field(default=32, gt=0, description="episodes of each update")
+    gradient_steps: int = Field(default=8, gt=0, description="updates after each episode")
+    lead: float = Field(
+        default=0.2, gt=0, le=1, description="share of the steps until the policy acts alone in all episodes"
+    )
+
+
 class EvolutionConfig(Config):
     """Hyperparameters of the evolution of weights (`softgym_envs.agents.learners.evolution`)."""
 
@@ -322,23 +333,25 @@ class LearnerConfig(Config):
     """A learning method and its hyperparameters.
 
     Attributes:
-        learner: ``"sac"``, ``"ppo"`` or ``"evolution"``, model-free, for every environment; or, model-based and on the
-            surrogate only, ``"analytic"``, which follows derivatives of the reward, or ``"cloning"``, which imitates
-            the inverse QP.
+        learner: ``"sac"``, ``"ppo"`` or ``"evolution"``, model-free, for every environment; or, model-based,
+            ``"analytic"``, which follows derivatives of the reward and needs the surrogate, ``"cloning"``, which
+            imitates the inverse QP, or ``"recurrent"``, which imitates it with a memory where goals are positions.
         sac: hyperparameters of SAC.
         ppo: hyperparameters of PPO.
         analytic: hyperparameters of the analytic policy gradient.
         cloning: hyperparameters of the imitation.
+        recurrent: hyperparameters of the imitation with a memory.
         evolution: hyperparameters of the evolution of weights.
         num_envs: number of sub-environments; for ``"evolution"`` the size of a generation.
         seed: seed of everything random.
     """
 
-    learner: Literal["sac", "ppo", "analytic", "cloning", "evolution"] = "sac"
+    learner: Literal["sac", "ppo", "analytic", "cloning", "recurrent", "evolution"] = "sac"
     sac: SACConfig = Field(default_factory=SACConfig)
     ppo: PPOConfig = Field(default_factory=PPOConfig)
     analytic: AnalyticConfig = Field(default_factory=AnalyticConfig)
     cloning: CloningConfig = Field(default_factory=CloningConfig)
+    recurrent: RecurrentConfig = Field(default_factory=RecurrentConfig)
     evolution: EvolutionConfig = Field(default_factory=EvolutionConfig)
     num_envs: int = Field(default=16, gt=0)
     seed: int = Field(default=0, ge=0)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.residual import BatchQP
 from softgym_envs.errors import DataError
 from softgym_envs.executors import parallel_map
+
+if TYPE_CHECKING:
+    import gymnasium
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +197,15 @@ def make_agent(agent: str | Path, seed: int = 0) -> Agent:
 
 
 def _acting(policy: Policy) -> Agent:
-    return lambda observation, env: policy(observation)
+    act = policy.begin()
+
+    def agent(observation: Any, env: Any) -> np.ndarray:
+        nonlocal act
+        if env.steps == 0:
+            act = policy.begin()
+        return act(observation)
+
+    return agent
 
 
 def evaluate(
@@ -313,6 +324,12 @@ def _evaluate(
     return Evaluation(columns[0], columns[1], columns[2], columns[3].astype(bool), columns[4], columns[5], steps)
 
 
+def _inverse_qp(env: gymnasium.vector.VectorEnv) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the inverse QP of a batch as a function of observations, which it does not need."""
+    control = BatchQP(env.unwrapped)  # type: ignore[arg-type]
+    return lambda _: control()
+
+
 def _evaluate_batch(
     policy: Policy | None,
     environment: EnvironmentConfig,
@@ -323,15 +340,14 @@ def _evaluate_batch(
     """Run all episodes at once on the batched environment, with a policy or, without one, the inverse QP."""
     count = len(goals)
     env = environment.make_vec(count, sample_design=False)
-    control = None if policy is not None else BatchQP(env.unwrapped)  # type: ignore[arg-type]
+    act = _inverse_qp(env) if policy is None else policy.begin()
     columns = {name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "length")}
     ends = np.zeros((count, 3))
     running = np.ones(count, dtype=bool)
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
         while running.any():
-            action = policy(observation) if control is None else control()  # type: ignore[misc]
-            observation, reward, terminated, truncated, info = env.step(action)
+            observation, reward, terminated, truncated, info = env.step(act(observation))
             last = info.get("final_info", info)
             columns["distance"] = np.where(running, last["distance"], columns["distance"])
             ends = np.where(running[:, None], last["effector"], ends)

@@ -40,7 +40,7 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
 
     Raises:
         WeightsError: if the policy cannot be read.
-        ValueError: for another file ending, or if ``onnx`` is not installed.
+        ValueError: for another file ending, a policy with a memory, or if ``onnx`` is not installed.
     """
     path = Path(path)
     if path.suffix != ".onnx":
@@ -57,7 +57,13 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
 
 
 def spaces_of(policy: Policy) -> AgentSpaces:
-    """Return the observation and action spaces of the environment in which a policy was trained."""
+    """Return the observation and action spaces of the environment in which a policy was trained.
+
+    Raises:
+        ValueError: for a policy with a memory, which the exported formats cannot keep.
+    """
+    if policy.memory is not None:
+        raise ValueError(f"policy '{policy.path}' has a memory and cannot be exported; allowed: policies without")
     env = policy.environment.make()
     env.close()
     return env.unwrapped.spaces  # type: ignore[attr-defined]

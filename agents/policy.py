@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +65,28 @@ def read_tensors(path: str | Path) -> dict[str, np.ndarray]:
         raise WeightsError(f"policy '{path}' is damaged or truncated: {error}") from None
 
 
+Layer = tuple[np.ndarray, np.ndarray]
+"""Weights (inputs, outputs) and biases (outputs,)."""
+
+
+def remember(memory: np.ndarray, observation: np.ndarray, read: Layer, recall: Layer) -> np.ndarray:
+    """Return the next memory (..., h) of a gated recurrent unit (Cho et al. 2014, with the gates of cuDNN).
+
+    Args:
+        memory: the last memory, shape (..., h).
+        observation: shape (..., d).
+        read: weights (d, 3 h) and biases (3 h,) of reset gate, update gate and proposal, for the observation.
+        recall: weights (h, 3 h) and biases (3 h,) of the same for the memory.
+    """
+    seen, kept = observation @ read[0] + read[1], memory @ recall[0] + recall[1]
+    h = memory.shape[-1]
+    reset, update = (0.5 * (1.0 + np.tanh(0.5 * (seen + kept)[..., k * h : (k + 1) * h])) for k in (0, 1))
+    proposal = np.tanh(seen[..., 2 * h :] + reset * kept[..., 2 * h :])
+    return proposal + update * (memory - proposal)
+
+
 class Policy:
-    """Policy that takes the mean action of a trained SAC actor.
+    """Policy that takes the mean action of a trained actor, which may have a memory.
 
     Args:
         path: ``policy.safetensors``, with its card next to it, or the name of a shipped policy.
@@ -75,6 +96,7 @@ class Policy:
         card: JSON card of the policy.
         environment: the environment of its training.
         hidden: weights (d, w) and biases (w,) of each hidden layer.
+        memory: weights of a gated recurrent unit in place of hidden layers, see `remember`; None without memory.
         mean: weights and biases of the last layer.
         observation_size: number of inputs.
 
@@ -100,7 +122,11 @@ class Policy:
         except ConfigError as error:
             raise WeightsError(str(error)) from None
         try:
-            self.hidden = []
+            self.hidden: list[Layer] = []
+            self.memory: tuple[Layer, Layer] | None = None
+            if "actor.memory.weight_ih" in tensors:
+                read, recall = ((f"actor.memory.weight_{s}", f"actor.memory.bias_{s}") for s in ("ih", "hh"))
+                self.memory = (tensors[read[0]].T, tensors[read[1]]), (tensors[recall[0]].T, tensors[recall[1]])
             k = 0
             while f"actor.latent_pi.{k}.weight" in tensors:
                 self.hidden.append((tensors[f"actor.latent_pi.{k}.weight"].T, tensors[f"actor.latent_pi.{k}.bias"]))
@@ -108,7 +134,8 @@ class Policy:
             self.mean = tensors["actor.mu.weight"].T, tensors["actor.mu.bias"]
         except KeyError as error:
             raise WeightsError(f"policy '{self.path}' lacks tensor {error}") from None
-        self.observation_size = int((self.hidden[0][0] if self.hidden else self.mean[0]).shape[0])
+        first = self.memory[0] if self.memory else self.hidden[0] if self.hidden else self.mean
+        self.observation_size = int(first[0].shape[0])
 
     @property
     def widths(self) -> list[int]:
@@ -136,21 +163,42 @@ class Policy:
                     f"{own[key][1]}; allowed: that, or another policy"
                 )
 
+    def begin(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Return a function like `__call__` for one episode, or a batch of episodes that begin together."""
+        if self.memory is None:
+            return self
+        memory = np.zeros(len(self.memory[1][0]), dtype=np.float32)
+
+        def act(observation: np.ndarray) -> np.ndarray:
+            nonlocal memory
+            x = self._checked(observation)
+            memory = remember(np.broadcast_to(memory, (*x.shape[:-1], memory.shape[-1])), x, *self.memory)  # type: ignore[misc]
+            return np.tanh(memory @ self.mean[0] + self.mean[1])
+
+        return act
+
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return actions (..., n_a) in [-1, 1] for observations (..., d).
 
         Raises:
-            ValueError: for observations of another size than the policy was trained on.
+            ValueError: for observations of another size than the policy was trained on, and for a policy with a memory,
+                whose actions depend on the episode: use `begin`.
         """
+        if self.memory is not None:
+            raise ValueError(f"policy '{self.path.name}' has a memory: call what begin() returns, in each episode")
+        x = self._checked(observation)
+        for weight, bias in self.hidden:
+            x = np.maximum(x @ weight + bias, 0.0)
+        return np.tanh(x @ self.mean[0] + self.mean[1])
+
+    def _checked(self, observation: np.ndarray) -> np.ndarray:
         x = np.asarray(observation, dtype=np.float32)
         if x.shape[-1] != self.observation_size:
             raise ValueError(
                 f"policy '{self.path.name}' takes observations of size {self.observation_size}, got {x.shape[-1]}: "
                 "was it trained with another design_in_observation or number of cables?"
             )
-        for weight, bias in self.hidden:
-            x = np.maximum(x @ weight + bias, 0.0)
-        return np.tanh(x @ self.mean[0] + self.mean[1])
+        return x
 
 
 def _meaning(environment: EnvironmentConfig, any_task: bool) -> dict[str, tuple[Any, object]]:
@@ -165,7 +213,7 @@ def _meaning(environment: EnvironmentConfig, any_task: bool) -> dict[str, tuple[
     scales = (
         [(actuator.name, actuator.low, actuator.high, actuator.rate) for actuator in robot.actuators],
         (robot.size, robot.workspace_scale, robot.effort_scale.tolist()),
-        [(variable.low, variable.high, variable.log) for variable in variables],
+        [(variable.low, variable.high, variable.log, variable.choices) for variable in variables],
     )
     return {
         "id": (

@@ -28,10 +28,11 @@ LEARNERS = {
     "evolution": "evolution",
     "analytic": "analytic gradient",
     "cloning": "cloning",
+    "recurrent": "recurrent",
 }
 """Titles of the learners."""
 
-MODEL_BASED = ("analytic", "cloning")
+MODEL_BASED = ("analytic", "cloning", "recurrent")
 """Learners that know the model of the robot, as the inverse QP does; the others are model-free."""
 
 AGENTS = LEARNERS | {
@@ -51,6 +52,7 @@ _COLOURS = {
     "ppo": ("#a9bff0", "#1d4ed8"),
     "analytic": ("#f3c49a", "#c2570c"),
     "cloning": ("#d3b5ea", "#7e22ce"),
+    "recurrent": ("#b9d59b", "#4d7c0f"),
     "evolution": ("#e3a3b5", "#be123c"),
 }
 

@@ -194,6 +194,7 @@ def _cost(config: TrainConfig) -> float:
         "ppo": 3e-5 * config.num_envs,
         "analytic": 0.001,
         "cloning": 1e-4 * config.num_envs + 0.0005 * config.cloning.gradient_steps,
+        "recurrent": 0.005,
         "evolution": 0.0,
     }  # per step of all environments together
     return config.steps * (step + updates[config.learner] / config.num_envs)

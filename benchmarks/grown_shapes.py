@@ -158,7 +158,20 @@ def side_mesh(distance: np.ndarray) -> tuple[np.ndarray, np.ndarray, RectBivaria
 
 
 def _one_piece(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the piece, connected over edges, that leads from the base to the tip."""
+    """Return the piece, connected over edges, that leads from the base to the tip.
+
+    Where parts of it touch in one node only, a wall would have no thickness: the triangles around the node are removed,
+    which opens a hole to the outside, for example.
+    """
+    kept, pinched = _through_piece(points, triangles)
+    while len(pinched):
+        kept, pinched = _through_piece(points, kept[~np.isin(kept, pinched).any(axis=1)])
+    used, again = np.unique(kept, return_inverse=True)
+    return points[used], again.reshape(-1, 3)
+
+
+def _through_piece(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the triangles of the piece that leads from the base to the tip, and nodes where its parts only touch."""
     if len(triangles) == 0:
         raise InfeasibleDesign("the side view is empty")
     sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
@@ -171,12 +184,9 @@ def _one_piece(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, n
         kept = triangles[label == piece]
         along = points[kept.ravel(), 1]
         if along.min() < 1e-9 and along.max() > LENGTH - 1e-9:
-            used, again = np.unique(kept, return_inverse=True)
-            boundary = sides[order][~(np.append(same, False) | np.insert(same, 0, False))]
-            ends = np.bincount(np.searchsorted(used, boundary[np.isin(boundary, used).all(axis=1)].ravel()))
-            if ends.max() > 2:
-                raise InfeasibleDesign("parts of the finger touch each other in one line")
-            return points[used], again.reshape(-1, 3)
+            single = ~(np.append(same, False) | np.insert(same, 0, False)) & (label[owner[order]] == piece)
+            ends = np.bincount(sides[order][single].ravel())
+            return kept, np.flatnonzero(ends > 2)
     raise InfeasibleDesign("no piece of the finger leads from the base to the tip")
 
 

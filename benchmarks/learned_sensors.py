@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.stats import chi2
@@ -20,54 +21,72 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.estimation import Noise, Readings, Touch, finger_grid
 from softgym_envs.estimation.learned import LearnedEstimator
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.base import Robot
+from softgym_envs.robots.base import MeshedRobot, Robot
 from softgym_envs.robots.registry import make_robot
+from softgym_envs.surrogate.calibration import learned_bounds
+from softgym_envs.surrogate.pretrained import pretrained_model
 
 BODIES, STATES, TOUCHES, READINGS, FORCE = 16, 4, 60, 10, 1.0
-VARIED = ("outer_radius", "wall_thickness")
 STRATA = {"untouched": None, "touch, 15 to 65 mm": (0.015, 0.065), "touch, 65 to 115 mm": (0.065, 0.115)}
+
+
+def bodies(learner: MeshedRobot) -> Iterator[tuple[bool, dict[str, float]]]:
+    """Yield bodies of the learned box: inside of it, then vertices, and whether they are vertices.
+
+    Vertices to which the mesh of the baseline does not move are left out: they are not those that are learned.
+    """
+    rng, bounds = np.random.default_rng(7), learned_bounds(pretrained_model(learner))
+    for number in range(BODIES):
+        at_bounds = number >= BODIES // 2
+        while True:
+            shares = rng.integers(2, size=len(bounds)) if at_bounds else rng.random(len(bounds))
+            values = zip(bounds.items(), shares, strict=True)
+            design = {name: float(low + share * (high - low)) for (name, (low, high)), share in values}
+            if learner.body(design).origin == "morphed":
+                break
+        yield at_bounds, design
 
 
 def strata(robot: Robot) -> dict[str, float]:
     """Errors of tip, volumes and tension under random commands, on bodies that no weights have seen.
 
     Touches have up to 2 N at the baseline's stiffness. A state counts for its stratum; slack cables are also counted
-    on their own.
+    on their own. ``new mesh`` are the untouched states of bodies inside the box with meshes of their own.
     """
     rng, learner = np.random.default_rng(7), robot.under_touch()
-    found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in (*STRATA, "slack cable", "bounds")}
-    for number in range(BODIES):
-        at_bounds = number >= BODIES // 2
-        shares = {name: round(rng.random()) if at_bounds else rng.random() for name in VARIED}
-        design: dict[str, float] = {}
-        for name, share in shares.items():
-            variable = robot.design_space[name]
-            design[name] = variable.low + share * (variable.high - variable.low)
-        backend = SurrogateBackend(robot, design)
-        for stratum, place in STRATA.items():
-            below = 0.065 if place is None else float(rng.uniform(*place))
-            force = 0.0 if place is None else float(rng.uniform(0.0, 2.0))
-            load = {"touch_force": force, "touch_below": below, "touch_beside": float(rng.uniform(-0.0075, 0.0075))}
-            statics = Statics(learner.build({**design, **load}))
-            context = backend.model.context(learner.design_space.complete({**design, **load}).array[None])
-            for command in np.sort(rng.uniform(robot.lower[0], robot.upper[0], STATES)):
-                try:
-                    truth = statics.solve([command])
-                except ConvergenceError:
-                    continue
-                target = np.array([[command]])
-                reached, effort, _ = backend.model.search(context, target, target, robot.unilateral, 5e-5, 25)
-                tip = np.linalg.norm(backend.model.effector(context, reached)[0][0, :3] - truth.condensed.delta.e[:3])
-                volumes = np.abs(backend.model.sensed(context, reached)[0] - truth.condensed.delta.s).max()
-                tension = abs(max(float(effort[0, 0]), 0.0) - float(truth.effort[0]))
-                row = (1e3 * float(tip), 1e9 * float(volumes), tension)
-                slack = bool(truth.slack[0])
-                names = ["bounds"] if at_bounds else [stratum, *(["slack cable"] if slack else [])]
-                for name in names:
-                    found[name].append(row)
+    assert isinstance(learner, MeshedRobot)
+    found: dict[str, list[tuple[float, float, float]]] = {
+        name: [] for name in (*STRATA, "slack cable", "vertices", "new mesh")
+    }
+    cases = [(at, design, name, learner) for at, design in bodies(learner) for name in STRATA]
+    cases += [(False, design, "new mesh", robot) for at, design in bodies(learner) if not at]
+    for at_bounds, design, stratum, body in cases:
+        backend, place = SurrogateBackend(robot, design), STRATA.get(stratum)
+        below = 0.065 if place is None else float(rng.uniform(*place))
+        force = 0.0 if place is None else float(rng.uniform(0.0, 2.0))
+        load = {"touch_force": force, "touch_below": below, "touch_beside": float(rng.uniform(-0.0075, 0.0075))}
+        context = backend.model.context(learner.design_space.complete({**design, **load}).array[None])
+        statics = Statics(body.build({**design, **load} if body is learner else design))
+        for command in np.sort(rng.uniform(robot.lower[0], robot.upper[0], STATES)):
+            try:
+                truth = statics.solve([command])
+            except ConvergenceError:
+                continue
+            target = np.array([[command]])
+            reached, effort, _ = backend.model.search(context, target, target, robot.unilateral, 5e-5, 25)
+            tip = np.linalg.norm(backend.model.effector(context, reached)[0][0, :3] - truth.condensed.delta.e[:3])
+            volumes = np.abs(backend.model.sensed(context, reached)[0] - truth.condensed.delta.s).max()
+            tension = abs(max(float(effort[0, 0]), 0.0) - float(truth.effort[0]))
+            row = (1e3 * float(tip), 1e9 * float(volumes), tension)
+            slack = bool(truth.slack[0])
+            names = ["vertices"] if at_bounds else [stratum, *(["slack cable"] if slack else [])]
+            for name in names:
+                found[name].append(row)
     result: dict[str, float] = {}
     for name, rows in found.items():
         result[f"{name}: states"] = len(rows)
+        if not rows:
+            continue
         for quantity, values in zip(("tip [mm]", "volume [mm3]", "tension [N]"), np.array(rows).T, strict=True):
             result[f"{name}: {quantity}, mean"] = float(values.mean())
             result[f"{name}: {quantity}, worst"] = float(values.max())
@@ -154,7 +173,9 @@ def strata_table() -> str:
     """Mean and worst errors of each stratum."""
     found, quantities = results("learned_sensors"), ("tip [mm]", "volume [mm3]", "tension [N]")
     rows = []
-    for name in (*STRATA, "slack cable", "bounds"):
+    for name in (*STRATA, "slack cable", "vertices", "new mesh"):
+        if not found[f"stratum: {name}: states"]:
+            continue
         errors = [[found[f"stratum: {name}: {q}, {kind}"] for kind in ("mean", "worst")] for q in quantities]
         rows.append(
             [name, str(found[f"stratum: {name}: states"]), *(f"{mean:.2f}, {worst:.2f}" for mean, worst in errors)]

@@ -21,7 +21,7 @@ import re
 import sys
 from pathlib import Path
 
-from benchmarks.accurate_finger import TABLES as ACCURATE_TABLES
+from benchmarks.accurate_meshes import TABLES as ACCURATE_TABLES
 from benchmarks.contact_sets import TABLES as SET_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
 from benchmarks.grasp_codesign import TABLES as GRASP_TABLES
@@ -31,6 +31,8 @@ from benchmarks.modular import TABLES as MODULAR_TABLES
 from benchmarks.motion import TABLES as MOTION_TABLES
 from benchmarks.printed import TABLES as PRINTED_TABLES
 from benchmarks.recorded import figure
+from benchmarks.robustness import TABLES as ROBUSTNESS_TABLES
+from benchmarks.structure_policy import TABLES as POLICY_TABLES
 from benchmarks.structures import TABLES as STRUCTURE_TABLES
 from benchmarks.tables import TABLES as OTHER_TABLES
 from benchmarks.zigzag_tables import ZIGZAG_TABLES
@@ -46,8 +48,10 @@ TABLES = (
     | MODULAR_TABLES
     | MOTION_TABLES
     | SENSOR_TABLES
+    | ROBUSTNESS_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
+    | POLICY_TABLES
     | GROWN_TABLES
 )
 ROOT = Path(__file__).resolve().parents[1]

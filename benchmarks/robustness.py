@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-GOALS, SEED = 30, 7
+from benchmarks.recorded import figure, records, results
+from benchmarks.tables import markdown
+
+GOALS, SENSED_GOALS, SEED = 30, 10, 7
 
 PLANTS: dict[str, dict[str, Any]] = {
     "nominal": {},
@@ -59,5 +62,68 @@ def _benchmark(robot: str) -> Callable[[], dict[str, object]]:
     return run
 
 
-BENCHMARKS = {f"robustness_{robot}": _benchmark(robot) for robot in POLICIES}
+SENSED = {
+    "inverse QP, open loop": "qp_model",
+    "inverse QP with estimator": "qp_estimated",
+    "policy with memory": "sensorized_finger_reach_recurrent",
+}
+"""Controllers of SensorizedFingerReach, which hides the tip; the policy was trained with 1 % of noise."""
+
+
+def sensed() -> dict[str, object]:
+    """Success of controllers that see sensors in place of the tip, on FEM, on plants unlike their model."""
+    from softgym_envs.agents.config import EnvironmentConfig
+    from softgym_envs.agents.evaluation import evaluate, sample_goals
+
+    nominal = EnvironmentConfig(id="SoftGym/SensorizedFingerReach-v0", backend="fem")
+    goals = sample_goals(nominal, SENSED_GOALS, SEED)
+    result: dict[str, object] = {}
+    for plant, option in PLANTS.items():
+        environment = nominal.model_copy(update={"plant": option})
+        for name, agent in SENSED.items():
+            found = evaluate(agent, environment, goals, seed=SEED)
+            result[f"{name}, {plant}: goals reached [%]"] = 100.0 * float(np.mean(found.successes))
+            result[f"{name}, {plant}: mean distance [mm]"] = 1e3 * found.mean_distance
+    return result
+
+
+BENCHMARKS = {f"robustness_{robot}": _benchmark(robot) for robot in POLICIES} | {"robustness_sensors": sensed}
 """Benchmarks by name."""
+
+
+def robustness_table() -> str:
+    """Controllers on plants unlike their model, of every robot that was run: goals reached and mean final distance."""
+    groups = (f"robustness_{robot}" for robot in POLICIES)
+    rows = [
+        [group.removeprefix("robustness_").capitalize(), *row]
+        for group in groups
+        if group in records()
+        for row in _on_plants(group, CONTROLLERS)
+    ]
+    return markdown(["robot", "plant", *CONTROLLERS], rows, "llrrr")
+
+
+def sensed_table() -> str:
+    """Controllers that see sensors in place of the tip, on plants unlike their model."""
+    return markdown(["plant", *SENSED], _on_plants("robustness_sensors", SENSED), "lrrr")
+
+
+def _on_plants(group: str, controllers: Iterable[str]) -> list[list[str]]:
+    """Return plant, and for each controller goals reached and mean distance."""
+    rows = []
+    for plant in PLANTS:
+        keys = [f"{name}, {plant}" for name in controllers]
+        if f"{keys[0]}: goals reached [%]" in results(group):
+            cells = [
+                figure(group, f"{key}: goals reached [%]", ".0f")
+                + " %, "
+                + figure(group, f"{key}: mean distance [mm]", ".2f")
+                + " mm"
+                for key in keys
+            ]
+            rows.append([plant, *cells])
+    return rows
+
+
+TABLES = {"robustness": robustness_table, "robustness_sensors": sensed_table}
+"""Tables of pages by name."""

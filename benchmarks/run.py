@@ -14,7 +14,7 @@ import click
 
 from benchmarks import (
     accuracy,
-    accurate_finger,
+    accurate_meshes,
     beams,
     carry,
     codesign_scale,
@@ -69,7 +69,6 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "motion": motion.motion,
     "printed": printed.printed,
     "test_set": accuracy.test_set,
-    "trust": trust.trust,
     "trajectories": accuracy.trajectories,
     "slack": accuracy.slack_states,
     "mesh_motion": accuracy.mesh_motion,
@@ -109,9 +108,10 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "strategies": strategies.strategies,
     "codesign_kills": codesign_scale.kills,
     "codesign_profile": codesign_scale.profile,
-    **accurate_finger.BENCHMARKS,
+    **accurate_meshes.BENCHMARKS,
     **convergence.BENCHMARKS,
     **robustness.BENCHMARKS,
+    **trust.BENCHMARKS,
 }
 """Registry of benchmarks."""
 

@@ -6,6 +6,9 @@
 and so for the seeds 1 and 2. Then ``python -m benchmarks.structures F`` judges the best body of each study, and the
 baseline, on quadratic finite elements of the whole body: where the inverse QP stays at the goals of the search and at
 unseen ones. It writes each best body as STL to its folder, and ``benchmarks/data/structures.json``.
+
+``python -m benchmarks.structures more`` judges the bodies in that file on `MANY` further unseen goals of the same zone,
+on superelements, and two of them on a finer mesh of the solid body; it writes ``benchmarks/data/structures_more.json``.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import qmc, ttest_ind
 
 from benchmarks.tables import markdown
 from softgym_envs.config import provenance
@@ -24,7 +28,13 @@ from softgym_envs.errors import ConvergenceError, DataError
 from softgym_envs.storage import write_json
 
 KEPT = Path(__file__).parent / "data" / "structures.json"
+MORE = KEPT.with_name("structures_more.json")
 SEEDS = (0, 1, 2)
+MANY = 150
+REFINE = 1.5
+"""Edges of the finer mesh are shorter by this factor."""
+ZONE = np.array([0.0, 0.0, 0.135]), np.array([0.020, 0.060, 0.010])
+"""Middle and half of the size of the zone of both studies [m]."""
 SEARCHES = {"structure and dimensions": "modular_reach", "dimensions": "modular_reach_fixed"}
 BASELINE = "baseline"
 PARTS, BODIES = ("search", "unseen"), ("superelements", "solid")
@@ -99,6 +109,61 @@ def judge_all(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def many_goals() -> np.ndarray:
+    """Return goals (n, 3) [m] that are spread over the zone, other ones than those of the studies."""
+    return ZONE[0] + (2.0 * qmc.Halton(3, rng=np.random.default_rng(20)).random(MANY) - 1.0) * ZONE[1]
+
+
+def judge_more() -> dict[str, Any]:
+    """Return the final distances [mm] of the bodies in the file of results at many goals, and errors of the mesh.
+
+    The mesh error is how far the tip of the best body of each search moves on a finer mesh, under the command where the
+    inverse QP of the superelements stays, at the first goals.
+    """
+    from softgym_envs.control.settling import settle
+    from softgym_envs.mechanics.solvers.statics import Statics
+    from softgym_envs.robots.registry import make_robot
+
+    robot, goals = make_robot("modular_arm", cells=6), many_goals()
+    rows: list[dict[str, Any]] = []
+    mesh: dict[str, list[float]] = {}
+    for row in json.loads(KEPT.read_text())["rows"]:
+        solver, distances, commands = Statics(robot.build(row["design"])), [], []
+        for goal in goals:
+            solver.reset()
+            settled = settle(solver, robot, goal, np.zeros(2))
+            distances.append(1e3 * settled.distance)
+            commands.append(settled.command)
+        rows.append({"search": row["search"], "seed": row["seed"], "distances [mm]": distances})
+        print(row["search"], row["seed"], np.mean(distances), file=sys.stderr, flush=True)
+        if row["seed"] == SEEDS[0] and row["search"] in SEARCHES:
+            tips = []
+            for refine in (1.0, REFINE):
+                body = make_robot("modular_arm", cells=6, body="solid", refine=refine)
+                solid = Statics(body.build(row["design"]))
+                tips.append([solid.solve(command).condensed.delta.e for command in commands[:2]])
+            mesh[row["search"]] = (1e3 * np.linalg.norm(np.subtract(*tips), axis=1)).tolist()
+            print(mesh, file=sys.stderr, flush=True)
+    return {"rows": rows, "tip on the finer mesh, moved [mm]": mesh, "finer by": REFINE, "goals": MANY}
+
+
+def more_table() -> str:
+    """Mean final distances of the best bodies at many unseen goals, and the difference of both searches."""
+    if not MORE.is_file():
+        raise DataError(f"'{MORE}' does not exist; make it with 'python -m benchmarks.structures more'")
+    found = json.loads(MORE.read_text())
+    means = {
+        search: [float(np.mean(row["distances [mm]"])) for row in found["rows"] if row["search"] == search]
+        for search in SEARCHES
+    }
+    rows = [[search, *(f"{mean:.2f}" for mean in each), f"{np.mean(each):.2f}"] for search, each in means.items()]
+    free, fixed = (np.array(means[search]) for search in SEARCHES)
+    interval = ttest_ind(fixed, free, equal_var=False).confidence_interval()
+    gain = f"{fixed.mean() - free.mean():.2f} ({interval.low:.2f} to {interval.high:.2f})"
+    rows.append(["difference (95 % interval over seeds)", *(f"{d:.2f}" for d in fixed - free), gain])
+    return markdown(["search", *(f"seed {seed} [mm]" for seed in SEEDS), "mean [mm]"], rows, "lrrrr")
+
+
 def structures_table() -> str:
     """Final distances of the best bodies on solid finite elements, and how far the superelements are off."""
     if not KEPT.is_file():
@@ -116,8 +181,11 @@ def structures_table() -> str:
     return markdown(head, rows, "llrrrrrr")
 
 
-TABLES = {"structures": structures_table}
+TABLES = {"structures": structures_table, "structures_more": more_table}
 """Tables of pages by name."""
 
 if __name__ == "__main__":
-    write_json(KEPT, {"rows": judge_all(Path(sys.argv[1])), "provenance": provenance()})
+    if sys.argv[1] == "more":
+        write_json(MORE, {**judge_more(), "provenance": provenance()})
+    else:
+        write_json(KEPT, {"rows": judge_all(Path(sys.argv[1])), "provenance": provenance()})

@@ -28,7 +28,12 @@ WEIGHTS = {
 }
 """Readable names of the robots, by name of the shipped weights."""
 
-HEADLINES = ("finger", "diamond", "trunk", "cable_trunk", "tetrapod")
+HEADLINES = ("finger_reach", "diamond_reach", "trunk_reach", "cable_trunk_reach", "tetrapod_reach")
+
+ACCURATE_HEADLINES = {
+    "finger": "Soft Finger, accurate mesh; inverse QP",
+}
+"""Rows of studies on accurate meshes, behind those of the same robots."""
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "") -> str:
@@ -63,10 +68,11 @@ def headlines() -> str:
         row = study["rows"][0]
         name = f"{study['title']}; {row['controller'].partition(',')[0]}"
         rows.append([name, *_ends(row), f"`{study['command']}`"])
-    accurate = results("accurate_study")
-    means = {f"{body} [mm]": np.mean(accurate[f"{body}: accurate: distance [mm]"]) for body in ("baseline", "winner")}
-    command = "`softgym codesign --config finger_reach_accurate`"
-    rows.insert(1, ["Soft Finger, accurate mesh; inverse QP", *_ends(means), command])
+        robot = key.removesuffix("_reach")
+        if robot in ACCURATE_HEADLINES and f"accurate_study_{robot}" in records():
+            found = results(f"accurate_study_{robot}")
+            ends = {f"{who} [mm]": np.mean(found[f"{who}: accurate: distance [mm]"]) for who in ("baseline", "winner")}
+            rows.append([ACCURATE_HEADLINES[robot], *_ends(ends), f"`softgym codesign --config {key}_accurate`"])
     return markdown(["robot; controller", "baseline", "winner", "command"], rows, "lrrl")
 
 
@@ -93,7 +99,7 @@ def codesign_goals() -> str:
     for study in results("codesign").values():
         for index, row in enumerate(study["rows"]):
             shares = [row.get(f"goals reached by the {who} [%]") for who in ("baseline", "winner")]
-            reached = ["" if shares[0] is None else f"{shares[0]}%", "" if shares[1] is None else f"→ {shares[1]}%"]
+            reached = ["" if shares[0] is None else f"{shares[0]:g}%", "" if shares[1] is None else f"→ {shares[1]:g}%"]
             time = row.get("CPU with FEM check [min]")
             cells = [row["controller"], *reached, str(row["test goals"]), f"{time:.1f} min" if time else ""]
             rows.append(["" if index else study["title"], *cells])
@@ -222,15 +228,16 @@ def test_set() -> str:
 
 
 def trust() -> str:
-    """Errors, coverage and trust of calibrated weights, by stratum.
+    """Errors, coverage and trust of calibrated weights on states that the calibration has not seen, by stratum.
 
     Intervals of the coverage are those of a share of independent states (Clopper and Pearson, 95 %).
     """
     rows = []
     for name, title in CALIBRATED.items():
-        found = {k.removeprefix(f"{name}: "): v for k, v in results("trust").items() if k.startswith(f"{name}: ")}
-        strata = {k: v for k, v in found.items() if isinstance(v, dict)}
-        rows += _trust_rows(title, strata, found["goal tolerance [mm]"])
+        if f"trust_{name}" in records():
+            found = results(f"trust_{name}")
+            strata = {k: v for k, v in found.items() if isinstance(v, dict)}
+            rows += _trust_rows(title, strata, found["goal tolerance [mm]"])
     return markdown(TRUST_HEAD, rows, "llrrrrrrr")
 
 
@@ -246,7 +253,7 @@ def calibrated() -> str:
     return markdown(TRUST_HEAD, rows, "llrrrrrrr")
 
 
-CALIBRATED = WEIGHTS | {"finger_2cables_accurate": "finger, 2 cables, accurate mesh"}
+CALIBRATED = WEIGHTS | {f"{name}_accurate": f"{title}, accurate mesh" for name, title in WEIGHTS.items()}
 FACTORS = {"mean": 1e3, "worst": 1e3, "worst_trusted": 1e3, "coverage": 100.0, "trusted": 100.0}
 """From metres and shares to millimetres and percent."""
 TRUST_HEAD = [
@@ -382,27 +389,6 @@ def _path_errors(benchmark: str, head: str) -> str:
             mean = results(benchmark)[f"{name}: mean [mm]"]
             rows.append([name.replace(" %", "%"), short(value), short(mean)])
     return markdown([head, "largest error [mm]", "mean [mm]"], rows, "lrr")
-
-
-def robustness() -> str:
-    """Controllers on plants unlike their model, of every robot that was run: goals reached and mean final distance."""
-    from benchmarks.robustness import BENCHMARKS, CONTROLLERS, PLANTS
-
-    rows = []
-    for group in (name for name in BENCHMARKS if name in records()):
-        found = results(group)
-        for plant in PLANTS:
-            keys = [f"{name}, {plant}" for name in CONTROLLERS]
-            if f"{keys[0]}: goals reached [%]" in found:
-                cells = [
-                    figure(group, f"{key}: goals reached [%]", ".0f")
-                    + " %, "
-                    + figure(group, f"{key}: mean distance [mm]", ".2f")
-                    + " mm"
-                    for key in keys
-                ]
-                rows.append([group.removeprefix("robustness_").capitalize(), plant, *cells])
-    return markdown(["robot", "plant", *CONTROLLERS], rows, "llrrr")
 
 
 def side_by_side() -> str:
@@ -585,7 +571,7 @@ TABLES: dict[str, Callable[[], str]] = {
         design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, sealed_stiffness,
         sealed_estimates, side_by_side, stiff_flop,
-        validation, contact, surrogate_speed, fem_speed, deployed, robustness, provenance,
+        validation, contact, surrogate_speed, fem_speed, deployed, provenance,
     )
 }  # fmt: skip
 """Tables by the name in a marked place."""

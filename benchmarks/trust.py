@@ -2,52 +2,73 @@
 
 from __future__ import annotations
 
+import json
 import time
+from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
+
+from softgym_envs.robots.registry import make_robot
+from softgym_envs.surrogate.calibration import attack, calibration_states, cross_validated, judged_states, report
+from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
 
 #: The calibration uses seed 11.
 SEED = 12
 
+BODIES, ATTACKS = 32, 100
+"""Most bodies of a stratum, and most states of the search."""
 
-def trust(folder: str | Path = "results/trust") -> dict[str, object]:
-    """Errors, coverage and trust under given commands by stratum, on FEM states that the calibration has not seen.
 
-    As many states as the calibration of the weights used; those of a robot are kept in the folder. States of an
-    accurate mesh take many seconds, so there the states of the calibration serve again, if the folder has them: those
-    of each body are judged by factors and a limit of trust from all others. ``adversarial`` is a search for trusted
-    states with large errors; a new one, with the limit of trust as it is, for the others. Weights that have not been
-    calibrated are left out.
+def trust(variant: str, folder: str | Path = "results/trust") -> dict[str, object]:
+    """Errors, coverage and trust of weights by stratum, on FEM states that their calibration has not seen.
+
+    As many states as the calibration used, but at most those of `BODIES` bodies. States of an accurate mesh take many
+    seconds, so there the states of the calibration serve again, if the folder has them: those of each body are judged
+    by factors and a limit of trust from all others. ``adversarial`` is a search for trusted states with large errors;
+    a new one, with the limit of trust as it is, for the others.
+
+    Args:
+        variant: name of shipped weights that have been calibrated.
+        folder: where the states of the weights are kept, in a folder of that name.
     """
-    from softgym_envs.robots.registry import make_robot
-    from softgym_envs.surrogate.calibration import (
-        attack,
-        calibration_states,
-        cross_validated,
-        judged_states,
-        report,
-    )
-    from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
+    name, options = shipped_robots()[variant]
+    robot = make_robot(name, **options)
+    model = pretrained_model(robot)
+    sizes, start, kept = model.card["calibration"], time.process_time(), Path(folder) / variant
+    if expensive := "mesh" in robot.mechanics_key:
+        rows = cross_validated(model, calibration_states(model, kept))
+    else:
+        states = judged_states(model, min(sizes["bodies"], BODIES), sizes["states"], SEED, kept)
+        attacked = attack(model, min(sizes["attacks"], ATTACKS), sizes["states"], SEED, kept)
+        rows = report(model, states) | {"adversarial": report(model, attacked)["adversarial"]}
+    result: dict[str, object] = {
+        "goal tolerance [mm]": 1e3 * robot.goal_tolerance,
+        "trusted below an uncertainty of [mm]": 1e3 * model.domain.limit,
+        "bodies": "of the calibration, each left out of it" if expensive else "new ones",
+    }
+    for stratum, row in rows.items():
+        lengths = {k: 1e3 * getattr(row, k) for k in ("mean", "worst", "worst_trusted")}
+        shares = {k: 100 * getattr(row, k) for k in ("coverage", "trusted")}
+        result[stratum] = asdict(replace(row, **lengths, **shares))
+    return {**result, "CPU [min]": (time.process_time() - start) / 60}
 
-    result: dict[str, object] = {}
+
+def calibrated() -> list[str]:
+    """Names of the shipped weights that have been calibrated by strata."""
+    names = []
     for variant, (name, options) in shipped_robots().items():
-        robot = make_robot(name, **options)
-        model = pretrained_model(robot)
-        if "calibration" not in model.card:
-            continue
-        sizes, start, kept = model.card["calibration"], time.process_time(), Path(folder) / variant
-        if expensive := "mesh" in robot.mechanics_key:
-            rows = cross_validated(model, calibration_states(model, kept))
-        else:
-            states = judged_states(model, sizes["bodies"], sizes["states"], SEED, kept)
-            attacked = attack(model, sizes["attacks"], sizes["states"], SEED, kept)
-            rows = report(model, states) | {"adversarial": report(model, attacked)["adversarial"]}
-        result[f"{variant}: goal tolerance [mm]"] = 1e3 * robot.goal_tolerance
-        result[f"{variant}: trusted below an uncertainty of [mm]"] = 1e3 * model.domain.limit
-        result[f"{variant}: bodies"] = "of the calibration, each left out of it" if expensive else "new ones"
-        for stratum, row in rows.items():
-            lengths = {k: 1e3 * getattr(row, k) for k in ("mean", "worst", "worst_trusted")}
-            shares = {k: 100 * getattr(row, k) for k in ("coverage", "trusted")}
-            result[f"{variant}: {stratum}"] = asdict(replace(row, **lengths, **shares))
-        result[f"{variant}: CPU [min]"] = (time.process_time() - start) / 60
-    return result
+        card = json.loads((pretrained_folder(make_robot(name, **options)) / "model.json").read_text())
+        if "calibration" in card:
+            names.append(variant)
+    return names
+
+
+def _of(variant: str) -> Callable[[], dict[str, object]]:
+    run = partial(trust, variant)
+    run.__doc__ = f"Coverage and trust of the weights '{variant}' on states that their calibration has not seen."
+    return run
+
+
+BENCHMARKS = {f"trust_{variant}": _of(variant) for variant in calibrated()}
+"""Benchmarks by name."""

@@ -146,7 +146,7 @@ def _try_sampler(config: StudyConfig) -> None:
     try:
         study = optuna.create_study(directions=config.directions, sampler=make_sampler(sampler, 0))
         for _ in range(sampler.options.get("n_startup_trials", 10) + 1):
-            params = {name: float(rng.uniform(v.low, v.high)) for name, v in config.optimised.items()}
+            params = {name: v.check(rng.uniform(v.low, v.high)) for name, v in config.optimised.items()}
             values = rng.random(len(study.directions)).tolist()
             study.add_trial(optuna.create_trial(params=params, distributions=space, values=values))
         study.ask(space)

@@ -16,6 +16,7 @@ PARTS = {
     "unseen": board.unseen_table,
     "methods": board.method_table,
     "winners": board.winners_table,
+    "bodies": board.bodies_table,
 }
 """Name of a part, in ``<!-- benchmark: NAME -->`` -> the function that writes it."""
 

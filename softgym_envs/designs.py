@@ -28,6 +28,9 @@ class DesignVariable:
         unit: SI unit, or ``"1"`` for a pure number.
         description: what the variable means to a designer.
         log: whether to sample and normalise on a logarithmic scale.
+        choices: names of what the whole part of the value chooses, from 0; the bounds are then 0 and their number, and
+            the upper one chooses the last. A design holds the middle value of its choice. Samplers of studies treat
+            such a variable as categorical, and observations show one number for each choice.
     """
 
     name: str
@@ -37,6 +40,7 @@ class DesignVariable:
     unit: str
     description: str
     log: bool = False
+    choices: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high)):
@@ -49,6 +53,11 @@ class DesignVariable:
             )
         if self.log and self.low <= 0:
             raise DesignError(f"design variable '{self.name}': a logarithmic scale needs low > 0, got {self.low}")
+        if self.choices and (self.low != 0 or self.high != len(self.choices) or self.log):
+            raise DesignError(
+                f"design variable '{self.name}': {len(self.choices)} choices need a linear scale from 0 to "
+                f"{len(self.choices)}, got {self.low} to {self.high}"
+            )
 
     def check(self, value: object) -> float:
         """Return ``value`` as a float inside the bounds, or raise `DesignError`."""
@@ -64,7 +73,11 @@ class DesignVariable:
         slack = 1e-6 * (self.high - self.low)
         if not self.low - slack <= number <= self.high + slack:
             raise DesignError(f"design variable '{self.name}' = {number:g}{unit} is out of bounds; {allowed}")
-        return min(max(number, self.low), self.high)
+        return float(self._nearest(min(max(number, self.low), self.high)))
+
+    def _nearest(self, value: float | np.ndarray) -> float | np.ndarray:
+        """Return values inside the bounds, of a choice the middle values."""
+        return np.minimum(np.floor(value), len(self.choices) - 1.0) + 0.5 if self.choices else value
 
     def to_unit(self, value: float | np.ndarray) -> np.ndarray:
         """Map [low, high] to [-1, 1]."""
@@ -74,6 +87,25 @@ class DesignVariable:
             low, high, value = self.low, self.high, np.asarray(value)
         return 2.0 * (value - low) / (high - low) - 1.0
 
+    def choice(self, value: float) -> str:
+        """Return the name of what a value chooses."""
+        return self.choices[int(self._nearest(value))]
+
+    @property
+    def observed_size(self) -> int:
+        """How many numbers of an observation show the variable."""
+        return len(self.choices) or 1
+
+    def observe(self, value: float | np.ndarray) -> np.ndarray:
+        """Return what observations show of values (...): shape (..., observed_size), in [-1, 1].
+
+        A number is shown by its place between the bounds, a choice by 1 among zeros.
+        """
+        if not self.choices:
+            return self.to_unit(value)[..., None]
+        middles = np.arange(len(self.choices)) + 0.5
+        return (np.asarray(self._nearest(value))[..., None] == middles).astype(float)
+
     def from_unit(self, unit_value: float | np.ndarray) -> np.ndarray:
         """Map [-1, 1] to [low, high]; values outside are clipped."""
         fraction = 0.5 * (np.clip(unit_value, -1.0, 1.0) + 1.0)
@@ -81,7 +113,7 @@ class DesignVariable:
             value = np.exp(math.log(self.low) + fraction * math.log(self.high / self.low))
         else:
             value = self.low + fraction * (self.high - self.low)
-        return np.clip(value, self.low, self.high)
+        return np.asarray(self._nearest(np.clip(value, self.low, self.high)))
 
 
 class Design(Mapping[str, float]):
@@ -207,6 +239,11 @@ class DesignSpace:
             raise DesignError(f"a unit design must be finite, got {vector.tolist()}")
         values = (float(variable.from_unit(u)) for variable, u in zip(self, vector, strict=True))
         return Design(self, dict(zip(self.names, values, strict=True)))
+
+    def observe(self, designs: np.ndarray, names: Sequence[str]) -> np.ndarray:
+        """Return what observations show of designs (..., len(self)): the variables in ``names``, shape (..., k)."""
+        shown = [self[name].observe(designs[..., self.names.index(name)]) for name in names]
+        return np.concatenate(shown, axis=-1) if shown else np.empty((*designs.shape[:-1], 0))
 
     def sample(self, rng: np.random.Generator, names: Sequence[str] | None = None) -> Design:
         """Draw a uniform design; variables not in ``names`` (default: all) keep their baseline."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.util import find_spec
 
 from softgym_envs.errors import MissingLibrary
@@ -18,6 +19,7 @@ EXTRAS = {
     "minari": ("minari", "h5py", "jax"),
     "design": ("SALib",),
     "benchmark": ("pyarrow",),
+    "optimisers": ("botorch", "ConfigSpace", "linear_operator", "optuna_integration", "ribs", "smac"),
 }
 """Extra in pyproject.toml -> modules that it installs."""
 
@@ -47,8 +49,14 @@ def require(extra: str) -> None:
         MissingLibrary: one line that says what to install.
     """
     for module in EXTRAS[extra]:
-        if find_spec(module) is None:
+        if not _installed(module):
             raise MissingLibrary(_missing(module, extra))
+
+
+def _installed(module: str) -> bool:
+    if module in sys.modules:  # some modules have no specification once they are imported
+        return sys.modules[module] is not None
+    return find_spec(module) is not None
 
 
 def _missing(module: str, extra: str) -> str:

@@ -236,6 +236,7 @@ def test_malformed_unit_vectors(vector, message):
         ({"baseline": 1.5}, r"baseline 1.5 is outside \[0.5, 1.0\]"),
         ({"baseline": float("nan")}, "baseline nan"),
         ({"low": -1.0, "log": True}, "logarithmic scale needs low > 0"),
+        ({"choices": ("a", "b")}, "2 choices need a linear scale from 0 to 2, got 0.5 to 1.0"),
     ],
     ids=str,
 )
@@ -277,3 +278,19 @@ def test_a_space_with_other_bounds():
         space.within({"length": (0.05, 0.06)})
     with pytest.raises(DesignError, match="'width'"):
         space.within({"width": (0.0, 1.0)})
+
+
+def test_choices_are_shown_one_by_one_and_kept_at_their_middles():
+    """A value anywhere in the interval of a choice is the same body; the upper bound is the last choice."""
+    kind = DesignVariable("kind", 0.0, 3.0, 0.5, "-", "", choices=("leaf", "block", "none"))
+    space = DesignSpace(SPACE["length"], kind)
+    assert [kind.choice(value) for value in (0.0, 0.99, 1.0, 2.5, 3.0)] == ["leaf", "leaf", "block", "none", "none"]
+    assert space.complete({"kind": 1.9}) == space.complete({"kind": 1.0}) and space.complete({"kind": 3})["kind"] == 2.5
+    assert kind.from_unit(np.linspace(-1.0, 1.0, 5)).tolist() == [0.5, 0.5, 1.5, 2.5, 2.5]
+    designs = np.array([space.complete({"kind": value}).array for value in (0.0, 1.5, 3.0)])
+    shown = space.observe(designs, ["kind", "length"])
+    np.testing.assert_array_equal(shown[:, :3], np.eye(3))
+    np.testing.assert_array_equal(shown[:, 3], space["length"].to_unit(designs[:, 0]))
+    assert space.observe(designs, []).shape == (3, 0)
+    drawn = {space.sample(np.random.default_rng(seed))["kind"] for seed in range(20)}
+    assert drawn == {0.5, 1.5, 2.5}

@@ -15,6 +15,7 @@ LEARNERS = {
     "ppo": "softgym_envs.agents.learners.ppo:PPOLearner",
     "analytic": "softgym_envs.agents.learners.analytic:AnalyticLearner",
     "cloning": "softgym_envs.agents.learners.cloning:CloningLearner",
+    "recurrent": "softgym_envs.agents.learners.recurrent:RecurrentLearner",
     "evolution": "softgym_envs.agents.learners.evolution:EvolutionLearner",
 }
 

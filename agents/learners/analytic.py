@@ -16,10 +16,13 @@ import numpy as np
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.gradient import GradientLearner
 from softgym_envs.envs.gradients import StepGradient
+from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 
 class AnalyticLearner(GradientLearner):
     """Analytic policy gradient, one step deep."""
+
+    env: SoftRobotVectorEnv
 
     def __init__(self, config: TrainConfig) -> None:
         super().__init__(config, config.analytic)

@@ -7,26 +7,39 @@ to samples of them. At first the QP acts in some of the environments, later only
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import SyncVectorEnv
 
+from softgym_envs.agents.baselines import InverseQPAgent
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.base import Tensors
 from softgym_envs.agents.learners.gradient import GradientLearner
 from softgym_envs.agents.residual import BatchQP
+from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 
 class CloningLearner(GradientLearner):
-    """Imitation of the inverse QP on the batched environment."""
+    """Imitation of the inverse QP, on the batched environment where there is one."""
+
+    needs_batch = False
 
     def __init__(self, config: TrainConfig) -> None:
         super().__init__(config, config.cloning)
-        self._expert = BatchQP(self.env)
+        self._expert = self._make_expert()
         size = config.steps + config.num_envs
         self._observations = np.zeros((size, *self.env.single_observation_space.shape), dtype=np.float32)  # type: ignore[misc]
         self._answers = np.zeros((size, *self.env.single_action_space.shape), dtype=np.float32)  # type: ignore[misc]
+
+    def _make_expert(self) -> Callable[[], np.ndarray]:
+        """Return a function that returns the answers of the QP in the present states, shape (num_envs, n_a)."""
+        if isinstance(self.env, SoftRobotVectorEnv):
+            return BatchQP(self.env)
+        assert isinstance(self.env, SyncVectorEnv)
+        singles, agent = [env.unwrapped for env in self.env.envs], InverseQPAgent()
+        return lambda: np.stack([agent(None, env) for env in singles])
 
     def advance(self, observation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         import torch

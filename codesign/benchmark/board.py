@@ -14,6 +14,7 @@ from softgym_envs.codesign.benchmark.regret import MethodRow, Stored, contests, 
 from softgym_envs.codesign.benchmark.runs import stored_runs
 from softgym_envs.codesign.benchmark.scoring import DATA, normalised, reference
 from softgym_envs.codesign.benchmark.submission import Submission
+from softgym_envs.codesign.benchmark.table import TABLE_JUDGES, Table, shipped_tables
 from softgym_envs.codesign.benchmark.winners import rank_correlation, stored_winners
 
 SUBMISSIONS = DATA / "submissions"
@@ -229,6 +230,25 @@ def winners_table(data: Path = DATA) -> str:
         )
     header = ["problem", "method", "median seed", "learned model [mm]", "finite elements [mm]", "exploitation [mm]"]
     return _table(header, cells) + "\n\n" + "\n".join(notes)
+
+
+def bodies_table() -> str:
+    """Return the shipped tables of bodies: how many each judge has scored, and how it ranks those of `rest`."""
+    rows = []
+    for name in shipped_tables():
+        table = Table.read(name)
+        unit = table.problem.definition.primary
+        for judge in (key for key in TABLE_JUDGES if key in table.values):
+            scored = int(np.isfinite(table.values[judge][:, 0]).sum())
+            cells = [f"`{name}`", f"`{judge}`", TABLE_JUDGES[judge].about, f"{scored:,}"]
+            if judge == "rest":
+                rows.append([*cells, "-", "-"])
+                continue
+            _, tau, bias = table.agreement("rest", judge)
+            rows.append([*cells, f"{tau:.3f}", f"{unit.scale * bias:+.4f}"])
+    if not rows:
+        return "No tables are shipped."
+    return _table(["problem", "judge", "about", "bodies", "Kendall's tau with `rest`", "mean difference [mm]"], rows)
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -16,22 +16,13 @@ from torch import Tensor
 
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem
 from softgym_envs.codesign.benchmark.problem import Score
+from softgym_envs.codesign.benchmark.rest import settle
 from softgym_envs.codesign.tools.bodies import learned_model
 from softgym_envs.codesign.tools.box import Box
 from softgym_envs.codesign.tools.gradient import descend
-from softgym_envs.control.inverse_qp import InverseQP
 
 if TYPE_CHECKING:
     from softgym_envs.envs.vector_env import SoftRobotVectorEnv
-
-LONGEST = 0.1
-"""Largest step of a command towards rest, relative to its range."""
-
-SETTLED = 3e-3
-"""Step of all commands, relative to their ranges, below which a body counts as at rest."""
-
-MOST_STEPS = 25
-"""Largest number of steps towards rest."""
 
 AT_LIMIT = 1e-4
 """Distance of a command to a limit, relative to its range, below which it counts as at the limit."""
@@ -145,14 +136,8 @@ class SettledCost:
         complete = {name: design[name] for name in self.box.space.names}
         env.reset(seed=0, options={"design": complete, "goal": self.goals[:, None]})
         span = robot.upper - robot.lower
-        controller = InverseQP.for_robot(robot, goal_weights=env.task.axes, rates=LONGEST * span)
-        for _ in range(MOST_STEPS):
-            command = controller.solve_batch(env.condensed, self.goals, env.command, env.slack)
-            change = np.abs(command - env.command).max(axis=0) / span
-            env.backend.step(command)
-            self.steps += len(self.goals)
-            if change.max() < SETTLED:
-                break
+        command, steps = settle(env, self.goals)
+        self.steps += steps * len(self.goals)
         state = env.backend.state
         loose = np.abs(state.effort) < TIGHT * np.abs(state.effort).max(axis=1, keepdims=True)
         slack = (state.slack | loose) & robot.unilateral

@@ -195,7 +195,14 @@ class FrozenProblem:
         return self.definition.design_from_unit(point)
 
     def evaluate(
-        self, design: Mapping[str, float], budget: float = 1.0, *, judge: Judge | None = None, seed: int = 0
+        self,
+        design: Mapping[str, float],
+        budget: float = 1.0,
+        *,
+        judge: Judge | None = None,
+        seed: int = 0,
+        initial: Path | None = None,
+        keep: Path | None = None,
     ) -> Score:
         """Score a body on the search goals.
 
@@ -204,12 +211,15 @@ class FrozenProblem:
             budget: share of the goals and of the training's steps, in (0, 1].
             judge: who controls the body; default that of the problem.
             seed: added to that of the training.
+            initial: policy that a training begins with, in place of that of the problem.
+            keep: folder for the policy of a training.
 
         Raises:
             DesignError: if the body is out of the box.
             ValueError: for a judge that the problem does not have, or a budget out of (0, 1].
         """
-        return self.evaluator("search")(design, judge or self.definition.judge, share=budget, seed=seed)
+        evaluator, judge = self.evaluator("search"), judge or self.definition.judge
+        return evaluator(design, judge, share=budget, seed=seed, initial=initial, keep=keep)
 
     def evaluator(self, goals: str, backend: str | None = None) -> Evaluator:
         """Return the evaluator on one set of goals."""

@@ -22,6 +22,14 @@ COLOURS = {
     "nsgaii": "#9333ea",
     "halving": "#ca8a04",
     "hyperband": "#db2777",
+    "botorch": "#14b8a6",
+    "smac": "#84cc16",
+    "map_elites": "#7c2d12",
+    "cma_me": "#f59e0b",
+    "gradient": "#111827",
+    "critic": "#be123c",
+    "distribution": "#6d28d9",
+    "inheritance": "#0369a1",
 }
 """Colour of each method in all figures."""
 

@@ -200,6 +200,8 @@ class Evaluator:
         share: float = 1.0,
         seed: int = 0,
         policy: Path | None = None,
+        initial: Path | None = None,
+        keep: Path | None = None,
     ) -> Score:
         """Score one body.
 
@@ -209,6 +211,8 @@ class Evaluator:
             share: share of the goals and of the steps of the training, in (0, 1].
             seed: added to that of the training.
             policy: file of a policy that controls the body in place of the judge.
+            initial: policy that a training begins with, in place of that of the problem.
+            keep: folder for the policy of a training; default it is not kept.
 
         Raises:
             DesignError: if the body is out of the box.
@@ -233,7 +237,8 @@ class Evaluator:
                     agent = policy
                 elif judge == "trained":
                     config = self._training(design, options, share, seed)
-                    agent = train(config, Path(folder) / "policy", initial=problem.policy, progress=False)
+                    start = initial or problem.policy
+                    agent = train(config, Path(keep or folder) / "policy", initial=start, progress=False)
                     reports = -(-config.steps // config.report_every)
                     result.environment_steps += config.steps
                     result.environment_steps += reports * config.evaluation_episodes * problem.episode_steps

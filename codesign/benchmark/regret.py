@@ -28,6 +28,9 @@ FINISHED = 0.01
 EQUAL = 0.001
 """Regrets are rounded to this before methods are compared, so that differences without a meaning are ties."""
 
+FEWEST_SEEDS = 3
+"""Seeds of each method below which a problem does not count for its track."""
+
 Stored = tuple[Run, Any]
 """A run and the scores of its winners on finite elements, or None."""
 
@@ -256,6 +259,8 @@ def track_rows(runs: Sequence[Stored]) -> list[TrackRow]:
 def _tracks(runs: Sequence[Stored]) -> Iterator[tuple[tuple[str, str, bool], list[Contest]]]:
     groups: dict[tuple[str, str, bool], list[Contest]] = defaultdict(list)
     for contest in contests(runs):
+        if min(len(members) for members in contest.runs.values()) < FEWEST_SEEDS:
+            continue
         track = load_problem(contest.problem, check=False).definition.track
         groups[track, contest.judge, contest.listed].append(contest)
     yield from sorted(groups.items())

@@ -5,13 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem
 from softgym_envs.codesign.benchmark.problem import LEVELS, Budget, Judge, Score
 from softgym_envs.codesign.sampling import SamplerConfig, construct, make_sampler
 from softgym_envs.codesign.scheduling.optuna_study import distributions
 from softgym_envs.errors import SoftGymError, unknown_name
+
+if TYPE_CHECKING:
+    from optuna.samplers import BaseSampler
 
 
 class BudgetSpent(SoftGymError):
@@ -24,7 +29,8 @@ class Optimiser(Protocol):
     One that works with several fidelities also has ``share``: the share of the goals and of the training's steps that
     the next body is scored with. One that evaluates the learned model itself has ``steps_left``, which is set before
     each `ask` to the environment steps that it may spend, and ``take_charge()``, which returns the environment steps
-    and CPU seconds that it has spent since; they count as those of the body scored next.
+    and CPU seconds that it has spent since; they count as those of the body scored next. One that passes policies on
+    has ``initial``, the policy that the next training begins with, and ``keep``, the folder for its policy.
     """
 
     def ask(self) -> Mapping[str, float]:
@@ -86,8 +92,8 @@ class Search:
             allowed = min(allowed, self.limit * self.ledger[0].environment_steps)
         return allowed - self.spent["environment_steps"]
 
-    def evaluate(self, design: Mapping[str, float], budget: float = 1.0) -> Score:
-        """Score a body and write it into the ledger; see `FrozenProblem.evaluate`.
+    def evaluate(self, design: Mapping[str, float], budget: float = 1.0, **training: Path | None) -> Score:
+        """Score a body and write it into the ledger; see `FrozenProblem.evaluate`, also for options of trainings.
 
         Raises:
             BudgetSpent: if no budget is left.
@@ -95,7 +101,7 @@ class Search:
         if not self.open:
             spent = ", ".join(f"{name} = {value:g}" for name, value in self.spent.items())
             raise BudgetSpent(f"problem '{self.problem.name}': the budget '{self.level}' is spent ({spent})")
-        row = self.problem.evaluate(design, budget, judge=self.judge, seed=self.seed)
+        row = self.problem.evaluate(design, budget, judge=self.judge, seed=self.seed, **training)
         self.ledger.append(row)
         return row
 
@@ -128,7 +134,8 @@ def solve(search: Search, optimiser: Optimiser) -> float:
         if charges:
             optimiser.steps_left = search.steps_left - search.ledger[0].environment_steps  # type: ignore[attr-defined]
         design = optimiser.ask()
-        row = search.evaluate(design, getattr(optimiser, "share", 1.0))
+        training = {name: getattr(optimiser, name) for name in ("initial", "keep") if hasattr(optimiser, name)}
+        row = search.evaluate(design, getattr(optimiser, "share", 1.0), **training)
         if charges:
             steps, seconds = optimiser.take_charge()  # type: ignore[attr-defined]
             row.environment_steps, row.cpu_seconds = row.environment_steps + steps, row.cpu_seconds + seconds
@@ -141,15 +148,15 @@ class OptunaOptimiser:
 
     Args:
         problem: the problem.
-        sampler: the sampler and its options.
+        sampler: the sampler.
     """
 
-    def __init__(self, problem: FrozenProblem, sampler: SamplerConfig) -> None:
+    def __init__(self, problem: FrozenProblem, sampler: BaseSampler) -> None:
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         definition = problem.definition
-        self._study = optuna.create_study(directions=definition.directions, sampler=make_sampler(sampler, 0))
+        self._study = optuna.create_study(directions=definition.directions, sampler=sampler)
         self._ranges = distributions(definition)
         self._trial: Any = None
 
@@ -235,15 +242,18 @@ def _optuna(name: str, **options: Any) -> Callable[[FrozenProblem, int], Optimis
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.ERROR)  # checking the options of qmc warns of a missing seed
-        return OptunaOptimiser(problem, SamplerConfig(name=name, seed=seed, options=options))  # type: ignore[arg-type]
+        config = SamplerConfig(name=name, seed=seed, options=options)  # type: ignore[arg-type]
+        return OptunaOptimiser(problem, make_sampler(config, 0))
 
     return make
 
 
-def _gradient(problem: FrozenProblem, seed: int) -> Optimiser:
-    from softgym_envs.codesign.benchmark.descents import GradientOptimiser
+def _own(module: str, name: str, **options: Any) -> Callable[[FrozenProblem, int], Optimiser]:
+    def make(problem: FrozenProblem, seed: int) -> Optimiser:
+        found = import_module(f"softgym_envs.codesign.benchmark.{module}")  # when needed: its packages are heavy
+        return getattr(found, name)(problem, seed, **options)
 
-    return GradientOptimiser(problem, seed)
+    return make
 
 
 METHODS: dict[str, Callable[[FrozenProblem, int], Optimiser]] = {
@@ -253,13 +263,20 @@ METHODS: dict[str, Callable[[FrozenProblem, int], Optimiser]] = {
     "gp": _optuna("gp", n_startup_trials=8),
     "cmaes": _optuna("cmaes"),
     "nsgaii": _optuna("nsgaii", population_size=8),
-    "gradient": _gradient,
+    "botorch": _own("packages", "BoTorchOptimiser"),
+    "smac": _own("packages", "SmacOptimiser"),
+    "map_elites": _own("packages", "QualityDiversityOptimiser", emitter="map_elites"),
+    "cma_me": _own("packages", "QualityDiversityOptimiser", emitter="cma_me"),
+    "gradient": _own("descents", "GradientOptimiser"),
+    "critic": _own("joint", "JointOptimiser", proposer="critic"),
+    "distribution": _own("joint", "JointOptimiser", proposer="distribution"),
+    "inheritance": _own("joint", "InheritanceOptimiser"),
     "halving": _halving("SuccessiveHalvingPruner", min_resource=1, reduction_factor=2),
     "hyperband": _halving("HyperbandPruner", min_resource=1, max_resource=4, reduction_factor=2),
 }
 """Baselines: name -> function of problem and seed. A new one is one row."""
 
-SINGLE_OBJECTIVE = ("cmaes", "gradient", "halving", "hyperband")
+SINGLE_OBJECTIVE = ("cmaes", "smac", "map_elites", "cma_me", "gradient", "inheritance", "halving", "hyperband")
 """Methods that know a single objective only."""
 
 

@@ -7,28 +7,35 @@ one in the unit box, and that is what the ledger says. Nothing is interpolated.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.agents.evaluation import evaluate
-from softgym_envs.agents.residual import BatchQP
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem
 from softgym_envs.codesign.benchmark.problem import Judge, Score
+from softgym_envs.codesign.benchmark.rest import LONGEST, outcome, settle, settle_on_fem
 from softgym_envs.codesign.benchmark.scoring import DATA
 from softgym_envs.codesign.benchmark.search import Search
-from softgym_envs.errors import DataError
+from softgym_envs.config import provenance
+from softgym_envs.errors import DataError, unknown_name
 from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_npz
 
+if TYPE_CHECKING:
+    from softgym_envs.envs.vector_env import SoftRobotVectorEnv
+
 CHUNK = 64
-"""Bodies that run at once, and after which an interrupted computation resumes."""
+"""Bodies whose episodes run at once."""
 
 COLUMNS = ("mean_distance", "mean_effort", "success_rate")
+"""What a table holds of each body and judge: means over the search goals. The effort is that of the end for judges at
+rest, and the mean over the episode for the others."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +105,23 @@ class Table:
         """Return `COLUMNS` [SI] of the nearest listed bodies, shape (k, 3), for points (k, n) of the unit box."""
         return self.values[judge][self.nearest(points, judge)]
 
+    def agreement(self, first: str, second: str) -> tuple[int, float, float]:
+        """Return on how many bodies two judges can be compared, Kendall's tau of their mean distances, and the bias.
+
+        The bias is the mean of the distances [m] of the second judge minus those of the first.
+        """
+        from scipy.stats import kendalltau
+
+        a, b = self.values[first][:, 0], self.values[second][:, 0]
+        both = np.isfinite(a) & np.isfinite(b)
+        tau = float(kendalltau(a[both], b[both]).statistic) if both.sum() > 2 else np.nan
+        return int(both.sum()), tau, float(np.mean(b[both] - a[both])) if both.any() else np.nan
+
+
+def shipped_tables() -> list[str]:
+    """Return the names of the problems with a shipped table."""
+    return sorted(path.stem for path in (DATA / "tables").glob("*.parquet"))
+
 
 class TableSearch(Search):
     """A search whose scores come from a table; it costs the environment steps of the real evaluations, and no time."""
@@ -113,7 +137,7 @@ class TableSearch(Search):
         search.table = table
         return search
 
-    def evaluate(self, design: Mapping[str, float], budget: float = 1.0) -> Score:
+    def evaluate(self, design: Mapping[str, float], budget: float = 1.0, **training: Path | None) -> Score:
         """Return the score of the nearest listed body, on all goals."""
         definition = self.problem.definition
         design = definition.checked(design)
@@ -132,34 +156,145 @@ class TableSearch(Search):
         return row
 
 
-def tabulate(name: str, bodies: int, qp_bodies: int, folder: Path, output: Path | None = None) -> Path:
-    """Score bodies of a problem and write the table; an interrupted call continues where it stopped.
+@dataclass(frozen=True)
+class Tabulation:
+    """How bodies of a problem are scored for a table: each judge by one function of points (k, n) to rows (k, 3).
 
     Args:
-        name: a problem with the objective ``mean_distance``, on a batched surrogate.
-        bodies: number of bodies, scored by the shared policy.
-        qp_bodies: number of these, the first ones, that the inverse QP scores too (far slower).
-        folder: where the parts are kept.
-        output: the Parquet file; default the shipped one.
+        problem: a problem with the objective ``mean_distance``, on a batched surrogate.
+        longest: largest step towards rest, see `softgym_envs.codesign.benchmark.rest`.
 
     Raises:
         ValueError: for a problem that has no such table.
     """
+
+    problem: FrozenProblem
+    longest: float = LONGEST
+
+    def __post_init__(self) -> None:
+        definition = self.problem.definition
+        learned = definition.environment.batched and definition.environment.backend == "surrogate"
+        if definition.objective != "mean_distance" or not learned:
+            raise ValueError(
+                f"problem '{self.problem.name}' cannot be tabulated: "
+                "it needs the objective mean_distance on a surrogate"
+            )
+
+    @property
+    def goals(self) -> np.ndarray:
+        """The search goals [m], shape (g, p, 3)."""
+        return self.problem.goals["search"]
+
+    def designs(self, points: np.ndarray) -> list[dict[str, float]]:
+        """Return the complete designs [SI] of points (k, n) of the unit box."""
+        return [self.problem.definition.body(self.problem.design(point))[0] for point in points]
+
+    def episodes(self, agent: str, points: np.ndarray) -> np.ndarray:
+        """Return `COLUMNS` of whole episodes on the learned model, all bodies at once."""
+        designs = [design for design in self.designs(points) for _ in self.goals]
+        tiled = np.tile(self.goals, (len(points), 1, 1))
+        found = evaluate(agent, self.problem.definition.environment, tiled, design=designs)
+        columns = np.stack([found.distances, found.efforts, found.successes.astype(float)], axis=1)
+        return columns.reshape(len(points), len(self.goals), -1).mean(axis=1)
+
+    def at_rest(self, points: np.ndarray) -> np.ndarray:
+        """Return `COLUMNS` where the inverse QP comes to rest on the learned model."""
+        return self._at_rest(points)[0]
+
+    def _at_rest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return `COLUMNS` of each body, and the last commands, shape (k, g, n_a)."""
+        count, goals = len(points), self.goals
+        tiled = np.tile(goals, (count, 1, 1))
+        made = self.problem.definition.environment.make_vec(len(tiled), sample_design=False)
+        env = cast("SoftRobotVectorEnv", made.unwrapped)
+        try:
+            designs = [design for design in self.designs(points) for _ in goals]
+            env.reset(seed=0, options={"design": designs, "goal": tiled})
+            command, _ = settle(env, tiled[:, 0], self.longest)
+            rows = outcome(env, tiled[:, 0])
+        finally:
+            made.close()
+        return rows.reshape(count, len(goals), -1).mean(axis=1), command.reshape(count, len(goals), -1)
+
+    def trained(self, points: np.ndarray) -> np.ndarray:
+        """Return `COLUMNS` of policies that are trained anew for each body, on the learned model."""
+        every = {"secondary_objectives": COLUMNS[1:]}
+        evaluator = self.problem.evaluator("search")
+        evaluator = replace(evaluator, problem=evaluator.problem.model_copy(update=every))
+        rows = [evaluator(self.problem.design(point), "trained").values for point in points]
+        return np.array([[values.get(name, np.nan) for name in COLUMNS] for values in rows])
+
+    def fem(self, mesh: str | None, points: np.ndarray) -> np.ndarray:
+        """Return `COLUMNS` where the inverse QP comes to rest on finite elements; default the mesh of the robot."""
+        environment = self.problem.definition.environment.on("fem")
+        if mesh is not None:
+            options = {**environment.robot_options, "mesh": mesh}
+            environment = environment.model_copy(update={"robot_options": options})
+        _, commands = self._at_rest(points)
+        rows = [
+            settle_on_fem(environment, design, self.goals[:, 0], command, self.longest).mean(axis=0)
+            for design, command in zip(self.designs(points), commands, strict=True)
+        ]
+        return np.array(rows)
+
+
+@dataclass(frozen=True)
+class TableJudge:
+    """A judge of a table: what it is, the bodies that it scores at once, and how."""
+
+    about: str
+    chunk: int
+    score: Callable[[Tabulation, np.ndarray], np.ndarray]
+
+
+TABLE_JUDGES: dict[str, TableJudge] = {
+    "rest": TableJudge("inverse QP, at rest on the learned model", 256, Tabulation.at_rest),
+    "qp": TableJudge("inverse QP, whole episodes", CHUNK, lambda t, points: t.episodes("qp", points)),
+    "shared": TableJudge(
+        "one policy for all bodies, whole episodes",
+        CHUNK,
+        lambda t, points: t.episodes(str(t.problem.definition.policy), points),
+    ),
+    "trained": TableJudge("a policy trained for each body, whole episodes", 1, Tabulation.trained),
+    "fem": TableJudge("inverse QP, at rest on finite elements", 1, lambda t, points: t.fem(None, points)),
+    "fem_accurate": TableJudge(
+        "inverse QP, at rest on the accurate mesh", 1, lambda t, points: t.fem("accurate", points)
+    ),
+}
+"""Judges of tables by name. Bodies are chunked so that an interrupted computation resumes after each chunk."""
+
+
+def tabulate(
+    name: str, counts: Mapping[str, int], folder: Path, output: Path | None = None, longest: float = LONGEST
+) -> Path:
+    """Score bodies of a problem and write the table; an interrupted call continues where it stopped.
+
+    Args:
+        name: a problem with the objective ``mean_distance``, on a batched surrogate.
+        counts: by judge of `TABLE_JUDGES`, how many bodies it scores: the first ones of the sequence.
+        folder: where the parts are kept.
+        output: the Parquet file; default the shipped one.
+        longest: largest step towards rest, relative to the range of a command.
+
+    Raises:
+        ValueError: for a problem that has no such table, or an unknown judge.
+    """
     require("benchmark")
     problem = load_problem(name)
-    definition = problem.definition
-    learned = definition.environment.batched and definition.environment.backend == "surrogate"
-    if definition.objective != "mean_distance" or not learned:
-        raise ValueError(f"problem '{name}' cannot be tabulated: it needs the objective mean_distance on a surrogate")
+    tabulation = Tabulation(problem, longest)
+    for judge in counts:
+        if judge not in TABLE_JUDGES or (judge == "shared" and problem.definition.policy is None):
+            raise ValueError(f"problem '{name}': {unknown_name('judge of tables', judge, TABLE_JUDGES)}")
+    bodies = max(counts.values())
     points = _points(len(problem.variables), bodies)
     values: dict[str, np.ndarray] = {}
-    counts = {"shared": bodies if definition.policy else 0, "qp": qp_bodies}
     for judge, count in counts.items():
+        chunk = TABLE_JUDGES[judge].chunk
         values[judge] = np.full((bodies, len(COLUMNS)), np.nan)
-        for start in range(0, count, CHUNK):
-            rows = slice(start, min(start + CHUNK, count))
-            values[judge][rows] = _chunk(problem, judge, points[rows], start, folder)
-    return _write(problem, points, values, output or DATA / "tables" / f"{name}.parquet")
+        for start in range(0, count, chunk):
+            rows = slice(start, min(start + chunk, count))
+            values[judge][rows] = tabulated(tabulation, judge, points[rows], folder, start)
+    return _write(problem, points, values, output or DATA / "tables" / f"{name}.parquet", longest)
 
 
 def _points(dimension: int, count: int) -> np.ndarray:
@@ -169,43 +304,33 @@ def _points(dimension: int, count: int) -> np.ndarray:
     return np.round(2.0 * qmc.Sobol(dimension, rng=np.random.default_rng(0)).random(whole)[:count] - 1.0, 6)
 
 
-def _chunk(problem: FrozenProblem, judge: str, points: np.ndarray, start: int, folder: Path) -> np.ndarray:
-    path = folder / "tables" / problem.name / problem.hash[:12] / f"{judge}-{start:07d}-{len(points)}.npz"
+def tabulated(
+    tabulation: Tabulation, judge: str, points: np.ndarray, folder: Path, start: int | None = None
+) -> np.ndarray:
+    """Return `COLUMNS` of points (k, n) of the unit box under a judge; computed once and kept in a folder.
+
+    Args:
+        tabulation: how bodies are scored.
+        judge: key of `TABLE_JUDGES`.
+        points: points of the unit box, shape (k, n).
+        folder: where results are kept.
+        start: place of the first point in the sequence of a table, which names the file; default a hash names it.
+    """
+    problem = tabulation.problem
+    way = judge if judge in ("qp", "shared", "trained") else f"{judge}-{tabulation.longest:g}"
+    place = sha256(np.round(points, 6).tobytes()).hexdigest()[:16] if start is None else f"{start:07d}"
+    path = folder / "tables" / problem.name / problem.hash[:12] / f"{way}-{place}-{len(points)}.npz"
     if path.is_file():
         return read_npz(path, ("values",))["values"]
-    definition, goals = problem.definition, problem.goals["search"]
-    designs = [definition.body(problem.design(point))[0] for point in points for _ in goals]
-    tiled = np.tile(goals, (len(points), 1, 1))
-    if judge == "qp":
-        columns = _qp(definition.environment, tiled, designs)
-    else:
-        found = evaluate(str(definition.policy), definition.environment, tiled, design=designs)
-        columns = np.stack([found.distances, found.efforts, found.successes.astype(float)], axis=1)
-    values = columns.reshape(len(points), len(goals), -1).mean(axis=1)
+    values = TABLE_JUDGES[judge].score(tabulation, points)
     with atomic_write(path) as stream:
         np.savez(stream, values=values)
     return values
 
 
-def _qp(environment: EnvironmentConfig, goals: np.ndarray, designs: list[dict[str, float]]) -> np.ndarray:
-    """Return final distance, mean effort and success of each episode under the inverse QP, shape (n, 3)."""
-    env = environment.make_vec(len(goals), sample_design=False)
-    try:
-        env.reset(seed=0, options={"design": designs, "goal": goals})
-        control, effort, count = BatchQP(env.unwrapped), np.zeros(len(goals)), 0  # type: ignore[arg-type]
-        while True:
-            *_, truncated, info = env.step(control())
-            last = info.get("final_info", info)
-            effort += np.abs(last["effort"]).mean(axis=1)
-            count += 1
-            if truncated.all():
-                success = last["is_success"] & last["converged"]
-                return np.stack([last["distance"], effort / count, success.astype(float)], axis=1)
-    finally:
-        env.close()
-
-
-def _write(problem: FrozenProblem, points: np.ndarray, values: Mapping[str, np.ndarray], path: Path) -> Path:
+def _write(
+    problem: FrozenProblem, points: np.ndarray, values: Mapping[str, np.ndarray], path: Path, longest: float
+) -> Path:
     import pyarrow
     from pyarrow import parquet
 
@@ -213,7 +338,13 @@ def _write(problem: FrozenProblem, points: np.ndarray, values: Mapping[str, np.n
     for judge, table in values.items():
         if np.isfinite(table).any():
             columns |= {f"{judge}.{key}": table[:, i].astype(np.float32) for i, key in enumerate(COLUMNS)}
-    meta = {"problem": problem.name, "hash": problem.hash, "columns": json.dumps(list(columns))}
+    meta = {
+        "problem": problem.name,
+        "hash": problem.hash,
+        "columns": json.dumps(list(columns)),
+        "longest": f"{longest:g}",
+        "commit": str(provenance()["commit"]),
+    }
     found = pyarrow.table(columns).replace_schema_metadata(meta)
     with atomic_write(path) as stream:
         parquet.write_table(found, stream, compression="zstd")

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.codesign.benchmark.frozen import load_problem, problem_names
+from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem, problem_names
 from softgym_envs.codesign.benchmark.runs import Run, stored_runs, tested
 from softgym_envs.codesign.benchmark.scoring import DATA
+from softgym_envs.codesign.benchmark.table import Tabulation, tabulated
 from softgym_envs.codesign.records import Record
 from softgym_envs.storage import atomic_write, read_json
 
@@ -32,6 +33,7 @@ class Winner(Record):
         design: values of the variables [SI].
         surrogate: score on the learned model [SI].
         fem: score on finite elements [SI]; None if the body has no equilibrium there.
+        rest: whether both scores are those where the inverse QP comes to rest, in place of whole episodes.
     """
 
     problem: str
@@ -42,6 +44,7 @@ class Winner(Record):
     design: dict[str, float]
     surrogate: float
     fem: float | None
+    rest: bool = False
 
     @property
     def exploitation(self) -> float:
@@ -49,7 +52,14 @@ class Winner(Record):
         return np.nan if self.fem is None else self.surrogate - self.fem
 
 
-def check(folder: Path, name: str, every: Sequence[str] = (), level: str = "small", data: Path = DATA) -> list[Winner]:
+def check(
+    folder: Path,
+    name: str,
+    every: Sequence[str] = (),
+    level: str = "small",
+    data: Path = DATA,
+    rest: bool = False,
+) -> list[Winner]:
     """Score the winner of each method's median seed on finite elements (seconds to minutes each).
 
     The median seed is the one whose search ended with the median score; of an even number, the better of both.
@@ -60,6 +70,7 @@ def check(folder: Path, name: str, every: Sequence[str] = (), level: str = "smal
         every: methods of which the winners of all seeds are scored.
         level: budget of the searches, which are the stored ones under the inverse QP.
         data: folder of the stored runs.
+        rest: compare the states where the inverse QP comes to rest, in place of whole episodes: a tenth of the steps.
 
     Raises:
         ValueError: if no such searches are stored.
@@ -76,13 +87,25 @@ def check(folder: Path, name: str, every: Sequence[str] = (), level: str = "smal
         ranked = sorted(runs, key=lambda run: (-run.search_scores[0][0], run.seed))
         middle = ranked[(len(ranked) - 1) // 2]
         for run in sorted(runs, key=lambda run: run.seed) if method in every else [middle]:
-            learned, exact = (
-                tested(problem, run.designs[0], "qp", "search", backend, folder) for backend in (None, "fem")
-            )
-            fem = exact.score if exact.feasible else None
-            row = Winner(name, problem.hash, method, run.seed, run is middle, run.designs[0], learned.score, fem)
+            learned, fem = (_at_rest if rest else _episodes)(problem, run.designs[0], folder)
+            row = Winner(name, problem.hash, method, run.seed, run is middle, run.designs[0], learned, fem, rest)
             found.append(row)
     return found
+
+
+def _episodes(problem: FrozenProblem, design: dict[str, float], folder: Path) -> tuple[float, float | None]:
+    learned, exact = (tested(problem, design, "qp", "search", backend, folder) for backend in (None, "fem"))
+    return learned.score, exact.score if exact.feasible else None
+
+
+def _at_rest(problem: FrozenProblem, design: dict[str, float], folder: Path) -> tuple[float, float | None]:
+    optimised, tabulation = problem.definition.optimised, Tabulation(problem)
+    point = np.array([[float(optimised[name].to_unit(value)) for name, value in design.items()]])
+    learned, exact = (
+        problem.definition.primary.score(float(tabulated(tabulation, judge, point, folder)[0, 0]))
+        for judge in ("rest", "fem")
+    )
+    return learned, exact if np.isfinite(exact) else None
 
 
 def rank_correlation(rows: Sequence[Winner]) -> float:

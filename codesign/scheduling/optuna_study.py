@@ -30,11 +30,13 @@ def make_pruner(config: StudyConfig) -> optuna.pruners.BasePruner:
 
 
 def distributions(config: StudyProblem) -> dict[str, optuna.distributions.BaseDistribution]:
-    """Return the range of each optimised variable [SI]."""
+    """Return the range of each optimised variable [SI]; of a choice, the middle of each of its values."""
     import optuna
 
     return {
-        name: optuna.distributions.FloatDistribution(variable.low, variable.high, log=variable.log)
+        name: optuna.distributions.CategoricalDistribution([k + 0.5 for k in range(len(variable.choices))])
+        if variable.choices
+        else optuna.distributions.FloatDistribution(variable.low, variable.high, log=variable.log)
         for name, variable in config.optimised.items()
     }
 

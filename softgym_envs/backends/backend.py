@@ -47,7 +47,8 @@ class State:
         motion: time, velocities and energies of the body; None without dynamics, and on the surrogate.
         stable: the equilibrium is stable whether displacements or efforts are commanded (always True on the
             surrogate). In dynamics: the tangent of the time step, including inertia, is positive definite.
-        uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM.
+        uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM without
+            learned superelements.
         trusted: the state lies where the learned model may be trusted; always True for FEM without superelements.
         doubt: why it is not trusted, 0 if it is: a sum of numbers in `softgym_envs.surrogate.domain.DOUBTS`.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.

@@ -215,7 +215,7 @@ class ChainBackend(Backend):
 
     def contact_model(self, *, friction: bool = False) -> CondensedModel:
         if friction:
-            raise ValueError("the contact model of a learned chain leaves friction out: friction=False, or backend='fem'")
+            raise ValueError("the contact model of a learned chain has no friction: friction=False or backend='fem'")
         return self._body.contact_model(self.state)
 
     def restore(self, state: State) -> None:

@@ -17,9 +17,10 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
+from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import TOUCH_RADIUS, Robot
-from softgym_envs.surrogate.domain import LOADED
+from softgym_envs.surrogate.domain import LOADED, SPREAD
 
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
@@ -338,7 +339,12 @@ class FEMBackend(Backend):
         if motion is not None and not still:
             assert self._dynamics is not None
             velocity = self._dynamics.effector_velocity().reshape(-1, 3)
-        known = all(block.knows(equilibrium.x) for block in self.model.blocks)
+        doubt = 0 if all(block.knows(equilibrium.x) for block in self.model.blocks) else LOADED
+        uncertainty = 0.0
+        if motion is None and any(block.learned for block in self.model.blocks):
+            held = np.abs(equilibrium.effort[slices["a"]]) < self.largest_efforts * SATURATED
+            uncertainty = float(np.linalg.norm(possible_errors(self._statics, held)[:3]))
+            doubt |= SPREAD if uncertainty > self.robot.goal_tolerance else 0
         return State(
             command=np.array(command, dtype=float),
             displacement=equilibrium.delta[slices["a"]],
@@ -351,8 +357,9 @@ class FEMBackend(Backend):
             motion=motion,
             bonds=equilibrium.effort[len(condensed.effort) :],
             stable=equilibrium.stable,
-            trusted=known,
-            doubt=0 if known else LOADED,
+            uncertainty=uncertainty,
+            trusted=doubt == 0,
+            doubt=doubt,
             contacts=equilibrium.contacts,
             memory=equilibrium.memory,
         )

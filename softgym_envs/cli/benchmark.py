@@ -131,9 +131,10 @@ def judges(name: str, bodies: int, folder: Path) -> None:
 @click.option(
     "--every", multiple=True, help="Check the winners of all seeds of this method; several with several options."
 )
+@click.option("--rest", is_flag=True, help="Compare states at rest in place of whole episodes (a tenth of the time).")
 @click.option("--store", is_flag=True, help="Add the winners to the stored ones (source checkout).")
 @results
-def winners(names: tuple[str, ...], every: tuple[str, ...], store: bool, folder: Path) -> None:
+def winners(names: tuple[str, ...], every: tuple[str, ...], rest: bool, store: bool, folder: Path) -> None:
     """Check the winners of the stored searches of problems NAMES on finite elements.
 
     They are those of each method's median seed under the inverse QP, on the search goals, with the budget `small`.
@@ -143,7 +144,7 @@ def winners(names: tuple[str, ...], every: tuple[str, ...], store: bool, folder:
 
     for name in names:
         with options.resumable():
-            rows = module.check(folder, name, every)
+            rows = module.check(folder, name, every, rest=rest)
         for row in rows:
             exact = "no equilibrium" if row.fem is None else f"{row.fem:.4g}"
             click.echo(
@@ -201,29 +202,57 @@ def board_() -> None:
 
 @benchmark.command()
 @click.argument("names", nargs=-1, required=True)
-def freeze(names: tuple[str, ...]) -> None:
-    """Freeze problems NAMES: draw their goals, and store these with the hashes (source checkout)."""
+@click.option("--keep", is_flag=True, help="Keep stored results, if stored winners still have the same scores.")
+def freeze(names: tuple[str, ...], keep: bool) -> None:
+    """Freeze problems NAMES: draw their goals, and store these with the hashes (source checkout).
+
+    A change that cannot change scores, such as another calibration of the uncertainty of weights, changes the hash too.
+    With --keep some stored winners are scored again; if nothing differs, the stored results get the new hash.
+    """
     from softgym_envs.codesign.benchmark import frozen
+    from softgym_envs.codesign.benchmark.refreeze import refreeze
 
     for name in names:
-        click.echo(f"wrote {frozen.freeze(name)}")
+        for path in refreeze(name) if keep else [frozen.freeze(name)]:
+            click.echo(f"wrote {path}")
 
 
 @benchmark.command()
 @click.argument("name")
-@click.option("--bodies", type=click.IntRange(min=1), default=100_000, show_default=True)
-@click.option("--qp-bodies", type=click.IntRange(min=0), default=1_000, show_default=True)
+@click.option(
+    "--judge",
+    "judges",
+    multiple=True,
+    metavar="JUDGE=N",
+    default=("rest=100000", "qp=1000"),
+    show_default=True,
+    help="Judge and how many bodies it scores: rest, qp, shared, trained, fem or fem_accurate; several with several.",
+)
+@click.option(
+    "--longest",
+    type=click.FloatRange(min=0.0, max=1.0, min_open=True),
+    default=0.1,
+    show_default=True,
+    help="Largest step towards rest, relative to the range of a command.",
+)
 @click.option("--output", type=options.PATH, help="Parquet file (default: the shipped table of the problem).")
 @results
-def tabulate(name: str, bodies: int, qp_bodies: int, output: Path | None, folder: Path) -> None:
-    """Score many bodies of a problem and write them as a table.
+def tabulate(name: str, judges: tuple[str, ...], longest: float, output: Path | None, folder: Path) -> None:
+    """Score many bodies of a problem by several judges and write them as a table.
 
-    The shared policy scores all bodies, the inverse QP the first of them. An interrupted call continues.
+    Each judge scores the first bodies of one Sobol sequence. An interrupted call continues where it stopped, and a call
+    with more bodies adds to what is there.
     """
     from softgym_envs.codesign.benchmark.table import tabulate as run
 
+    counts = {}
+    for each in judges:
+        judge, _, count = each.partition("=")
+        if not count.isdigit() or int(count) < 1:
+            raise ValueError(f"--judge {each}: give a judge and a number of bodies, such as rest=100000")
+        counts[judge] = int(count)
     with options.resumable():
-        click.echo(f"wrote {run(name, bodies, qp_bodies, folder, output)}")
+        click.echo(f"wrote {run(name, counts, folder, output, longest)}")
 
 
 def _scores(bodies: Sequence[Sequence[float]]) -> str:

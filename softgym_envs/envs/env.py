@@ -123,7 +123,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self._sensed: Sensed | None = None
         self._renderer: Any = None
         self._path = np.zeros((1, 3))
-        self._unit_design = np.zeros(len(setup.shown))
+        self._show(self._fixed_design)
         self._step = 0
 
     @property
@@ -161,6 +161,11 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
 
     def _goal_at(self, step: int) -> np.ndarray:
         return self.task.goals(self._path[None], np.array([len(self._path)]), np.array([step]))[0]
+
+    @property
+    def steps(self) -> int:
+        """Steps of the present episode so far."""
+        return self._step
 
     @property
     def path(self) -> np.ndarray:
@@ -210,8 +215,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.backend.cable_friction = self.plant.cable_friction
 
     def _show(self, design: Design) -> None:
-        names = self.spaces.design_names
-        self._unit_design = np.array([self.design_space[name].to_unit(design[name]) for name in names], dtype=float)
+        self._unit_design = self.design_space.observe(design.array, self.spaces.design_names)
 
     def get_state(self) -> EpisodeState:
         """Return the present moment of the episode, for `set_state`.

@@ -78,7 +78,7 @@ class AgentSpaces:
             ("goal", 3),
             ("error", 3 * seen),
             ("velocity", 3 * (moving and seen)),
-            ("design", len(design_names)),
+            ("design", sum(robot.design_space[name].observed_size for name in design_names)),
         ):
             self.slices[name] = slice(start, start + size)
             start += size
@@ -157,7 +157,7 @@ class AgentSpaces:
             effort: efforts, shape (..., n_a).
             effector: first effector [m], shape (..., 3).
             goal: goal [m], shape (..., 3).
-            unit_design: design variables in [-1, 1], shape (..., k).
+            unit_design: design variables as `DesignSpace.observe` shows them, shape (..., k).
             velocity: of the first effector [m/s], shape (..., 3); required if ``moving``.
             sensors: values in [-1, 1], shape (..., sensors); required if there are any.
         """

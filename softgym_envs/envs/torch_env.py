@@ -131,6 +131,8 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self._bounds = self._put_double([[v.low, v.high] for v in variables]).T
         self._ends = torch.where(self._log, torch.log(self._bounds), self._bounds)
         self._sampled = [self.design_space.names.index(name) for name in setup.sampled]
+        if chosen := [name for name in setup.shown if self.design_space[name].choices]:
+            raise ValueError(f"design_in_observation = {chosen} are choices, which this environment does not show")
         self._shown = [self.design_space.names.index(name) for name in setup.shown]
         self._fixed = self._put_double(setup.design.array)
 

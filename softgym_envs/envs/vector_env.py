@@ -114,13 +114,12 @@ class SoftRobotVectorEnv(VectorEnv):
         longest = 0 if setup.plants is None else setup.plants.longest_delay
         self._sent = np.zeros((longest + 1, num_envs, len(self.robot.actuators)))  # the newest command first
         self._reward_gradient: RewardGradient | None = None  # made when it is first needed, because it loads torch
-        self._unit_design = np.zeros((num_envs, len(setup.shown)))
+        self._unit_design = self.design_space.observe(self.designs, self.spaces.design_names)
         self._paths = np.zeros((num_envs, 1, 3))
         self._counts = np.ones(num_envs, dtype=np.int64)  # goals in each path
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)  # episodes that are over and not reset yet
         self._changed = np.zeros(num_envs, dtype=bool)  # bodies given in reset that differ from the fixed one
-        self._show_designs(np.arange(num_envs))
 
     def _draw_uniformly(self, rng: np.random.Generator, index: np.ndarray) -> np.ndarray:
         return rng.uniform(-1.0, 1.0, (len(self.sampled_variables), len(index))).T
@@ -135,9 +134,7 @@ class SoftRobotVectorEnv(VectorEnv):
         return impossible
 
     def _show_designs(self, index: np.ndarray) -> None:
-        for column, name in enumerate(self.spaces.design_names):
-            values = self.designs[index, self.design_space.names.index(name)]
-            self._unit_design[index, column] = self.design_space[name].to_unit(values)
+        self._unit_design[index] = self.design_space.observe(self.designs[index], self.spaces.design_names)
 
     def _draw_bodies(self, index: np.ndarray) -> None:
         """Draw the sampled variables; bodies that cannot exist are drawn again.

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.estimation.loads import Load
-from softgym_envs.estimation.places import Mixture
+from softgym_envs.estimation.places import Bend, Mixture, Moments, joint_moments
 from softgym_envs.estimation.posterior import Gaussian, Posterior, most_probable
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir
@@ -27,6 +27,15 @@ from softgym_envs.robots.base import Robot
 
 IMPROBABLE = 0.999
 """Probability of a smaller misfit from which on an estimate is also sought with slack cables."""
+
+UNSURE = 1e-3
+"""Probability that a cable is slack in place of tight, or vice versa, from which on both cases count."""
+
+ACCURATE = 0.1
+"""Deviation of effectors from lines, in standard deviations of the best known direction, from which on it counts."""
+
+SMALLEST = 1e-6
+"""Smallest variance of effectors that is not zero, as a part of the largest."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +185,45 @@ class _Found:
     solved: int
 
 
+@dataclass(frozen=True)
+class _Branch:
+    """Explanations of a reading with the same cables slack.
+
+    Attributes:
+        mixture: errors of actuators and size of the load at each place.
+        base: effectors without errors and load, shape (n_e,).
+        slopes: their derivatives by errors and size at each place, shape (q, n_e, n_a + 1).
+        unilateral: which actuators may be slack, shape (n_a,).
+        margins: without errors and load, tension of each tight cable and how far a slack one reaches beyond its
+            command, shape (n_a,): consistent if at least 0.
+        margin_slopes: their derivatives at each place, shape (q, n_a, n_a + 1).
+    """
+
+    mixture: Mixture
+    base: np.ndarray
+    slopes: np.ndarray
+    unilateral: np.ndarray
+    margins: np.ndarray
+    margin_slopes: np.ndarray
+
+    @property
+    def unsure(self) -> np.ndarray:
+        """Which cables are slack in place of tight, or vice versa, with a probability of `UNSURE` or more, (n_a,)."""
+        total = np.logaddexp.reduce(self.mixture.logarithms)
+        unsure = np.zeros(len(self.unilateral), dtype=bool)
+        for k in np.flatnonzero(self.unilateral):
+            inside = self.mixture.cut(self.margins[k], self.margin_slopes[:, k]).logarithms
+            unsure[k] = np.logaddexp.reduce(inside) < total + np.log(1.0 - UNSURE)
+        return unsure
+
+    def consistent(self, cables: np.ndarray) -> _Branch:
+        """Return the explanations with which some cables (n_a,) are tight or slack as assumed."""
+        mixture = self.mixture
+        for k in np.flatnonzero(cables):
+            mixture = mixture.cut(self.margins[k], self.margin_slopes[:, k])
+        return replace(self, mixture=mixture)
+
+
 class Estimator:
     """Finds the shape of a body and the load on it from a stream of readings.
 
@@ -224,8 +272,10 @@ class Estimator:
         model = self.robot.build(self.design)
         for number, point in enumerate(np.empty((0, 3)) if load is None else load.points):
             model.add_contact(f"touch_{number}", point, radius=self.radius)
-        self._statics = Statics(model)
+        self._statics, self._solved = Statics(model), 0
         self._near: Linearised | None = None
+        self._other: Linearised | None = None  # with other cables slack
+        self._bent: tuple[Linearised, Bend | None] | None = None
         self._evidence: _Evidence | None = None
         sizes = dict(model.roles)
         self._counts = sizes.get("a", 0), sizes.get("e", 0), sizes.get("c", 0)
@@ -266,6 +316,7 @@ class Estimator:
             ConvergenceError: if there is no equilibrium.
         """
         n_e, forces = self._counts[1], self.forces(load)
+        self._solved += 1
         state = self._statics.solve(displacement, effector_force=forces[:n_e], contact=forces[n_e:])
         return Linearised(displacement, load, forces, state)
 
@@ -325,7 +376,7 @@ class Estimator:
             ValueError: if readings have a wrong shape or are not finite, as with a lost sensor.
             ConvergenceError: if the body has no equilibrium under the command, at the most probable load before it.
         """
-        n_a = self._counts[0]
+        n_a, self._solved = self._counts[0], 0
         assert self.belief is not None
         evidence = self._joined(readings)
         command = evidence.command
@@ -337,7 +388,8 @@ class Estimator:
         tight = self._statics.unilateral & ~found.near.state.slack
         if tight.any() and found.posterior.misfit > chi2.ppf(IMPROBABLE, len(found.posterior.residuals)):
             # The load may have slackened cables: readings have a most probable explanation with them and one without.
-            released = self._released(command, found.posterior.mode)
+            mode = found.posterior.mode
+            released = self._with_slack(command + mode[:n_a], mode[n_a:], self._statics.unilateral)
             slack = self._search(released, evidence, found.solved + 1)
             if slack.posterior.cost < found.posterior.cost:
                 found = slack
@@ -357,16 +409,41 @@ class Estimator:
             parameters=self.belief,
             misfit=found.posterior.misfit,
             converged=found.posterior.converged and found.close,
-            equilibria=found.solved,
+            equilibria=self._solved,
             near=found.near,
         )
         return estimate if evidence.mixture is None else self._mean(estimate, evidence.mixture, evidence)
 
     def _mean(self, estimate: Estimate, before: Mixture, evidence: _Evidence) -> Estimate:
-        """Replace the most probable values of an estimate by means over all sizes and places of the load."""
-        n_a, near = self._counts[0], estimate.near
-        unloaded = np.zeros(len(near.forces))
-        delta, effort = near.rows(evidence.command, unloaded)
+        """Replace the most probable values of an estimate by means over all that explains the readings.
+
+        These are all sizes and places of the load and, where it is not certain which cables are slack, both cases.
+        """
+        branch = self._branch(estimate.near, before, evidence)
+        branches, unsure = [branch], branch.unsure
+        if unsure.any() and (other := self._turned(estimate, evidence, unsure)) is not None:
+            branches = [each.consistent(unsure) for each in (branch, self._branch(other, before, evidence))]
+        self._mixture = branches[0].mixture
+        for each in branches[1:]:
+            self._mixture = self._mixture.beside(each.mixture)
+        parts = [(each.mixture, each.base, each.slopes) for each in branches]
+        moments = joint_moments(parts)
+        if (bend := self._bend(estimate, moments)) is not None:
+            moments = joint_moments(parts, bend)
+        return replace(
+            estimate,
+            displacement=evidence.command + moments.displacement,
+            load=moments.load,
+            load_covariance=moments.load_covariance,
+            effector=moments.outputs,
+            effector_covariance=moments.output_covariance,
+            equilibria=self._solved,
+        )
+
+    def _branch(self, near: Linearised, before: Mixture, evidence: _Evidence) -> _Branch:
+        """Return what readings tell if the body stays near an equilibrium, with the same cables slack."""
+        n_a, unilateral = self._counts[0], self._statics.unilateral
+        delta, effort = near.rows(evidence.command, np.zeros(len(near.forces)))
         by_displacement, by_effort = near.response
         directions = before.places.directions.T
 
@@ -380,16 +457,63 @@ class Estimator:
         base, response = self._rest + delta[cavities], by_displacement[cavities]
         if self.noise.effort is not None:
             base, response = np.concatenate([base, effort]), np.vstack([response, by_effort])
-        self._mixture = before.after(evidence.measured, evidence.spread, base, at_places(response))
-        moments = self._mixture.moments(delta[effectors], at_places(by_displacement[effectors]))
-        return replace(
-            estimate,
-            displacement=evidence.command + moments.displacement,
-            load=moments.load,
-            load_covariance=moments.load_covariance,
-            effector=moments.outputs,
-            effector_covariance=moments.output_covariance,
-        )
+        mixture = before.after(evidence.measured, evidence.spread, base, at_places(response))
+        # A tight cable pulls; a slack one reaches further than its command.
+        beyond = by_displacement[:n_a].copy()
+        beyond[:, :n_a] -= np.eye(n_a)
+        slack = near.state.slack
+        margins = np.where(slack, delta[:n_a] - evidence.command, effort)
+        slopes = at_places(np.where(slack[:, None], beyond, by_effort))
+        return _Branch(mixture, delta[effectors], at_places(by_displacement[effectors]), unilateral, margins, slopes)
+
+    def _turned(self, estimate: Estimate, evidence: _Evidence, turned: np.ndarray) -> Linearised | None:
+        """Return the body near its most probable state if some cables (n_a,) are slack in place of tight or vice versa.
+
+        None if there is no such equilibrium.
+        """
+        n_a, near, slack = self._counts[0], estimate.near, estimate.near.state.slack ^ turned
+        other, displacement, load = self._other, near.displacement, near.load
+        try:
+            for _ in range(3):
+                if other is None or (other.state.slack != slack).any():
+                    other = self._with_slack(displacement, load, slack)
+                mode = self._explain(other, evidence, None).mode
+                displacement, load = evidence.command + mode[:n_a], mode[n_a:]
+                if self._close(other, displacement, load, estimate.parameters):
+                    break
+                self._other, other = other, None
+        except ConvergenceError:
+            return None
+        self._other = other or self._other
+        return self._other
+
+    def _bend(self, estimate: Estimate, moments: Moments) -> Bend | None:
+        """Return how effectors deviate from lines as the load grows, where that matters; kept for one equilibrium."""
+        near = estimate.near
+        if self._bent is not None and self._bent[0] is near:
+            return self._bent[1]
+        variances = np.linalg.eigvalsh(moments.output_covariance)
+        known = variances[variances > SMALLEST * variances[-1]]
+        size = float(np.sqrt(moments.load_covariance[0, 0]))
+        # Bodies bend by angles of about the motion over their size.
+        if variances[-1] / self.robot.size < ACCURATE * np.sqrt(known[0]) or not size > 0.0:
+            return None
+        bend, effectors = None, near.state.condensed.slices["e"]
+        more = near.load.copy()
+        more[0] += size
+        try:
+            further = self._with_slack(near.displacement, more, near.state.slack)
+        except ConvergenceError:
+            further = None
+        if further is not None:
+            origin = near.state.condensed.delta.array[effectors]
+            straight = near.rows(near.displacement, self.forces(more))[0][effectors]
+            length = float(np.linalg.norm(straight - origin))
+            deviation = further.state.condensed.delta.array[effectors] - straight
+            if length > 0.0:
+                bend = Bend(origin, (straight - origin) / length, 2.0 * deviation / length**2)
+        self._bent = near, bend
+        return bend
 
     def _search(self, near: Linearised, evidence: _Evidence, solved: int) -> _Found:
         """Explain readings by the body near an equilibrium, and near those that follow, until they hardly change."""
@@ -418,15 +542,22 @@ class Estimator:
                 continue
         return None
 
-    def _released(self, command: np.ndarray, parameters: np.ndarray) -> Linearised:
-        """Return the body near the equilibrium for parameters (n_a + m,) with all of its cables slack."""
-        n_a, n_e, _ = self._counts
-        displacement, forces = command + parameters[:n_a], self.forces(parameters[n_a:])
-        loose = self._statics.unilateral
-        modes = ["effort" if free else "displacement" for free in loose]
-        target = np.where(loose, 0.0, displacement)
-        state = self._statics.solve(target, modes, effector_force=forces[:n_e], contact=forces[n_e:])
-        return Linearised(displacement, parameters[n_a:], forces, replace(state, slack=loose))
+    def _with_slack(self, displacement: np.ndarray, load: np.ndarray, slack: np.ndarray) -> Linearised:
+        """Return the body near the equilibrium with certain cables slack (n_a,), whether that is consistent or not.
+
+        Raises:
+            ConvergenceError: if there is none.
+        """
+        statics, n_e, forces = self._statics, self._counts[1], self.forces(load)
+        self._solved += 1
+        kept, statics.unilateral = statics.unilateral, np.zeros_like(slack)
+        try:
+            modes = ["effort" if free else "displacement" for free in slack]
+            target = np.where(slack, 0.0, displacement)
+            state = statics.solve(target, modes, effector_force=forces[:n_e], contact=forces[n_e:])
+        finally:
+            statics.unilateral = kept
+        return Linearised(displacement, load, forces, replace(state, slack=slack))
 
     def _close(self, near: Linearised, displacement: np.ndarray, load: np.ndarray, found: Gaussian) -> bool:
         """Whether an estimate is within the accuracy of the equilibrium near which it was found."""

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import log_ndtr
+from scipy.stats import chi2
 
 from softgym_envs.backends.surrogate import TOLERANCE
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.estimation.estimator import Noise, Readings, checked_readings
+from softgym_envs.estimation.estimator import IMPROBABLE, Noise, Readings, checked_readings
 from softgym_envs.estimation.loads import Touch, cell_nodes
 from softgym_envs.estimation.places import Mixture, Moments, Places
 from softgym_envs.estimation.posterior import Gaussian
@@ -177,27 +178,49 @@ class LearnedEstimator:
                 self._before = self._mixture
             self._command, self._count, self._mean = command, 0, np.zeros_like(volumes)
             assert self._before is not None
-            self._at = self._before.means.copy()
+            self._at, self._tried = self._before.means.copy(), False
         self._count += 1
         self._mean = self._mean + (volumes - self._mean) / self._count
         spread = np.full(len(volumes), np.hypot(self.noise.volume / np.sqrt(self._count), self.volume_error))
-        before = self._before
-        assert before is not None
-        for _ in range(self.steps if self._count == 1 else 1):
-            at, response = self._at, self.respond(command, self._at)
-            base = response.sensors - np.einsum("qkn,qn->qk", response.sensor_slopes, at)
-            found = before.after(self._mean, spread, base, response.sensor_slopes)
-            self._at = self._limited(found.means)
-            deviation = np.sqrt(np.einsum("qnn->qn", found.covariances))
-            likely = _logarithms(found) > _logarithms(found).max() - 8.0
-            if (np.abs(self._at - at) <= self.accuracy * deviation)[likely].all():
-                break
-        self._mixture = found
+        steps = self.steps if self._count == 1 else 1
+        found, response, at = self._search(command, spread, self._at, steps)
+        misfit, best = self._misfit(found, response, at, spread)
+        if not self._tried and self.load is not None and misfit > chi2.ppf(IMPROBABLE, len(spread)):
+            # Beyond a slack cable there may be a better explanation, which steps from small forces do not reach.
+            self._tried, strong = True, at.copy()
+            strong[:, -1] = self._largest
+            other = self._search(command, spread, strong, self.steps)
+            if np.logaddexp.reduce(_logarithms(other[0])) > np.logaddexp.reduce(_logarithms(found)):
+                found, response, at = other
+                misfit, best = self._misfit(found, response, at, spread)
+        self._mixture, self._at = found, self._limited(found.means)
         tips = response.effectors - np.einsum("qon,qn->qo", response.effector_slopes, at)
         moments = found.moments(tips, response.effector_slopes)
+        return self._estimate(command, moments, misfit, response, best)
+
+    def _search(
+        self, command: np.ndarray, spread: np.ndarray, start: np.ndarray, steps: int
+    ) -> tuple[Mixture, _Responses, np.ndarray]:
+        """Return the distribution after Gauss-Newton steps at all places, the last responses, and where they were."""
+        before, now = self._before, start
+        assert before is not None and steps > 0
+        for _ in range(steps):
+            at, response = now, self.respond(command, now)
+            base = response.sensors - np.einsum("qkn,qn->qk", response.sensor_slopes, at)
+            found = before.after(self._mean, spread, base, response.sensor_slopes)
+            now = self._limited(found.means)
+            deviation = np.sqrt(np.einsum("qnn->qn", found.covariances))
+            likely = _logarithms(found) > _logarithms(found).max() - 8.0
+            if (np.abs(now - at) <= self.accuracy * deviation)[likely].all():
+                break
+        return found, response, at
+
+    def _misfit(self, found: Mixture, response: _Responses, at: np.ndarray, spread: np.ndarray) -> tuple[float, int]:
+        """Return the sum of the squared residuals at the most probable place, and the number of that place."""
         best = int(np.argmax(_logarithms(found)))
-        residual = (self._mean - base[best] - response.sensor_slopes[best] @ found.means[best]) / spread
-        return self._estimate(command, moments, float(residual @ residual), response, best)
+        expected = response.sensors[best] + response.sensor_slopes[best] @ (found.means[best] - at[best])
+        residual = (self._mean - expected) / spread
+        return float(residual @ residual), best
 
     def _estimate(
         self, command: np.ndarray, moments: Moments, misfit: float, response: _Responses, best: int
@@ -222,11 +245,14 @@ class LearnedEstimator:
 
     def _limited(self, parameters: np.ndarray) -> np.ndarray:
         """Return errors and forces (q, n_a + 1) at which the model is evaluated: forces that it has learned."""
-        variable = self.model.robot.design_space["touch_force"]
-        most = variable.high * self._stiffness
         found = parameters.copy()
-        found[:, -1] = np.clip(found[:, -1], 0.0, most)
+        found[:, -1] = np.clip(found[:, -1], 0.0, self._largest)
         return found
+
+    @property
+    def _largest(self) -> float:
+        """The largest force that the model has learned, for this body [N]."""
+        return self.model.robot.design_space["touch_force"].high * self._stiffness
 
     @property
     def _stiffness(self) -> float:

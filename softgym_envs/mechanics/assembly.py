@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.sparse import coo_matrix, csr_matrix
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates
 from softgym_envs.mechanics.frames import KinematicMap

@@ -9,6 +9,7 @@ import numpy as np
 
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.block import ElementBlock
+from softgym_envs.mechanics.elements.closed_superelement import ClosedSuperelement, PortVolume
 from softgym_envs.mechanics.elements.rigid import RigidBody
 from softgym_envs.mechanics.elements.superelement import PortEnergy, Superelement
 from softgym_envs.mechanics.frames import frame_rows
@@ -109,12 +110,22 @@ class ModelBuilder:
             )
         self._parts.append((Beam, np.asarray(frames, dtype=np.int64), {"section": section, **options}))
 
-    def add_superelement(self, near: int, far: int, energy: PortEnergy, **options: Any) -> None:
-        """Add an elastic part between two frames, known by its energy alone; options as for `Superelement`."""
+    def add_superelement(
+        self, near: int, far: int, energy: PortEnergy, *, cavity: PortVolume | None = None, **options: Any
+    ) -> None:
+        """Add an elastic part between two frames, known by its energy alone; options as for `Superelement`.
+
+        With the volume of its cavity it is a `ClosedSuperelement`.
+        """
         for row in (near, far):
             if row not in self._frames:
                 raise ValueError(f"row {row} is not the first row of a frame; frames start at rows {self._frames}")
-        self._parts.append((Superelement, np.array([near, far]), {"energy": energy, **options}))
+        options["energy"] = energy
+        if cavity is None:
+            self._parts.append((Superelement, np.array([near, far]), options))
+            return
+        bulge = self._append(np.zeros((1, 3)), np.array([[False, True, True]]))
+        self._parts.append((ClosedSuperelement, np.array([near, far, bulge]), {"cavity": cavity, **options}))
 
     def add_mass(self, frame: int, mass: float, inertia: np.ndarray) -> None:
         """Assign a mass [kg] and an inertia along the directors [kg m2] (3, 3) to the rigid part at a frame."""

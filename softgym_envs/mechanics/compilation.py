@@ -1,14 +1,79 @@
-"""A line on standard error when compiled kernels are not in Numba's cache yet, so that the wait is understood."""
+"""Compiled kernels: a cache that notices edits of any kernel, and a line that explains the wait for compilation.
+
+Numba keeps compiled functions on disk until their own file changes, although they contain the code of functions from
+other files. Modules of this package therefore import `njit` from here: a cached function is compiled again when any
+file changes that its code may come from.
+"""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import os
+import re
 import sys
+from pathlib import Path
+from typing import Any
 
-from numba.core import event
+import numba
+from numba.core import caching, event
 
 ANNOUNCED = "SOFTGYM_COMPILATION_ANNOUNCED"
 """Environment variable that is set once the line has been printed; worker processes inherit it."""
+FAST = {"contract", "nsz", "reassoc"}
+"""What compilers may do with sums (``fastmath``): rounding changes, but not what follows from infinities and NaN."""
+ROOT = Path(__file__).resolve().parents[1]
+"""Folder of the package."""
+_IMPORT = re.compile(rf"^from ({ROOT.name}[.\w]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
+
+njit = numba.njit
+
+
+@functools.cache
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def _imported_sources(text: str) -> set[Path]:
+    """Return the files from which a kernel's file imports kernels, or constants and types that kernels may use."""
+    found = set()
+    for module, names in _IMPORT.findall(text):
+        path = ROOT.joinpath(*module.split(".")[1:]).with_suffix(".py")
+        if path.is_file() and ("njit" in _text(path) or re.search(r"\b[A-Z]", names)):
+            found.add(path)
+    return found
+
+
+@functools.cache
+def source_hash(path: Path) -> str:
+    """Return a hash of all files of this package that the kernels in one of its files depend on."""
+    known: dict[Path, str] = {}
+    waiting = [path]
+    while waiting:
+        file = waiting.pop()
+        if file not in known:
+            known[file] = _text(file)
+            if "njit" in known[file]:  # constants and types of other files do not depend on kernels
+                waiting.extend(_imported_sources(known[file]))
+    digest = hashlib.sha256()
+    for file in sorted(known):
+        digest.update(f"{file.relative_to(ROOT)}\0{known[file]}\0".encode())
+    return digest.hexdigest()
+
+
+def _stamp_with_sources() -> None:
+    """Let Numba's cache compare what kernels of this package depend on, and not their own files alone."""
+    locator: Any = caching._SourceFileBackedLocatorMixin
+    own_stamp = locator.get_source_stamp
+
+    def get_source_stamp(self: Any) -> Any:
+        path = Path(self._py_file).resolve()
+        return (own_stamp(self), source_hash(path)) if ROOT in path.parents else own_stamp(self)
+
+    locator.get_source_stamp = get_source_stamp
+
+
+_stamp_with_sources()
 
 
 class _Announcement(event.Listener):

@@ -17,8 +17,9 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.sparse import csr_matrix
+
+from softgym_envs.mechanics.compilation import njit
 
 
 def frame_rows(position: np.ndarray | Sequence[float], rotation: np.ndarray | None = None) -> np.ndarray:

@@ -10,9 +10,9 @@ import math
 from abc import ABC, abstractmethod
 
 import numpy as np
-from numba import njit
 
 from softgym_envs.errors import unknown_name
+from softgym_envs.mechanics.compilation import njit
 
 
 def lame_parameters(young_modulus: float, poisson_ratio: float) -> tuple[float, float]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 

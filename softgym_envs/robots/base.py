@@ -21,6 +21,7 @@ from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature, Morpher
+from softgym_envs.robots.geometry.symmetry import Symmetry
 from softgym_envs.robots.mesh_tiers import UNIFORM, MeshTier, choose_mesh
 
 F = TypeVar("F", bound=Callable[..., None])
@@ -153,8 +154,8 @@ class Robot(ABC):
             many of them at once.
         learned: how the robot is learned: one ``"potential"`` of its actuators and effectors, a ``"chain"`` of
             segments for any contacts, or a ``"hand"`` of such chains.
-        mirror: order of the actuators in the mirror image of the robot in the plane x = 0, where every mesh of it is
-            its own mirror image, and so are its effectors; None otherwise. Surrogates then also learn from the images.
+        symmetries: reflections and rotations, besides the identity, that map every body and its mesh to itself.
+            Surrogates also learn from the images of their states.
         non_mechanical_options: options that do not change the condensed model.
     """
 
@@ -179,7 +180,7 @@ class Robot(ABC):
     made_of_beams: bool = False
     learned: str = "potential"
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
-    mirror: tuple[int, ...] | None = None
+    symmetries: tuple[Symmetry, ...] = ()
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")
     _options: dict[str, object]
 

@@ -18,6 +18,7 @@ from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.geometry.symmetry import square_symmetries
 from softgym_envs.robots.mesh_tiers import choose_mesh
 
 MASS = 0.042  # of the published body [kg]
@@ -180,6 +181,8 @@ class CableTrunk(Robot):
         baseline = self.design_space.baseline
         self.effector_rest = np.array([0.0, 0.0, baseline["length"]])
         self.effort_scale = np.full(8, 10.0)
+        if not any(gravity[:2]) and not self.obstacles:
+            self.symmetries = square_symmetries(2)
         self.density = MASS / self.volume(baseline)
         self.actuators = tuple(
             # A twentieth of the stroke per control step.

@@ -16,7 +16,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, MeshedRobot
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature, Plane
-from softgym_envs.robots.geometry.symmetry import mirrored
+from softgym_envs.robots.geometry.symmetry import mirrored, square_symmetries
 from softgym_envs.robots.mesh_tiers import MeshTier
 
 # Contours of one leg (r, z) from the base to the top [mm], inset by a few tenths to match the published volume.
@@ -119,6 +119,8 @@ class Diamond(MeshedRobot):
         self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.effector_rest = self._top(self.design_space.baseline)
         self.effort_scale = np.full(4, 40.0)
+        if not any(self.gravity[:2]) and not self.obstacles:
+            self.symmetries = square_symmetries()
         self.actuators = tuple(
             # The published range is 0 to 30 mm. Unless the antagonists are paid out, the top stays 6 mm above the
             # published circle.

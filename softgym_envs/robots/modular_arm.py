@@ -11,8 +11,11 @@ from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import InfeasibleDesign, unknown_name
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.cable import Cable
+from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.elements.closed_superelement import ClosedSuperelement, PortCavity
+from softgym_envs.mechanics.elements.superelement import point_masses
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin, bridge_skin
 from softgym_envs.robots.base import Actuator, Robot
@@ -30,6 +33,7 @@ CELLS: dict[str, tuple[str, np.ndarray]] = {
     "notch_y": ("notch_hinge", _QUARTER_TURN),
     "tube": ("torsion_tube", np.eye(3)),
     "accordion": ("accordion", np.eye(3)),
+    "bellows": ("bellows", np.eye(3)),
 }
 """What a cell may be: a module, and the axes in which it stands. A ``leaf_x`` bends towards x."""
 
@@ -58,6 +62,7 @@ SHAPES = {
     "notch_hinge": _Shape(("radius", "width", "neck"), lambda d: (0.5 * d["neck"], 0.5 * d["width"])),
     "torsion_tube": _Shape(("length", "radius", "wall"), lambda d: (d["radius"], d["radius"])),
     "accordion": _Shape(("pitch", "width", "amplitude"), lambda d: (d["amplitude"], 0.5 * d["width"])),
+    "bellows": _Shape(("pitch", "radius", "amplitude"), lambda d: (d["radius"], d["radius"])),
 }
 """By the name of the module. A tube is drawn as a square bar around it, an accordion as one around its folds."""
 
@@ -98,10 +103,13 @@ class ModularArm(Robot):
             the whole body, by which designs are judged.
         stroke: largest displacement of a wire either way [m].
         max_effort: largest force of a wire [N].
+        refine: divides the edges of the finite elements of a solid body.
+        largest_volume: by which the cavity of a bellows may grow or shrink [m3].
+        max_pressure: in a bellows, either way [Pa].
         **options: options of `Robot`.
 
     Raises:
-        ValueError: for an unknown cell, kind or body, or gravity on superelements, which have no mass.
+        ValueError: for an unknown cell, kind or body, or bellows as a kind: their number is that of the actuators.
     """
 
     name = "modular_arm"
@@ -116,6 +124,9 @@ class ModularArm(Robot):
         body: str = "superelements",
         stroke: float = 0.006,
         max_effort: float = 1.0,
+        refine: float = 1.0,
+        largest_volume: float = 2.0e-7,
+        max_pressure: float = 2.0e4,
         **options: Any,
     ) -> None:
         if isinstance(cells, int) and not isinstance(cells, bool):
@@ -129,15 +140,16 @@ class ModularArm(Robot):
             raise ValueError(f"kinds must be a list of names, got {kinds!r}; allowed: {', '.join(CELLS)}")
         if unknown := [kind for kind in kinds if kind not in CELLS]:
             raise ValueError(unknown_name("kind", unknown[0], CELLS))
+        if closed := [kind for kind in kinds if MODULES.class_of(CELLS[kind][0]).closed]:
+            raise ValueError(f"kinds must not contain '{closed[0]}', which is an actuator; allowed: in a list of cells")
         if body not in BODIES:
             raise ValueError(unknown_name("body", body, BODIES))
         super().__init__(**options)
-        if body == "superelements" and any(self.gravity):
-            raise ValueError("superelements have no mass: use body = 'solid' with gravity")
         self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.cells = cells if isinstance(cells, int) else tuple(cells)
         self._kinds = (*kinds, NONE)
         self.body = body
+        self.refine = float(refine)
         self.stroke = float(stroke)
         self.max_effort = float(max_effort)
         self.design_space = DesignSpace(
@@ -146,11 +158,20 @@ class ModularArm(Robot):
             DesignVariable("young_modulus", 1.0e7, 4.0e7, 2.0e7, "Pa", "stiffness of the printed material", log=True),
         )
         self.effector_rest = np.array([0.0, 0.0, self._height(self.design_space.baseline)])
-        self.effort_scale = np.full(2, 0.2)
-        self.actuators = tuple(
-            Actuator(name, -self.stroke, self.stroke, self.stroke / 10.0, unilateral=False, max_effort=self.max_effort)
-            for name in WIRES
+        volume = float(largest_volume)
+        listed = () if isinstance(self.cells, int) else self.cells
+        closed_cells = [number for number, cell in enumerate(listed, start=1) if cell == "bellows"]
+        self.actuators = (
+            *(
+                Actuator(name, -self.stroke, self.stroke, self.stroke / 10.0, "m", False, self.max_effort)
+                for name in WIRES
+            ),
+            *(
+                Actuator(f"pressure_{n}", -volume, volume, volume / 10.0, "m3", False, float(max_pressure))
+                for n in closed_cells
+            ),
         )
+        self.effort_scale = np.array([0.2] * len(WIRES) + [0.2 * float(max_pressure)] * len(closed_cells))
 
     def _dimensions(self) -> Iterator[DesignVariable]:
         if isinstance(self.cells, int):
@@ -168,8 +189,8 @@ class ModularArm(Robot):
         if not isinstance(self.cells, int):
             return self.cells
         complete = self.design_space.complete(design)
-        numbers = [int(complete[f"kind_{number}"]) for number in range(1, self.cells + 1)]
-        return tuple(self._kinds[min(number, len(self._kinds) - 1)] for number in numbers)
+        names = [f"kind_{number}" for number in range(1, self.cells + 1)]
+        return tuple(self.design_space[name].choice(complete[name]) for name in names)
 
     def _modules(self, design: Mapping[str, float]) -> Iterator[_Cell]:
         """Yield the cells of a complete design from the base to the tip."""
@@ -205,28 +226,41 @@ class ModularArm(Robot):
             raise InfeasibleDesign("all cells of the arm are left out; allowed: at least one that is not 'none'")
         builder = ModelBuilder(gravity=self.gravity)
         ports = [builder.add_frame(np.zeros(3), fixed=True, fixed_spin=True)]
+        cavities: list[np.ndarray | ClosedSuperelement] = []
         for part in self._modules(design):
             origin = np.array([0.0, 0.0, part.height])
             if self.body == "solid":
-                far = part.module.add_to(builder, part.design, near=ports[-1], origin=origin, rotation=part.axes)
-            else:
-                far = builder.add_frame(origin + [0.0, 0.0, part.length])
-                energy = learned_module(part.kind).energy(part.design)
-                builder.add_superelement(
-                    ports[-1],
-                    far,
-                    energy,
-                    length=part.length,
-                    rotation=part.axes,
-                    young_modulus=part.design["young_modulus"],
+                placed = part.module.add_to(
+                    builder, part.design, near=ports[-1], origin=origin, rotation=part.axes, refine=self.refine
                 )
+                ports.append(placed.far)
+                cavities += [] if placed.cavity is None else [placed.cavity]
+                continue
+            learned = learned_module(part.kind)
+            far = builder.add_frame(origin + [0.0, 0.0, part.length])
+            builder.add_superelement(
+                ports[-1],
+                far,
+                learned.energy(part.design),
+                length=part.length,
+                rotation=part.axes,
+                young_modulus=part.design["young_modulus"],
+                inertia=point_masses(part.module.mass(part.design)) if any(self.gravity) else None,
+                cavity=learned.cavity(part.design) if part.module.closed else None,
+            )
             ports.append(far)
         model = builder.build()
         rows = np.array(ports[1:])[:, None] + np.arange(4)
-        for actuator, direction in zip(self.actuators, WIRES.values(), strict=True):
+        for actuator, direction in zip(self.actuators, WIRES.values(), strict=False):
             guide = design["wire_radius"] * np.array([*direction, 0.0])
             points = EmbeddedPoints.from_weights(rows, np.tile([1.0, *guide], (len(rows), 1)), model.nodes)
             model.add("a", Cable(actuator.name, points, guide, unilateral=actuator.unilateral))
+        cavities += [block for block in model.blocks if isinstance(block, ClosedSuperelement)]
+        for actuator, cavity in zip(self.actuators[len(WIRES) :], cavities, strict=True):
+            if isinstance(cavity, ClosedSuperelement):
+                model.add("a", PortCavity(actuator.name, cavity))
+            else:
+                model.add("a", Cavity(actuator.name, cavity, model.nodes))
         model.add("e", Point("tip", EmbeddedPoints.in_frame(ports[-1], np.zeros(3), model.nodes)))
         if self.body == "superelements":
             half = design["wire_radius"]
@@ -252,7 +286,8 @@ def _free_cells(count: int, kinds: Sequence[str]) -> Iterator[DesignVariable]:
         described = (
             f"what the cell is: {', '.join(f'{k} from {place}' for place, k in enumerate(kinds))} (cell {number})"
         )
-        yield DesignVariable(f"kind_{number}", 0.0, float(len(kinds)), kind + 0.5, "-", described)
+        bounds = 0.0, float(len(kinds))
+        yield DesignVariable(f"kind_{number}", *bounds, kind + 0.5, "-", described, choices=tuple(kinds))
         for name, dimension in zip(("length", "width", "depth"), SHAPES[module].dimensions, strict=True):
             low, high = box[dimension]
             share = (_typical(module, dimension) - low) / (high - low)

@@ -96,7 +96,8 @@ class SensorizedFinger(MeshedRobot):
             101,325 Pa in the undeformed body and outside of it.
         touch: whether a touch on the flat back is part of the design: its force along +y, and its place. The force
             grows with Young's modulus, so that this still scales all efforts and nothing else. The touched point is a
-            second effector. This is the robot that is learned: to a network, a touch is an input like any other.
+            second effector. This is the robot that is learned, with ``meshing="morph"``: to a network, a touch is an
+            input like any other.
         **options: options of `MeshedRobot`.
     """
 
@@ -185,7 +186,8 @@ class SensorizedFinger(MeshedRobot):
     def under_touch(self) -> SensorizedFinger:
         if self.touch:
             return self
-        return SensorizedFinger(**{**self._options, "touch": True})  # type: ignore[arg-type]
+        # A network is smooth in the design, so it learns a mesh that moves with it. At the baseline both are one.
+        return SensorizedFinger(**{**self._options, "touch": True, "meshing": "morph"})  # type: ignore[arg-type]
 
     def touch_design(self, design: Mapping[str, float], point: np.ndarray, force: np.ndarray) -> dict[str, float]:
         x, y, z = map(float, point)

@@ -26,6 +26,7 @@ from softgym_envs.robots.geometry.graded_finger import (
 )
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature
+from softgym_envs.robots.geometry.symmetry import left_right
 from softgym_envs.robots.mesh_tiers import MeshTier
 
 BELLOWS = {
@@ -152,9 +153,8 @@ class SoftFinger(MeshedRobot):
         self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.effector_rest = self.tip(self.design_space.baseline)
         self.effort_scale = np.full(cables, 20.0)
-        self.mirror = (
-            tuple(reversed(range(cables))) if is_half(self.tier) and not (self.gravity[0] or self.obstacles) else None
-        )
+        if is_half(self.tier) and not (self.gravity[0] or self.obstacles):
+            self.symmetries = left_right(range(cables)[::-1])
         self.actuators = tuple(
             Actuator(f"cable_{i + 1}", 0.0, 0.020, 0.001, unilateral=unilateral) for i in range(cables)
         )

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-import numba
 import numpy as np
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.robots.base import Robot
 
 #: Why a state is not trusted. Batched states hold the sum of these numbers, 0 for a trusted state.
@@ -88,7 +88,7 @@ class Calibration:
         return factor, (self.slack_corners / self.corners) ** share
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def judge(
     displacement, command, spread, slot, low, high, command_low, command_high, pulls,
     factor, corner, known, scale, floor, power, limit, uncertainty, doubt,

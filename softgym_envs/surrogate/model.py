@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numba
 import numpy as np
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row, effort_unit, point_rows
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
 from softgym_envs.robots.base import Robot
@@ -23,7 +23,7 @@ from softgym_envs.surrogate.domain import SOFT, Domain, judge
 from softgym_envs.surrogate.features import Features
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def definite(matrices):
     """Return whether symmetric matrices (B, n, n) are positive definite, shape (B,): all pivots are positive."""
     found = np.ones(len(matrices), dtype=np.bool_)

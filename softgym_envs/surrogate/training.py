@@ -22,7 +22,7 @@ from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.data.dataset import generate_dataset
 from softgym_envs.surrogate.data.sampling import SamplingPlan
-from softgym_envs.surrogate.data.states import full_compliance, stable_rows, training_states, with_mirror_images
+from softgym_envs.surrogate.data.states import full_compliance, stable_rows, training_states, with_images
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel, definite
 from softgym_envs.surrogate.networks import NETWORKS, network_module
@@ -357,8 +357,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     torch.set_num_threads(1)
     features = Features(robot)
     learned = {
-        name: with_mirror_images(robot, columns) if name.endswith("train") else columns
-        for name, columns in data.items()
+        name: with_images(robot, columns) if name.endswith("train") else columns for name, columns in data.items()
     }
     if more := learned.pop("more/train", None):
         learned["train"] = {name: np.concatenate([column, more[name]]) for name, column in learned["train"].items()}

@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from softgym_envs.agents.config import EvolutionConfig, TrainConfig
+from softgym_envs.agents.config import EvolutionConfig, RecurrentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
+from softgym_envs.agents.export import spaces_of
 from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.learners.analytic import AnalyticLearner
 from softgym_envs.agents.learners.cloning import CloningLearner
 from softgym_envs.agents.learners.evolution import EvolutionLearner
 from softgym_envs.agents.learners.ppo import PPOLearner
-from softgym_envs.agents.policy import Policy, read_tensors
+from softgym_envs.agents.learners.recurrent import RecurrentLearner
+from softgym_envs.agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.agents.residual import BatchQP
 from softgym_envs.agents.training import train
 from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.robots.modular_arm import KINDS
 
 CONFIG = TrainConfig.model_validate(
     {
@@ -64,6 +67,9 @@ QUICK = {
     "analytic": SHORT,
     "cloning": SHORT.model_copy(update={"learner": "cloning"}),
     "ppo": TrainConfig.model_validate({**SHORT.model_dump(), "learner": "ppo", "ppo": {"n_steps": 2, "n_epochs": 2}}),
+    "recurrent": TrainConfig.model_validate(
+        {**SHORT.model_dump(), "learner": "recurrent", "num_envs": 1, "recurrent": {"gradient_steps": 1}}
+    ),
     "evolution": TrainConfig.model_validate(
         {**SHORT.model_dump(), "learner": "evolution", "num_envs": 8, "evolution": {"net_arch": [3]}}
     ),
@@ -166,6 +172,38 @@ def test_a_clone_does_what_the_qp_does():
     learner.close()
 
 
+def test_a_memory_is_that_of_torch_and_learns_the_answers_of_the_qp(tmp_path):
+    config = QUICK["recurrent"].model_copy(update={"recurrent": RecurrentConfig(gradient_steps=8, batch_size=8)})
+    learner = RecurrentLearner(config)
+    learner.learn(1, lambda steps: None)
+    seen, answers = learner._observations[:1], learner._answers[0]
+
+    def actions():
+        with torch.no_grad():
+            return torch.tanh(learner._mean(learner._unit(torch.from_numpy(seen))[0])).numpy()[0]
+
+    first = np.abs(actions() - answers).mean()
+    for _ in range(80):
+        learner._imitate(np.zeros(4, dtype=np.int64))
+    assert np.abs(actions() - answers).mean() < 0.5 * first
+
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, learner.weights(), {"config": config.model_dump(mode="json")})
+    policy = Policy(path)
+    for act in (policy.begin(), policy.begin()):  # each episode begins without memory
+        found = np.array([act(row) for row in seen[0]])
+        np.testing.assert_allclose(found, actions(), atol=1e-5)
+    together = policy.begin()
+    np.testing.assert_allclose([together(np.stack([row, row]))[1] for row in seen[0]], found, atol=1e-6)
+    with pytest.raises(ValueError, match="has a memory: call what begin"):
+        policy(seen[0, 0])
+    with pytest.raises(ValueError, match="has a memory and cannot be exported"):
+        spaces_of(policy)
+    learner.close()
+    with pytest.raises(ValueError, match="learner 'recurrent' needs num_envs = 1"):
+        RecurrentLearner(config.model_copy(update={"num_envs": 2}))
+
+
 def test_training_starts_from_a_policy_of_the_same_widths(trained, tmp_path):
     warm = train(SHORT, tmp_path / "warm", initial=trained, progress=False)
     goals = sample_goals(CONFIG.environment, 20, seed=5)
@@ -175,10 +213,35 @@ def test_training_starts_from_a_policy_of_the_same_widths(trained, tmp_path):
         train(narrow, tmp_path / "narrow", initial=trained, progress=False)
 
 
-@pytest.mark.parametrize("learner", ["analytic", "cloning"])
+def test_a_clone_learns_on_any_environment():
+    """Structures of superelements are solved one by one; the network's answers come close to the QP's."""
+    environment = {"id": "SoftGym/ModularReach-v0", "max_episode_steps": 8, "robot_options": {"cells": 2}}
+    config = TrainConfig.model_validate(
+        {
+            "environment": {**environment, "sample_design": ["kind_1"], "design_in_observation": ["kind_1"]},
+            "learner": "cloning",
+            "cloning": {"net_arch": [32, 32], "gradient_steps": 40},
+            "steps": 160,
+            "num_envs": 4,
+        }
+    )
+    learner = CloningLearner(config)
+    answers, observations = learner._answers, learner._observations
+    assert observations.shape[1] == 2 + 2 + 2 + 3 + 3 + 3 + len(KINDS) + 1
+    learner.learn(config.steps, lambda steps: None)
+    learned = learner.policy(observations[:160]).detach().numpy()
+    assert 0.0 < np.abs(answers[:160]).mean()
+    assert np.abs(learned - answers[:160]).mean() < 0.5 * np.abs(answers[:160]).mean()
+    learner.close()
+
+
 @pytest.mark.parametrize(
-    "environment",
-    [{"id": "SoftGym/FingerReach-v0", "backend": "fem"}, {"id": "SoftGym/FingerReach-v0", "residual_scale": 0.5}],
+    ("learner", "environment"),
+    [
+        ("analytic", {"id": "SoftGym/FingerReach-v0", "backend": "fem"}),
+        ("analytic", {"id": "SoftGym/FingerReach-v0", "residual_scale": 0.5}),
+        ("cloning", {"id": "SoftGym/FingerReach-v0", "residual_scale": 0.5}),
+    ],
 )
 def test_environments_without_a_model_are_refused(environment, learner, tmp_path):
     config = TrainConfig.model_validate({**SHORT.model_dump(), "environment": environment, "learner": learner})

@@ -184,3 +184,52 @@ def test_an_estimate_beyond_the_last_equilibrium_is_sought_as_far_as_the_body_st
     assert not found.converged
     assert 0.2 < np.abs(found.near.forces).sum() <= 1.0
     assert found.load[0] == pytest.approx(2.0, rel=0.3)
+
+
+@pytest.mark.parametrize("force", [0.84, 0.9], ids=["tight", "slack"])
+def test_near_a_slack_cable_the_estimate_is_the_integral_over_both_cases(force):
+    """The cell is so small that force and error of the cable are all that is unknown: their integral is a plain sum."""
+    grid, command, noise = finger_grid(2e-4), np.array([0.0015]), Noise(displacement=1e-4, volume=3e-10)
+    robot = make_robot("sensorized_finger", cavities=2)
+    estimator = Estimator(robot, load=Touch(grid, grid.cell(np.array([0.001, 0.0, -0.095])), 1.0), noise=noise)
+
+    def state(error, size):
+        return estimator.linearise(command + error, np.array([size, 0.0, 0.0])).state
+
+    truth = state(np.zeros(1), force)
+    assert truth.slack[0] == (force > 0.86)
+    errors, sizes = np.linspace(-3e-4, 3e-4, 11), np.linspace(force - 0.15, force + 0.15, 21)
+    values = np.array([[state(error, size).condensed.delta.array for size in sizes] for error in errors])
+    sensors, tips = values[..., -2:], values[..., 1:4]
+    exponent = (errors[:, None] / 1e-4) ** 2 + sizes**2 + (((sensors - truth.condensed.delta.s) / 3e-10) ** 2).sum(-1)
+    weights = np.exp(-0.5 * (exponent - exponent.min()))
+    weights /= weights.sum()
+    mean, tip = float((weights * sizes).sum()), np.einsum("ij,ijk->k", weights, tips)
+    spread = float(np.sqrt((weights * (sizes - mean) ** 2).sum()))
+    deviations = np.sqrt(np.einsum("ij,ijk->k", weights, (tips - tip) ** 2))
+
+    estimator.touch(estimator.load)
+    found = estimator.update(estimator.reading(command, truth.condensed.delta.s))
+    assert abs(found.load[0] - mean) < 0.05 * spread
+    assert np.sqrt(found.load_covariance[0, 0]) == pytest.approx(spread, rel=0.05)
+    assert abs(found.effector[1] - tip[1]) < 0.05 * deviations[1]
+    assert np.sqrt(found.effector_covariance[1, 1]) == pytest.approx(deviations[1], rel=0.05)
+
+
+def test_tip_of_an_uncertain_force_lies_on_a_curve(monkeypatch):
+    """Near the flange the force is known to 1 N; along the finger the tip is known much better than lines are exact."""
+    robot, command = make_robot("sensorized_finger", cavities=4), np.array([0.006])
+    touch = Touch(GRID, (1, 1))
+    estimator = Estimator(robot, load=touch, noise=Noise(volume=7e-11))
+    state = estimator.linearise(command, np.array([2.5, 0.0, 0.0])).state
+
+    def misfit():
+        estimator.touch(touch)
+        found = estimator.update(estimator.reading(command, state.condensed.delta.s))
+        away = found.effector - state.condensed.delta.e
+        return float(away @ np.linalg.solve(found.effector_covariance, away))
+
+    curved = misfit()
+    monkeypatch.setattr(Estimator, "_bend", lambda *given: None)
+    straight = misfit()
+    assert curved < 3.0 < straight  # of the mean of three squares

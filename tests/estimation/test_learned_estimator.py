@@ -66,6 +66,21 @@ def test_force_and_tip_are_found_on_the_model(robot):
     assert np.abs(found.effector - state.effector[0]).max() < 1e-3
 
 
+def test_a_push_that_slackens_the_cable_is_found_from_small_forces(robot):
+    """Volumes change less with the force where the cable pulls, so Gauss-Newton alone ends at half of the force."""
+    grid, command, force = finger_grid(), np.array([0.0023]), np.array([0.0, 1.9, 0.0])
+    point = np.array([0.005, 0.0, -0.112])
+    plant = SurrogateBackend(robot)
+    plant.touch(PointForce(point, force))
+    state = plant.step(command)
+    assert state.slack[0]
+    estimator = LearnedEstimator(robot, load=Touch(grid, grid.cell(point), 1.0), noise=Noise(volume=6e-10), exact=True)
+    for _ in range(3):
+        found = estimator.update(Readings(command, estimator.rest_volumes + state.condensed.delta.s))
+    assert found.slack[0] and found.load[0] == pytest.approx(1.9, abs=0.1)
+    assert np.abs(found.effector - state.effector[0]).max() < 2e-3
+
+
 def test_errors_of_the_model_keep_the_truth_of_finite_elements_likely(robot):
     load = robot.touch_design(robot.design_space.baseline, POINT, np.array([0.0, 0.8, 0.0]))
     state = Statics(robot.under_touch().build(load)).solve(COMMAND)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from softgym_envs.estimation import Payload, Touch, finger_grid
-from softgym_envs.estimation.places import Mixture, Places
+from softgym_envs.estimation.places import Bend, Mixture, Places
 from softgym_envs.estimation.posterior import Gaussian
 
 INFINITE = np.full(1, np.inf)
@@ -77,3 +77,35 @@ def test_payload_has_one_place():
     places = Payload().places(effectors=3)
     np.testing.assert_allclose(places.directions, [[0.0, 0.0, -9.81]])
     assert places.coordinates.shape == (1, 0)
+
+
+def test_a_cut_distribution_has_the_moments_of_its_samples():
+    before, _ = mixture(np.array([[0.3], [0.9]]))
+    rng, slope, offset = np.random.default_rng(0), np.array([2.0, -1.0]), 0.3
+    cut = before.cut(offset, slope)
+    samples = rng.multivariate_normal(before.means[0], before.covariances[0], 400_000)
+    kept = samples[offset + samples @ slope >= 0.0]
+    np.testing.assert_allclose(cut.means[0], kept.mean(axis=0), atol=0.01)
+    np.testing.assert_allclose(cut.covariances[0], np.cov(kept.T), atol=0.01)
+    share = np.exp(cut.logarithms - before.logarithms)
+    np.testing.assert_allclose(share, len(kept) / len(samples), atol=0.005)
+
+
+def test_both_sides_of_a_cut_make_up_the_whole():
+    before, _ = mixture(np.array([[0.3], [0.9]]))
+    slope = np.array([2.0, -1.0])
+    whole = before.cut(0.3, slope).beside(before.cut(-0.3, -slope))
+    for name in ("logarithms", "means", "covariances"):
+        np.testing.assert_allclose(getattr(whole, name), getattr(before, name), atol=1e-12)
+
+
+def test_bent_outputs_have_the_moments_of_bent_samples():
+    rng = np.random.default_rng(0)
+    mean, covariance = np.array([0.2, -0.1, 0.3]), np.diag([0.3, 0.2, 0.1]) ** 2 + 0.01
+    bend = Bend(np.array([0.1, 0.1, 0.0]), np.array([0.6, 0.8, 0.0]), np.array([0.5, -0.3, 1.0]))
+    samples = rng.multivariate_normal(mean, covariance, 400_000)
+    y = (samples - bend.origin) @ bend.axis
+    samples = samples + 0.5 * y[:, None] ** 2 * bend.curvature
+    (found,), (spread,) = bend.apply(mean[None], covariance[None])
+    np.testing.assert_allclose(found, samples.mean(axis=0), atol=2e-3)
+    np.testing.assert_allclose(spread, np.cov(samples.T), atol=2e-3)

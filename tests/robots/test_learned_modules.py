@@ -84,7 +84,8 @@ def test_a_fit_finds_the_energy_that_made_the_states(name):
     strain = 0.05 * rng.normal(size=(120, 6))
     strain[:12] = 0.0
     rows = [ModuleEnergy(1.0, k * d[0], c, symmetry).evaluate(e) for d, e in zip(designs, strain, strict=True)]
-    states = ModuleStates(designs, strain, np.array([r[1] for r in rows]), np.array([r[2] for r in rows]))
+    gradient, hessian = np.array([r[1] for r in rows]), np.array([r[2] for r in rows])
+    states = ModuleStates(designs, strain, gradient, hessian, np.zeros((len(strain), 6)), np.zeros(len(strain)))
     stable = np.linalg.eigvalsh(states.hessian)[:, 0] > 0.0
     found = fit(Recipe(box, 0.5), name, states.rows(stable), {})
     error = errors(found, states.rows(stable))["stiffness_mean"]
@@ -124,6 +125,23 @@ def test_bodies_are_drawn_from_the_box_in_any_order_of_its_dimensions(monkeypatc
         learning.learn_module("accordion", Recipe({"width": (0.008, 0.014), "amplitude": (0.003, 0.0079)}, 0.3, 16))
     for name, low, high in (("width", 0.008, 0.014), ("amplitude", 0.003, 0.0079)):
         assert 0.9 * low < drawn[0][name].min() < 1.1 * low < 0.9 * high < drawn[0][name].max() < 1.1 * high
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_learned_modules_know_how_wrong_they_may_be(name):
+    """Nothing at rest, where the force is exactly zero; more at the corners of the box, and for larger strains."""
+    learned, module = learned_module(name), MODULES[name]()
+    middle = {each: (low * high) ** 0.5 for each, (low, high) in learned.box.items()}
+    corner = {each: high for each, (_, high) in learned.box.items()}
+    inside, outside = (learned.energy({**design, "young_modulus": 1e7}) for design in (middle, corner))
+    assert inside.error == pytest.approx(learned.errors["inside"]["relative_max"])
+    assert outside.error >= learned.errors["corners"]["relative_max"] and 0.0 < inside.error <= outside.error < 0.1
+    scale = np.array([module.length(module.design_space.complete(middle))] * 3 + [1.0] * 3)
+    strains = 0.3 * scale * learned.largest_strains * np.sign(np.arange(6) - 2.5)
+    assert not inside.possible_errors(np.zeros(6)).any()
+    compliance = np.linalg.inv(inside.evaluate(strains)[2])
+    off = np.array([compliance @ row / scale for row in inside.possible_errors(strains)])
+    np.testing.assert_allclose(off, inside.error * np.linalg.norm(strains / scale) * np.eye(6), atol=1e-9)
 
 
 def test_strains_that_were_not_learned_are_not_known():

@@ -9,6 +9,7 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.geometry.export import export_body
+from softgym_envs.robots.modular_arm import BODIES
 from softgym_envs.surrogate.domain import doubt_text
 
 
@@ -31,9 +32,30 @@ def test_the_modular_arm_follows_finite_elements_of_the_whole_body(cells, comman
     assert np.linalg.norm(found["superelements"].delta.e - found["solid"].delta.e) < 0.01 * np.linalg.norm(moved)
 
 
-def test_superelements_of_the_arm_have_no_weight():
-    with pytest.raises(ValueError, match="superelements have no mass"):
-        make_robot("modular_arm", gravity=(0.0, 0.0, -9.81))
+def test_the_arm_sinks_under_its_weight_as_finite_elements_do():
+    """Weight across a leaf that carries a block, within the loads that were learned."""
+    found = {}
+    for body in ("superelements", "solid"):
+        robot = make_robot("modular_arm", cells=["leaf_x", "block"], body=body, gravity=(4.0, 0.0, 0.0))
+        solver = Statics(robot.build())
+        found[body] = solver.solve(np.zeros(2), "effort").condensed.delta.e - robot.effector_rest
+    assert found["solid"][0] > 5e-4
+    assert found["superelements"][0] == pytest.approx(found["solid"][0], rel=0.02)
+
+
+def test_the_arm_knows_how_far_its_tip_may_be_off():
+    """Larger far from rest; the tip on finite elements of the whole body is within it."""
+    robots = {body: make_robot("modular_arm", cells=["leaf_x", "notch_y"], body=body) for body in BODIES}
+    backend = FEMBackend(robots["superelements"])
+    assert backend.state.uncertainty < 1e-6
+    sizes = []
+    for share in (0.5, 1.0):
+        state = backend.step(share * np.array([0.003, 0.002]))
+        sizes.append(state.uncertainty)
+        solid = Statics(robots["solid"].build()).solve(share * np.array([0.003, 0.002])).condensed.delta.e
+        assert np.linalg.norm(state.effector[0] - solid) < state.uncertainty
+    assert 0.0 < sizes[0] < sizes[1] < robots["solid"].goal_tolerance
+    assert FEMBackend(robots["solid"]).state.uncertainty == 0.0
 
 
 def test_the_compliance_of_the_arm_is_the_derivative_of_its_equilibria():

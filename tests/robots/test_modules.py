@@ -149,7 +149,7 @@ def monolith(parts, tip):
         length = module.length(module.design_space.complete(design))
         frames[far] = module.add_to(
             builder, design, near=frames[near], far=frames.get(far), origin=places[near], rotation=rotation
-        )
+        ).far
         places[far] = places[near] + length * rotation[:, 2]
     model = builder.build()
     for component in range(6):

@@ -161,18 +161,19 @@ def test_configurations_of_accurate_meshes_fit_their_robots(path):
     config = load_config(path, FitConfig)
     robot = make_robot(config.robot, **config.robot_options)
     assert path.stem == pretrained_folder(robot).name  # where the weights ship
-    assert config.pretraining is not None and config.correction is not None
-    first, coarser, finer = (
-        make_robot(config.robot, **config.robot_options | options)
-        for options in (
-            config.pretraining.robot_options,
-            config.correction.coarser,
-            config.correction.finer,
-        )
-    )
+    assert config.pretraining is not None
+    first = make_robot(config.robot, **config.robot_options | config.pretraining.robot_options)
     assert first.design_space == robot.design_space and first.mechanics_key != robot.mechanics_key
-    assert config.correction.sizes == (coarser.mesh_size, robot.mesh_size, finer.mesh_size)
     assert config.data.plan_of(config.pretraining.train).boundary > 0.0
     plan = config.data.plan("train")
-    states = (plan.states + 1) * plan.groups + (few := config.correction.states).groups * (few.states + 1)
-    assert states <= 400 and few.groups * (few.states + 1) <= 60  # on the robot's mesh, and on the finer one
+    states = (plan.states + 1) * plan.groups
+    if config.correction is not None:
+        coarser, finer = (
+            make_robot(config.robot, **config.robot_options | options)
+            for options in (config.correction.coarser, config.correction.finer)
+        )
+        assert config.correction.sizes == (coarser.mesh_size, robot.mesh_size, finer.mesh_size)
+        few = config.correction.states
+        assert few.groups * (few.states + 1) <= 60  # on the finer mesh
+        states += few.groups * (few.states + 1)
+    assert states <= 400  # on the robot's mesh

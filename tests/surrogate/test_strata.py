@@ -143,7 +143,7 @@ def test_mirror_images_of_commands_are_not_solved_again(monkeypatch):
     states = solve_commands(robot, commands)
     assert states.found.all()
     solved = len(count)
-    monkeypatch.setattr(robot, "mirror", None)
+    monkeypatch.setattr(robot, "symmetries", ())
     every = solve_commands(robot, commands)
     assert len(count) == 2 * solved + 1
     for name in ("displacement", "effort", "effector", "slack", "growth"):

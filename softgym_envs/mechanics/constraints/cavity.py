@@ -5,8 +5,8 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.constraint import Constraint
 
 ATMOSPHERE = 101_325.0

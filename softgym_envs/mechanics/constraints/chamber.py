@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 

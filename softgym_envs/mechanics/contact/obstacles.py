@@ -18,9 +18,9 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numba import njit
 
 from softgym_envs.errors import unknown_name
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.frames import frame_rows
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Unpack
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.elements.block import StrainRates
 from softgym_envs.mechanics.elements.tetrahedra import (
     SolidOptions,

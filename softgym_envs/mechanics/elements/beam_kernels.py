@@ -3,131 +3,196 @@
 A state at a Gauss point is an array ``z`` (7, 3): ``r', d_1, d_2, d_3, d_1', d_2', d_3'``, which is linear in the rows.
 The six strains (see `beams`) are quadratic in it. ``rows`` (k,) are the first rows of an element's frames; ``shape``
 and ``slope`` (k,) the values and slopes of the shape functions at the point.
+
+Sums run in local variables and may be reordered and fused, which compilers then keep in vector registers.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+from softgym_envs.mechanics.compilation import FAST, njit
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def interpolate(x, rows, shape, slope, z):
     """Fill ``z`` at rows ``x`` (n, 3)."""
-    for v in range(7):
-        for d in range(3):
-            z[v, d] = 0.0
-    for a in range(rows.shape[0]):
-        row, h, s = rows[a], shape[a], slope[a]
-        for d in range(3):
-            z[0, d] += s * x[row, d]
-            for i in range(1, 4):
-                z[i, d] += h * x[row + i, d]
-                z[3 + i, d] += s * x[row + i, d]
+    for d in range(3):
+        t, a, b, c, u, v, w = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for f in range(rows.shape[0]):
+            row, h, s = rows[f], shape[f], slope[f]
+            p, q, r = x[row + 1, d], x[row + 2, d], x[row + 3, d]
+            t += s * x[row, d]
+            a += h * p
+            b += h * q
+            c += h * r
+            u += s * p
+            v += s * q
+            w += s * r
+        z[0, d], z[1, d], z[2, d], z[3, d], z[4, d], z[5, d], z[6, d] = t, a, b, c, u, v, w
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def strains(z, out):
     """Fill ``out`` (6,) with the strains, those at rest included."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        stretch, bend = 0.0, 0.0
-        for d in range(3):
-            stretch += z[0, d] * z[1 + i, d]
-            bend += z[1 + k, d] * z[4 + j, d] - z[1 + j, d] * z[4 + k, d]
-        out[i], out[3 + i] = stretch, 0.5 * bend
+    a, b, c, p, q, r = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for d in range(3):
+        a += z[0, d] * z[1, d]
+        b += z[0, d] * z[2, d]
+        c += z[0, d] * z[3, d]
+        p += z[3, d] * z[5, d] - z[2, d] * z[6, d]
+        q += z[1, d] * z[6, d] - z[3, d] * z[4, d]
+        r += z[2, d] * z[4, d] - z[1, d] * z[5, d]
+    out[0], out[1], out[2], out[3], out[4], out[5] = a, b, c, 0.5 * p, 0.5 * q, 0.5 * r
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def pull_back(z, stress, gradient):
     """Add to ``gradient`` (7, 3) the derivative by ``z`` of the work that ``stress`` (6,) does on the strains."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        force, moment = stress[i], 0.5 * stress[3 + i]
-        for d in range(3):
-            gradient[0, d] += force * z[1 + i, d]
-            gradient[1 + i, d] += force * z[0, d]
-            gradient[1 + k, d] += moment * z[4 + j, d]
-            gradient[4 + j, d] += moment * z[1 + k, d]
-            gradient[1 + j, d] -= moment * z[4 + k, d]
-            gradient[4 + k, d] -= moment * z[1 + j, d]
+    f, g, h = stress[0], stress[1], stress[2]
+    p, q, r = 0.5 * stress[3], 0.5 * stress[4], 0.5 * stress[5]
+    for d in range(3):
+        t, a, b, c, u, v, w = z[0, d], z[1, d], z[2, d], z[3, d], z[4, d], z[5, d], z[6, d]
+        gradient[0, d] += f * a + g * b + h * c
+        gradient[1, d] += f * t + q * w - r * v
+        gradient[2, d] += g * t + r * u - p * w
+        gradient[3, d] += h * t + p * v - q * u
+        gradient[4, d] += r * b - q * c
+        gradient[5, d] += p * c - r * a
+        gradient[6, d] += q * a - p * b
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def add_forces(gradient, rows, shape, slope, out):
     """Add the derivative by the rows to ``out`` (n, 3), given that by ``z``, ``gradient`` (7, 3)."""
-    for a in range(rows.shape[0]):
-        row, h, s = rows[a], shape[a], slope[a]
-        for d in range(3):
-            out[row, d] += s * gradient[0, d]
-            for i in range(1, 4):
-                out[row + i, d] += h * gradient[i, d] + s * gradient[3 + i, d]
+    for d in range(3):
+        t, a, b, c = gradient[0, d], gradient[1, d], gradient[2, d], gradient[3, d]
+        u, v, w = gradient[4, d], gradient[5, d], gradient[6, d]
+        for f in range(rows.shape[0]):
+            row, h, s = rows[f], shape[f], slope[f]
+            out[row, d] += s * t
+            out[row + 1, d] += h * a + s * u
+            out[row + 2, d] += h * b + s * v
+            out[row + 3, d] += h * c + s * w
 
 
-@njit(cache=True, error_model="numpy")
-def strain_columns(x, rows, shape, slope, z, scale, out):
-    """Fill ``out`` (18, 6) with derivatives of the strains at ``z``, times ``scale`` (6,), by the motions of 3 frames.
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def spin_columns(x, row, h, s, z, out):
+    """Fill ``out`` (6, 3) with derivatives of the strains by the spin of a frame, which turns its directors in ``x``.
 
-    A frame's motion has six components: the displacement of its origin and its spin, which turns its directors in
-    ``x`` (n, 3).
+    ``h`` and ``s`` are value and slope of its shape function. A displacement of its origin changes only the first three
+    strains, by ``s`` times the directors in ``z``.
     """
-    for a in range(3):
-        row, h, s = rows[a], shape[a], slope[a]
-        u, w = 6 * a, 6 * a + 3
+    # The spin turns d into w x d, and (w x d) . g = w . (d x g).
+    p, q, r = s * z[1, 0] - h * z[4, 0], s * z[1, 1] - h * z[4, 1], s * z[1, 2] - h * z[4, 2]
+    t, u, v = s * z[2, 0] - h * z[5, 0], s * z[2, 1] - h * z[5, 1], s * z[2, 2] - h * z[5, 2]
+    f, g, k = s * z[3, 0] - h * z[6, 0], s * z[3, 1] - h * z[6, 1], s * z[3, 2] - h * z[6, 2]
+    a0, a1, a2 = x[row + 1, 0], x[row + 1, 1], x[row + 1, 2]
+    b0, b1, b2 = x[row + 2, 0], x[row + 2, 1], x[row + 2, 2]
+    c0, c1, c2 = x[row + 3, 0], x[row + 3, 1], x[row + 3, 2]
+    e0, e1, e2 = h * z[0, 0], h * z[0, 1], h * z[0, 2]
+    out[0, 0], out[0, 1], out[0, 2] = a1 * e2 - a2 * e1, a2 * e0 - a0 * e2, a0 * e1 - a1 * e0
+    out[1, 0], out[1, 1], out[1, 2] = b1 * e2 - b2 * e1, b2 * e0 - b0 * e2, b0 * e1 - b1 * e0
+    out[2, 0], out[2, 1], out[2, 2] = c1 * e2 - c2 * e1, c2 * e0 - c0 * e2, c0 * e1 - c1 * e0
+    # Strain 3 + i changes by w . (d_j x g_k - d_k x g_j) / 2 with g = s d - h d' at the point.
+    out[3, 0] = 0.5 * (b1 * k - b2 * g - c1 * v + c2 * u)
+    out[3, 1] = 0.5 * (b2 * f - b0 * k - c2 * t + c0 * v)
+    out[3, 2] = 0.5 * (b0 * g - b1 * f - c0 * u + c1 * t)
+    out[4, 0] = 0.5 * (c1 * r - c2 * q - a1 * k + a2 * g)
+    out[4, 1] = 0.5 * (c2 * p - c0 * r - a2 * f + a0 * k)
+    out[4, 2] = 0.5 * (c0 * q - c1 * p - a0 * g + a1 * f)
+    out[5, 0] = 0.5 * (a1 * v - a2 * u - b1 * r + b2 * q)
+    out[5, 1] = 0.5 * (a2 * t - a0 * v - b2 * p + b0 * r)
+    out[5, 2] = 0.5 * (a0 * u - a1 * t - b0 * q + b1 * p)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def displacement_by_spin(z, stiffness, spin, row, h, stress, x, out):
+    """Fill ``out`` (3, 3) with the tangent of a displacement by the spin of a frame, per slope of the displaced one.
+
+    Args:
+        z: state at a Gauss point.
+        stiffness: of the strains, shape (6,).
+        spin: what `spin_columns` gives for the frame that turns, shape (6, 3).
+        row: first row of this frame.
+        h: its shape function.
+        stress: shape (6,).
+        x: rows, shape (n, 3).
+        out: shape (3, 3).
+    """
+    for d in range(3):
+        a, b, c = stiffness[0] * z[1, d], stiffness[1] * z[2, d], stiffness[2] * z[3, d]
+        out[d, 0] = a * spin[0, 0] + b * spin[1, 0] + c * spin[2, 0]
+        out[d, 1] = a * spin[0, 1] + b * spin[1, 1] + c * spin[2, 1]
+        out[d, 2] = a * spin[0, 2] + b * spin[1, 2] + c * spin[2, 2]
+    # The stress turns with the frame: u . (w x pull), with pull = h sum_i force_i d_i
+    f, g, k = h * stress[0], h * stress[1], h * stress[2]
+    p = f * x[row + 1, 0] + g * x[row + 2, 0] + k * x[row + 3, 0]
+    q = f * x[row + 1, 1] + g * x[row + 2, 1] + k * x[row + 3, 1]
+    r = f * x[row + 1, 2] + g * x[row + 2, 2] + k * x[row + 3, 2]
+    out[0, 1] += r
+    out[0, 2] -= q
+    out[1, 2] += p
+    out[1, 0] -= r
+    out[2, 0] += q
+    out[2, 1] -= p
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def spin_by_spin(first, second, stiffness, block):
+    """Fill the part (3, 3) of a block that belongs to both spins with the terms of the stiffness.
+
+    ``first`` and ``second`` (2, 6, 3) are what `spin_columns` gives at two Gauss points, ``stiffness`` (2, 6).
+    """
+    a, b, c, p, q, r, t, u, v = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for g in range(2):
+        for s in range(6):
+            k = stiffness[g, s]
+            f0, f1, f2 = k * first[g, s, 0], k * first[g, s, 1], k * first[g, s, 2]
+            e0, e1, e2 = second[g, s, 0], second[g, s, 1], second[g, s, 2]
+            a += f0 * e0
+            b += f0 * e1
+            c += f0 * e2
+            p += f1 * e0
+            q += f1 * e1
+            r += f1 * e2
+            t += f2 * e0
+            u += f2 * e1
+            v += f2 * e2
+    block[3, 3], block[3, 4], block[3, 5] = a, b, c
+    block[4, 3], block[4, 4], block[4, 5] = p, q, r
+    block[5, 3], block[5, 4], block[5, 5] = t, u, v
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def add_turned(x, one, other, m, block):
+    """Add the second derivative of ``sum_ij m_ij (w x p_i) . (v x q_j)`` by two spins to a block (6, 6).
+
+    ``p`` and ``q`` are the directors of frames with first rows ``one`` and ``other``; ``m`` has shape (3, 3).
+    """
+    a, b, c, p, q, r, t, u, v = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(3):
+        f0, f1, f2 = 0.0, 0.0, 0.0
         for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            c, b = scale[i], 0.5 * scale[3 + i]
-            for d in range(3):
-                e, f = (d + 1) % 3, (d + 2) % 3
-                out[u + d, i] = c * s * z[1 + i, d]
-                out[u + d, 3 + i] = 0.0
-                # The spin turns d into w x d, and (w x d) . g = w . (d x g).
-                out[w + d, i] = c * h * (x[row + 1 + i, e] * z[0, f] - x[row + 1 + i, f] * z[0, e])
-                out[w + d, 3 + i] = b * (
-                    x[row + 1 + j, e] * (s * z[1 + k, f] - h * z[4 + k, f])
-                    - x[row + 1 + j, f] * (s * z[1 + k, e] - h * z[4 + k, e])
-                    + x[row + 1 + k, e] * (h * z[4 + j, f] - s * z[1 + j, f])
-                    - x[row + 1 + k, f] * (h * z[4 + j, e] - s * z[1 + j, e])
-                )
-
-
-@njit(cache=True, error_model="numpy")
-def add_turned(p, q, factor, block, row, column):
-    """Add the second derivative of ``factor (w_a x p) . (w_b x q)``, ``factor ((p . q) 1 - q p^T)``, to a block."""
-    dot = factor * (p[0] * q[0] + p[1] * q[1] + p[2] * q[2])
-    for i in range(3):
-        for j in range(3):
-            block[row + i, column + j] -= factor * q[i] * p[j]
-        block[row + i, column + i] += dot
-
-
-@njit(cache=True, error_model="numpy")
-def add_geometric(x, rows, shape, slope, stress, matrix):
-    """Add the terms of the stress to an element's matrix (18, 18) over the motions of 3 frames.
-
-    Terms of single frames, the curvature of their rotation, are left out: all forces on a frame contribute to them.
-    """
-    pull = np.empty((3, 3))  # sum_i force_i d_i of each frame
-    for a in range(3):
-        for d in range(3):
-            pull[a, d] = 0.0
-            for i in range(3):
-                pull[a, d] += shape[a] * stress[i] * x[rows[a] + 1 + i, d]
-    for a in range(3):
-        for b in range(3):
-            # u_a . (w_b x pull_b), and its mirror image
-            s = slope[a]
-            for i in range(3):
-                j, k = (i + 1) % 3, (i + 2) % 3
-                matrix[6 * a + i, 6 * b + 3 + j] += s * pull[b, k]
-                matrix[6 * a + i, 6 * b + 3 + k] -= s * pull[b, j]
-                matrix[6 * b + 3 + j, 6 * a + i] += s * pull[b, k]
-                matrix[6 * b + 3 + k, 6 * a + i] -= s * pull[b, j]
-            if a == b:
-                continue
-            c = shape[a] * slope[b] - slope[a] * shape[b]
-            for i in range(3):
-                j, k = 1 + (i + 1) % 3, 1 + (i + 2) % 3
-                moment = 0.5 * c * stress[3 + i]
-                add_turned(x[rows[a] + k], x[rows[b] + j], moment, matrix, 6 * a + 3, 6 * b + 3)
-                add_turned(x[rows[a] + j], x[rows[b] + k], -moment, matrix, 6 * a + 3, 6 * b + 3)
+            k = m[i, j]
+            f0 += k * x[one + 1 + i, 0]
+            f1 += k * x[one + 1 + i, 1]
+            f2 += k * x[one + 1 + i, 2]
+        e0, e1, e2 = x[other + 1 + j, 0], x[other + 1 + j, 1], x[other + 1 + j, 2]
+        a += e0 * f0
+        b += e0 * f1
+        c += e0 * f2
+        p += e1 * f0
+        q += e1 * f1
+        r += e1 * f2
+        t += e2 * f0
+        u += e2 * f1
+        v += e2 * f2
+    # (p . q) 1 - q p^T
+    block[3, 3] += q + v
+    block[3, 4] -= b
+    block[3, 5] -= c
+    block[4, 3] -= p
+    block[4, 4] += a + v
+    block[4, 5] -= r
+    block[5, 3] -= t
+    block[5, 4] -= u
+    block[5, 5] += a + q

@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.beam_kernels import interpolate, pull_back, strains
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs

@@ -45,6 +45,7 @@ class ElementBlock(ABC):
         volume: rest volume [m3].
         mass: mass [kg].
         stiffness: a typical stiffness against displacements [N/m], for scaling.
+        learned: whether the energy is learned, so that `possible_errors` has rows.
         elasticity_version: increases with every change of the elasticity, so that solvers can detect it.
     """
 
@@ -52,6 +53,7 @@ class ElementBlock(ABC):
     volume: float
     mass: float
     stiffness: float
+    learned: bool = False
     elasticity_version: int = 0
 
     @property
@@ -62,6 +64,18 @@ class ElementBlock(ABC):
     def knows(self, x: np.ndarray) -> bool:
         """Whether the energy is known at rows ``x`` (n, 3); learned ones are known where they were learned."""
         return True
+
+    def possible_errors(self, x: np.ndarray, fields: np.ndarray) -> np.ndarray:
+        """Return the work of possible errors of the forces at rows ``x`` (n, 3) along motions of the rows.
+
+        Args:
+            x: positions [m].
+            fields: motions per unit, shape (m, n, 3).
+
+        Returns:
+            A row for each of k independent errors, shape (k, m); no rows where the energy is exact.
+        """
+        return np.empty((0, len(fields)))
 
     @abstractmethod
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -12,7 +12,8 @@ with ``S = 2 mu D + lame tr D``. For small steps, ``D`` is the rate of deformati
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from softgym_envs.mechanics.compilation import njit
 
 FIRST = np.array([0, 1, 2, 0, 0, 1])
 SECOND = np.array([0, 1, 2, 1, 2, 2])

@@ -6,8 +6,8 @@ import math
 from typing import Unpack
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, SolidOptions, element_masses, orient_corners
 

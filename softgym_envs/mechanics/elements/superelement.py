@@ -19,9 +19,10 @@ Rows are transformed first, so ports may be turned and shifted against the frame
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numba import njit
 
 from softgym_envs.mechanics.elements.beams import warp_lines
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
@@ -38,6 +39,14 @@ class PortEnergy(Protocol):
 
     def knows(self, strains: np.ndarray) -> bool:
         """Whether the energy is known at strains (6,)."""
+
+
+@runtime_checkable
+class LearnedEnergy(PortEnergy, Protocol):
+    """Energy of a superelement that knows how wrong it may be."""
+
+    def possible_errors(self, strains: np.ndarray) -> np.ndarray:
+        """Return independent errors that its gradient may have at strains (6,), as rows (k, 6) [N, N m]."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +85,51 @@ def _strain_forms() -> np.ndarray:
 _FORMS = _strain_forms()
 
 
+@njit(cache=True, error_model="numpy")
+def _slopes(forms, z, slopes):
+    """Write the derivatives of the strains by the rows ``z`` (8, 3), shape (6, 8, 3)."""
+    for i in range(6):
+        for a in range(8):
+            for d in range(3):
+                total = 0.0
+                for b in range(8):
+                    total += forms[i, a, b] * z[b, d]
+                slopes[i, a, d] = total
+
+
+@njit(cache=True, error_model="numpy")
+def _add_tangent(forms, slopes, force, stiffness, scatter, values):
+    """Add the tangent of an energy with derivatives (6,) and (6, 6) by the strains where ``scatter`` (300,) says."""
+    entry = 0
+    row = np.empty(6)
+    for r in range(24):
+        a, d = r // 3, r % 3
+        for q in range(6):
+            row[q] = 0.0
+            for p in range(6):
+                row[q] += slopes[p, a, d] * stiffness[p, q]
+        for s in range(r + 1):
+            target = scatter[entry]
+            entry += 1
+            if target < 0:
+                continue
+            b, e = s // 3, s % 3
+            total = 0.0
+            for q in range(6):
+                total += row[q] * slopes[q, b, e]
+                if d == e:
+                    total += force[q] * forms[q, a, b]
+            values[target] += total
+
+
+def point_masses(mass: float) -> np.ndarray:
+    """Return the inertia (8, 8) of a part whose mass [kg] is in the middles of both ports, half in each.
+
+    Its weight is exact, with its centre in the middle between the ports; its motion in time is not.
+    """
+    return np.diag([0.5 * mass, 0.0, 0.0, 0.0] * 2)
+
+
 class Superelement(ElementBlock):
     """An elastic part between two frames.
 
@@ -92,6 +146,8 @@ class Superelement(ElementBlock):
     """
 
     volume = 0.0
+    rows: np.ndarray
+    """Rows of both ports, shape (8,)."""
 
     def __init__(
         self,
@@ -112,14 +168,15 @@ class Superelement(ElementBlock):
         start = nodes[first] if origin is None else np.asarray(origin, dtype=float)
         self.energy, self.length = energy, float(length)
         self._young_modulus = float(young_modulus)
-        self.nodes_used = np.concatenate([first + np.arange(4), last + np.arange(4)])
+        self.rows = np.concatenate([first + np.arange(4), last + np.arange(4)])
+        self.nodes_used = self.rows
         ports = np.zeros((8, 8))
         for slot, row, middle in ((0, first, start), (4, last, start + length * axes[:, 2])):
             directors = nodes[row + 1 : row + 4]
             ports[slot, slot] = 1.0
             ports[slot, slot + 1 : slot + 4] = directors @ (middle - nodes[row])
             ports[slot + 1 : slot + 4, slot + 1 : slot + 4] = (directors @ axes).T
-        self._forms = ports.T @ _FORMS @ ports
+        self._forms = np.ascontiguousarray(ports.T @ _FORMS @ ports)
         matrix = np.zeros((8, 8)) if inertia is None else np.asarray(inertia, dtype=float)
         self._inertia = ports.T @ matrix @ ports
         # The axes of each port share the inertia of its own motion; middles move by their weights in every point.
@@ -129,6 +186,7 @@ class Superelement(ElementBlock):
         self.mass = float(weights @ matrix @ weights)
         self._rest = np.zeros(6)
         self._rest = self.strains(nodes)
+        self.learned = isinstance(energy, LearnedEnergy)
         self._viscous = energy.evaluate(np.zeros(6))[2]
         self.stiffness = float(np.trace(self._viscous[:3, :3]) / 3.0)
         self._line = (np.array([[first, last]]), np.array([[0.5, 0.5]]), np.array([[[-1.0, 1.0]]]) / length)
@@ -139,21 +197,45 @@ class Superelement(ElementBlock):
 
     def strains(self, x: np.ndarray) -> np.ndarray:
         """Return the strains (6,) at rows ``x`` (n, 3)."""
-        z = x[self.nodes_used]
-        return 0.5 * np.einsum("iab,ad,bd->i", self._forms, z, z, optimize=True) - self._rest
+        z = x[self.rows]
+        return 0.5 * (self.strain_slopes(x) @ z.ravel()) - self._rest
+
+    def strain_slopes(self, x: np.ndarray) -> np.ndarray:
+        """Return the derivatives (6, 24) of the strains by the rows `rows` at rows ``x`` (n, 3)."""
+        slopes = np.empty((6, 8, 3))
+        _slopes(self._forms, x[self.rows], slopes)
+        return slopes.reshape(6, 24)
+
+    def strain_hessian(self, x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:
+        """Return the second derivatives (24, 24) by the rows of a function of the strains.
+
+        Args:
+            x: rows, shape (n, 3).
+            gradient: of the function, shape (6,).
+            hessian: of the function, shape (6, 6).
+        """
+        flat = self.strain_slopes(x)
+        return flat.T @ hessian @ flat + np.kron(np.tensordot(gradient, self._forms, 1), np.eye(3))
 
     def knows(self, x: np.ndarray) -> bool:
         return self.energy.knows(self.strains(x))
 
+    def possible_errors(self, x: np.ndarray, fields: np.ndarray) -> np.ndarray:
+        if not isinstance(self.energy, LearnedEnergy):
+            return super().possible_errors(x, fields)
+        rates = fields[:, self.rows].reshape(len(fields), 24) @ self.strain_slopes(x).T
+        return self.energy.possible_errors(self.strains(x)) @ rates.T
+
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        return [lower_pairs((3 * self.nodes_used[:, None] + np.arange(3)).reshape(1, 24))]
+        return [lower_pairs((3 * self.rows[:, None] + np.arange(3)).reshape(1, 24))]
 
     def add(
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
-        z = x[self.nodes_used]
-        slopes = self._forms @ z  # of the strains by the rows, (6, 8, 3)
-        strains = 0.5 * np.einsum("iad,ad->i", slopes, z) - self._rest
+        z = x[self.rows]
+        slopes = np.empty((6, 8, 3))
+        _slopes(self._forms, z, slopes)
+        strains = 0.5 * (slopes.reshape(6, 24) @ z.ravel()) - self._rest
         if not (np.abs(strains[3:]) <= LARGEST_ROTATION).all():
             return np.inf, 1
         energy, force, stiffness = self.energy.evaluate(strains)
@@ -170,15 +252,9 @@ class Superelement(ElementBlock):
         scatter: list[np.ndarray] | None,
     ) -> None:
         """Add forces and tangent for the derivatives of an energy by the strains, (6,) and (6, 6)."""
-        gradient[self.nodes_used] += np.tensordot(force, slopes, 1)
-        if values is None or scatter is None:
-            return
-        flat = slopes.reshape(6, 24)
-        matrix = flat.T @ stiffness @ flat + np.kron(np.tensordot(force, self._forms, 1), np.eye(3))
-        r, s = np.tril_indices(24)
-        target = scatter[0].ravel()
-        kept = target >= 0
-        np.add.at(values, target[kept], matrix[r[kept], s[kept]])
+        gradient[self.rows] += (force @ slopes.reshape(6, 24)).reshape(8, 3)
+        if values is not None and scatter is not None:
+            _add_tangent(self._forms, slopes, force, stiffness, scatter[0].ravel(), values)
 
     def add_damping(
         self,
@@ -194,18 +270,18 @@ class Superelement(ElementBlock):
         change = self.strains(rates.middle + half) - self.strains(rates.middle - half)
         viscosity = rates.damping * factor * self._viscous
         force = viscosity @ change
-        self._spread(self._forms @ x[self.nodes_used], force, viscosity, gradient, values, scatter)
+        self._spread(self._forms @ x[self.rows], force, viscosity, gradient, values, scatter)
         return factor * float(change @ force)
 
     def nodal_masses(self, count: int) -> np.ndarray:
         masses = np.zeros(count)
-        masses[self.nodes_used] = self._weights
+        masses[self.rows] = self._weights
         return masses
 
     def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Entries between all rows of both ports: there is no lumped mass of a superelement."""
         i, j = np.tril_indices(8)
-        return self.nodes_used[i], self.nodes_used[j], self._inertia[i, j]
+        return self.rows[i], self.rows[j], self._inertia[i, j]
 
     def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
         warp_lines(x, step, *self._line, np.array([[self.length]]), out)

@@ -6,8 +6,8 @@ from abc import abstractmethod
 from typing import TypedDict, Unpack
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.averaging import averaged_points
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs

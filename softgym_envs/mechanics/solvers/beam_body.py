@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from softgym_envs.mechanics.assembly import MassMatrix
 from softgym_envs.mechanics.constraints.chamber import Chamber
@@ -12,6 +13,7 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.elements.rigid import RigidBody
+from softgym_envs.mechanics.frames import Frames
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, BlockPattern, analyse
 
@@ -80,14 +82,16 @@ class MovingFrames(NamedTuple):
 
 
 class Masses(NamedTuple):
-    """The mass matrix between rows, as a CSR matrix, and as a list of its entries in the tangent.
+    """The mass matrix between the own rows of frames, as a CSR matrix, and as a list of its blocks in the tangent.
+
+    Rows that follow a frame have no mass of their own: they are linear in the rows of that frame.
 
     Attributes:
         pointers: shape (n + 1,).
         columns: of the matrix.
         values: of the matrix [kg].
-        pairs: row, column and block of the tangent for one half of the entries between rows that move, shape (k, 3).
-        entries: their values [kg], shape (k,).
+        pairs: first rows of two frames that move, and their block of the tangent, shape (k, 3).
+        entries: masses between their rows [kg], shape (k, 4, 4).
     """
 
     pointers: np.ndarray
@@ -222,9 +226,11 @@ def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
     kind[block_of_frame[owner] < 0] = FIXED
 
     elements = np.concatenate([beam.rows for beam in beams])
-    masses = mass.rows.tocoo()
-    moved = (kind[masses.row] != FIXED) & (kind[masses.col] != FIXED)
-    first, second = block_of_frame[owner[masses.row]], block_of_frame[owner[masses.col]]
+    masses = _own_masses(mass.rows, frames, n)
+    places = np.where(owner < 0, -1, block_of_frame[owner])
+    coupled = masses.tocoo()
+    first, second = places[coupled.row], places[coupled.col]
+    moved = (first >= 0) & (second >= 0)
     element_blocks = block_of_frame[owner[elements]]
     pairs = {(int(i), int(j)) for i, j in zip(first[moved], second[moved], strict=True)}
     chambers = [(c, rows.start) for c, rows in model.rows if isinstance(c, Chamber)]
@@ -237,12 +243,6 @@ def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
 
     own = (frames.rows[:, None] + np.arange(1, 4)).ravel()
     follows = ~np.isin(frames.carried, own) & (kind[frames.carried] != FIXED)
-
-    i, j, value = masses.row[moved], masses.col[moved], masses.data[moved]
-    # Between different blocks the entry above the diagonal; within one block, one of each pair of rows.
-    half = np.where(block[i] == block[j], i <= j, block[i] < block[j])
-    i, j, value = i[half], j[half], value[half]
-    mass_place = np.array([pattern.place(a, b) for a, b in zip(block[i], block[j], strict=True)], dtype=np.int64)
 
     free = np.zeros((len(movable), SIZE))
     scale = np.zeros((len(movable), SIZE))
@@ -271,13 +271,7 @@ def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
             moves=frames.moves[follows],
             arm=frames.arm[follows],
         ),
-        masses=Masses(
-            pointers=mass.rows.indptr.astype(np.int64),
-            columns=mass.rows.indices.astype(np.int64),
-            values=mass.rows.data,
-            pairs=np.column_stack([i, j, mass_place]).astype(np.int64),
-            entries=value,
-        ),
+        masses=_masses(masses, frames.rows[movable], order, pattern),
         pattern=pattern,
         components=Components(free, free.min(axis=1) > 0.0, scale),
         servos=Servos(
@@ -299,6 +293,39 @@ def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
             weights=np.concatenate([np.empty((0, 12)), *(c.weights for c, _ in chambers)]).reshape(-1, 3, 4),
             place=_element_places(block[lines], pattern),
         ),
+    )
+
+
+def _own_masses(matrix: csr_matrix, frames: Frames, count: int) -> csr_matrix:
+    """Return the mass matrix of ``count`` rows with the masses of rows that follow frames given to the frames' rows."""
+    own = (frames.rows[:, None] + np.arange(4)).ravel()
+    follows = ~np.isin(frames.carried, own)
+    carried, origin = frames.carried[follows], frames.rows[frames.owner[follows]]
+    rows = np.concatenate([own, np.repeat(carried, 4)])
+    columns = np.concatenate([own, (origin[:, None] + np.arange(4)).ravel()])
+    values = np.column_stack([frames.moves, frames.arm])[follows].ravel()
+    follow = csr_matrix((np.concatenate([np.ones(len(own)), values]), (rows, columns)), shape=(count, count))
+    found = csr_matrix(follow.T @ matrix @ follow)
+    found.eliminate_zeros()
+    return found
+
+
+def _masses(matrix: csr_matrix, rows: np.ndarray, blocks: np.ndarray, pattern: BlockPattern) -> Masses:
+    """Return the mass matrix between rows, and its parts between moving frames of given first rows and blocks."""
+    pairs, entries = [], []
+    for row, i in zip(rows, blocks, strict=True):
+        near = matrix[row : row + 4].tocsc()
+        for other, j in zip(rows, blocks, strict=True):
+            if j < i or not near.indptr[other] < near.indptr[other + 4]:
+                continue
+            pairs.append((row, other, pattern.place(i, j)))
+            entries.append(near[:, other : other + 4].toarray())
+    return Masses(
+        pointers=matrix.indptr.astype(np.int64),
+        columns=matrix.indices.astype(np.int64),
+        values=matrix.data,
+        pairs=np.array(pairs, dtype=np.int64).reshape(-1, 3),
+        entries=np.array(entries).reshape(-1, 4, 4),
     )
 
 

@@ -9,18 +9,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import FAST, njit
 from softgym_envs.mechanics.elements.beam_kernels import (
     add_forces,
-    add_geometric,
     add_turned,
+    displacement_by_spin,
     interpolate,
     pull_back,
-    strain_columns,
+    spin_by_spin,
+    spin_columns,
     strains,
 )
-from softgym_envs.mechanics.solvers.beam_body import DIRECTOR, FIXED, MOUNTED, ORIGIN, BeamBody
+from softgym_envs.mechanics.solvers.beam_body import DIRECTOR, FIXED, ORIGIN, BeamBody
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE
 
 
@@ -57,8 +58,6 @@ class Equations(NamedTuple):
         delta: values of the constraints, shape (size,).
         H: their gradients, shape (size, b, 6).
         energy: elastic energy [J], shape (1,).
-        element: tangent of an element over the motions of its frames, shape (18, 18).
-        columns: derivatives of the strains, shape (18, 12).
     """
 
     gradient: np.ndarray
@@ -68,8 +67,6 @@ class Equations(NamedTuple):
     delta: np.ndarray
     H: np.ndarray
     energy: np.ndarray
-    element: np.ndarray
-    columns: np.ndarray
 
 
 def make_equations(body: BeamBody, size: int) -> Equations:
@@ -83,12 +80,10 @@ def make_equations(body: BeamBody, size: int) -> Equations:
         delta=np.zeros(size),
         H=np.zeros((size, count, SIZE)),
         energy=np.zeros(1),
-        element=np.zeros((18, 18)),
-        columns=np.zeros((18, 12)),
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def point_strains(elements, x, out):
     """Fill ``out`` (m, 2, 6) with the strains at the Gauss points, those at rest included, at rows ``x`` (n, 3)."""
     z = np.empty((7, 3))
@@ -98,7 +93,7 @@ def point_strains(elements, x, out):
             strains(z, out[e, q])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def drag_work(elements, x, step):
     """Return the work [J] that the stiffness damping takes on the way to rows ``x`` (n, 3)."""
     z, end = np.empty((7, 3)), np.empty(6)
@@ -113,51 +108,111 @@ def drag_work(elements, x, step):
     return work
 
 
-@njit(cache=True, error_model="numpy")
-def _add_arm(rows, arm, a):
-    """Let frame ``a`` of an element's matrix (18, 18) follow another one, from whose origin it is ``arm`` away."""
-    u, w = 6 * a, 6 * a + 3
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        for c in range(18):
-            rows[w + i, c] += arm[j] * rows[u + k, c] - arm[k] * rows[u + j, c]
-    for c in range(18):
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            rows[c, w + i] += arm[j] * rows[c, u + k] - arm[k] * rows[c, u + j]
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _add_arms(x, own, mounted, block, transposed):
+    """Let the first frame of a block (6, 6) of the tangent follow the frame on which it is mounted, or the second one.
+
+    ``own`` is the first row of the frame, ``mounted`` that of the frame that it follows.
+    """
+    p, q, r = x[own, 0] - x[mounted, 0], x[own, 1] - x[mounted, 1], x[own, 2] - x[mounted, 2]
+    for c in range(6):
+        if transposed:
+            u, v, w = block[c, 0], block[c, 1], block[c, 2]
+            block[c, 3] += q * w - r * v
+            block[c, 4] += r * u - p * w
+            block[c, 5] += p * v - q * u
+        else:
+            u, v, w = block[0, c], block[1, c], block[2, c]
+            block[3, c] += q * w - r * v
+            block[4, c] += r * u - p * w
+            block[5, c] += p * v - q * u
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _fill_gram(columns, out):
-    """Fill ``out`` (18, 18) with ``C C^T`` for an array ``C`` (18, 12)."""
-    for i in range(18):
-        for j in range(i + 1):
-            value = 0.0
-            for r in range(12):
-                value += columns[i, r] * columns[j, r]
-            out[i, j] = value
-            out[j, i] = value
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _add_tangent(elements, e, x, z, stress, rate, work, tangent):
+    """Add the tangent of an element to its blocks.
+
+    Terms of single frames, the curvature of their rotation, are left out: all forces on a frame contribute to them.
+    ``z`` (2, 7, 3) and ``stress`` (2, 6) are those of its Gauss points. ``work`` are work arrays.
+    """
+    stiffness, spins, crossed, straight, moments, block = work
+    frames, shapes, slopes = elements.frames[e], elements.shape, elements.slope[e]
+    mount, place = elements.mount[e], elements.place[e]
+    for q in range(2):
+        for s in range(6):
+            stiffness[q, s] = (1.0 + rate) * elements.stiffness[e, q, s]
+        k = stiffness[q]
+        for d in range(3):
+            a, b, c = k[0] * z[q, 1, d], k[1] * z[q, 2, d], k[2] * z[q, 3, d]
+            for f in range(3):
+                straight[q, d, f] = a * z[q, 1, f] + b * z[q, 2, f] + c * z[q, 3, f]
+        for a in range(3):
+            spin_columns(x, frames[a], shapes[q, a], slopes[q, a], z[q], spins[a, q])
+            displacement_by_spin(z[q], k, spins[a, q], frames[a], shapes[q, a], stress[q], x, crossed[a, q])
+    for a in range(3):
+        for b in range(a, 3):
+            if place[a, b] < 0 and place[b, a] < 0:
+                continue
+            g, h = slopes[0, a], slopes[1, a]
+            k, m = slopes[0, b], slopes[1, b]
+            for i in range(3):
+                for j in range(3):
+                    block[i, j] = g * k * straight[0, i, j] + h * m * straight[1, i, j]
+                    block[i, 3 + j] = g * crossed[b, 0, i, j] + h * crossed[b, 1, i, j]
+                    block[3 + i, j] = k * crossed[a, 0, j, i] + m * crossed[a, 1, j, i]
+            spin_by_spin(spins[a], spins[b], stiffness, block)
+            if a != b:
+                # The strain 3 + i is (d_k . d_j' - d_j . d_k') / 2, bilinear in the directors of two frames.
+                g = 0.5 * (shapes[0, a] * k - g * shapes[0, b])
+                h = 0.5 * (shapes[1, a] * m - h * shapes[1, b])
+                for i in range(3):
+                    j, k = (i + 1) % 3, (i + 2) % 3
+                    moment = g * stress[0, 3 + i] + h * stress[1, 3 + i]
+                    moments[k, j], moments[j, k] = moment, -moment
+                add_turned(x, frames[a], frames[b], moments, block)
+            if mount[a] >= 0:
+                _add_arms(x, frames[a], mount[a], block, False)
+            if mount[b] >= 0:
+                _add_arms(x, frames[b], mount[b], block, True)
+            if place[a, b] >= 0:
+                target = tangent[place[a, b]]
+                for i in range(6):
+                    for j in range(6):
+                        target[i, j] += block[i, j]
+            if a != b and place[b, a] >= 0:
+                target = tangent[place[b, a]]
+                for i in range(6):
+                    for j in range(6):
+                        target[i, j] += block[j, i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def _add_elements(elements, x, step, equations, full):
     """Add the forces of the elements and, if ``full``, their tangents."""
-    gradient, tangent = equations.gradient, equations.tangent
-    matrix, columns = equations.element, equations.columns
     frames_of, shapes, slopes = elements.frames, elements.shape, elements.slope
-    stiffnesses, rests, places = elements.stiffness, elements.rest, elements.place
-    z, pull = np.empty((7, 3)), np.empty((7, 3))
-    stress, scale = np.empty((2, 6)), np.empty(6)
-    arm = np.empty(3)
+    z, pull, stress = np.empty((2, 7, 3)), np.empty((7, 3)), np.empty((2, 6))
+    moments = np.zeros((3, 3))
+    work = (
+        np.empty((2, 6)),
+        np.empty((3, 2, 6, 3)),
+        np.empty((3, 2, 3, 3)),
+        np.empty((2, 3, 3)),
+        moments,
+        np.empty((6, 6)),
+    )
     rate = step.stiffness_damping / step.h
     elastic = 0.0
     for e in range(frames_of.shape[0]):
         frames = frames_of[e]
         for q in range(2):
-            shape, slope, stiffness, rest = shapes[q], slopes[e, q], stiffnesses[e, q], rests[e, q]
-            tension, start = stress[q], step.strains[e, q]
-            interpolate(x, frames, shape, slope, z)
-            strains(z, tension)
+            stiffness, rest, tension, start = (
+                elements.stiffness[e, q],
+                elements.rest[e, q],
+                stress[q],
+                step.strains[e, q],
+            )
+            interpolate(x, frames, shapes[q], slopes[e, q], z[q])
+            strains(z[q], tension)
             for s in range(6):
                 strain, change = tension[s] - rest[s], tension[s] - start[s]
                 elastic += 0.5 * stiffness[s] * strain**2
@@ -165,34 +220,14 @@ def _add_elements(elements, x, step, equations, full):
             for v in range(7):
                 for d in range(3):
                     pull[v, d] = 0.0
-            pull_back(z, tension, pull)
-            add_forces(pull, frames, shape, slope, gradient)
-            if full:
-                for s in range(6):
-                    scale[s] = np.sqrt((1.0 + rate) * stiffness[s])
-                strain_columns(x, frames, shape, slope, z, scale, columns[:, 6 * q : 6 * q + 6])
-        if not full:
-            continue
-        _fill_gram(columns, matrix)
-        for q in range(2):
-            add_geometric(x, frames, shapes[q], slopes[e, q], stress[q], matrix)
-        for a in range(3):
-            if elements.mount[e, a] >= 0:
-                for d in range(3):
-                    arm[d] = x[frames[a], d] - x[elements.mount[e, a], d]
-                _add_arm(matrix, arm, a)
-        for a in range(3):
-            for b in range(3):
-                place = places[e, a, b]
-                if place >= 0:
-                    block = tangent[place]
-                    for i in range(6):
-                        for j in range(6):
-                            block[i, j] += matrix[6 * a + i, 6 * b + j]
+            pull_back(z[q], tension, pull)
+            add_forces(pull, frames, shapes[q], slopes[e, q], equations.gradient)
+        if full:
+            _add_tangent(elements, e, x, z, stress, rate, work, equations.tangent)
     equations.energy[0] = elastic
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def multiply_mass(masses, rows, out):
     """Add ``M rows`` to ``out``, both (n, 3)."""
     pointers, columns, values = masses.pointers, masses.columns, masses.values
@@ -217,80 +252,97 @@ def _vector(rows, x, row, out):
     return kind != DIRECTOR
 
 
-@njit(cache=True, error_model="numpy")
-def _add_inertia(masses, rows, x, step, equations, full):
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _add_inertia(masses, x, step, equations, full):
     """Add the forces of inertia and of mass damping and, if ``full``, their tangents."""
-    factor = (1.0 / step.h + step.mass_damping) / step.h
+    rate = 1.0 / step.h
+    factor = (rate + step.mass_damping) * rate
     start, velocity, momentum = step.x, step.velocity, equations.momentum
     for row in range(x.shape[0]):
         for d in range(3):
             # M ((v' - v) / h + alpha v') with v' = (x - x_n) / h
-            momentum[row, d] = factor * (x[row, d] - start[row, d]) - velocity[row, d] / step.h
+            momentum[row, d] = factor * (x[row, d] - start[row, d]) - rate * velocity[row, d]
     multiply_mass(masses, momentum, equations.gradient)
     if not full or factor == 0.0:
         return
-    r, s = np.empty(3), np.empty(3)
-    tangent, pairs, entries = equations.tangent, masses.pairs, masses.entries
-    for k in range(pairs.shape[0]):
-        first, second = pairs[k, 0], pairs[k, 1]
-        block, m = tangent[pairs[k, 2]], factor * entries[k]
-        moves, follows = _vector(rows, x, first, r), _vector(rows, x, second, s)
-        twice = first != second and rows.block[first] == rows.block[second]
-        for half in range(2 if twice else 1):
-            if half == 1:
-                r, s = s, r
-                moves, follows = follows, moves
-            if moves and follows:
-                for d in range(3):
-                    block[d, d] += m
-            if rows.kind[first] != ORIGIN or rows.kind[second] != ORIGIN:
-                add_turned(r, s, m, block, 3, 3)
-                for i in range(3):
-                    j, n = (i + 1) % 3, (i + 2) % 3
-                    if moves:  # u . (w x s)
-                        block[i, 3 + j] += m * s[n]
-                        block[i, 3 + n] -= m * s[j]
-                    if follows:  # (w x r) . u
-                        block[3 + j, i] += m * r[n]
-                        block[3 + n, i] -= m * r[j]
-
-
-@njit(cache=True, error_model="numpy")
-def _reduce(rows, x, forces, out):
-    """Fill ``out`` (b, 6) with the forces and moments of ``forces`` (n, 3) on the frames."""
-    for k in range(out.shape[0]):
-        for i in range(6):
-            out[k, i] = 0.0
-    r = np.empty(3)
-    for row in range(x.shape[0]):
-        kind = rows.kind[row]
-        if kind == FIXED:
-            continue
-        target, g = out[rows.block[row]], forces[row]
-        if kind != DIRECTOR:
-            for d in range(3):
-                target[d] += g[d]
-        if kind != ORIGIN:
-            _vector(rows, x, row, r)
-            target[3] += r[1] * g[2] - r[2] * g[1]
-            target[4] += r[2] * g[0] - r[0] * g[2]
-            target[5] += r[0] * g[1] - r[1] * g[0]
-
-
-@njit(cache=True, error_model="numpy")
-def _add_curvature(rows, x, gradient, tangent):
-    """Add the second derivative of rotations, ``(g r^T + r g^T) / 2 - (g . r) 1`` for each row that turns."""
-    r = np.empty(3)
-    for row in range(x.shape[0]):
-        if rows.kind[row] != DIRECTOR and rows.kind[row] != MOUNTED:
-            continue
-        _vector(rows, x, row, r)
-        g, block = gradient[row], tangent[rows.block[row]]
-        dot = g[0] * r[0] + g[1] * r[1] + g[2] * r[2]
+    m = np.empty((3, 3))
+    for k in range(masses.pairs.shape[0]):
+        one, other, block = masses.pairs[k, 0], masses.pairs[k, 1], equations.tangent[masses.pairs[k, 2]]
+        entries = masses.entries[k]
         for i in range(3):
+            block[i, i] += factor * entries[0, 0]
             for j in range(3):
-                block[3 + i, 3 + j] += 0.5 * (g[i] * r[j] + r[i] * g[j])
-            block[3 + i, 3 + i] -= dot
+                m[i, j] = factor * entries[1 + i, 1 + j]
+        add_turned(x, one, other, m, block)
+        for i in range(3):
+            j, n = (i + 1) % 3, (i + 2) % 3
+            r, s = 0.0, 0.0
+            for a in range(1, 4):
+                r += entries[a, 0] * x[one + a, i]
+                s += entries[0, a] * x[other + a, i]
+            # u . (w x s) and (w x r) . u, component i of s and r
+            block[j, 3 + n] += factor * s
+            block[n, 3 + j] -= factor * s
+            block[3 + n, j] += factor * r
+            block[3 + j, n] -= factor * r
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _reduce(frames, x, forces, out):
+    """Fill ``out`` (b, 6) with the forces and moments of ``forces`` (n, 3) on the frames.
+
+    The forces on rows that follow a frame are replaced by those on its own rows.
+    """
+    for k in range(frames.mounted.shape[0]):
+        row, owner, arm = frames.mounted[k], frames.owner[k], frames.arm[k]
+        p, q, r = forces[row, 0], forces[row, 1], forces[row, 2]
+        moves, a, b, g = frames.moves[k], arm[0], arm[1], arm[2]
+        for d, force in ((0, p), (1, q), (2, r)):
+            forces[owner, d] += moves * force
+            forces[owner + 1, d] += a * force
+            forces[owner + 2, d] += b * force
+            forces[owner + 3, d] += g * force
+            forces[row, d] = 0.0
+    for f in range(frames.rows.shape[0]):
+        row, target = frames.rows[f], out[frames.block[f]]
+        a, b, c = 0.0, 0.0, 0.0
+        for k in range(row + 1, row + 4):
+            p, q, r = x[k, 0], x[k, 1], x[k, 2]
+            u, v, w = forces[k, 0], forces[k, 1], forces[k, 2]
+            a += q * w - r * v
+            b += r * u - p * w
+            c += p * v - q * u
+        target[0], target[1], target[2] = forces[row, 0], forces[row, 1], forces[row, 2]
+        target[3], target[4], target[5] = a, b, c
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _add_curvature(frames, x, gradient, tangent):
+    """Add the second derivative of rotations, ``(g d^T + d g^T) / 2 - (g . d) 1`` for each director.
+
+    Forces on rows that follow a frame must have been replaced by those on its own rows.
+    """
+    for f in range(frames.rows.shape[0]):
+        row, block = frames.rows[f], tangent[frames.block[f]]
+        a, b, c, p, q, r = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(row + 1, row + 4):
+            u, v, w = x[k, 0], x[k, 1], x[k, 2]
+            e, h, g = gradient[k, 0], gradient[k, 1], gradient[k, 2]
+            a += e * u
+            b += h * v
+            c += g * w
+            p += e * v + h * u
+            q += e * w + g * u
+            r += h * w + g * v
+        block[3, 3] -= b + c
+        block[4, 4] -= a + c
+        block[5, 5] -= a + b
+        block[3, 4] += 0.5 * p
+        block[4, 3] += 0.5 * p
+        block[3, 5] += 0.5 * q
+        block[5, 3] += 0.5 * q
+        block[4, 5] += 0.5 * r
+        block[5, 4] += 0.5 * r
 
 
 @njit(cache=True, error_model="numpy")
@@ -448,19 +500,19 @@ def assemble(body, x, effort, step, equations, full):
     if full:
         equations.tangent[:] = 0.0
     _add_elements(body.elements, x, step, equations, full)
-    _add_inertia(body.masses, body.rows, x, step, equations, full)
+    _add_inertia(body.masses, x, step, equations, full)
     add_constraints(body, x, effort, equations, full)
-    _reduce(body.rows, x, gradient, equations.residual)
+    _reduce(body.frames, x, gradient, equations.residual)
     free, residual = body.components.free, equations.residual
     for k in range(free.shape[0]):
         for i in range(6):
             residual[k, i] *= free[k, i]
     if full:
-        _add_curvature(body.rows, x, gradient, equations.tangent)
+        _add_curvature(body.frames, x, gradient, equations.tangent)
         _hold(body.pattern, body.components, equations)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def move(frames, x, motion, turned):
     """Move the frames in place by ``motion`` (b, 6): displacements of their origins [m], and spins [rad].
 
@@ -505,7 +557,7 @@ def move(frames, x, motion, turned):
             x[row, d] = value
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def motion_of(frames, free, x, velocity, h, out):
     """Fill ``out`` (b, 6) with ``h`` times the motion of the frames at ``x`` (n, 3) with velocities of the rows."""
     for f in range(frames.rows.shape[0]):

@@ -13,9 +13,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from softgym_envs.mechanics.assembly import MassMatrix
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_body import beam_body, is_beam_body
 from softgym_envs.mechanics.solvers.beam_equations import (

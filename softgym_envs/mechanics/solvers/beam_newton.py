@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import FAST, njit
 from softgym_envs.mechanics.solvers.beam_equations import assemble, move
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, factorise, solve_lower, solve_upper
 from softgym_envs.mechanics.solvers.complementarity import solve_row
@@ -21,9 +21,10 @@ MAX_ITERATIONS, MAX_SEARCHES = 20, 30
 SHORTEST, SMALLEST_INCREMENT = 1e-3, 0.25
 """Smallest part of a step of Newton's method, and of the way to a target within one time step."""
 SLOW, STEEP = 0.1, 0.75
-"""A step longer than this part of the last one calls for a new factor; or in dynamics for shorter steps."""
-LONG, TOO_LONG = 0.01, 1.0
-"""Steps that turn a frame by more [rad], or move it as far, call for a new factor in statics; or the general solver."""
+"""After a step longer than this part of the last one the factor is renewed; or in dynamics the step is not taken."""
+LONG, LONG_IN_TIME, TOO_LONG = 0.01, 0.002, 1.0
+"""After steps that turn a frame by more [rad], or move it as far, the factor is renewed, in statics and in dynamics; or
+the general solver takes over."""
 REMAINING, SMALLEST = 0.01, 1e-13
 """The next step must be shorter than this part of the tolerance, or than this length [m], which is near rounding.
 Errors of a time step act on the next one through the velocities."""
@@ -64,13 +65,13 @@ def make_factor(blocks: int, size: int) -> Factor:
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def _dot(a, b, signs):
     """Return the sum of the products of two vectors with signs, all of shape (b, 6)."""
+    first, second, sign = a.reshape(a.size), b.reshape(b.size), signs.reshape(signs.size)
     value = 0.0
-    for k in range(a.shape[0]):
-        for i in range(SIZE):
-            value += signs[k, i] * a[k, i] * b[k, i]
+    for i in range(first.shape[0]):
+        value += sign[i] * first[i] * second[i]
     return value
 
 
@@ -94,7 +95,7 @@ def factorise_tangent(body, equations, factor, rows):
     return negative
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def _correct(body, equations, factor, effort, target, driven, forced, one_way):
     """Solve the linearised equations for the steps of the motions and of the efforts, as `Statics` does.
 
@@ -129,23 +130,21 @@ def _correct(body, equations, factor, effort, target, driven, forced, one_way):
             for j in range(count):
                 value -= factor.driven[i, j] * gap[j]
             change[driven[i]] = value
-    for k in range(step.shape[0]):
-        for i in range(SIZE):
-            step[k, i] = -step[k, i]
+    size = step.size
+    flat, signs, scale = step.reshape(size), factor.signs.reshape(size), body.components.scale.reshape(size)
+    for i in range(flat.shape[0]):
+        flat[i] *= -signs[i]
     for c in range(change.shape[0]):
         if change[c] != 0.0:
-            half = factor.half[c]
-            for k in range(step.shape[0]):
-                for i in range(SIZE):
-                    step[k, i] += change[c] * half[k, i]
-    for k in range(step.shape[0]):
-        for i in range(SIZE):
-            step[k, i] *= factor.signs[k, i]
+            half = factor.half[c].reshape(size)
+            for i in range(flat.shape[0]):
+                flat[i] += change[c] * signs[i] * half[i]
     solve_upper(equations.tangent, body.pattern.pointers, body.pattern.columns, step)
-    largest, scale = 0.0, body.components.scale
-    for k in range(step.shape[0]):
-        for i in range(SIZE):
-            largest = max(largest, abs(step[k, i]) * scale[k, i])
+    largest = 0.0
+    for i in range(flat.shape[0]):
+        largest = max(largest, abs(flat[i]) * scale[i])
+        if flat[i] != flat[i]:  # NaN
+            return np.nan
     return largest
 
 
@@ -174,44 +173,48 @@ def _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, 
 def solve(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance, fresh):
     """Solve the equations in place, starting at the predicted rows ``x``; the iterations, or -1 on failure.
 
-    It starts with the factor of the last solution unless ``fresh``, and fails where a step with a new factor is longer
-    than the last of them; in dynamics, where any step is not much shorter than the last one. ``one_way`` (d,) are
-    driven rows that cannot push.
+    It starts with the factor of the last solution unless ``fresh``. It fails where a step with a new factor is longer
+    than the last of them, and in dynamics where the first step with a factor is not followed by a shorter one: such
+    steps are too long. ``one_way`` (d,) are driven rows that cannot push.
     """
     rows = np.concatenate((driven, forced))
-    definite = step.h == np.inf
+    static = step.h == np.inf
     before = last = np.inf
-    kept = not fresh
+    taken = 0  # with the present factor, in this solution
     radian = body.components.scale[:, 3:].max()
-    long = LONG * radian if step.h == np.inf else np.inf
+    long = (LONG if static else LONG_IN_TIME) * radian
     enough = min(tolerance, max(REMAINING * tolerance, SMALLEST))
     for iteration in range(1, MAX_ITERATIONS + 1):
         if not fresh:
             assemble(body, x, effort, step, equations, False)
-        elif _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, definite) < 0:
+        elif _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, static) < 0:
             return -1
+        else:
+            taken = 0
         length = _correct(body, equations, factor, effort, target, driven, forced, one_way)
         if not length <= TOO_LONG * radian:  # also true for NaN
             return -1
-        ratio = length / before
-        if step.h < np.inf and ratio > STEEP and length > tolerance:
-            return -1
+        ratio = length / before if iteration > 1 else 1.0
         if fresh:
             if length > last:
                 return -1
             last = length
-        elif ratio > 1.0:
+        elif iteration > 1 and ratio > (1.0 if static else STEEP) and (static or length > tolerance):
+            if taken == 1 and not static:
+                return -1
             fresh = True  # this step is not taken
             continue
         move(body.frames, x, factor.step, factor.turned)
         for c in range(effort.shape[0]):
             effort[c] += factor.efforts[c]
-        # Two steps in a row with one factor, or the last new factor, tell how much shorter the next step will be.
-        known = iteration > 1 and (fresh or kept)
-        if length <= enough or (known and length * ratio <= enough):
+        taken += 1
+        # The next step with the same factor will be shorter by about this ratio again. Where the last step was the
+        # first one with it, Newton's own, by up to twice the ratio.
+        next_ratio = 2.0 * ratio if taken == 2 else ratio
+        if length <= enough or length * next_ratio <= enough:
             return iteration
-        kept = not fresh
-        fresh = length > long or (iteration > 1 and ratio > SLOW)
+        # In dynamics a second step with each new factor tells whether the first one was too long.
+        fresh = length > long and (static or not fresh) or (iteration > 1 and not fresh and ratio > SLOW)
         before = length
     return -1
 

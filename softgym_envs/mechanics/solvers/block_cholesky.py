@@ -11,7 +11,8 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from softgym_envs.mechanics.compilation import FAST, njit
 
 SIZE = 6
 """Rows of a block."""
@@ -84,7 +85,7 @@ def analyse(count: int, pairs: Iterable[tuple[int, int]]) -> tuple[np.ndarray, B
     return place, pattern._replace(targets=np.array(targets, dtype=np.int64))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _invert_factor(D, diagonal, sign, negative):
     """Replace a block by the inverse of its factor (lower triangle), and fill the signs (6,) of its pivots.
 
@@ -120,7 +121,7 @@ def _invert_factor(D, diagonal, sign, negative):
     return negative
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def factorise(A, pointers, targets, signs):
     """Factorise a matrix in place and fill the signs (b, 6) of the pivots; diagonal blocks become inverses of factors.
 
@@ -128,7 +129,7 @@ def factorise(A, pointers, targets, signs):
     down.
     """
     count, t, negative = pointers.shape[0] - 1, 0, 0
-    product, diagonal = np.empty((SIZE, SIZE)), np.empty((count, SIZE))
+    signed, diagonal = np.empty((SIZE, SIZE)), np.empty((count, SIZE))
     for k in range(count):
         for i in range(SIZE):
             diagonal[k, i] = A[k, i, i]
@@ -139,52 +140,62 @@ def factorise(A, pointers, targets, signs):
             return -1
         for p in range(pointers[k], pointers[k + 1]):
             B = A[count + p]
-            for i in range(SIZE):
-                for j in range(SIZE):
-                    product[i, j] = D[i, 0] * B[0, j]
-                for m in range(1, SIZE):
-                    for j in range(SIZE):
-                        product[i, j] += D[i, m] * B[m, j]
-            for i in range(SIZE):
-                for j in range(SIZE):
-                    B[i, j] = sign[i] * product[i, j]
+            for i in range(SIZE - 1, -1, -1):  # row i depends on the rows before it
+                a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                for m in range(i + 1):
+                    v = D[i, m]
+                    a += v * B[m, 0]
+                    b += v * B[m, 1]
+                    c += v * B[m, 2]
+                    d += v * B[m, 3]
+                    e += v * B[m, 4]
+                    f += v * B[m, 5]
+                s = sign[i]
+                B[i, 0], B[i, 1], B[i, 2], B[i, 3], B[i, 4], B[i, 5] = s * a, s * b, s * c, s * d, s * e, s * f
+                signed[i, 0], signed[i, 1], signed[i, 2], signed[i, 3], signed[i, 4], signed[i, 5] = a, b, c, d, e, f
             for q in range(pointers[k], p + 1):
                 C, L = A[targets[t]], A[count + q]
                 for i in range(SIZE):
+                    a, b, c, d, e, f = C[i, 0], C[i, 1], C[i, 2], C[i, 3], C[i, 4], C[i, 5]
                     for m in range(SIZE):
-                        factor = sign[m] * L[m, i]
-                        for j in range(SIZE):
-                            C[i, j] -= factor * B[m, j]
+                        v = L[m, i]
+                        a -= v * signed[m, 0]
+                        b -= v * signed[m, 1]
+                        c -= v * signed[m, 2]
+                        d -= v * signed[m, 3]
+                        e -= v * signed[m, 4]
+                        f -= v * signed[m, 5]
+                    C[i, 0], C[i, 1], C[i, 2], C[i, 3], C[i, 4], C[i, 5] = a, b, c, d, e, f
                 t += 1
     return negative
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def solve_lower(A, pointers, columns, y):
     """Solve with the lower factor ``U^T`` in place, for one vector ``y`` (b, 6). Leading zeros are passed over.
 
     The result is to be multiplied by the signs before `solve_upper`.
     """
     count = pointers.shape[0] - 1
-    v = np.empty(SIZE)
     for k in range(count):
-        if not (y[k, 0] or y[k, 1] or y[k, 2] or y[k, 3] or y[k, 4] or y[k, 5]):
+        a, b, c, d, e, f = y[k, 0], y[k, 1], y[k, 2], y[k, 3], y[k, 4], y[k, 5]
+        if not (a or b or c or d or e or f):
             continue
         D = A[k]
-        for i in range(SIZE):
-            v[i] = 0.0
-            for j in range(i + 1):
-                v[i] += D[i, j] * y[k, j]
-        for i in range(SIZE):
-            y[k, i] = v[i]
+        f = D[5, 0] * a + D[5, 1] * b + D[5, 2] * c + D[5, 3] * d + D[5, 4] * e + D[5, 5] * f
+        e = D[4, 0] * a + D[4, 1] * b + D[4, 2] * c + D[4, 3] * d + D[4, 4] * e
+        d = D[3, 0] * a + D[3, 1] * b + D[3, 2] * c + D[3, 3] * d
+        c = D[2, 0] * a + D[2, 1] * b + D[2, 2] * c
+        b = D[1, 0] * a + D[1, 1] * b
+        a = D[0, 0] * a
+        y[k, 0], y[k, 1], y[k, 2], y[k, 3], y[k, 4], y[k, 5] = a, b, c, d, e, f
         for p in range(pointers[k], pointers[k + 1]):
             B, row = A[count + p], columns[p]
-            for m in range(SIZE):
-                for j in range(SIZE):
-                    y[row, j] -= B[m, j] * v[m]
+            for j in range(SIZE):
+                y[row, j] -= B[0, j] * a + B[1, j] * b + B[2, j] * c + B[3, j] * d + B[4, j] * e + B[5, j] * f
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def solve_upper(A, pointers, columns, y):
     """Solve with the upper factor ``U`` in place, for one vector ``y`` (b, 6)."""
     count = pointers.shape[0] - 1
@@ -194,12 +205,14 @@ def solve_upper(A, pointers, columns, y):
             v[i] = y[k, i]
         for p in range(pointers[k], pointers[k + 1]):
             B, row = A[count + p], columns[p]
+            a, b, c, d, e, f = y[row, 0], y[row, 1], y[row, 2], y[row, 3], y[row, 4], y[row, 5]
             for i in range(SIZE):
-                for j in range(SIZE):
-                    v[i] -= B[i, j] * y[row, j]
+                v[i] -= B[i, 0] * a + B[i, 1] * b + B[i, 2] * c + B[i, 3] * d + B[i, 4] * e + B[i, 5] * f
         D = A[k]
-        for j in range(SIZE):
-            y[k, j] = 0.0
-        for i in range(SIZE):
-            for j in range(i + 1):
-                y[k, j] += D[i, j] * v[i]
+        a, b, c, d, e, f = v[0], v[1], v[2], v[3], v[4], v[5]
+        y[k, 0] = D[0, 0] * a + D[1, 0] * b + D[2, 0] * c + D[3, 0] * d + D[4, 0] * e + D[5, 0] * f
+        y[k, 1] = D[1, 1] * b + D[2, 1] * c + D[3, 1] * d + D[4, 1] * e + D[5, 1] * f
+        y[k, 2] = D[2, 2] * c + D[3, 2] * d + D[4, 2] * e + D[5, 2] * f
+        y[k, 3] = D[3, 3] * d + D[4, 3] * e + D[5, 3] * f
+        y[k, 4] = D[4, 4] * e + D[5, 4] * f
+        y[k, 5] = D[5, 5] * f

@@ -1,4 +1,4 @@
-"""Symmetric bodies from a mesh of one part.
+"""Symmetries of a robot, and symmetric bodies from a mesh of one part.
 
 Mesh generators do not preserve symmetry: of two identical legs, one becomes stiffer. A body that is mirrored from one
 part responds as symmetrically as its shape, up to round-off.
@@ -6,9 +6,54 @@ part responds as symmetrically as its shape, up to round-off.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from softgym_envs.robots.geometry.meshing import BodyMesh
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """A reflection or rotation about the origin that maps each body of a robot, and its mesh, to itself.
+
+    The image of an equilibrium is then an equilibrium too.
+
+    Attributes:
+        matrix: orthogonal; maps positions and forces, shape (3, 3). Every effector is its own image at rest.
+        order: actuator ``k`` of the image does what actuator ``order[k]`` does, shape (n_a,).
+    """
+
+    matrix: np.ndarray
+    order: np.ndarray
+
+    def rows(self, effectors: int) -> np.ndarray:
+        """Return the map of the coordinates of several effectors, shape (3 effectors, 3 effectors)."""
+        return np.kron(np.eye(effectors), self.matrix)
+
+
+def left_right(order: Sequence[int]) -> tuple[Symmetry, ...]:
+    """Return the reflection in the plane x = 0, which exchanges actuators in this ``order``."""
+    return (Symmetry(np.diag([-1.0, 1.0, 1.0]), np.array(order)),)
+
+
+def square_symmetries(rings: int = 1) -> tuple[Symmetry, ...]:
+    """Return the seven rotations and reflections of a square about the z axis, without the identity.
+
+    Args:
+        rings: number of groups of four actuators in the directions +y, -x, -y and +x.
+    """
+    directions = np.array([(0, 1, 0), (-1, 0, 0), (0, -1, 0), (1, 0, 0)])
+    quarter, plane = np.array([(0, -1, 0), (1, 0, 0), (0, 0, 1)]), np.diag([-1, 1, 1])
+    turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
+    found = []
+    for matrix in (*turns[1:], *(turn @ plane for turn in turns)):
+        # An actuator of the image comes from where the inverse takes it.
+        order = [int((directions == matrix.T @ direction).all(axis=1).argmax()) for direction in directions]
+        whole = np.concatenate([4 * ring + np.array(order) for ring in range(rings)])
+        found.append(Symmetry(matrix.astype(float), whole))
+    return tuple(found)
 
 
 def mirrored(part: BodyMesh, normal: tuple[float, float, float]) -> BodyMesh:

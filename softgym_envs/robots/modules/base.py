@@ -5,16 +5,19 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.builder import ModelBuilder
+from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.constraints.pose import Pose
-from softgym_envs.mechanics.elements.tetrahedra import SolidOptions
+from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles
+from softgym_envs.mechanics.elements.tetrahedra import SolidOptions, Tetrahedra
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.mechanics.surfaces import cavity_around
 from softgym_envs.robots.base import Drawing
 from softgym_envs.robots.geometry.export import write_drawing
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
@@ -22,11 +25,26 @@ from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 POSE = ("x", "y", "z", "rx", "ry", "rz")
 """Motion of a port: displacement of its middle [m] and rotation [rad]; the wrench has forces [N] and torques [N m]."""
 
+DENSITY = 1100.0
+"""Of the printed material [kg/m3]."""
+
 MATERIAL = (
     DesignVariable("young_modulus", 1.0e5, 3.0e9, 1.0e7, "Pa", "stiffness of the printed material", log=True),
     DesignVariable("poisson_ratio", 0.0, 0.49, 0.40, "1", "0.5 is incompressible"),
 )
 """Variables that all modules have."""
+
+
+class Placed(NamedTuple):
+    """A body that `Module.add_to` has added to a model.
+
+    Attributes:
+        far: first row of the frame that carries the far port.
+        cavity: quadratic triangles (k, 6) around the cavity of a closed module, else None.
+    """
+
+    far: int
+    cavity: np.ndarray | None
 
 
 class Module(ABC):
@@ -40,11 +58,13 @@ class Module(ABC):
         design_space: dimensions and material.
         symmetry: reflections about its middle that map any body onto itself: the axes that each of them reverses.
             ``"x"`` is the plane normal to x, ``"xz"`` half a turn about y.
+        closed: whether the middle of the body is a closed cavity, which takes a pressure.
     """
 
     name: ClassVar[str]
     design_space: ClassVar[DesignSpace]
     symmetry: ClassVar[tuple[str, ...]] = ("x", "y", "z")
+    closed: ClassVar[bool] = False
 
     @abstractmethod
     def drawing(self, design: Mapping[str, float]) -> Drawing:
@@ -79,7 +99,7 @@ class Module(ABC):
         origin: np.ndarray | None = None,
         rotation: np.ndarray | None = None,
         refine: float = 1.0,
-    ) -> int:
+    ) -> Placed:
         """Add the body, of quadratic tetrahedra, to a model that is being built.
 
         Args:
@@ -90,9 +110,6 @@ class Module(ABC):
             origin: middle of the near port [m], shape (3,); default the origin of space.
             rotation: matrix whose columns are the axes of the module, shape (3, 3); default those of space.
             refine: see `body`.
-
-        Returns:
-            First row of the frame that carries the far port.
         """
         complete = self.design_space.complete(design)
         origin = np.zeros(3) if origin is None else np.asarray(origin, dtype=float)
@@ -118,20 +135,39 @@ class Module(ABC):
         if far is None:
             far = builder.add_frame(origin + length * rotation[:, 2])
         builder.carry(far, start + np.flatnonzero(height > (1.0 - 1e-6) * length))
-        return far
+        cavity = None
+        if self.closed:
+            inside = cavity_around(mesh.nodes, mesh.tetrahedra, np.array([0.0, 0.0, 0.5 * length]), self.name)
+            _, quadratic = add_midside_nodes(mesh.nodes, mesh.tetrahedra)
+            cavity = start + quadratic_triangles(inside, quadratic)
+        return Placed(far, cavity)
 
     def elasticity(self, design: Mapping[str, float], rotation: np.ndarray) -> SolidOptions:
         """Return the elasticity of the body of a complete design; the columns of ``rotation`` (3, 3) are its axes."""
-        return {"young_modulus": design["young_modulus"], "poisson_ratio": design["poisson_ratio"]}
+        return {
+            "young_modulus": design["young_modulus"],
+            "poisson_ratio": design["poisson_ratio"],
+            "density": DENSITY,
+        }
 
     def model(self, design: Mapping[str, float] | None = None, *, refine: float = 1.0) -> MechanicalModel:
-        """Return the model of a design with the near port clamped; its six actuators drive the pose of the far port."""
+        """Return the model of a design with the near port clamped.
+
+        Its first six actuators drive the pose of the far port. A closed module has a seventh, the volume of its cavity.
+        """
         builder = ModelBuilder()
-        far = self.add_to(builder, design, refine=refine)
+        placed = self.add_to(builder, design, refine=refine)
         model = builder.build()
         for component, name in enumerate(POSE):
-            model.add("a", Pose(name, far, component, model.nodes))
+            model.add("a", Pose(name, placed.far, component, model.nodes))
+        if placed.cavity is not None:
+            model.add("a", Cavity("cavity", placed.cavity, model.nodes))
         return model
+
+    def mass(self, design: Mapping[str, float] | None = None) -> float:
+        """Return the mass of a body [kg], from its mesh; for the exceptions see `body`."""
+        mesh = self.body(design)
+        return DENSITY * float(Tetrahedra(mesh.nodes, mesh.tetrahedra).volume)
 
     def write(self, path: str | Path, design: Mapping[str, float] | None = None) -> Path:
         """Write the exact shape as ``.step`` or ``.stl`` [mm] and return the path.
@@ -150,5 +186,5 @@ class Module(ABC):
             DesignError: for a malformed design.
             InfeasibleDesign: if the body cannot be drawn or meshed.
         """
-        rest = Statics(self.model(design, refine=refine)).solve(np.zeros(6), "effort")
-        return rest.condensed.W.aa
+        rest = Statics(self.model(design, refine=refine)).solve(np.zeros(6 + self.closed), "effort")
+        return rest.condensed.W.aa[:6, :6]

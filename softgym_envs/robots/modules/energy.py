@@ -21,7 +21,8 @@ from functools import cache
 from itertools import combinations_with_replacement
 
 import numpy as np
-from numba import njit
+
+from softgym_envs.mechanics.compilation import njit
 
 _SIGNS = {"x": (-1, 1, 1, 1, -1, -1), "y": (1, -1, 1, -1, 1, -1), "z": (-1, -1, 1, 1, 1, -1)}
 """Sign of each strain when an axis through the middle of the module is reversed; the last one swaps the ports."""
@@ -58,6 +59,71 @@ def terms(symmetry: tuple[str, ...] = MIRRORED) -> np.ndarray:
     found = np.array(rows, dtype=np.int64)
     found.flags.writeable = False
     return found
+
+
+@cache
+def volume_terms(symmetry: tuple[str, ...] = MIRRORED) -> np.ndarray:
+    """Return the products of strains that no reflection changes, of which the volume of a cavity may consist.
+
+    Returns:
+        Factors of each product, -1 for no factor, shape (m, 3).
+    """
+    signs = reflections(symmetry)
+    products = [f for degree in (1, 2, 3) for f in combinations_with_replacement(range(6), degree)]
+    kept = [[*f, *([-1] * (3 - len(f)))] for f in products if (signs[:, list(f)].prod(axis=1) == 1).all()]
+    found = np.array(kept, dtype=np.int64)
+    found.flags.writeable = False
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _polynomial(e, factors, b, gradient, hessian):
+    """Return a sum of products of strains (6,) and write its gradient (6,) and Hessian (6, 6)."""
+    x, first, second = np.ones(7), np.zeros(7), np.zeros((7, 7))
+    x[:6] = e
+    total = 0.0
+    for m in range(factors.shape[0]):
+        p, q, r = factors[m]
+        total += b[m] * x[p] * x[q] * x[r]
+        first[p] += b[m] * x[q] * x[r]
+        first[q] += b[m] * x[p] * x[r]
+        first[r] += b[m] * x[p] * x[q]
+        second[p, q] += b[m] * x[r]
+        second[q, p] += b[m] * x[r]
+        second[p, r] += b[m] * x[q]
+        second[r, p] += b[m] * x[q]
+        second[q, r] += b[m] * x[p]
+        second[r, q] += b[m] * x[p]
+    gradient[:] = first[:6]
+    hessian[:] = second[:6, :6]
+    return total
+
+
+class CavityVolume:
+    """How the volume of the cavity of a closed module grows with the strains of a superelement.
+
+    The walls bulge under pressure; what that adds, with the ports held, is proportional to the pressure.
+
+    Args:
+        length: of the module [m].
+        coefficients: of the `volume_terms` of its symmetry [m3], shape (m,).
+        bulge: growth by pressure with the ports held [m3/Pa].
+        symmetry: of the module; see `reflections`.
+    """
+
+    def __init__(
+        self, length: float, coefficients: np.ndarray, bulge: float, symmetry: tuple[str, ...] = MIRRORED
+    ) -> None:
+        self.bulge = float(bulge)
+        self._coefficients = np.array(coefficients, dtype=float)
+        self._terms = volume_terms(symmetry)
+        self._scale = np.array([1.0 / length] * 3 + [1.0] * 3)
+
+    def evaluate(self, strains: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the growth [m3], its gradient (6,) and its Hessian (6, 6) at strains (6,) [m, 1], without pressure."""
+        gradient, hessian = np.empty(6), np.empty((6, 6))
+        growth = _polynomial(self._scale * strains, self._terms, self._coefficients, gradient, hessian)
+        return growth, self._scale * gradient, self._scale[:, None] * hessian * self._scale
 
 
 @njit(cache=True, error_model="numpy")
@@ -107,6 +173,8 @@ class ModuleEnergy:
         rotation: the largest load that was learned, as the angle by which it would turn the softest rotation [rad];
             see `softgym_envs.robots.modules.states.solve_states`. Default any load.
         largest_strains: size of each strain that was learned, the first three over the length, shape (6,). Default any.
+        error: bound on the error of the strains under a load, relative to their size, the first three over the length.
+            Default none.
 
     Raises:
         ValueError: for a stiffness that is not positive.
@@ -120,7 +188,9 @@ class ModuleEnergy:
         symmetry: tuple[str, ...] = MIRRORED,
         rotation: float = np.inf,
         largest_strains: np.ndarray | float = np.inf,
+        error: float = 0.0,
     ) -> None:
+        self.error = float(error)
         self.stiffness = np.array(stiffness, dtype=float)
         self.corrections = np.array(corrections, dtype=float)
         if not (self.stiffness > 0.0).all():
@@ -136,6 +206,14 @@ class ModuleEnergy:
         gradient, hessian = np.empty(6), np.empty((6, 6))
         energy = _energy(self._scale * strains, self._terms, self.stiffness, self.corrections, gradient, hessian)
         return energy, self._scale * gradient, self._scale[:, None] * hessian * self._scale
+
+    def possible_errors(self, strains: np.ndarray) -> np.ndarray:
+        """Return the errors of the gradient at strains (6,) that wrong strains cause, by axis: shape (6, 6) [N, N m].
+
+        Row i is that of strains which are off along their axis i by the bound. So the root of the sum of squares of the
+        work of all rows along a motion is the largest work of all errors within the bound.
+        """
+        return self.error * np.linalg.norm(self._scale * strains) / self._scale[:, None] * self.evaluate(strains)[2]
 
     def load(self, strains: np.ndarray) -> float:
         """Return the load at strains (6,) over the largest one that was learned."""

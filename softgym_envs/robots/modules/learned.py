@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import combinations_with_replacement
 from pathlib import Path
@@ -17,11 +17,14 @@ import numpy as np
 
 from softgym_envs.errors import DesignError, WeightsError
 from softgym_envs.robots.modules.base import Module
-from softgym_envs.robots.modules.energy import ModuleEnergy, terms
+from softgym_envs.robots.modules.energy import CavityVolume, ModuleEnergy, terms
 from softgym_envs.robots.modules.registry import MODULES
 
+EDGE = 0.5
+"""A dimension counts as being at its bound within this part of half its range, linearly from 0 to 1."""
+
 FORMAT = 1
-_ARRAYS = ("stiffness", "corrections", "largest_strains")
+_ARRAYS = ("stiffness", "corrections", "largest_strains", "swelling", "bulge")
 FOLDER = Path(__file__).parent / "energies"
 
 
@@ -47,6 +50,8 @@ class LearnedModule:
         largest_strains: size of each strain of the states, the first three over the length, shape (6,).
         errors: those on bodies that were not used, as `learning.errors` returns them.
         degrees: of the polynomials of ``stiffness`` and ``corrections``.
+        swelling: weights of the coefficients of `energy.CavityVolume`, shape (p, m); none if the module is not closed.
+        bulge: weights of the logarithm of its ``bulge``, shape (p,); likewise.
     """
 
     module: str
@@ -58,6 +63,8 @@ class LearnedModule:
     largest_strains: np.ndarray
     errors: Mapping[str, Mapping[str, float]]
     degrees: tuple[int, int]
+    swelling: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    bulge: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     @property
     def terms(self) -> np.ndarray:
@@ -76,6 +83,45 @@ class LearnedModule:
         Raises:
             DesignError: for a malformed design, or one outside the box.
         """
+        length, modulus, unit = self._body(design)
+        modulus *= length**3
+        P, Q = (polynomials(unit, degree)[0] for degree in self.degrees)
+        return ModuleEnergy(
+            length,
+            modulus * np.exp(P @ self.stiffness),
+            Q @ self.corrections,
+            MODULES[self.module].symmetry,  # type: ignore[attr-defined]
+            self.rotation,
+            self.largest_strains,
+            self.error(unit[0]),
+        )
+
+    def error(self, unit: np.ndarray) -> float:
+        """Return the bound on the error of the strains relative to their size, of a body (v,) in [-1, 1].
+
+        It is the largest error on bodies that were not learned: inside the box, and at its corners. Between these, its
+        logarithm is linear in the share of dimensions at their bounds, as in `softgym_envs.surrogate.domain`.
+        """
+        inside, corners = (self.errors.get(place, {}).get("relative_max", 0.0) for place in ("inside", "corners"))
+        share = np.clip((np.abs(unit) - 1.0) / EDGE + 1.0, 0.0, 1.0).mean()
+        return float(max(inside, 1e-300) ** (1.0 - share) * max(corners, inside, 1e-300) ** share)
+
+    def cavity(self, design: Mapping[str, float] | None = None) -> CavityVolume:
+        """Return how the volume of the cavity of a body grows; see `energy`.
+
+        Raises:
+            ValueError: if the module has no closed cavity.
+        """
+        if not len(self.swelling):
+            raise ValueError(f"module '{self.module}' has no closed cavity")
+        length, modulus, unit = self._body(design)
+        P = polynomials(unit, self.degrees[0])[0]
+        bulge = length**3 / modulus * float(np.exp(P @ self.bulge))
+        symmetry = MODULES[self.module].symmetry  # type: ignore[attr-defined]
+        return CavityVolume(length, length**3 * (P @ self.swelling), bulge, symmetry)
+
+    def _body(self, design: Mapping[str, float] | None) -> tuple[float, float, np.ndarray]:
+        """Return the length [m] and Young's modulus [Pa] of a body, and its dimensions in [-1, 1], shape (1, v)."""
         module: Module = MODULES[self.module]()
         complete = module.design_space.complete(design)
         for name, (low, high) in self.box.items():
@@ -90,15 +136,7 @@ class LearnedModule:
                     f"superelement '{self.module}' was learned for {name} = {value:g} only, got {complete[name]:g}"
                 )
         unit = self.unit(np.array([[complete[name] for name in self.box]]))
-        length = module.length(complete)
-        return ModuleEnergy(
-            length,
-            complete["young_modulus"] * length**3 * np.exp(polynomials(unit, self.degrees[0]) @ self.stiffness)[0],
-            (polynomials(unit, self.degrees[1]) @ self.corrections)[0],
-            module.symmetry,
-            self.rotation,
-            self.largest_strains,
-        )
+        return module.length(complete), complete["young_modulus"], unit
 
     def save(self, path: str | Path) -> None:
         """Write the superelement as JSON, for `load_module`."""
@@ -123,7 +161,8 @@ def load_module(path: str | Path) -> LearnedModule:
         # Files of earlier versions do not limit strains.
         record.setdefault("largest_strains", [np.inf] * 6)
         for name in _ARRAYS:
-            record[name] = np.array(record[name], dtype=float)
+            if name in record:
+                record[name] = np.array(record[name], dtype=float)
         found = LearnedModule(**record)
         if found.corrections.shape[-1] != len(found.terms):
             raise ValueError(f"it has {found.corrections.shape[-1]} corrections, needed {len(found.terms)}")

@@ -16,6 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import qmc
 
+from softgym_envs.robots.modules.base import Module
+from softgym_envs.robots.modules.energy import volume_terms
 from softgym_envs.robots.modules.learned import LearnedModule, polynomials
 from softgym_envs.robots.modules.registry import MODULES
 from softgym_envs.robots.modules.states import ModuleStates, solve_states
@@ -60,6 +62,9 @@ RECIPES = {
         {"radius": (0.003, 0.006), "width": (0.008, 0.014), "neck": (0.0018, 0.0035)}, 0.3, 16, 16, 2, (2, 1)
     ),
     "torsion_tube": Recipe({"length": (0.015, 0.040), "radius": (0.006, 0.010), "wall": (0.0015, 0.003)}, 0.3),
+    "bellows": Recipe(
+        {"pitch": (0.007, 0.010), "radius": (0.007, 0.010), "amplitude": (0.0012, 0.0024)}, 0.3, 14, 16, 2, (2, 1)
+    ),
     "accordion": Recipe(
         {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)}, 0.4, 14, 16, 2, (2, 1)
     ),
@@ -167,6 +172,23 @@ def _guess(model: LearnedModule, states: ModuleStates, products: _Products, Q: n
     return found
 
 
+def _guess_at_rest(model: LearnedModule, states: ModuleStates, P: np.ndarray, Q: np.ndarray) -> LearnedModule:
+    """Return a model whose stiffness at rest fits that of the states; ``P`` and ``Q`` are their polynomials.
+
+    At rest the stiffness is ``L D L^T``: ``D`` is k, and a correction of first degree is an entry of ``L``.
+    """
+    rest = (states.strain == 0.0).all(axis=1)
+    lower = np.linalg.cholesky(states.hessian[rest])
+    root = np.einsum("nii->ni", lower)
+    terms = model.terms
+    corrections = np.zeros((Q.shape[1], len(terms)))
+    for t in np.flatnonzero(terms[:, 2] < 0):
+        i, j = terms[t, :2]
+        corrections[:, t] = np.linalg.lstsq(Q[rest], lower[:, j, i] / root[:, i], rcond=None)[0]
+    stiffness = np.linalg.lstsq(P[rest], 2.0 * np.log(root), rcond=None)[0]
+    return replace(model, stiffness=stiffness, corrections=corrections)
+
+
 def fit(
     recipe: Recipe,
     module: str,
@@ -196,19 +218,7 @@ def fit(
     )
     unit = model.unit(states.designs)
     P, Q = polynomials(unit, recipe.degrees[0]), polynomials(unit, recipe.degrees[1])
-    rest = (states.strain == 0.0).all(axis=1)
-    # At rest the stiffness is L D L^T: D is k, and a correction of first degree is an entry of L.
-    lower = np.linalg.cholesky(states.hessian[rest])
-    root = np.einsum("nii->ni", lower)
-    start = np.linalg.lstsq(P[rest], 2.0 * np.log(root), rcond=None)[0]
-    terms = model.terms
-    target = terms[:, 0]
-    corrections = np.zeros((Q.shape[1], len(terms)))
-    for t in np.flatnonzero(terms[:, 2] < 0):
-        i, j = terms[t, :2]
-        corrections[:, t] = np.linalg.lstsq(Q[rest], lower[:, j, i] / root[:, i], rcond=None)[0]
-    model = replace(model, stiffness=start, corrections=corrections)
-    products, weights = _products(states.strain, terms), _weights(states, recipe.rotation)
+    products, weights = _products(states.strain, model.terms), _weights(states, recipe.rotation)
 
     def errors_of(trial: LearnedModule) -> tuple[_Corrected, np.ndarray]:
         found = _corrected(trial, states, products)
@@ -218,10 +228,11 @@ def fit(
         return float((residual**2).sum() + RIDGE * (trial.corrections**2).sum())
 
     # The guesses do not always come closer: the search begins at the best of them.
-    trials = [model]
+    trials = [_guess_at_rest(model, states, P, Q)]
     for _ in range(5):
-        trials.append(replace(model, corrections=_guess(trials[-1], states, products, Q)))
+        trials.append(replace(trials[0], corrections=_guess(trials[-1], states, products, Q)))
     model = min(trials, key=lambda trial: cost_of(trial, errors_of(trial)[1]))
+    target = model.terms[:, 0]
     state, residual = errors_of(model)
     cost, damping = cost_of(model, residual), 1e-3
     for _ in range(steps):
@@ -276,52 +287,79 @@ def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
     Returns:
         ``strain_mean`` and ``strain_max``: error of the strains under the load of a state over the largest strain of
         the states, to first order; ``stiffness_mean`` and ``stiffness_max``: largest relative error of the stiffness
-        over all directions of motion.
+        over all directions of motion; ``loaded``: the number of states under load, and ``relative_max``: the largest
+        error of their strains relative to the own strains of the state.
     """
     found = _corrected(model, states, _products(states.strain, model.terms))
     weights = _weights(states, 1.0)
     strain = np.einsum("nij,nj->ni", weights.compliance, found.gradient() - states.gradient)
-    strain = np.linalg.norm(strain, axis=1) / np.linalg.norm(states.strain, axis=1).max()
+    wrong = np.linalg.norm(strain, axis=1)
+    strain = wrong / np.linalg.norm(states.strain, axis=1).max()
     relative = weights.root @ (found.hessian() - states.hessian) @ np.swapaxes(weights.root, 1, 2)
     stiffness = np.abs(np.linalg.eigvalsh(relative)).max(axis=1)
     values = {"strain_mean": strain.mean(), "strain_max": strain.max()}
     values |= {"stiffness_mean": stiffness.mean(), "stiffness_max": stiffness.max()}
+    moved = (states.strain != 0.0).any(axis=1)
+    own = wrong[moved] / np.linalg.norm(states.strain[moved], axis=1)
+    values |= {"loaded": moved.sum(), "relative_max": own.max(initial=0.0)}
     return {name: float(value) for name, value in values.items()}
+
+
+def with_cavity(model: LearnedModule, states: ModuleStates) -> LearnedModule:
+    """Return a model of a closed module with the volume of its cavity, by least squares; other models unchanged."""
+    P = polynomials(model.unit(states.designs), model.degrees[0])
+    module: type[Module] = MODULES[model.module]
+    if not module.closed:
+        return model
+    slopes = _products(states.strain, np.insert(volume_terms(module.symmetry), 0, 0, axis=1)).first
+    columns = np.einsum("nti,np->nipt", slopes, P)
+    shape = columns.shape
+    columns = columns.reshape(shape[0] * shape[1], -1)
+    ridge = RIDGE * np.sqrt((columns**2).mean()) * np.eye(columns.shape[1])
+    wanted = np.concatenate([states.swelling.ravel(), np.zeros(len(ridge))])
+    swelling = np.linalg.lstsq(np.vstack([columns, ridge]), wanted, rcond=None)[0].reshape(shape[2:])
+    return replace(model, swelling=swelling, bulge=np.linalg.lstsq(P, np.log(states.bulge), rcond=None)[0])
+
+
+def _solved(module: str, recipe: Recipe, unit: np.ndarray, rays: int, seed: int) -> ModuleStates:
+    """Return states of bodies (n, v) in [-1, 1], which is the box."""
+    made, names = MODULES[module](), tuple(recipe.box)
+    low, high = np.log(np.array(list(recipe.box.values()))).T
+    found = np.exp(0.5 * (low + high) + 0.5 * unit * (high - low))
+    bounds = np.array([[made.design_space[name].low, made.design_space[name].high] for name in names])
+    designs = np.clip(found, bounds[:, 0], bounds[:, 1])
+    rng = np.random.default_rng(seed)
+    return solve_states(made, designs, names, rotation=recipe.rotation, rays=rays, rng=rng)
+
+
+def _drawn(number: int, variables: int, seed: int) -> np.ndarray:
+    return 2.0 * qmc.Sobol(variables, seed=seed).random(number) - 1.0
+
+
+def tested(model: LearnedModule) -> LearnedModule:
+    """Return a model with its `errors` on four corners of the box and on two bodies inside, which are not learned."""
+    recipe = Recipe(model.box, model.rotation)
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=float)[:, : len(model.box)]
+    states = {
+        "corners": _solved(model.module, recipe, corners, 1, 3),
+        "inside": _solved(model.module, recipe, _drawn(2, len(model.box), 4), 1, 4),
+    }
+    return replace(model, errors={place: errors(model, each) for place, each in states.items()})
 
 
 def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
     """Return the superelement of a module, learned from finite elements; this takes some minutes.
-
-    It is tested on four corners of the box and on two bodies inside, which are not learned.
 
     Raises:
         KeyError: for a module without a recipe, if none is given.
         ValueError: for an unknown module.
     """
     recipe = RECIPES[module] if recipe is None else recipe
-    made = MODULES[module]()
-    low, high = np.log(np.array(list(recipe.box.values()))).T
-    names = tuple(recipe.box)
-
-    def bodies(unit: np.ndarray) -> np.ndarray:
-        found = np.exp(0.5 * (low + high) + 0.5 * unit * (high - low))
-        bounds = np.array([[made.design_space[name].low, made.design_space[name].high] for name in names])
-        return np.clip(found, bounds[:, 0], bounds[:, 1])
-
-    def solved(unit: np.ndarray, rays: int, seed: int) -> ModuleStates:
-        rng = np.random.default_rng(seed)
-        return solve_states(made, bodies(unit), names, rotation=recipe.rotation, rays=rays, rng=rng)
-
-    def drawn(number: int, seed: int) -> np.ndarray:
-        return 2.0 * qmc.Sobol(len(names), seed=seed).random(number) - 1.0
-
-    loaded = solved(MARGIN * drawn(recipe.bodies, 1), recipe.rays, 1)
-    states = loaded.joined(solved(MARGIN * drawn(recipe.unloaded, 2), 0, 2))
-    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=float)[:, : len(names)]
-    tests = {"corners": solved(corners, 1, 3), "inside": solved(drawn(2, 4), 1, 4)}
-    others = {v.name: v.baseline for v in made.design_space if v.name not in names and v.name != "young_modulus"}
-    model = fit(recipe, module, states, others)
-    return replace(model, errors={name: errors(model, each) for name, each in tests.items()})
+    made, variables = MODULES[module](), len(recipe.box)
+    loaded = _solved(module, recipe, MARGIN * _drawn(recipe.bodies, variables, 1), recipe.rays, 1)
+    states = loaded.joined(_solved(module, recipe, MARGIN * _drawn(recipe.unloaded, variables, 2), 0, 2))
+    others = {v.name: v.baseline for v in made.design_space if v.name not in recipe.box and v.name != "young_modulus"}
+    return tested(with_cavity(fit(recipe, module, states, others), states))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ MODULES = Registry(
         "crossed_leaves": "softgym_envs.robots.modules.crossed_leaves:CrossedLeaves",
         "notch_hinge": "softgym_envs.robots.modules.notch_hinge:NotchHinge",
         "torsion_tube": "softgym_envs.robots.modules.torsion_tube:TorsionTube",
+        "bellows": "softgym_envs.robots.modules.bellows:Bellows",
         "accordion": "softgym_envs.robots.modules.accordion:Accordion",
     },
     base="softgym_envs.robots.modules.base:Module",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.elements.superelement import QuadraticEnergy, Superelement
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -29,19 +31,25 @@ class ModuleStates:
         strain: those of a superelement, the first three over the length, shape (n, 6).
         gradient: of the energy in the strains, shape (n, 6).
         hessian: of the energy in the strains, shape (n, 6, 6).
+        swelling: derivative of the volume of the cavity by the strains over the cube of the length, shape (n, 6); zero
+            for modules that are not closed.
+        bulge: growth of that volume under a pressure with the ports held, times Young's modulus over the cube of the
+            length, shape (n,).
     """
 
     designs: np.ndarray
     strain: np.ndarray
     gradient: np.ndarray
     hessian: np.ndarray
+    swelling: np.ndarray
+    bulge: np.ndarray
 
     def __len__(self) -> int:
         return len(self.strain)
 
     def rows(self, index: np.ndarray) -> ModuleStates:
         """Return some of the states."""
-        return ModuleStates(self.designs[index], self.strain[index], self.gradient[index], self.hessian[index])
+        return ModuleStates(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def joined(self, other: ModuleStates) -> ModuleStates:
         """Return these states and others of the same module."""
@@ -77,15 +85,15 @@ def solve_states(
         more: other variables of all designs.
         refine: see `Module.body`.
     """
-    kept: list[tuple[np.ndarray, ...]] = []
+    kept: list[tuple[Any, ...]] = []
     for row in designs:
         design = dict(zip(names, row, strict=True)) | dict(more or {}) | {"young_modulus": MODULUS}
         length = module.length(module.design_space.complete(design))
         solver = Statics(module.model(design, refine=refine))
-        rest = solver.solve(np.zeros(6), "effort").condensed
-        stiffness = np.linalg.inv(rest.W.aa)
-        kept.append((row, *_in_strains(np.zeros(6), np.zeros(6), stiffness, length)))
-        moment = rotation / np.diag(rest.W.aa)[3:].max()
+        # A closed module has no pressure, which would be its seventh effort.
+        rest = solver.solve(np.zeros(6 + module.closed), "effort").condensed
+        kept.append((row, *_in_strains(rest, length)))
+        moment = rotation / np.diag(rest.W.aa)[3:6].max()
         scale = np.array([2.0 * moment / length] * 3 + [moment] * 3)
         for _ in range(rays):
             direction = rng.normal(size=6)
@@ -94,16 +102,14 @@ def solve_states(
             load[3:5] += 0.5 * length * np.array([load[1], -load[0]])
             for share in (0.5, 1.0):
                 try:
-                    found = solver.solve(share * load, "effort")
+                    found = solver.solve(np.append(share * load, np.zeros(int(module.closed))), "effort")
                 except ConvergenceError:
                     break
                 if not found.stable:
                     break
-                state = found.condensed
-                pose, tangent = state.delta.a, np.linalg.inv(state.W.aa)
-                if np.linalg.norm(pose[3:]) > LARGEST_SINE:
+                if np.linalg.norm(found.condensed.delta.a[3:6]) > LARGEST_SINE:
                     break
-                kept.append((row, *_in_strains(pose, state.lambda_.a, tangent, length)))
+                kept.append((row, *_in_strains(found.condensed, length)))
     return ModuleStates(*(np.array(column) for column in zip(*kept, strict=True)))
 
 
@@ -116,10 +122,11 @@ def pose_rows(pose: np.ndarray, length: float) -> np.ndarray:
     return np.vstack([frame_rows(np.zeros(3)), frame_rows(pose[:3] + [0.0, 0.0, length], rotation)])
 
 
-def _in_strains(
-    pose: np.ndarray, effort: np.ndarray, tangent: np.ndarray, length: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Turn efforts and tangent over a far port's pose into gradient and Hessian of the energy over strains."""
+def _in_strains(state: CondensedModel, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    """Turn a state over a far port's pose into one over strains: the fields of `ModuleStates`."""
+    effort, W = state.lambda_.a[:6], state.W.aa
+    pose = state.delta.a[:6] if effort.any() else np.zeros(6)  # at rest without round-off
+    tangent = np.linalg.inv(W[:6, :6])
     scale = np.array([length] * 3 + [1.0] * 3)
     rest = pose_rows(np.zeros(6), length)
     element = Superelement(rest, np.array([0, 4]), energy=QuadraticEnergy(np.eye(6)), length=length)
@@ -140,4 +147,9 @@ def _in_strains(
     inverse = np.linalg.inv(jacobian)
     gradient = inverse.T @ (scale * effort) / unit
     hessian = scale[:, None] * tangent * scale / unit - np.einsum("i,ijk->jk", gradient, bend)
-    return strain(pose), gradient, inverse.T @ hessian @ inverse
+    swelling, bulge = np.zeros(6), 0.0
+    if len(W) > 6:
+        by_pose = W[6, :6] @ tangent
+        swelling = inverse.T @ (scale * by_pose) / length**3
+        bulge = float(W[6, 6] - by_pose @ W[:6, 6]) * MODULUS / length**3
+    return strain(pose), gradient, inverse.T @ hessian @ inverse, swelling, bulge

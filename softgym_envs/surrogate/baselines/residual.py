@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
 from softgym_envs.errors import DataError
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.baselines.perceptron import layers, mean_scale, perceptron, standardise, weights
 from softgym_envs.surrogate.data.states import States

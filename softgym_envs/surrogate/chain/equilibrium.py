@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.surrogate.chain.kernels import (
     MAX_ITERATIONS,
     MAX_STEP,

@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.surrogate.chain.equilibrium import TOLERANCE, commit, drive_direction, place_drive
 from softgym_envs.surrogate.chain.kernels import (
     MAX_ITERATIONS,

@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.contact.obstacles import prism_geometry
 
 PLANE, ROUND, PRISM = 0, 1, 2

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.surrogate.chain.contact import ChainBatch
 from softgym_envs.surrogate.chain.equilibrium import drive_direction
 from softgym_envs.surrogate.chain.kernels import assemble, gap_of, skin_point, touch, turns

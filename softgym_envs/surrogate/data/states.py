@@ -77,25 +77,28 @@ def full_compliance(upper: np.ndarray, size: int) -> np.ndarray:
     return W
 
 
-def with_mirror_images(robot: Robot, data: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return a dataset, followed by the mirror images of its states if the robot is symmetric (`Robot.mirror`)."""
+def with_images(robot: Robot, data: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return a dataset, followed by the images of its states under each symmetry of the robot (`Robot.symmetries`)."""
     data = dict(data)
-    if robot.mirror is None:
+    if not robot.symmetries:
         return data
-    count, effectors = data["effort"].shape[1], data["effector"].shape[1]
-    size = count + effectors
-    order = np.array([*robot.mirror, *range(count, size)])
-    sign = np.ones(size)
-    sign[count::3] = -1.0
-    W = full_compliance(data["compliance"], size)[:, order][:, :, order] * sign[:, None] * sign
-    images = {
-        **data,
-        "displacement": data["displacement"][:, order[:count]],
-        "effort": data["effort"][:, order[:count]],
-        "effector": data["effector"] * sign[count:],
-        "compliance": W[:, *np.triu_indices(size)],
-    }
-    return {name: np.concatenate([column, images[name]]) for name, column in data.items()}
+    count, coordinates = data["effort"].shape[1], data["effector"].shape[1]
+    size = count + coordinates
+    W, upper, parts = full_compliance(data["compliance"], size), np.triu_indices(size), [data]
+    for symmetry in robot.symmetries:
+        turn = np.zeros((size, size))
+        turn[np.arange(count), symmetry.order] = 1.0
+        turn[count:, count:] = symmetry.rows(coordinates // 3)
+        parts.append(
+            {
+                **data,
+                "displacement": data["displacement"][:, symmetry.order],
+                "effort": data["effort"][:, symmetry.order],
+                "effector": data["effector"] @ turn[count:, count:].T,
+                "compliance": (turn @ W @ turn.T)[:, *upper],
+            }
+        )
+    return {name: np.concatenate([part[name] for part in parts]) for name in data}
 
 
 def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:

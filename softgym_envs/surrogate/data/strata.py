@@ -291,10 +291,11 @@ def _solve_body(robot: Robot, commands: Commands, number: int, second_start: boo
         part.growth[k] = growth_of(rest, found)
     for name in ("displacement", "effort", "effector", "slack", "touching", "growth", "apart", "found"):
         getattr(part, name)[:] = getattr(part, name)[source]
-    if image.any():
+    for k in np.flatnonzero(image >= 0):
+        symmetry = robot.symmetries[image[k]]
         for name in ("displacement", "effort", "slack"):
-            getattr(part, name)[image] = getattr(part, name)[image][:, list(robot.mirror or ())]
-        part.effector[image, ::3] *= -1.0
+            getattr(part, name)[k] = getattr(part, name)[k][symmetry.order]
+        part.effector[k] = symmetry.rows(len(robot.effectors)) @ part.effector[k]
     return part
 
 
@@ -302,19 +303,18 @@ def _repeated(robot: Robot, commands: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Return which commands (n, n_a) need no solution of their own.
 
     Returns:
-        For each command, the number of the first that is equal to it or its mirror image (`Robot.mirror`), its own if
-        there is none before; and whether it is the mirror image of that one.
+        For each command, the number of the first that is equal to it or has it as an image (`Robot.symmetries`), its
+        own if there is none before; and the number of that symmetry, -1 for none.
     """
-    source, image = np.arange(len(commands)), np.zeros(len(commands), dtype=bool)
+    source, image = np.arange(len(commands)), np.full(len(commands), -1)
     for k, command in enumerate(commands):
         for first in range(k):
-            if np.array_equal(command, commands[first]):
-                source[k] = first
-            elif robot.mirror is not None and np.array_equal(command, commands[first][list(robot.mirror)]):
-                source[k], image[k] = first, True
-            else:
-                continue
-            break
+            before = commands[first]
+            alike = [before, *(before[symmetry.order] for symmetry in robot.symmetries)]
+            found = next((i for i, other in enumerate(alike) if np.array_equal(command, other)), None)
+            if found is not None:
+                source[k], image[k] = first, found - 1
+                break
     return source, image
 
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import zlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from softgym_envs.mechanics.solvers import complementarity
+from softgym_envs.mechanics.compilation import FAST, njit
 from softgym_envs.mechanics.solvers.complementarity import solve_row
 
-_FAST: Any = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
+_FAST: Any = {"cache": True, "error_model": "numpy", "fastmath": FAST}
 #: Rows evaluated together: each weight is then fetched once for all of them, and the weights and results of one member
 #: stay in the fast caches.
 ROWS_PER_BLOCK = 48
@@ -365,106 +362,93 @@ def _invert(a):
     return True
 
 
-def _compile_search(source: int) -> Any:
-    """Compile `search`; ``source`` is the checksum of the file of `solve_row`.
+@njit(**_FAST)
+def search(
+    target, guess, unilateral, limit, tolerance, iterations, middle, half, scale, stiffness, slot,
+    A1, A2, P, PT, c1, c2, a, b, quadratic, linear, first, displacement, effort, converged,
+):  # fmt: skip
+    """Newton's method on the complementarity problem of each row; see `SurrogateModel.search`.
 
-    The code of `solve_row` becomes part of the compiled search, but numba's cache notices changes of this file only. It
-    also compares the values of free variables: the checksum is one, so an edit of that file recompiles the search.
+    The steps use the curvature of the first member alone, whose quadratic part is ``first``. One row in five
+    therefore needs one more step (cable trunk; up to one in four elsewhere). That costs less than the curvature of
+    all members, which took half of the time.
+
+    The rows of a block take their steps together, so that one evaluation of the network serves all rows that move.
     """
-
-    @njit(**_FAST)
-    def search(
-        target, guess, unilateral, limit, tolerance, iterations, middle, half, scale, stiffness, slot,
-        A1, A2, P, PT, c1, c2, a, b, quadratic, linear, first, displacement, effort, converged,
-    ):  # fmt: skip
-        """Newton's method on the complementarity problem of each row; see `SurrogateModel.search`.
-
-        The steps use the curvature of the first member alone, whose quadratic part is ``first``. One row in five
-        therefore needs one more step (cable trunk; up to one in four elsewhere). That costs less than the curvature of
-        all members, which took half of the time.
-
-        The rows of a block take their steps together, so that one evaluation of the network serves all rows that move.
-        """
-        source  # noqa: B018 - a free variable, so that numba's cache depends on it
-        n = target.shape[1]
-        size = min(ROWS_PER_BLOCK, len(target))
-        kept = np.empty((len(A1), 3, size, A1.shape[2]), np.float32)
-        u, g, K = np.empty((size, n), np.float32), np.empty((size, n), np.float32), np.empty((size, n, n), np.float32)
-        moving, asked, part = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
-        W, gap, taut = np.empty((size, n, n)), np.empty(n), np.empty(n)
-        work, index = np.empty((n, n + 1)), np.empty(n, np.int64)
-        for start in range(0, len(target), ROWS_PER_BLOCK):
-            # Displacements, efforts, and the rows of this block that still move.
-            d, e = displacement[start : start + ROWS_PER_BLOCK], effort[start : start + ROWS_PER_BLOCK]
-            count = len(d)
-            for row in range(count):
-                moving[row] = row
-                converged[start + row] = False
+    n = target.shape[1]
+    size = min(ROWS_PER_BLOCK, len(target))
+    kept = np.empty((len(A1), 3, size, A1.shape[2]), np.float32)
+    u, g, K = np.empty((size, n), np.float32), np.empty((size, n), np.float32), np.empty((size, n, n), np.float32)
+    moving, asked, part = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
+    W, gap, taut = np.empty((size, n, n)), np.empty(n), np.empty(n)
+    work, index = np.empty((n, n + 1)), np.empty(n, np.int64)
+    for start in range(0, len(target), ROWS_PER_BLOCK):
+        # Displacements, efforts, and the rows of this block that still move.
+        d, e = displacement[start : start + ROWS_PER_BLOCK], effort[start : start + ROWS_PER_BLOCK]
+        count = len(d)
+        for row in range(count):
+            moving[row] = row
+            converged[start + row] = False
+            for i in range(n):
+                d[row, i] = guess[start + row, i]
+        for iteration in range(iterations + 1):
+            for k in range(count):
+                row = moving[k]
+                part[k] = slot[start + row]
                 for i in range(n):
-                    d[row, i] = guess[start + row, i]
-            for iteration in range(iterations + 1):
-                for k in range(count):
-                    row = moving[k]
-                    part[k] = slot[start + row]
-                    for i in range(n):
-                        u[k, i] = (d[row, i] - middle[i]) / half[i]
-                _gradients(u[:count], part, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, g)
-                left = 0
-                for k in range(count):
-                    row = moving[k]
-                    finite, right = True, iteration == 0
-                    for i in range(n):
-                        e[row, i] = g[k, i] * scale[i] * stiffness[part[k], 0]
-                        finite = finite and np.isfinite(e[row, i])
-                        if unilateral[i] and (e[row, i] < 0.0 or d[row, i] > target[start + row, i]):
-                            right = False
-                    if not finite or right:
-                        converged[start + row] = finite
-                    else:
-                        moving[left], asked[left] = row, k
-                        left += 1
-                count = left
-                renew = iteration % 4 == 0
+                    u[k, i] = (d[row, i] - middle[i]) / half[i]
+            _gradients(u[:count], part, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, g)
+            left = 0
+            for k in range(count):
+                row = moving[k]
+                finite, right = True, iteration == 0
+                for i in range(n):
+                    e[row, i] = g[k, i] * scale[i] * stiffness[part[k], 0]
+                    finite = finite and np.isfinite(e[row, i])
+                    if unilateral[i] and (e[row, i] < 0.0 or d[row, i] > target[start + row, i]):
+                        right = False
+                if not finite or right:
+                    converged[start + row] = finite
+                else:
+                    moving[left], asked[left] = row, k
+                    left += 1
+            count = left
+            renew = iteration % 4 == 0
+            if renew:
+                # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
+                _curvatures(asked[:count], part, A1[:1], A2[:1], PT[:1], first, kept, K)
+            left = 0
+            for k in range(count):
+                row = moving[k]
                 if renew:
-                    # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
-                    _curvatures(asked[:count], part, A1[:1], A2[:1], PT[:1], first, kept, K)
-                left = 0
-                for k in range(count):
-                    row = moving[k]
-                    if renew:
-                        for i in range(n):
-                            for j in range(n):
-                                W[row, i, j] = K[asked[k], i, j] * scale[i] / half[j] * stiffness[slot[start + row], 0]
-                        if not _invert(W[row]):
-                            continue
                     for i in range(n):
-                        gap[i] = d[row, i] - target[start + row, i]
                         for j in range(n):
-                            gap[i] -= W[row, i, j] * e[row, j]
-                    if not solve_row(W[row], gap, unilateral, taut, work, index):
+                            W[row, i, j] = K[asked[k], i, j] * scale[i] / half[j] * stiffness[slot[start + row], 0]
+                    if not _invert(W[row]):
                         continue
-                    far = False
-                    for i in range(n):
-                        step = 0.0
-                        for j in range(n):
-                            step += W[row, i, j] * (taut[j] - e[row, j])
-                        # Long steps are cut, so that the network is evaluated near known states only.
-                        step = min(max(step, -limit[i]), limit[i])
-                        d[row, i] += step
-                        far = far or abs(step) > tolerance[i]
-                    if far:
-                        moving[left] = row
-                        left += 1
-                        continue
-                    # A last step below the tolerance is taken without evaluating the model again.
-                    converged[start + row] = True
-                    for i in range(n):
-                        e[row, i] = taut[i]
-                count = left
-                if count == 0:
-                    break
-
-    return search
-
-
-search = _compile_search(zlib.crc32(Path(complementarity.__file__).read_bytes()))
+                for i in range(n):
+                    gap[i] = d[row, i] - target[start + row, i]
+                    for j in range(n):
+                        gap[i] -= W[row, i, j] * e[row, j]
+                if not solve_row(W[row], gap, unilateral, taut, work, index):
+                    continue
+                far = False
+                for i in range(n):
+                    step = 0.0
+                    for j in range(n):
+                        step += W[row, i, j] * (taut[j] - e[row, j])
+                    # Long steps are cut, so that the network is evaluated near known states only.
+                    step = min(max(step, -limit[i]), limit[i])
+                    d[row, i] += step
+                    far = far or abs(step) > tolerance[i]
+                if far:
+                    moving[left] = row
+                    left += 1
+                    continue
+                # A last step below the tolerance is taken without evaluating the model again.
+                converged[start + row] = True
+                for i in range(n):
+                    e[row, i] = taut[i]
+            count = left
+            if count == 0:
+                break

@@ -1,6 +1,7 @@
 """Frozen problems: nothing that decides a score may change unnoticed, and searches keep to their budget."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -102,8 +103,14 @@ def test_an_evaluation_counts_what_it_costs(tiny):
         tiny.evaluate(baseline, judge="pq")
 
 
-@pytest.mark.parametrize("method", METHODS)
+JOINT = ("critic", "distribution")
+PACKAGES = {"botorch": "botorch", "smac": "smac", "map_elites": "ribs", "cma_me": "ribs"}
+
+
+@pytest.mark.parametrize("method", [method for method in METHODS if method not in JOINT])
 def test_each_baseline_solves_and_repeats_itself(tiny, method):
+    if method in PACKAGES:
+        pytest.importorskip(PACKAGES[method])
     found = []
     for _ in range(2):
         search = Search(tiny)
@@ -139,3 +146,59 @@ def test_halving_scores_only_promising_bodies_on_all_goals(method):
         assert second.share == 0.25 or (second.share == 2.0 * first.share and second.design == first.design)
     kept, all_ = ([row.design["length"] for row in told if row.share == share] for share in (0.5, 0.25))
     assert np.mean(kept) < np.mean(all_)  # short bodies score better here
+
+
+@pytest.mark.parametrize("method", PACKAGES)
+def test_methods_of_other_packages_find_a_better_body_than_the_baseline(method):
+    """A smooth score without a simulator; 40 bodies are enough for every seed that was tried."""
+    pytest.importorskip(PACKAGES[method])
+    problem = load_problem("finger-zone-v1")
+    optimiser, scores = make_optimiser(method, problem, 0), []
+    optimised = problem.definition.optimised
+    for _ in range(40):
+        design = dict(optimiser.ask())
+        point = np.array([float(optimised[name].to_unit(value)) for name, value in design.items()])
+        assert np.abs(point).max() <= 1.0 + 1e-9
+        infeasible = "none" if point[0] > 0.9 else None
+        scores.append(-float(np.sum((point - 0.5) ** 2)))
+        optimiser.tell(Score(design, "qp", scores=[] if infeasible else scores[-1:], reason=infeasible))
+    assert max(scores) > -0.75  # that of the middle of the box
+
+
+@pytest.mark.parametrize("method", JOINT)
+def test_joint_methods_train_first_and_count_the_steps(tiny, problems, method):
+    from softgym_envs.codesign.benchmark.joint import EPISODES, REPORTS, JointOptimiser
+
+    optimiser = JointOptimiser(tiny, 0, method, steps=300)
+    optimiser.steps_left = 100.0
+    with pytest.raises(ValueError, match="100 environment steps are left, too few for a joint training"):
+        optimiser.ask()
+    optimiser.steps_left = 10_000.0
+    bodies = [dict(optimiser.ask()) for _ in range(2)]
+    assert all(tiny.definition.checked(body) == pytest.approx(body) for body in bodies) and bodies[0] != bodies[1]
+    steps, seconds = optimiser.take_charge()
+    assert steps == 300 + REPORTS * EPISODES * tiny.definition.episode_steps and seconds > 0.0
+    assert optimiser.take_charge() == (0, 0.0)
+
+
+def test_children_inherit_the_policies_of_their_parents(tiny, monkeypatch):
+    from softgym_envs.codesign.benchmark import problem as module
+
+    started, real = [], module.train
+    monkeypatch.setattr(
+        module, "train", lambda *args, **keys: started.append(str(keys["initial"])) or real(*args, **keys)
+    )
+    definition = tiny.definition.model_copy(
+        update={
+            "training": tiny.definition.training.model_copy(update={"steps": 256, "report_every": 256}),
+            "budgets": {
+                **tiny.definition.budgets,
+                "small": tiny.definition.budgets["small"].model_copy(update={"environment_steps": 100_000}),
+            },
+        }
+    )
+    problem = replace(tiny, definition=definition)
+    search = Search(problem, judge="trained", limit=8)
+    solve(search, make_optimiser("inheritance", problem, 0))
+    assert started[:7] == [definition.policy] * 7  # the baseline and the first six bodies
+    assert started[7].endswith("policy.safetensors") and started[7] != definition.policy

@@ -101,17 +101,31 @@ def test_runs_resume_and_become_a_table(tiny, tmp_path):
 
 def test_tables(tiny, tmp_path):
     output = tmp_path / "tiny.parquet"
-    tabulate("tiny-v1", 70, 2, tmp_path, output)
+    counts = {"shared": 70, "qp": 2, "rest": 3, "trained": 1, "fem": 2}
+    tabulate("tiny-v1", counts, tmp_path, output, longest=0.5)
     parts = {path: path.stat().st_mtime_ns for path in tmp_path.glob("tables/**/*.npz")}
-    assert len(parts) == 3  # two of the shared policy, one of the inverse QP
-    tabulate("tiny-v1", 70, 2, tmp_path, output)
+    assert len(parts) == 7  # two of the shared policy and of finite elements, one of each other judge
+    tabulate("tiny-v1", counts, tmp_path, output, longest=0.5)
     assert {path: path.stat().st_mtime_ns for path in parts} == parts
     table = Table.read("tiny-v1", output)
     assert len(table) == 70 and np.isfinite(table.values["qp"][:, 0]).sum() == 2
-    for judge, index in (("shared", 69), ("qp", 1)):
+    for listed, judge, index in (
+        ("shared", "shared", 69),
+        ("qp", "qp", 1),
+        ("rest", "qp", 2),
+        ("trained", "trained", 0),
+    ):
         design = tiny.design(table.points[index])
         exact = tiny.evaluate(design, judge=judge).values["mean_distance"]
-        assert table.lookup(table.points[index : index + 1], judge)[0, 0] == pytest.approx(exact, rel=1e-4)
+        assert table.lookup(table.points[index : index + 1], listed)[0, 0] == pytest.approx(exact, rel=1e-4)
+    exact = tiny.evaluator("search", "fem")(tiny.design(table.points[1]), "qp").values["mean_distance"]
+    assert table.lookup(table.points[1:2], "fem")[0, 0] == pytest.approx(exact, abs=1e-7)
+    with pytest.raises(ValueError, match=r"unknown judge of tables 'rst'; did you mean 'rest'"):
+        tabulate("tiny-v1", {"rst": 1}, tmp_path, output)
+    count, tau, bias = table.agreement("rest", "fem")
+    assert count == 2 and np.isnan(tau) and abs(bias) < 1e-4
+    distances = {"rest": np.array([[1.0], [2.0], [3.0], [np.nan]]), "qp": np.array([[2.0], [4.0], [3.0], [1.0]])}
+    assert Table(tiny, table.points[:4], distances).agreement("rest", "qp") == (3, pytest.approx(1 / 3), 1.0)
     search = TableSearch.on(table, "small", "shared")
     solve(search, make_optimiser("tpe", tiny, 0))
     assert len(search.ledger) == 7 and search.best is not None

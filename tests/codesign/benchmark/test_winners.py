@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from softgym_envs.codesign.benchmark import board, runs, winners
+from softgym_envs.codesign.benchmark import board, frozen, refreeze, runs, winners
+from softgym_envs.errors import DataError
 
 
 def test_winners_are_scored_on_both_models_and_stored(tiny, tmp_path):
@@ -16,12 +17,35 @@ def test_winners_are_scored_on_both_models_and_stored(tiny, tmp_path):
     assert [row.seed for row in every] == [0, 1, 2] and [row for row in every if row.median] == [median]
     assert sorted(row.surrogate for row in every)[1] == median.surrogate
     assert abs(median.exploitation) < 0.1 * abs(median.fem)
+    (settled,) = winners.check(tmp_path, "tiny-v1", data=tmp_path, rest=True)
+    assert settled.rest and settled.fem == pytest.approx(median.fem, abs=2e-6)
+    assert settled.surrogate == pytest.approx(median.surrogate, abs=1e-6)
     winners.store([median], tmp_path)
     winners.store(every, tmp_path)
     assert winners.stored_winners(tmp_path) == every
     text = board.winners_table(tmp_path)
     assert "| `tiny-v1` | random |" in text and "3 winners" in text
     assert -1.0 <= winners.rank_correlation(every) <= 1.0 and math.isnan(winners.rank_correlation(every[:2]))
+
+
+def test_a_problem_frozen_again_keeps_results_that_are_still_true(tiny, problems, tmp_path):
+    with pytest.raises(DataError, match="no winner is stored that could be scored again"):
+        refreeze.refreeze("tiny-v1", data=tmp_path)
+    run = runs.run(tmp_path, "tiny-v1", "random", "shared", "small", 0)
+    runs.collect(tmp_path, tmp_path)
+    path = problems / "tiny-v1.json"
+    path.write_text(path.read_text().replace(tiny.parts["weights"], "0" * 32))  # as after another calibration
+    stale = frozen.load_problem("tiny-v1", check=False).hash
+    stored = tmp_path / "runs.json"
+    stored.write_text(stored.read_text().replace(tiny.hash, stale))
+    assert refreeze.refreeze("tiny-v1", data=tmp_path) == [stored]
+    assert frozen.load_problem("tiny-v1").hash == tiny.hash
+    ((kept, _),) = runs.stored_runs(tmp_path)
+    assert kept == run and kept.hash == tiny.hash
+    text = stored.read_text()
+    stored.write_text(text.replace(repr(run.search_scores[0][0]), repr(1.01 * run.search_scores[0][0])))
+    with pytest.raises(DataError, match="this is another problem and needs a new version"):
+        refreeze.refreeze("tiny-v1", data=tmp_path)
 
 
 def test_problems_without_stored_searches_are_refused(tiny, tmp_path):

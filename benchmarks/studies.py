@@ -1,0 +1,124 @@
+"""Record what studies found: baseline and winner of each on the test goals, by finite elements.
+
+    softgym codesign --config NAME --folder F
+    python -m benchmarks.studies F [F ...]
+
+copies the comparison of each finished study into ``benchmarks/data/recorded.json``, with its commit and command.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.recorded import SOURCES
+from softgym_envs.agents.results import LEARNERS
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.config import load_config
+from softgym_envs.errors import DataError
+from softgym_envs.storage import write_json
+
+RECORDED = SOURCES[0]
+
+TITLES = {
+    "finger_reach": "Soft Finger",
+    "diamond_reach": "Diamond",
+    "trunk_reach": "Stiff-Flop trunk",
+    "gripper_pinch": "Two-finger gripper",
+    "cable_trunk_reach": "Cable trunk",
+    "tetrapod_reach": "Tetrapod",
+    "finger_press": "Press finger",
+    "gripper_manipulate": "Three-finger hand",
+}
+"""Studies of the tables in their order, and the readable names of their robots."""
+
+COMMANDS = {"finger_reach": "make demo"}
+"""Commands that run a study, where it is not ``softgym codesign --config NAME``."""
+
+SHOWN = {"m": (1e3, "mm"), "Pa": (1e-6, "MPa"), "1": (1.0, "")}
+"""Scale and unit of a design variable in text, by its SI unit."""
+
+
+def study(folder: Path) -> tuple[str, dict[str, Any]]:
+    """Return the name of a study and its entry in the recorded results.
+
+    Raises:
+        DataError: if the folder has no finished study, its commit is not clean, or it was judged on no finite elements.
+    """
+    file = folder / "results.json"
+    if not file.exists():
+        raise DataError(f"{file}: no such file; a study writes it when it has finished")
+    found = json.loads(file.read_text())
+    commit = found["provenance"]["commit"]
+    if not commit or commit.endswith("-dirty"):
+        raise DataError(f"{file}: commit is {commit!r}; results are recorded from clean commits only")
+    config = load_config(folder / "config.yaml", StudyConfig)
+    seconds = found["cost"]["cpu_seconds"]
+    rows = [
+        {
+            "controller": _controller(config, found, compared["agent"]),
+            "baseline [mm]": 1e3 * compared["baseline"]["objective"],
+            "winner [mm]": 1e3 * compared["winner"]["objective"],
+            "change, 95% interval [mm]": _interval(compared),
+            "goals reached by the baseline [%]": 100.0 * compared["baseline"]["success_rate"],
+            "goals reached by the winner [%]": 100.0 * compared["winner"]["success_rate"],
+            "test goals": compared["goals"],
+        }
+        for compared in found["comparison"]
+        if compared["backend"] == "fem"
+    ]
+    if not rows:
+        raise DataError(f"{file}: neither baseline nor winner was tested by finite elements")
+    rows[0]["CPU with FEM check [min]"] = sum(seconds.values()) / 60.0
+    rows[0]["winner's body"] = _body(found)
+    command = COMMANDS.get(found["name"], f"softgym codesign --config {found['name']}")
+    title = TITLES.get(found["name"], found["title"])
+    entry = {"title": title, "command": command, "commit": commit, "trials": found["trials"]["complete"], "rows": rows}
+    return found["name"], entry
+
+
+def _controller(config: StudyConfig, found: dict[str, Any], agent: str) -> str:
+    if agent == "qp":
+        return "inverse QP"
+    seeds = len({training["seed"] for training in found["trainings"]})
+    trainings = f", {seeds} trainings" if seeds > 1 else ""
+    return f"{LEARNERS[config.training.learner]}, a policy for each body{trainings}"
+
+
+def _interval(compared: dict[str, Any]) -> list[float] | None:
+    """Interval of the change [mm]; None for a single goal, which has none."""
+    interval = compared["objective_change_interval"]
+    return [1e3 * end for end in interval] if interval and compared["goals"] > 1 else None
+
+
+def _body(found: dict[str, Any]) -> str:
+    """Dimensions of the winner; those at an end of their range are said to be."""
+    if found["winner"] is None or found["winner"]["role"] == "baseline":
+        return f"the baseline: none of {found['trials']['complete']} bodies is better"
+    parts = []
+    for variable in found["variables"]:
+        if variable["optimised"]:
+            scale, unit = SHOWN[variable["unit"]]
+            ends = f"{scale * variable['baseline']:.4g} → {scale * variable['winner']:.4g} {unit}".strip()
+            limit = f" ({variable['at_limit']} bound)" if variable["at_limit"] else ""
+            parts.append(f"{variable['name'].replace('_', ' ')} {ends}{limit}")
+    return ", ".join(parts)
+
+
+def main(folders: Sequence[str]) -> None:
+    """Copy the studies of some folders into the recorded results."""
+    recorded = json.loads(RECORDED.read_text())
+    kept = recorded["codesign"]["results"]
+    for folder in folders:
+        name, entry = study(Path(folder))
+        kept[name] = entry
+        print(f"{name}: {entry['rows'][0]['baseline [mm]']:.2f} -> {entry['rows'][0]['winner [mm]']:.2f} mm")
+    recorded["codesign"]["results"] = {name: kept[name] for name in (*TITLES, *kept) if name in kept}
+    write_json(RECORDED, recorded)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,86 @@
+"""The cache of compiled kernels."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from softgym_envs.mechanics import compilation
+
+MECHANICS = compilation.ROOT / "mechanics"
+KERNEL = """
+from tiny.mechanics.compilation import njit
+
+LENGTH = {length}
+
+@njit(cache=True)
+def length():
+    return LENGTH
+"""
+CALLER = """
+from tiny.mechanics.compilation import njit
+from tiny.kernel import length
+
+@njit(cache=True)
+def twice():
+    return 2 * length()
+
+print(twice(), *(sum(counts.values()) for counts in twice.stats[1:]))
+"""
+
+
+@pytest.fixture
+def edited(monkeypatch):
+    """A function that pretends that a file has another content."""
+
+    def edit(file):
+        compilation.source_hash.cache_clear()
+        text = compilation._text
+        monkeypatch.setattr(compilation, "_text", lambda path: text(path) + ("# edited" if path == file else ""))
+
+    yield edit
+    monkeypatch.undo()
+    compilation.source_hash.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("file", "depends"),
+    [
+        ("solvers/beam_batch.py", True),
+        ("solvers/beam_motion.py", True),
+        ("elements/beam_kernels.py", True),  # over beam_equations
+        ("solvers/equilibrium.py", True),  # constants
+        ("contact/obstacles.py", False),
+        ("solvers/statics.py", False),
+    ],
+)
+def test_kernels_depend_on_the_files_that_their_code_comes_from(edited, file, depends):
+    path = MECHANICS / "solvers/beam_batch.py"
+    before = compilation.source_hash(path)
+    edited(MECHANICS / file)
+    assert (compilation.source_hash(path) != before) == depends
+
+
+def test_an_edit_of_a_kernel_recompiles_kernels_of_other_files_that_call_it(tmp_path):
+    """In a small package with a copy of the module; numba alone would go on with the old code."""
+    package = tmp_path / "tiny"
+    (package / "mechanics").mkdir(parents=True)
+    shutil.copy(compilation.__file__, package / "mechanics" / "compilation.py")
+    (package / "caller.py").write_text(CALLER)
+
+    def run(length):
+        (package / "kernel.py").write_text(KERNEL.format(length=length))
+        command = [sys.executable, "-c", "import tiny.caller"]
+        return subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stdout.split()
+
+    assert run(1) == ["2", "0", "1"]  # result, loaded from the cache, compiled
+    assert run(1) == ["2", "1", "0"]
+    assert run(3) == ["6", "0", "1"]
+
+
+def test_all_kernels_use_this_cache():
+    sources = {path: path.read_text() for path in compilation.ROOT.rglob("*.py") if path.name != "compilation.py"}
+    assert [path for path, text in sources.items() if "from numba import" in text or "import numba" in text] == []
