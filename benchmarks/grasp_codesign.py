@@ -89,14 +89,20 @@ def draw_scenes(count: int, forces: tuple[float, float], seed: int = SEED) -> li
 
 
 def close(
-    environment: EnvironmentConfig, body: str, design: Mapping[str, float], scenes: Sequence[Scene], k: int, mesh: float
+    environment: EnvironmentConfig,
+    body: str,
+    design: Mapping[str, float],
+    scenes: Sequence[Scene],
+    k: int,
+    mesh: float,
+    agent: str | Path = "force",
 ) -> Episode:
-    """Close one body on the scene with number ``k``, on finite elements."""
+    """Close one body on the scene with number ``k``, on finite elements, under a baseline or the file of a policy."""
     scene = scenes[k]
     options = {**environment.robot_options, "object": scene.kind, "mesh_size": mesh}
     own = environment.on("fem").model_copy(update={"robot_options": options, "design": None})
     try:
-        found = evaluate("force", own, np.array([[scene.force, 0.0, 0.0]]), design={**design, **scene.place})
+        found = evaluate(agent, own, np.array([[scene.force, 0.0, 0.0]]), design={**design, **scene.place})
     except (InfeasibleDesign, ConvergenceError):
         return Episode(body, mesh, k, False, 0.0, False, 1.0, 0.0)
     values = float(found.returns[0]), bool(found.successes[0]), float(found.distances[0])
@@ -109,6 +115,7 @@ def compare(
     scenes: Sequence[Scene],
     meshes: Sequence[float],
     folder: Path,
+    agents: Mapping[str, str | Path] | None = None,
 ) -> list[Episode]:
     """Return the episodes of all bodies, those of a mesh together; each is kept in a folder.
 
@@ -118,6 +125,7 @@ def compare(
         scenes: what they close on.
         meshes: target edge lengths [m].
         folder: where episodes are kept, and taken from if they are there.
+        agents: what closes each body, by its name; control of the force where it is missing.
     """
     episodes = []
     for mesh in meshes:
@@ -125,7 +133,10 @@ def compare(
             for body, design in bodies.items():
                 path = folder / f"{body}_{1e3 * mesh:g}mm_scene{k}.json"
                 if not path.exists():
-                    write_json(path, asdict(close(environment, body, design, scenes, k, mesh)))
+                    write_json(
+                        path,
+                        asdict(close(environment, body, design, scenes, k, mesh, (agents or {}).get(body, "force"))),
+                    )
                     print(path.read_text(), file=sys.stderr, flush=True)
                 episodes.append(Episode(**json.loads(path.read_text())))
     return episodes
