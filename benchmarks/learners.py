@@ -92,7 +92,7 @@ def config_path(task: str, learner: str) -> Path:
     return CONFIGS / f"{task if learner == 'sac' else f'{task}_{learner}'}.yaml"
 
 
-def measure(task: str, learner: str, seed: int, folder: Path) -> LearnerRow:
+def measure(task: str, learner: str, seed: int, commit: str, folder: Path) -> LearnerRow:
     """Train and evaluate one policy."""
     from softgym_envs.agents.config import TrainConfig
     from softgym_envs.agents.evaluation import Evaluation, evaluate
@@ -144,7 +144,7 @@ def measure(task: str, learner: str, seed: int, folder: Path) -> LearnerRow:
         scores[curve.index(best)],
         score("fem"),
         card["stopped_early"],
-        provenance()["commit"],
+        commit,
     )
 
 
@@ -152,12 +152,13 @@ def main(folder: Path, chosen: list[str]) -> None:
     """Compute the rows that are missing, each in a process of its own, and write them to the kept file."""
     every = [[task, learner] for learner in REPORTS for task in TASKS if config_path(task, learner).exists()]
     pairs = [name.split(":") for name in chosen] or every
+    commit = str(provenance()["commit"])  # of the code, before the first row changes the kept file
     for seed in SEEDS:
         for task, learner in pairs:
             path = folder / f"{task}_{learner}_{seed}.json"
             if not path.exists():
                 subprocess.run(
-                    [sys.executable, "-m", "benchmarks.learners", "--row", task, learner, str(seed), str(path)],
+                    [sys.executable, "-m", "benchmarks.learners", "--row", task, learner, str(seed), commit, str(path)],
                     check=True,
                 )
                 print(f"{path.name}: {json.loads(path.read_text())}", flush=True)
@@ -230,7 +231,7 @@ if __name__ == "__main__":
         import torch
 
         torch.set_num_threads(1)
-        task, learner, seed, path = sys.argv[2:]
-        write_json(Path(path), asdict(measure(task, learner, int(seed), Path(path).parent / "runs")))
+        task, learner, seed, commit, path = sys.argv[2:]
+        write_json(Path(path), asdict(measure(task, learner, int(seed), commit, Path(path).parent / "runs")))
     else:
         main(Path(sys.argv[1] if sys.argv[1:] else "results/learners").resolve(), sys.argv[2:])
