@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numba import njit
 
+from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.elements.beams import warp_lines
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
 
