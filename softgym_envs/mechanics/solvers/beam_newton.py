@@ -209,7 +209,7 @@ def solve(body, x, effort, target, driven, forced, one_way, step, equations, fac
             effort[c] += factor.efforts[c]
         taken += 1
         # The next step with the same factor will be shorter by about this ratio again. Where the last step was the
-        # first one with it, Newton's own, by up to twice the ratio; but in statics that tells nothing: the first step of a
+        # first one with it, Newton's own, by up to twice the ratio. In statics that tells nothing: the first step of a
         # slender body bends it, and what is left is stretch, for which the old factor is wrong by much more.
         known = taken != 2 or not static
         next_ratio = 2.0 * ratio if taken == 2 else ratio
