@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +85,12 @@ def remember(memory: np.ndarray, observation: np.ndarray, read: Layer, recall: L
     return proposal + update * (memory - proposal)
 
 
+def memory_layers(tensors: Mapping[str, np.ndarray]) -> tuple[Layer, Layer]:
+    """Return the weights and biases that `remember` takes, for observation and memory, from those of an actor."""
+    read, recall = ((tensors[f"actor.memory.weight_{s}"].T, tensors[f"actor.memory.bias_{s}"]) for s in ("ih", "hh"))
+    return read, recall
+
+
 class Policy:
     """Policy that takes the mean action of a trained actor, which may have a memory.
 
@@ -125,8 +131,7 @@ class Policy:
             self.hidden: list[Layer] = []
             self.memory: tuple[Layer, Layer] | None = None
             if "actor.memory.weight_ih" in tensors:
-                read, recall = ((f"actor.memory.weight_{s}", f"actor.memory.bias_{s}") for s in ("ih", "hh"))
-                self.memory = (tensors[read[0]].T, tensors[read[1]]), (tensors[recall[0]].T, tensors[recall[1]])
+                self.memory = memory_layers(tensors)
             k = 0
             while f"actor.latent_pi.{k}.weight" in tensors:
                 self.hidden.append((tensors[f"actor.latent_pi.{k}.weight"].T, tensors[f"actor.latent_pi.{k}.bias"]))

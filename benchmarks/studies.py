@@ -113,7 +113,10 @@ def main(folders: Sequence[str]) -> None:
     recorded = json.loads(RECORDED.read_text())
     kept = recorded["codesign"]["results"]
     for folder in folders:
-        name, entry = study(Path(folder))
+        try:
+            name, entry = study(Path(folder))
+        except DataError as error:
+            raise SystemExit(f"nothing recorded: {error}") from None
         kept[name] = entry
         print(f"{name}: {entry['rows'][0]['baseline [mm]']:.2f} -> {entry['rows'][0]['winner [mm]']:.2f} mm")
     recorded["codesign"]["results"] = {name: kept[name] for name in (*TITLES, *kept) if name in kept}

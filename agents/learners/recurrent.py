@@ -17,7 +17,7 @@ from softgym_envs.agents.baselines import make_baseline
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.base import Tensors
 from softgym_envs.agents.learners.network import NetworkLearner
-from softgym_envs.agents.policy import remember
+from softgym_envs.agents.policy import memory_layers, remember
 
 
 class RecurrentLearner(NetworkLearner):
@@ -76,7 +76,7 @@ class RecurrentLearner(NetworkLearner):
         """Keep an episode in which the QP or the policy acts, with the answers of the QP; return its length."""
         env, row = self.env, self._episodes
         w = self.weights()
-        read, recall = ((w[f"actor.memory.weight_{s}"].T, w[f"actor.memory.bias_{s}"]) for s in ("ih", "hh"))
+        read, recall = memory_layers(w)
         memory = np.zeros(len(recall[0]), dtype=np.float32)
         observation, _ = env.reset(seed=seed)
         length, ended = 0, False

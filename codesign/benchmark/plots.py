@@ -15,7 +15,7 @@ from softgym_envs.codesign.report.plots import STYLE
 
 COLOURS = {
     "random": "#94a3b8",
-    "sobol": "#64748b",
+    "sobol": "#a16207",
     "tpe": "#2563eb",
     "gp": "#0f766e",
     "cmaes": "#ea580c",
@@ -58,6 +58,7 @@ def draw_regret(runs: Sequence[Stored] | None = None, columns: int = 3) -> np.nd
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     shown = [c for c in contests(stored_runs() if runs is None else runs) if next(iter(c.runs.values()))[0][0].curve]
     with matplotlib.rc_context(STYLE):
@@ -75,11 +76,12 @@ def draw_regret(runs: Sequence[Stored] | None = None, columns: int = 3) -> np.nd
                 (line,) = axes.plot(steps, np.maximum(mean, EQUAL), color=COLOURS.get(method), lw=1.6)
                 handles.setdefault(method, line)
             axes.set(xscale="log", yscale="log", ylim=(0.9 * EQUAL, 1.2))
+            axes.xaxis.set_minor_formatter(NullFormatter())  # on short axes these labels would overlap
             judge = contest.judge + (", table" if contest.listed else "")
             axes.set_title(f"{contest.problem} ({judge})", fontsize=9)
         figure.supxlabel("environment steps", fontsize=9.5)
         figure.supylabel("regret", fontsize=9.5)
-        figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=len(handles))
+        figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=min(len(handles), 6))
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 

@@ -84,7 +84,7 @@ class _Announcement(event.Listener):
         if module.startswith("softgym_envs.") and ANNOUNCED not in os.environ:
             os.environ[ANNOUNCED] = "1"
             print(
-                "softgym-envs: compiling numerical kernels (up to a minute); later runs load them from a cache",
+                "softgym-envs: compiling numerical kernels (a minute or two); later runs load them from a cache",
                 file=sys.stderr,
                 flush=True,
             )
