@@ -217,8 +217,17 @@ class ModuleEnergy:
 
     def load(self, strains: np.ndarray) -> float:
         """Return the load at strains (6,) over the largest one that was learned."""
-        return float(np.linalg.norm(self.evaluate(strains)[1] / self._largest_load))
+        return self._load(self.evaluate(strains)[1])
+
+    def _load(self, gradient: np.ndarray) -> float:
+        return float(np.linalg.norm(gradient / self._largest_load))
 
     def knows(self, strains: np.ndarray) -> bool:
-        """Whether no strain of (6,) is larger than it was learned, and the load at them not either."""
-        return bool((np.abs(strains) <= self._largest_strains).all()) and self.load(strains) <= 1.0
+        """Whether the energy may be trusted at strains (6,).
+
+        No strain and no load is larger than those that were learned, and the Hessian is positive definite, as it was in
+        all learned states.
+        """
+        _, gradient, hessian = self.evaluate(strains)
+        learned = bool((np.abs(strains) <= self._largest_strains).all()) and self._load(gradient) <= 1.0
+        return learned and bool(np.linalg.eigvalsh(hessian)[0] > 0.0)
