@@ -52,6 +52,7 @@ class LearnedModule:
         degrees: of the polynomials of ``stiffness`` and ``corrections``.
         swelling: weights of the coefficients of `energy.CavityVolume`, shape (p, m); none if the module is not closed.
         bulge: weights of the logarithm of its ``bulge``, shape (p,); likewise.
+        order: of the corrections; see `energy.terms`.
     """
 
     module: str
@@ -65,12 +66,13 @@ class LearnedModule:
     degrees: tuple[int, int]
     swelling: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     bulge: np.ndarray = field(default_factory=lambda: np.empty(0))
+    order: int = 3
 
     @property
     def terms(self) -> np.ndarray:
         """The corrections that the symmetry of the module allows, shape (m, 4); see `energy.terms`."""
         module: type[Module] = MODULES[self.module]
-        return terms(module.symmetry)
+        return terms(module.symmetry, self.order)
 
     def unit(self, designs: np.ndarray) -> np.ndarray:
         """Map dimensions (n, v) to [-1, 1] on a logarithmic scale."""
@@ -91,6 +93,7 @@ class LearnedModule:
             modulus * np.exp(P @ self.stiffness),
             Q @ self.corrections,
             MODULES[self.module].symmetry,  # type: ignore[attr-defined]
+            self.order,
             self.rotation,
             self.largest_strains,
             self.error(unit[0]),

@@ -45,6 +45,7 @@ class Recipe:
         unloaded: number of further bodies, only at rest.
         rays: number of random directions of load for each body.
         degrees: of the polynomials of stiffness and corrections; the first needs many bodies.
+        order: of the corrections; see `softgym_envs.robots.modules.energy.terms`.
     """
 
     box: Mapping[str, tuple[float, float]]
@@ -53,6 +54,7 @@ class Recipe:
     unloaded: int = 32
     rays: int = 3
     degrees: tuple[int, int] = (3, 1)
+    order: int = 3
 
 
 RECIPES = {
@@ -91,12 +93,12 @@ def _products(strain: np.ndarray, terms: np.ndarray) -> _Products:
         value[:, t] = padded[:, factors].prod(axis=1)
         present = [p for p, f in enumerate(factors) if f >= 0]
         for p in present:
-            others = [factors[k] for k in range(3) if k != p]
+            others = [f for k, f in enumerate(factors) if k != p]
             first[:, t, factors[p]] += padded[:, others].prod(axis=1)
             for q in present:
                 if q != p:
-                    (left,) = (factors[k] for k in range(3) if k not in (p, q))
-                    second[:, t, factors[p], factors[q]] += padded[:, left]
+                    left = [f for k, f in enumerate(factors) if k not in (p, q)]
+                    second[:, t, factors[p], factors[q]] += padded[:, left].prod(axis=1)
     return _Products(value, first, second)
 
 
@@ -215,6 +217,7 @@ def fit(
         np.abs(states.strain).max(axis=0),
         {},
         recipe.degrees,
+        order=recipe.order,
     )
     unit = model.unit(states.designs)
     P, Q = polynomials(unit, recipe.degrees[0]), polynomials(unit, recipe.degrees[1])
