@@ -161,9 +161,10 @@ def module_energies_table() -> str:
             percent = {of: 100.0 * error for of, error in found.items()}
             cells = [f"{percent[f'{of}_mean']:.2g} %, {percent[f'{of}_max']:.2g} %" for of in ("strain", "stiffness")]
             first = [f"`{name}`", f"{learned.rotation:g}"] if place == "inside" else ["", ""]
-            rows.append([*first, place, *cells])
+            bound = f"{100.0 * learned.bounds[place]:.2g} %"
+            rows.append([*first, place, *cells, bound, f"{found['covered']:.0f} of {found['loaded']:.0f}"])
     head = ["module", "load [rad]", "bodies", "strains: mean, largest", "stiffness: mean, largest"]
-    return markdown(head, rows, "lrlrr")
+    return markdown([*head, "bound", "states within it"], rows, "lrlrrrr")
 
 
 TABLES = {"modular_arm": modular_arm_table, "module_energies": module_energies_table}

@@ -22,7 +22,7 @@ from softgym_envs.robots.modules.learned import LearnedModule, polynomials
 from softgym_envs.robots.modules.registry import MODULES
 from softgym_envs.robots.modules.states import ModuleStates, solve_states
 
-RIDGE = 1e-3
+RIDGE = 1e-5
 """Weight of the squares of the weights of corrections, against overfitting."""
 
 GUESS_RIDGE = 1e-4
@@ -30,6 +30,9 @@ GUESS_RIDGE = 1e-4
 
 MARGIN = 1.1
 """Bodies are drawn from a box that is wider by this factor than the one that users may use."""
+
+CONFIDENCE, FOLDS = 0.95, 5
+"""Share of states whose strains are within the bound of their error, and parts of the bodies that calibrate it."""
 
 _ROWS, _COLUMNS = np.triu_indices(6)
 
@@ -216,6 +219,7 @@ def fit(
         np.empty((0, 0)),
         np.abs(states.strain).max(axis=0),
         {},
+        {},
         recipe.degrees,
         order=recipe.order,
     )
@@ -284,28 +288,60 @@ def fit(
     return model
 
 
+class _Errors(NamedTuple):
+    """Size of the wrong strains of states (n,), and largest relative error of their stiffness over directions (n,)."""
+
+    strain: np.ndarray
+    stiffness: np.ndarray
+
+
+def _errors(model: LearnedModule, states: ModuleStates) -> _Errors:
+    found = _corrected(model, states, _products(states.strain, model.terms))
+    weights = _weights(states, 1.0)
+    strain = np.einsum("nij,nj->ni", weights.compliance, found.gradient() - states.gradient)
+    relative = weights.root @ (found.hessian() - states.hessian) @ np.swapaxes(weights.root, 1, 2)
+    return _Errors(np.linalg.norm(strain, axis=1), np.abs(np.linalg.eigvalsh(relative)).max(axis=1))
+
+
 def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
     """Return the errors on states: those of strains under load and of the stiffness.
 
     Returns:
         ``strain_mean`` and ``strain_max``: error of the strains under the load of a state over the largest strain of
         the states, to first order; ``stiffness_mean`` and ``stiffness_max``: largest relative error of the stiffness
-        over all directions of motion; ``loaded``: the number of states under load, and ``relative_max``: the largest
-        error of their strains relative to the own strains of the state.
+        over all directions of motion; ``loaded``: the number of states under load, and ``covered``: how many of them
+        have strains within the bound of `LearnedModule.error`.
     """
-    found = _corrected(model, states, _products(states.strain, model.terms))
-    weights = _weights(states, 1.0)
-    strain = np.einsum("nij,nj->ni", weights.compliance, found.gradient() - states.gradient)
-    wrong = np.linalg.norm(strain, axis=1)
-    strain = wrong / np.linalg.norm(states.strain, axis=1).max()
-    relative = weights.root @ (found.hessian() - states.hessian) @ np.swapaxes(weights.root, 1, 2)
-    stiffness = np.abs(np.linalg.eigvalsh(relative)).max(axis=1)
-    values = {"strain_mean": strain.mean(), "strain_max": strain.max()}
-    values |= {"stiffness_mean": stiffness.mean(), "stiffness_max": stiffness.max()}
-    moved = (states.strain != 0.0).any(axis=1)
-    own = wrong[moved] / np.linalg.norm(states.strain[moved], axis=1)
-    values |= {"loaded": moved.sum(), "relative_max": own.max(initial=0.0)}
+    found = _errors(model, states)
+    sizes = np.linalg.norm(states.strain, axis=1)
+    values = {"strain_mean": found.strain.mean() / sizes.max(), "strain_max": found.strain.max() / sizes.max()}
+    values |= {"stiffness_mean": found.stiffness.mean(), "stiffness_max": found.stiffness.max()}
+    covered = found.strain <= model.error(model.unit(states.designs)) * sizes
+    values |= {"loaded": (sizes > 0.0).sum(), "covered": covered[sizes > 0.0].sum()}
     return {name: float(value) for name, value in values.items()}
+
+
+def calibrated(model: LearnedModule, recipe: Recipe, states: ModuleStates) -> LearnedModule:
+    """Return a model with bounds on the errors of its strains, from models that did not learn a part of the bodies.
+
+    Each part of the bodies is left out once, and a model of the others predicts their states under load. The logarithm
+    of the errors, relative to the size of the strains, is a line over the share of dimensions at the bounds of the box
+    (`LearnedModule.error`); the line is raised until `CONFIDENCE` of these states, and one more, are below it (split
+    conformal prediction over folds). States of one body are not independent, so the share holds only about.
+    """
+    bodies, number = np.unique(states.designs, axis=0, return_inverse=True)
+    fold = (np.random.default_rng(0).permutation(len(bodies)) % FOLDS)[number]
+    moved = (states.strain != 0.0).any(axis=1)
+    wrong = np.empty(len(states))
+    for part in range(FOLDS):
+        other = fit(recipe, model.module, states.rows(fold != part), model.others)
+        wrong[fold == part] = _errors(other, states.rows(fold == part)).strain
+    share = model.share(model.unit(states.designs))[moved]
+    logarithm = np.log(wrong[moved] / np.linalg.norm(states.strain[moved], axis=1))
+    slope = max(float(np.polyfit(share, logarithm, 1)[0]), 0.0)
+    above = np.sort(logarithm - slope * share)
+    level = above[min(int(np.ceil(CONFIDENCE * (len(above) + 1))), len(above)) - 1]
+    return replace(model, bounds={"inside": float(np.exp(level)), "corners": float(np.exp(level + slope))})
 
 
 def with_cavity(model: LearnedModule, states: ModuleStates) -> LearnedModule:
@@ -362,7 +398,8 @@ def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
     loaded = _solved(module, recipe, MARGIN * _drawn(recipe.bodies, variables, 1), recipe.rays, 1)
     states = loaded.joined(_solved(module, recipe, MARGIN * _drawn(recipe.unloaded, variables, 2), 0, 2))
     others = {v.name: v.baseline for v in made.design_space if v.name not in recipe.box and v.name != "young_modulus"}
-    return tested(with_cavity(fit(recipe, module, states, others), states))
+    model = calibrated(with_cavity(fit(recipe, module, states, others), states), recipe, states)
+    return tested(model)
 
 
 if __name__ == "__main__":
@@ -371,4 +408,4 @@ if __name__ == "__main__":
     for name in sys.argv[1:]:
         learned = learn_module(name)
         learned.save(f"{name}.json")
-        print(f"wrote {name}.json: {learned.errors}")
+        print(f"wrote {name}.json: bounds {learned.bounds}, errors {learned.errors}")
