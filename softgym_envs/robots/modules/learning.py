@@ -61,17 +61,22 @@ class Recipe:
 
 
 RECIPES = {
-    "leaf_spring": Recipe({"leaf_length": (0.010, 0.025), "width": (0.008, 0.020), "thickness": (0.001, 0.0025)}, 0.4),
+    "leaf_spring": Recipe(
+        {"leaf_length": (0.010, 0.025), "width": (0.008, 0.020), "thickness": (0.001, 0.0025)}, 0.6, 40, 32, 2, order=5
+    ),
     "solid_block": Recipe({"length": (0.010, 0.030), "width": (0.008, 0.020), "depth": (0.008, 0.020)}, 0.3),
     "notch_hinge": Recipe(
-        {"radius": (0.003, 0.006), "width": (0.008, 0.014), "neck": (0.0018, 0.0035)}, 0.3, 16, 16, 2, (2, 1)
+        {"radius": (0.003, 0.006), "width": (0.008, 0.014), "neck": (0.0018, 0.0035)}, 0.3, 16, 32, 2, (2, 1)
     ),
-    "torsion_tube": Recipe({"length": (0.015, 0.040), "radius": (0.006, 0.010), "wall": (0.0015, 0.003)}, 0.3),
+    "torsion_tube": Recipe(
+        {"length": (0.015, 0.040), "radius": (0.006, 0.010), "wall": (0.0015, 0.003)}, 0.3, 30, 40, 2
+    ),
     "bellows": Recipe(
         {"pitch": (0.007, 0.010), "radius": (0.007, 0.010), "amplitude": (0.0012, 0.0024)}, 0.3, 14, 16, 2, (2, 1)
     ),
+    # Stiffer rotations carry several times the load that turns the softest one.
     "accordion": Recipe(
-        {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)}, 0.4, 14, 16, 2, (2, 1)
+        {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)}, 0.9, 16, 32, 2, (2, 1), 5
     ),
     "crossed_leaves": Recipe(
         {"leaf_length": (0.012, 0.020), "width": (0.012, 0.018), "thickness": (0.001, 0.0018)}, 0.3, 16, 16, 2, (2, 1)

@@ -17,8 +17,8 @@ FINER = 3.0
 def draw_notched(*, width: float, neck: float, radius: float, length: float) -> None:
     """Draw a block with two half-round notches that leave a neck between them, in mm.
 
-    The mesh is one of the side view in layers along y. Its edges are shorter at the neck, because straight edges between
-    points of a notch leave a thicker neck, which is stiffer by the third power.
+    The mesh is one of the side view in layers along y. Its edges are shorter at the neck, because straight edges
+    between points of a notch leave a thicker neck, which is stiffer by the third power.
     """
     import gmsh
 
