@@ -121,7 +121,53 @@ def benchmark(name: str) -> str:
     return f"modular_arm_{name.replace(' ', '_')}"
 
 
-BENCHMARKS = {benchmark(name): of(name) for name in ARMS}
+MEMBERS, SHARE = 4, 0.75
+"""Energies of the ensembles that are compared with calibrated bounds, and the share of bodies that each learns."""
+
+
+def module_bounds() -> dict[str, object]:
+    """Bounds on errors of strains from the place in the box alone, and from the spread of an ensemble of energies.
+
+    Every fifth of the bodies is predicted by an energy that learned the others, and by the members of an ensemble that
+    learned different parts of these. Each scale of the errors is multiplied so that 95 % of all states are within it;
+    the better scale gives narrower bounds.
+    """
+    from scipy.stats import spearmanr
+
+    from softgym_envs.robots.modules import learning
+
+    result: dict[str, object] = {}
+    for name in ("solid_block", "crossed_leaves"):
+        recipe = learning.RECIPES[name]
+        states = learning.training_states(name, recipe)
+        _, body = np.unique(states.designs, axis=0, return_inverse=True)
+        fold, moved, rng = learning.folds(states), (states.strain != 0.0).any(axis=1), np.random.default_rng(1)
+        wrong, spread, share = [], [], []
+        for part in range(learning.FOLDS):
+            left = states.rows((fold == part) & moved)
+            others = np.unique(body[fold != part])
+            drawn = [rng.choice(others, int(SHARE * len(others)), replace=False) for _ in range(MEMBERS)]
+            models = [learning.fit(recipe, name, states.rows(np.isin(body, some)), {}) for some in (others, *drawn)]
+            found = np.array([learning.wrong_strains(model, left) for model in models])
+            sizes = np.linalg.norm(left.strain, axis=1)
+            wrong.append(np.linalg.norm(found[0], axis=1) / sizes)
+            spread.append(np.sqrt(found[1:].var(axis=0).sum(axis=1)) / sizes)
+            share.append(models[0].share(models[0].unit(left.designs)))
+        error, spreads, shares = (np.concatenate(each) for each in (wrong, spread, share))
+        slope = max(float(np.polyfit(shares, np.log(error), 1)[0]), 0.0)
+        scales = {
+            "place": np.exp(slope * shares),
+            "ensemble": np.hypot(spreads, np.median(spreads)),
+        }
+        result[f"{name}: error of the strains, median [%]"] = 100.0 * float(np.median(error))
+        for scale, values in scales.items():
+            factor = np.quantile(error / values, learning.CONFIDENCE)
+            result[f"{name}: bound from the {scale}, median [%]"] = 100.0 * float(np.median(factor * values))
+            result[f"{name}: rank correlation of the {scale} with the error"] = float(spearmanr(values, error)[0])
+    return result
+
+
+BENCHMARKS = {benchmark(name): of(name) for name in ARMS} | {"module_bounds": module_bounds}
 """One benchmark for each arm, each recorded on its own, because the arm of eight cells takes minutes."""
 
 

@@ -72,7 +72,7 @@ RECIPES = {
         {"length": (0.015, 0.040), "radius": (0.006, 0.010), "wall": (0.0015, 0.003)}, 0.3, 30, 40, 2
     ),
     "bellows": Recipe(
-        {"pitch": (0.007, 0.010), "radius": (0.007, 0.010), "amplitude": (0.0012, 0.0024)}, 0.3, 14, 16, 2, (2, 1)
+        {"pitch": (0.007, 0.010), "radius": (0.007, 0.010), "amplitude": (0.0012, 0.0024)}, 0.3, 28, 24, 2, (2, 1)
     ),
     # Stiffer rotations carry several times the load that turns the softest one.
     "accordion": Recipe(
@@ -293,19 +293,18 @@ def fit(
     return model
 
 
-class _Errors(NamedTuple):
-    """Size of the wrong strains of states (n,), and largest relative error of their stiffness over directions (n,)."""
-
-    strain: np.ndarray
-    stiffness: np.ndarray
-
-
-def _errors(model: LearnedModule, states: ModuleStates) -> _Errors:
+def wrong_strains(model: LearnedModule, states: ModuleStates) -> np.ndarray:
+    """Return by how much the strains of states are wrong under their loads, to first order, shape (n, 6)."""
     found = _corrected(model, states, _products(states.strain, model.terms))
-    weights = _weights(states, 1.0)
-    strain = np.einsum("nij,nj->ni", weights.compliance, found.gradient() - states.gradient)
-    relative = weights.root @ (found.hessian() - states.hessian) @ np.swapaxes(weights.root, 1, 2)
-    return _Errors(np.linalg.norm(strain, axis=1), np.abs(np.linalg.eigvalsh(relative)).max(axis=1))
+    return np.einsum("nij,nj->ni", np.linalg.inv(states.hessian), found.gradient() - states.gradient)
+
+
+def wrong_stiffness(model: LearnedModule, states: ModuleStates) -> np.ndarray:
+    """Return the largest relative errors of the stiffness of states over all directions of motion, shape (n,)."""
+    found = _corrected(model, states, _products(states.strain, model.terms))
+    root = _weights(states, 1.0).root
+    relative = root @ (found.hessian() - states.hessian) @ np.swapaxes(root, 1, 2)
+    return np.abs(np.linalg.eigvalsh(relative)).max(axis=1)
 
 
 def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
@@ -317,13 +316,19 @@ def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
         over all directions of motion; ``loaded``: the number of states under load, and ``covered``: how many of them
         have strains within the bound of `LearnedModule.error`.
     """
-    found = _errors(model, states)
+    wrong, stiffness = np.linalg.norm(wrong_strains(model, states), axis=1), wrong_stiffness(model, states)
     sizes = np.linalg.norm(states.strain, axis=1)
-    values = {"strain_mean": found.strain.mean() / sizes.max(), "strain_max": found.strain.max() / sizes.max()}
-    values |= {"stiffness_mean": found.stiffness.mean(), "stiffness_max": found.stiffness.max()}
-    covered = found.strain <= model.error(model.unit(states.designs)) * sizes
+    values = {"strain_mean": wrong.mean() / sizes.max(), "strain_max": wrong.max() / sizes.max()}
+    values |= {"stiffness_mean": stiffness.mean(), "stiffness_max": stiffness.max()}
+    covered = wrong <= model.error(model.unit(states.designs)) * sizes
     values |= {"loaded": (sizes > 0.0).sum(), "covered": covered[sizes > 0.0].sum()}
     return {name: float(value) for name, value in values.items()}
+
+
+def folds(states: ModuleStates) -> np.ndarray:
+    """Return the part of the bodies to which the body of each state belongs, 0 to `FOLDS` - 1, shape (n,)."""
+    bodies, number = np.unique(states.designs, axis=0, return_inverse=True)
+    return (np.random.default_rng(0).permutation(len(bodies)) % FOLDS)[number]
 
 
 def calibrated(model: LearnedModule, recipe: Recipe, states: ModuleStates) -> LearnedModule:
@@ -334,13 +339,12 @@ def calibrated(model: LearnedModule, recipe: Recipe, states: ModuleStates) -> Le
     (`LearnedModule.error`); the line is raised until `CONFIDENCE` of these states, and one more, are below it (split
     conformal prediction over folds). States of one body are not independent, so the share holds only about.
     """
-    bodies, number = np.unique(states.designs, axis=0, return_inverse=True)
-    fold = (np.random.default_rng(0).permutation(len(bodies)) % FOLDS)[number]
+    fold = folds(states)
     moved = (states.strain != 0.0).any(axis=1)
     wrong = np.empty(len(states))
     for part in range(FOLDS):
         other = fit(recipe, model.module, states.rows(fold != part), model.others)
-        wrong[fold == part] = _errors(other, states.rows(fold == part)).strain
+        wrong[fold == part] = np.linalg.norm(wrong_strains(other, states.rows(fold == part)), axis=1)
     share = model.share(model.unit(states.designs))[moved]
     logarithm = np.log(wrong[moved] / np.linalg.norm(states.strain[moved], axis=1))
     slope = max(float(np.polyfit(share, logarithm, 1)[0]), 0.0)
@@ -391,6 +395,13 @@ def tested(model: LearnedModule) -> LearnedModule:
     return replace(model, errors={place: errors(model, each) for place, each in states.items()})
 
 
+def training_states(module: str, recipe: Recipe) -> ModuleStates:
+    """Return the states from which a module is learned; this takes up to some minutes of finite elements."""
+    variables = len(recipe.box)
+    loaded = _solved(module, recipe, MARGIN * _drawn(recipe.bodies, variables, 1), recipe.rays, 1)
+    return loaded.joined(_solved(module, recipe, MARGIN * _drawn(recipe.unloaded, variables, 2), 0, 2))
+
+
 def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
     """Return the superelement of a module, learned from finite elements; this takes some minutes.
 
@@ -399,12 +410,10 @@ def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
         ValueError: for an unknown module.
     """
     recipe = RECIPES[module] if recipe is None else recipe
-    made, variables = MODULES[module](), len(recipe.box)
-    loaded = _solved(module, recipe, MARGIN * _drawn(recipe.bodies, variables, 1), recipe.rays, 1)
-    states = loaded.joined(_solved(module, recipe, MARGIN * _drawn(recipe.unloaded, variables, 2), 0, 2))
+    made, states = MODULES[module](), training_states(module, recipe)
     others = {v.name: v.baseline for v in made.design_space if v.name not in recipe.box and v.name != "young_modulus"}
-    model = calibrated(with_cavity(fit(recipe, module, states, others), states), recipe, states)
-    return tested(model)
+    model = with_cavity(fit(recipe, module, states, others), states)
+    return tested(calibrated(model, recipe, states))
 
 
 if __name__ == "__main__":
