@@ -121,6 +121,32 @@ def benchmark(name: str) -> str:
     return f"modular_arm_{name.replace(' ', '_')}"
 
 
+def stability() -> dict[str, object]:
+    """How often random arms are stable: of up to eight cells, at rest, and under two commands of up to 4 mm."""
+    from softgym_envs.mechanics.solvers.statics import Statics
+    from softgym_envs.robots.modular_arm import CELLS
+    from softgym_envs.robots.registry import make_robot
+
+    kinds, rng, arms = [kind for kind in CELLS if kind != "bellows"], np.random.default_rng(5), 150
+    counts = {"states": 0, "stable": 0, "modules know their loads": 0, "of these unstable": 0, "unstable at rest": 0}
+    counts |= {"stable with an indefinite W": 0}
+    for _ in range(arms):
+        chosen = [kinds[k] for k in rng.integers(0, len(kinds), int(rng.integers(1, 9)))]
+        robot = make_robot("modular_arm", cells=chosen)
+        solver = Statics(robot.build(robot.design_space.sample(rng)))
+        for share in (0.0, 0.5, 1.0):
+            state = solver.solve(share * rng.uniform(-0.004, 0.004, 2))
+            known = all(block.knows(state.x) for block in solver.model.blocks)
+            counts["states"] += 1
+            counts["stable"] += state.stable
+            counts["modules know their loads"] += known
+            counts["of these unstable"] += known and not state.stable
+            counts["unstable at rest"] += share == 0.0 and not state.stable
+            indefinite = np.linalg.eigvalsh(state.condensed.compliance)[0] <= 0.0
+            counts["stable with an indefinite W"] += state.stable and bool(indefinite)
+    return {"arms": arms, **{name: int(count) for name, count in counts.items()}}
+
+
 MEMBERS, SHARE = 4, 0.75
 """Energies of the ensembles that are compared with calibrated bounds, and the share of bodies that each learns."""
 
@@ -167,8 +193,27 @@ def module_bounds() -> dict[str, object]:
     return result
 
 
-BENCHMARKS = {benchmark(name): of(name) for name in ARMS} | {"module_bounds": module_bounds}
-"""One benchmark for each arm, each recorded on its own, because the arm of eight cells takes minutes."""
+def module_meshes() -> dict[str, object]:
+    """By how much half as long edges make modules softer, in the direction of motion in which that is most."""
+    from softgym_envs.robots.modules import MODULES
+    from softgym_envs.robots.modules.learning import RECIPES
+
+    result: dict[str, object] = {}
+    for name, recipe in RECIPES.items():
+        design = {dimension: 0.5 * (low + high) for dimension, (low, high) in recipe.box.items()}
+        usual, fine = (MODULES[name]().compliance(design, refine=refine) for refine in (1.0, 2.0))
+        root = np.linalg.inv(np.linalg.cholesky(usual))
+        result[f"{name}: softer [%]"] = 100.0 * float(np.linalg.eigvalsh(root @ fine @ root.T)[-1] - 1.0)
+        result[f"{name}: stiffer [%]"] = 100.0 * float(1.0 - np.linalg.eigvalsh(root @ fine @ root.T)[0])
+    return result
+
+
+BENCHMARKS = {benchmark(name): of(name) for name in ARMS} | {
+    "modular_arm_stability": stability,
+    "module_bounds": module_bounds,
+    "module_meshes": module_meshes,
+}
+"""Each arm is a benchmark of its own, because the arm of eight cells takes minutes; so are bounds and meshes."""
 
 
 def modular_arm_table() -> str:
@@ -210,12 +255,31 @@ def module_energies_table() -> str:
         for place, found in sorted(learned.errors.items(), reverse=True):
             percent = {of: 100.0 * error for of, error in found.items()}
             cells = [f"{percent[f'{of}_mean']:.2g} %, {percent[f'{of}_max']:.2g} %" for of in ("strain", "stiffness")]
-            first = [f"`{name}`", f"{learned.rotation:g}"] if place == "inside" else ["", ""]
-            bound = f"{100.0 * learned.bounds[place]:.2g} %"
-            rows.append([*first, place, *cells, bound, f"{found['covered']:.0f} of {found['loaded']:.0f}"])
+            first, mesh = ["", ""], ""
+            if place == "inside":
+                first = [f"`{name}`", f"{learned.rotation:g}"]
+                mesh = figure("module_meshes", f"{name}: softer [%]", ".1f") + " %"
+            bound = f"{100.0 * np.linalg.norm(learned.bounds[place]):.2g} %"
+            within = f"{100.0 * found['covered']:.0f} % of {6 * found['loaded']:.0f}"
+            rows.append([*first, place, *cells, bound, within, mesh])
     head = ["module", "load [rad]", "bodies", "strains: mean, largest", "stiffness: mean, largest"]
-    return markdown([*head, "bound", "states within it"], rows, "lrlrrrr")
+    return markdown([*head, "bound", "errors within it", "finer mesh: softer by"], rows, "lrlrrrrr")
 
 
-TABLES = {"modular_arm": modular_arm_table, "module_energies": module_energies_table}
+def module_bounds_table() -> str:
+    """Calibrated bounds of two modules against those from the spread of an ensemble."""
+    rows = []
+    for name in ("solid_block", "crossed_leaves"):
+        keys = [f"bound from the {scale}, median [%]" for scale in ("place", "ensemble")]
+        keys = ["error of the strains, median [%]", *keys]
+        rows.append([f"`{name}`", *(figure("module_bounds", f"{name}: {key}", ".2f") + " %" for key in keys)])
+    head = ["module", "error: median", "bound from the place in the box: median", "from an ensemble: median"]
+    return markdown(head, rows, "lrrr")
+
+
+TABLES = {
+    "modular_arm": modular_arm_table,
+    "module_energies": module_energies_table,
+    "module_bounds": module_bounds_table,
+}
 """Tables of pages by name."""

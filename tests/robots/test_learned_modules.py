@@ -111,9 +111,9 @@ def test_bounds_cover_states_that_were_neither_learned_nor_used_to_calibrate():
     recipe = Recipe({"length": (0.01, 0.03)}, 0.5, degrees=(1, 0))
     model = calibrated(fit(recipe, "solid_block", learned, {}), recipe, learned)
     found = errors(model, others)
-    assert 0.9 < found["covered"] / found["loaded"] < 0.99
+    assert 0.9 < found["covered"] < 0.99
     halved = replace(model, bounds={place: 0.5 * bound for place, bound in model.bounds.items()})
-    assert errors(halved, others)["covered"] < 0.5 * found["loaded"]
+    assert errors(halved, others)["covered"] < 0.8
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -157,14 +157,15 @@ def test_learned_modules_know_how_wrong_they_may_be(name):
     middle = {each: (low * high) ** 0.5 for each, (low, high) in learned.box.items()}
     corner = {each: high for each, (_, high) in learned.box.items()}
     inside, outside = (learned.energy({**design, "young_modulus": 1e7}) for design in (middle, corner))
-    assert inside.error == pytest.approx(learned.bounds["inside"])
-    assert outside.error == pytest.approx(learned.bounds["corners"]) and 0.0 < inside.error <= outside.error < 0.1
+    np.testing.assert_allclose(inside.error, learned.bounds["inside"])
+    np.testing.assert_allclose(outside.error, learned.bounds["corners"])
+    assert (0.0 < inside.error).all() and (inside.error <= outside.error).all() and outside.error.max() < 0.1
     scale = np.array([module.length(module.design_space.complete(middle))] * 3 + [1.0] * 3)
     strains = 0.3 * scale * learned.largest_strains * np.sign(np.arange(6) - 2.5)
     assert not inside.possible_errors(np.zeros(6)).any()
     compliance = np.linalg.inv(inside.evaluate(strains)[2])
     off = np.array([compliance @ row / scale for row in inside.possible_errors(strains)])
-    np.testing.assert_allclose(off, inside.error * np.linalg.norm(strains / scale) * np.eye(6), atol=1e-9)
+    np.testing.assert_allclose(off, np.linalg.norm(strains / scale) * np.diag(inside.error), atol=1e-9)
 
 
 def test_strains_that_were_not_learned_are_not_known():

@@ -192,8 +192,8 @@ class ModuleEnergy:
         rotation: the largest load that was learned, as the angle by which it would turn the softest rotation [rad];
             see `softgym_envs.robots.modules.states.solve_states`. Default any load.
         largest_strains: size of each strain that was learned, the first three over the length, shape (6,). Default any.
-        error: bound on the error of the strains under a load, relative to their size, the first three over the length.
-            Default none.
+        error: bounds on the errors of the strains under a load, relative to the size of all, the first three over the
+            length, shape (6,). Default none.
 
     Raises:
         ValueError: for a stiffness that is not positive.
@@ -208,9 +208,9 @@ class ModuleEnergy:
         order: int = 3,
         rotation: float = np.inf,
         largest_strains: np.ndarray | float = np.inf,
-        error: float = 0.0,
+        error: np.ndarray | float = 0.0,
     ) -> None:
-        self.error = float(error)
+        self.error = np.broadcast_to(np.asarray(error, dtype=float), 6)
         self.stiffness = np.array(stiffness, dtype=float)
         self.corrections = np.array(corrections, dtype=float)
         if not (self.stiffness > 0.0).all():
@@ -230,10 +230,11 @@ class ModuleEnergy:
     def possible_errors(self, strains: np.ndarray) -> np.ndarray:
         """Return the errors of the gradient at strains (6,) that wrong strains cause, by axis: shape (6, 6) [N, N m].
 
-        Row i is that of strains which are off along their axis i by the bound. So the root of the sum of squares of the
-        work of all rows along a motion is the largest work of all errors within the bound.
+        Row i is that of strains which are off along their axis i by its bound. If errors along different axes are
+        independent, the root of the sum of squares of the work of all rows along a motion bounds the work of all.
         """
-        return self.error * np.linalg.norm(self._scale * strains) / self._scale[:, None] * self.evaluate(strains)[2]
+        off = self.error * np.linalg.norm(self._scale * strains) / self._scale
+        return off[:, None] * self.evaluate(strains)[2]
 
     def load(self, strains: np.ndarray) -> float:
         """Return the load at strains (6,) over the largest one that was learned."""

@@ -49,8 +49,8 @@ class LearnedModule:
         corrections: weights of ``c``, shape (q, len(terms)).
         largest_strains: size of each strain of the states, the first three over the length, shape (6,).
         errors: those on bodies that were not used, as `learning.errors` returns them.
-        bounds: on the errors of the strains relative to their size, ``"inside"`` the box and at its ``"corners"``, as
-            `learning.calibrated` finds them; without them, the errors count as zero.
+        bounds: on the error of each strain relative to the size of all, ``"inside"`` the box and at its ``"corners"``,
+            shape (6,), as `learning.calibrated` finds them; without them, the errors count as zero.
         degrees: of the polynomials of ``stiffness`` and ``corrections``.
         swelling: weights of the coefficients of `energy.CavityVolume`, shape (p, m); none if the module is not closed.
         bulge: weights of the logarithm of its ``bulge``, shape (p,); likewise.
@@ -65,7 +65,7 @@ class LearnedModule:
     corrections: np.ndarray
     largest_strains: np.ndarray
     errors: Mapping[str, Mapping[str, float]]
-    bounds: Mapping[str, float]
+    bounds: Mapping[str, np.ndarray]
     degrees: tuple[int, int]
     swelling: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     bulge: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -99,7 +99,7 @@ class LearnedModule:
             self.order,
             self.rotation,
             self.largest_strains,
-            float(self.error(unit[0])),
+            self.error(unit[0]),
         )
 
     def share(self, unit: np.ndarray) -> np.ndarray:
@@ -107,13 +107,13 @@ class LearnedModule:
         return np.clip((np.abs(unit) - 1.0) / EDGE + 1.0, 0.0, 1.0).mean(axis=-1)
 
     def error(self, unit: np.ndarray) -> np.ndarray:
-        """Return the bound on the error of the strains relative to their size, of bodies (..., v) in [-1, 1].
+        """Return the bounds (..., 6) on the error of each strain over the size of all, of bodies (..., v) in [-1, 1].
 
-        Its logarithm is linear in the share of dimensions at their bounds, as in `softgym_envs.surrogate.domain`.
+        Their logarithms are linear in the share of dimensions at their bounds, as in `softgym_envs.surrogate.domain`.
         """
         if not self.bounds:
-            return np.zeros(unit.shape[:-1])
-        share = self.share(unit)
+            return np.zeros((*unit.shape[:-1], 6))
+        share = self.share(unit)[..., None]
         return self.bounds["inside"] ** (1.0 - share) * self.bounds["corners"] ** share
 
     def cavity(self, design: Mapping[str, float] | None = None) -> CavityVolume:
@@ -152,6 +152,7 @@ class LearnedModule:
         """Write the superelement as JSON, for `load_module`."""
         record = {"format": FORMAT, **asdict(self)}
         record |= {name: np.round(getattr(self, name), 8).tolist() for name in _ARRAYS}
+        record["bounds"] = {place: np.round(bound, 8).tolist() for place, bound in self.bounds.items()}
         Path(path).write_text(json.dumps(record) + "\n")
 
 
@@ -170,7 +171,7 @@ def load_module(path: str | Path) -> LearnedModule:
         record["degrees"] = tuple(record["degrees"])
         # Files of earlier versions do not limit strains, and have no calibrated bounds.
         record.setdefault("largest_strains", [np.inf] * 6)
-        record.setdefault("bounds", {})
+        record["bounds"] = {place: np.array(bound) for place, bound in record.get("bounds", {}).items()}
         for name in _ARRAYS:
             if name in record:
                 record[name] = np.array(record[name], dtype=float)

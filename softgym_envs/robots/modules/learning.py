@@ -313,15 +313,15 @@ def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
     Returns:
         ``strain_mean`` and ``strain_max``: error of the strains under the load of a state over the largest strain of
         the states, to first order; ``stiffness_mean`` and ``stiffness_max``: largest relative error of the stiffness
-        over all directions of motion; ``loaded``: the number of states under load, and ``covered``: how many of them
-        have strains within the bound of `LearnedModule.error`.
+        over all directions of motion; ``loaded``: the number of states under load, and ``covered``: the share of
+        the six errors of their strains that are within the bounds of `LearnedModule.error`.
     """
     wrong, stiffness = np.linalg.norm(wrong_strains(model, states), axis=1), wrong_stiffness(model, states)
     sizes = np.linalg.norm(states.strain, axis=1)
     values = {"strain_mean": wrong.mean() / sizes.max(), "strain_max": wrong.max() / sizes.max()}
     values |= {"stiffness_mean": stiffness.mean(), "stiffness_max": stiffness.max()}
-    covered = wrong <= model.error(model.unit(states.designs)) * sizes
-    values |= {"loaded": (sizes > 0.0).sum(), "covered": covered[sizes > 0.0].sum()}
+    within = np.abs(wrong_strains(model, states)) <= model.error(model.unit(states.designs)) * sizes[:, None]
+    values |= {"loaded": (sizes > 0.0).sum(), "covered": within[sizes > 0.0].mean()}
     return {name: float(value) for name, value in values.items()}
 
 
@@ -336,21 +336,21 @@ def calibrated(model: LearnedModule, recipe: Recipe, states: ModuleStates) -> Le
 
     Each part of the bodies is left out once, and a model of the others predicts their states under load. The logarithm
     of the errors, relative to the size of the strains, is a line over the share of dimensions at the bounds of the box
-    (`LearnedModule.error`); the line is raised until `CONFIDENCE` of these states, and one more, are below it (split
-    conformal prediction over folds). States of one body are not independent, so the share holds only about.
+    (`LearnedModule.error`). For each strain the line is raised until `CONFIDENCE` of its errors, and one more, are
+    below it (conformal prediction over folds). States of one body are not independent, so the share holds only about.
     """
     fold = folds(states)
     moved = (states.strain != 0.0).any(axis=1)
-    wrong = np.empty(len(states))
+    wrong = np.empty((len(states), 6))
     for part in range(FOLDS):
         other = fit(recipe, model.module, states.rows(fold != part), model.others)
-        wrong[fold == part] = np.linalg.norm(wrong_strains(other, states.rows(fold == part)), axis=1)
+        wrong[fold == part] = wrong_strains(other, states.rows(fold == part))
+    wrong = wrong[moved] / np.linalg.norm(states.strain[moved], axis=1)[:, None]
     share = model.share(model.unit(states.designs))[moved]
-    logarithm = np.log(wrong[moved] / np.linalg.norm(states.strain[moved], axis=1))
-    slope = max(float(np.polyfit(share, logarithm, 1)[0]), 0.0)
-    above = np.sort(logarithm - slope * share)
+    slope = max(float(np.polyfit(share, np.log(np.linalg.norm(wrong, axis=1)), 1)[0]), 0.0)
+    above = np.sort(np.abs(wrong) * np.exp(-slope * share)[:, None], axis=0)
     level = above[min(int(np.ceil(CONFIDENCE * (len(above) + 1))), len(above)) - 1]
-    return replace(model, bounds={"inside": float(np.exp(level)), "corners": float(np.exp(level + slope))})
+    return replace(model, bounds={"inside": level, "corners": level * np.exp(slope)})
 
 
 def with_cavity(model: LearnedModule, states: ModuleStates) -> LearnedModule:
