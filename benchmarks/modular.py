@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.recorded import figure
+from benchmarks.recorded import figure, results
 from benchmarks.tables import markdown
 from softgym_envs.mechanics.condensation import RoleMatrix
 
@@ -194,7 +194,7 @@ def module_bounds() -> dict[str, object]:
 
 
 def module_meshes() -> dict[str, object]:
-    """By how much half as long edges make modules softer, in the direction of motion in which that is most."""
+    """By how much half as long edges make modules softer or stiffer, in the directions of motion of the extremes."""
     from softgym_envs.robots.modules import MODULES
     from softgym_envs.robots.modules.learning import RECIPES
 
@@ -249,7 +249,7 @@ def module_energies_table() -> str:
     from softgym_envs.robots.modules import learned_module
     from softgym_envs.robots.modules.learning import RECIPES
 
-    rows = []
+    rows, meshes = [], results("module_meshes")
     for name in RECIPES:
         learned = learned_module(name)
         for place, found in sorted(learned.errors.items(), reverse=True):
@@ -258,12 +258,12 @@ def module_energies_table() -> str:
             first, mesh = ["", ""], ""
             if place == "inside":
                 first = [f"`{name}`", f"{learned.rotation:g}"]
-                mesh = figure("module_meshes", f"{name}: softer [%]", ".1f") + " %"
+                mesh = f"{max(meshes[f'{name}: {way} [%]'] for way in ('softer', 'stiffer')):.1f} %"
             bound = f"{100.0 * np.linalg.norm(learned.bounds[place]):.2g} %"
             within = f"{100.0 * found['covered']:.0f} % of {6 * found['loaded']:.0f}"
             rows.append([*first, place, *cells, bound, within, mesh])
     head = ["module", "load [rad]", "bodies", "strains: mean, largest", "stiffness: mean, largest"]
-    return markdown([*head, "bound", "errors within it", "finer mesh: softer by"], rows, "lrlrrrrr")
+    return markdown([*head, "bound", "errors within it", "mesh"], rows, "lrlrrrrr")
 
 
 def module_bounds_table() -> str:
