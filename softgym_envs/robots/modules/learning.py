@@ -32,7 +32,7 @@ MARGIN = 1.1
 """Bodies are drawn from a box that is wider by this factor than the one that users may use."""
 
 CONFIDENCE, FOLDS = 0.95, 5
-"""Share of states whose strains are within the bound of their error, and parts of the bodies that calibrate it."""
+"""Share of the errors of strains that are within their bounds, and parts of the bodies that calibrate these."""
 
 _ROWS, _COLUMNS = np.triu_indices(6)
 
