@@ -1,7 +1,8 @@
 """Fingers grown from examples: a latent space of side views against seven parameters, at an equal number of bodies.
 
 ``python -m benchmarks.grown_shapes FOLDER [BODIES]`` trains the variational autoencoder, searches with both for three
-seeds, and writes ``benchmarks/data/grown_shapes.json``; what is in FOLDER is not computed again.
+seeds, and writes ``benchmarks/data/grown_shapes.json``; what is in FOLDER is not computed again. With ``quality
+FOLDER`` only what the autoencoder is worth is measured, and replaced in that file.
 
 A finger is a side view, extruded to the width of the Soft Finger. The side view is where a function of the place along
 the finger (s) and across it (y) is negative: near its surface the signed distance. Examples have one to four notches,
@@ -44,6 +45,8 @@ DEEPEST = 6.0
 """Signed distances are cut off here [mm]."""
 LATENT, LATENT_BOUND = 8, 3.0
 """Dimension of the latent space, and bounds of the search there; places of examples have a deviation of about 1.9."""
+SAMPLES = 100
+"""Of the latent space, of which the share that meshes and solves is measured."""
 CELL = 3.0
 """Distance of the nodes of the mesh [mm]."""
 PARAMETERS = {
@@ -348,26 +351,49 @@ def examples(count: int, seed: int) -> np.ndarray:
     return np.array(found)
 
 
-def quality(model: Autoencoder, test: np.ndarray, samples: int, seed: int = 5) -> dict[str, float]:
+def tried(model: Autoencoder, kept: Path, samples: int, seed: int = 5) -> list[str]:
+    """Solve samples of the latent space; those in the file ``kept`` are not solved again.
+
+    Returns:
+        For each sample ``"solved"``, or the reason why it cannot be used.
+    """
+    found = kept.read_text().splitlines()[:samples] if kept.exists() else []
+    latent = np.random.default_rng(seed).normal(size=(samples, LATENT))
+    for distance in model.decode(latent[len(found) :]) if len(found) < samples else []:
+        try:
+            judge(distance)
+            found.append("solved")
+        except SoftGymError as error:
+            found.append(str(error).splitlines()[0])
+        with kept.open("a") as stream:
+            stream.write(found[-1] + "\n")
+    return found
+
+
+def quality(model: Autoencoder, test: np.ndarray, samples: list[str]) -> dict[str, Any]:
     """Return errors of reconstruction on examples that were not learned, and the share of samples that can be used."""
     found = model.decode(model.encode(test))
     near = np.abs(test) < 3.0
     both, either = ((found < 0) & (test < 0)).sum(axis=(1, 2)), ((found < 0) | (test < 0)).sum(axis=(1, 2))
-    usable = []
-    for distance in model.decode(np.random.default_rng(seed).normal(size=(samples, LATENT))):
-        try:
-            judge(distance)
-            usable.append("solved")
-        except SoftGymError as error:
-            usable.append(str(error))
-    share = usable.count("solved") / samples
-    print({text: usable.count(text) for text in set(usable)}, file=sys.stderr)
     return {
         "error near the surface [mm]": float(np.abs(found - test)[near].mean()),
         "overlap": float((both / either).mean()),
-        "decoded samples": samples,
-        "share that meshes and solves": share,
+        "decoded samples": len(samples),
+        "share that meshes and solves": samples.count("solved") / len(samples),
+        "other samples": {text: samples.count(text) for text in sorted(set(samples) - {"solved"})},
     }
+
+
+def measure(folder: Path) -> tuple[Autoencoder, dict[str, Any]]:
+    """Train the autoencoder and return it and its `quality`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    began = time.process_time()
+    model = Autoencoder(examples(2000, 1))
+    seconds = time.process_time() - began
+    print(f"trained in {seconds:.0f} CPU s", file=sys.stderr)
+    found = quality(model, examples(300, 2), tried(model, folder / "samples.txt", SAMPLES))
+    print(json.dumps(found), file=sys.stderr, flush=True)
+    return model, found | {"training [CPU s]": seconds, "commit": provenance()["commit"]}
 
 
 def search(
@@ -417,14 +443,7 @@ def volume(rows: list[dict[str, Any]], baseline: Judged) -> float:
 
 def run(folder: Path, budget: int) -> dict[str, Any]:
     """Train, search and compare; see the module."""
-    folder.mkdir(parents=True, exist_ok=True)
-    began = time.process_time()
-    model = Autoencoder(examples(2000, 1))
-    seconds = time.process_time() - began
-    print(f"trained in {seconds:.0f} CPU s", file=sys.stderr)
-    if not (folder / "quality.json").exists():
-        write_json(folder / "quality.json", quality(model, examples(300, 2), 60) | {"training [CPU s]": seconds})
-    print((folder / "quality.json").read_text(), file=sys.stderr, flush=True)
+    model, measured = measure(folder)
     baseline = judge(seven_parameters(BASELINE))
     spaces: dict[str, tuple[list[str], np.ndarray, Callable[[np.ndarray], np.ndarray]]] = {
         "seven parameters": (list(PARAMETERS), np.array(list(PARAMETERS.values())), seven_parameters),
@@ -434,7 +453,7 @@ def run(folder: Path, budget: int) -> dict[str, Any]:
             lambda x: model.decode(x)[0],
         ),
     }
-    found: dict[str, Any] = {"baseline": asdict(baseline), "quality": json.loads((folder / "quality.json").read_text())}
+    found: dict[str, Any] = {"baseline": asdict(baseline), "quality": measured}
     found |= {"budget": budget, "searches": []}
     for seed in SEEDS:
         for name, (names, bounds, shape) in spaces.items():
@@ -536,5 +555,8 @@ TABLES = {"grown_shapes": grown_shapes_table, "grown_quality": grown_quality_tab
 """Tables of pages by name."""
 
 if __name__ == "__main__":
-    budget = int(sys.argv[2]) if len(sys.argv) > 2 else 60
-    write_json(KEPT, {**run(Path(sys.argv[1]), budget), "provenance": provenance()})
+    if sys.argv[1] == "quality":
+        write_json(KEPT, json.loads(KEPT.read_text()) | {"quality": measure(Path(sys.argv[2]))[1]})
+    else:
+        budget = int(sys.argv[2]) if len(sys.argv) > 2 else 60
+        write_json(KEPT, {**run(Path(sys.argv[1]), budget), "provenance": provenance()})

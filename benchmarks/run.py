@@ -86,7 +86,6 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "shared_finger": robots.shared_finger,
     "stiff_flop": robots.stiff_flop,
     "carry": carry.carry,
-    "modular_arm": modular.modular_arm,
     "contact_control": contact_control.contact_control,
     "contact_friction": contact_friction.contact_friction,
     "sensor_finger": sensor_finger.published,
@@ -110,6 +109,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "codesign_profile": codesign_scale.profile,
     **accurate_meshes.BENCHMARKS,
     **convergence.BENCHMARKS,
+    **modular.BENCHMARKS,
     **robustness.BENCHMARKS,
     **trust.BENCHMARKS,
 }

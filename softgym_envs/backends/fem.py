@@ -20,7 +20,7 @@ from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import TOUCH_RADIUS, Robot
-from softgym_envs.surrogate.domain import LOADED, SPREAD
+from softgym_envs.surrogate.domain import LOADED, SOFT, SPREAD
 
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
@@ -341,7 +341,10 @@ class FEMBackend(Backend):
             velocity = self._dynamics.effector_velocity().reshape(-1, 3)
         doubt = 0 if all(block.knows(equilibrium.x) for block in self.model.blocks) else LOADED
         uncertainty = 0.0
-        if motion is None and any(block.learned for block in self.model.blocks):
+        learned = any(block.learned for block in self.model.blocks)
+        if learned and not equilibrium.stable:
+            doubt |= SOFT
+        if motion is None and learned:
             held = np.abs(equilibrium.effort[slices["a"]]) < self.largest_efforts * SATURATED
             uncertainty = float(np.linalg.norm(possible_errors(self._statics, held)[:3]))
             doubt |= SPREAD if uncertainty > self.robot.goal_tolerance else 0

@@ -16,8 +16,8 @@ OUTSIDE, SPREAD, SOFT, LOADED = 1, 2, 4, 8
 
 DOUBTS = {OUTSIDE: "outside box", SPREAD: "spread", SOFT: "softening", LOADED: "loads"}
 """The reasons in words: body or displacements lie outside the box of the training states; the uncertainty is above the
-limit; the actuators are so soft that the body may be about to buckle; a learned superelement carries larger loads than
-those that it was learned under."""
+limit; the actuators are so soft that the body may be about to buckle, or a body of superelements has; a learned
+superelement carries larger loads than those that it was learned under."""
 
 SLACK = 1e-3
 """Actuators that end farther beyond their commands than this are slack [half their range]."""

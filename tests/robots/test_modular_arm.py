@@ -9,7 +9,7 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.geometry.export import export_body
-from softgym_envs.robots.modular_arm import BODIES
+from softgym_envs.robots.modular_arm import BODIES, CELLS
 from softgym_envs.surrogate.domain import doubt_text
 
 
@@ -65,6 +65,46 @@ def test_the_compliance_of_the_arm_is_the_derivative_of_its_equilibria():
     moves = [solver.solve(command + s * step * np.eye(2)[0]).condensed.delta.e for s in (1.0, -1.0)]
     held = W.ea @ np.linalg.inv(W.aa)
     np.testing.assert_allclose((moves[0] - moves[1]) / (2.0 * step), held[:, 0], rtol=1e-3, atol=1e-4)
+
+
+def test_an_arm_that_buckles_is_told_and_not_trusted():
+    """A wire bends a leaf about its stiff axis until it buckles sideways, as on finite elements.
+
+    The wires hold the state: the compliance with the wires held is positive definite, that under given forces is not.
+    """
+    command = np.array([0.002, 0.0005])
+    for body in BODIES:
+        robot = make_robot("modular_arm", cells=["leaf_x", "block"], body=body, max_effort=10.0)
+        backend = FEMBackend(robot)
+        before = backend.step(np.array([0.002, 0.00025]))
+        state = backend.step(command)
+        np.testing.assert_allclose(state.displacement, command, atol=1e-6)
+        assert before.stable and not state.stable
+        for found, definite in ((before, True), (state, False)):
+            W = found.condensed.W
+            assert (np.linalg.eigvalsh(W.aa)[0] > 0.0) == definite
+            assert np.linalg.eigvalsh(W.ee - W.ea @ np.linalg.solve(W.aa, W.ae))[0] > 0.0
+        assert state.trusted == (body == "solid")
+        assert ("softening" in doubt_text(state.doubt)) == (body == "superelements")
+
+
+def test_the_compliance_of_any_arm_is_positive_definite_where_it_is_stable():
+    """Random structures, dimensions and commands: at rest, and wherever the modules know their loads."""
+    kinds = [kind for kind in CELLS if kind != "bellows"]
+    robot, rng = make_robot("modular_arm", cells=5, kinds=kinds), np.random.default_rng(2)
+    stable = []
+    for _ in range(12):
+        design = dict(robot.design_space.sample(rng))
+        design = design | {f"kind_{number}": float(rng.integers(len(kinds))) + 0.5 for number in range(1, 6)}
+        solver = Statics(robot.build(design))
+        for share in (0.0, 1.0):
+            state = solver.solve(share * rng.uniform(-0.003, 0.003, 2))
+            known = all(block.knows(state.x) for block in solver.model.blocks)
+            if known or state.stable:
+                assert state.stable and np.linalg.eigvalsh(state.condensed.compliance)[0] > 0.0
+            assert known or share
+            stable.append(state.stable)
+    assert sum(stable) > 18
 
 
 def test_cells_are_an_option_and_their_dimensions_the_design():

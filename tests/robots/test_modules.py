@@ -124,8 +124,14 @@ def test_a_notch_turns_like_a_beam_of_varying_depth():
     depth = neck + 2.0 * (radius - np.sqrt(np.maximum(radius**2 - z**2, 0.0)))
     blocks = module.length(module.design_space.complete({"radius": radius})) - 2.0 * radius
     curvature = np.trapezoid(1.0 / depth**3, z) + blocks / (neck + 2.0 * radius) ** 3
-    # The neck is short, so plane sections do not quite stay plane: measured 2 % below.
-    assert found[RY, RY] == pytest.approx(12.0 / (E * width) * curvature, rel=0.03)
+    # Plane sections do not stay plane where the depth changes fast: the neck is softer than the beam, here by 6 %.
+    beam = 12.0 / (E * width) * curvature
+    assert beam < found[RY, RY] < 1.08 * beam
+    # Fit of Schotborgh et al. (2005) to finite elements of circular hinges in plane stress.
+    ratio = math.sqrt(neck / (2.0 * radius))
+    stiffness = E * width * neck**2 / 12.0 * (-0.0089 + 1.3556 * ratio - 0.5227 * ratio**2)
+    ends = 12.0 * blocks / (E * width * (neck + 2.0 * radius) ** 3)
+    assert found[RY, RY] == pytest.approx(1.0 / stiffness + ends, rel=0.015)
 
 
 def test_an_accordion_stretches_by_bending_its_folds():

@@ -42,11 +42,16 @@ def reflections(symmetry: Sequence[str]) -> np.ndarray:
 
 
 @cache
-def terms(symmetry: tuple[str, ...] = MIRRORED) -> np.ndarray:
+def terms(symmetry: tuple[str, ...] = MIRRORED, order: int = 3) -> np.ndarray:
     """Return the corrections of strains that a symmetry allows; see `reflections`.
 
+    Args:
+        symmetry: of the module.
+        order: 3, all products of up to three strains; or 5, also products of two squares of strains, and of two squares
+            and the corrected strain: modules that bend far need them, and others would be too many to learn.
+
     Returns:
-        Shape (m, 4): the corrected strain, and the factors of the product; -1 for no factor.
+        Shape (m, order + 1): the corrected strain, and the factors of the product; -1 for no factor.
     """
     signs = reflections(symmetry)
     rows = []
@@ -55,7 +60,13 @@ def terms(symmetry: tuple[str, ...] = MIRRORED) -> np.ndarray:
             product = signs[:, list(factors)].prod(axis=1)
             for target in range(6):
                 if (signs[:, target] == product).all() and (degree > 1 or target < factors[0]):
-                    rows.append([target, *factors, *([-1] * (3 - degree))])
+                    rows.append([target, *factors, *([-1] * (order - degree))])
+    if order == 5:
+        for i, j in combinations_with_replacement(range(6), 2):
+            for target in range(6):
+                if (signs[:, target] == 1).all():
+                    rows.append([target, i, i, j, j, -1])
+                rows.append([target, i, i, j, j, target])
     found = np.array(rows, dtype=np.int64)
     found.flags.writeable = False
     return found
@@ -127,32 +138,39 @@ class CavityVolume:
 
 
 @njit(cache=True, error_model="numpy")
+def _product(x, factors, count, left, right):
+    """Return the product of ``count`` factors of ``x``, without two of them."""
+    total = 1.0
+    for k in range(count):
+        if k != left and k != right:
+            total *= x[factors[k]]
+    return total
+
+
+@njit(cache=True, error_model="numpy")
 def _energy(e, terms, k, c, gradient, hessian):
     """Return the energy at strains (6,) and write its gradient (6,) and Hessian (6, 6)."""
-    # A factor that is not there, -1, is the last number: one. Derivatives by it are not used.
-    x, G, second = np.ones(7), np.zeros((6, 7)), np.zeros((7, 7))
-    x[:6] = e
+    G, second = np.eye(6), np.zeros((6, 6))
     g = e.copy()
-    for i in range(6):
-        G[i, i] = 1.0
+    counts = np.zeros(terms.shape[0], dtype=np.int64)
     for m in range(terms.shape[0]):
-        i, a, b, d = terms[m]
-        g[i] += c[m] * x[a] * x[b] * x[d]
-        G[i, a] += c[m] * x[b] * x[d]
-        G[i, b] += c[m] * x[a] * x[d]
-        G[i, d] += c[m] * x[a] * x[b]
+        i, factors = terms[m, 0], terms[m, 1:]
+        while counts[m] < len(factors) and factors[counts[m]] >= 0:
+            counts[m] += 1
+        g[i] += c[m] * _product(e, factors, counts[m], -1, -1)
+        for p in range(counts[m]):
+            G[i, factors[p]] += c[m] * _product(e, factors, counts[m], p, -1)
     for m in range(terms.shape[0]):
-        i, a, b, d = terms[m]
-        factor = k[i] * g[i] * c[m]
-        second[a, b] += factor * x[d]
-        second[b, a] += factor * x[d]
-        second[a, d] += factor * x[b]
-        second[d, a] += factor * x[b]
-        second[b, d] += factor * x[a]
-        second[d, b] += factor * x[a]
+        i, factors = terms[m, 0], terms[m, 1:]
+        force = k[i] * g[i] * c[m]
+        for p in range(counts[m]):
+            for q in range(p):
+                both = force * _product(e, factors, counts[m], p, q)
+                second[factors[p], factors[q]] += both
+                second[factors[q], factors[p]] += both
     energy = 0.0
     gradient[:] = 0.0
-    hessian[:] = second[:6, :6]
+    hessian[:] = second
     for i in range(6):
         energy += 0.5 * k[i] * g[i] * g[i]
         for p in range(6):
@@ -170,11 +188,12 @@ class ModuleEnergy:
         stiffness: ``k`` [J], shape (6,).
         corrections: ``c`` of the `terms` of its symmetry, shape (m,).
         symmetry: of the module; see `reflections`.
+        order: of the `terms`.
         rotation: the largest load that was learned, as the angle by which it would turn the softest rotation [rad];
             see `softgym_envs.robots.modules.states.solve_states`. Default any load.
         largest_strains: size of each strain that was learned, the first three over the length, shape (6,). Default any.
-        error: bound on the error of the strains under a load, relative to their size, the first three over the length.
-            Default none.
+        error: bounds on the errors of the strains under a load, relative to the size of all, the first three over the
+            length, shape (6,). Default none.
 
     Raises:
         ValueError: for a stiffness that is not positive.
@@ -186,16 +205,17 @@ class ModuleEnergy:
         stiffness: np.ndarray,
         corrections: np.ndarray,
         symmetry: tuple[str, ...] = MIRRORED,
+        order: int = 3,
         rotation: float = np.inf,
         largest_strains: np.ndarray | float = np.inf,
-        error: float = 0.0,
+        error: np.ndarray | float = 0.0,
     ) -> None:
-        self.error = float(error)
+        self.error = np.broadcast_to(np.asarray(error, dtype=float), 6)
         self.stiffness = np.array(stiffness, dtype=float)
         self.corrections = np.array(corrections, dtype=float)
         if not (self.stiffness > 0.0).all():
             raise ValueError(f"the stiffness of a module must be positive, got {self.stiffness.tolist()} J")
-        self._terms = terms(symmetry)
+        self._terms = terms(symmetry, order)
         self._scale = np.array([1.0 / length] * 3 + [1.0] * 3)
         self._largest_strains = np.broadcast_to(largest_strains, 6) / self._scale
         moment = rotation / np.diag(np.linalg.inv(self.evaluate(np.zeros(6))[2]))[3:].max()
@@ -210,15 +230,25 @@ class ModuleEnergy:
     def possible_errors(self, strains: np.ndarray) -> np.ndarray:
         """Return the errors of the gradient at strains (6,) that wrong strains cause, by axis: shape (6, 6) [N, N m].
 
-        Row i is that of strains which are off along their axis i by the bound. So the root of the sum of squares of the
-        work of all rows along a motion is the largest work of all errors within the bound.
+        Row i is that of strains which are off along their axis i by its bound. If errors along different axes are
+        independent, the root of the sum of squares of the work of all rows along a motion bounds the work of all.
         """
-        return self.error * np.linalg.norm(self._scale * strains) / self._scale[:, None] * self.evaluate(strains)[2]
+        off = self.error * np.linalg.norm(self._scale * strains) / self._scale
+        return off[:, None] * self.evaluate(strains)[2]
 
     def load(self, strains: np.ndarray) -> float:
         """Return the load at strains (6,) over the largest one that was learned."""
-        return float(np.linalg.norm(self.evaluate(strains)[1] / self._largest_load))
+        return self._load(self.evaluate(strains)[1])
+
+    def _load(self, gradient: np.ndarray) -> float:
+        return float(np.linalg.norm(gradient / self._largest_load))
 
     def knows(self, strains: np.ndarray) -> bool:
-        """Whether no strain of (6,) is larger than it was learned, and the load at them not either."""
-        return bool((np.abs(strains) <= self._largest_strains).all()) and self.load(strains) <= 1.0
+        """Whether the energy may be trusted at strains (6,).
+
+        No strain and no load is larger than those that were learned, and the Hessian is positive definite, as it was in
+        all learned states.
+        """
+        _, gradient, hessian = self.evaluate(strains)
+        learned = bool((np.abs(strains) <= self._largest_strains).all()) and self._load(gradient) <= 1.0
+        return learned and bool(np.linalg.eigvalsh(hessian)[0] > 0.0)

@@ -49,9 +49,12 @@ class LearnedModule:
         corrections: weights of ``c``, shape (q, len(terms)).
         largest_strains: size of each strain of the states, the first three over the length, shape (6,).
         errors: those on bodies that were not used, as `learning.errors` returns them.
+        bounds: on the error of each strain relative to the size of all, ``"inside"`` the box and at its ``"corners"``,
+            shape (6,), as `learning.calibrated` finds them; without them, the errors count as zero.
         degrees: of the polynomials of ``stiffness`` and ``corrections``.
         swelling: weights of the coefficients of `energy.CavityVolume`, shape (p, m); none if the module is not closed.
         bulge: weights of the logarithm of its ``bulge``, shape (p,); likewise.
+        order: of the corrections; see `energy.terms`.
     """
 
     module: str
@@ -62,15 +65,17 @@ class LearnedModule:
     corrections: np.ndarray
     largest_strains: np.ndarray
     errors: Mapping[str, Mapping[str, float]]
+    bounds: Mapping[str, np.ndarray]
     degrees: tuple[int, int]
     swelling: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     bulge: np.ndarray = field(default_factory=lambda: np.empty(0))
+    order: int = 3
 
     @property
     def terms(self) -> np.ndarray:
         """The corrections that the symmetry of the module allows, shape (m, 4); see `energy.terms`."""
         module: type[Module] = MODULES[self.module]
-        return terms(module.symmetry)
+        return terms(module.symmetry, self.order)
 
     def unit(self, designs: np.ndarray) -> np.ndarray:
         """Map dimensions (n, v) to [-1, 1] on a logarithmic scale."""
@@ -91,20 +96,25 @@ class LearnedModule:
             modulus * np.exp(P @ self.stiffness),
             Q @ self.corrections,
             MODULES[self.module].symmetry,  # type: ignore[attr-defined]
+            self.order,
             self.rotation,
             self.largest_strains,
             self.error(unit[0]),
         )
 
-    def error(self, unit: np.ndarray) -> float:
-        """Return the bound on the error of the strains relative to their size, of a body (v,) in [-1, 1].
+    def share(self, unit: np.ndarray) -> np.ndarray:
+        """Return the share of dimensions at the bounds of the box, of bodies (..., v) in [-1, 1]; see `EDGE`."""
+        return np.clip((np.abs(unit) - 1.0) / EDGE + 1.0, 0.0, 1.0).mean(axis=-1)
 
-        It is the largest error on bodies that were not learned: inside the box, and at its corners. Between these, its
-        logarithm is linear in the share of dimensions at their bounds, as in `softgym_envs.surrogate.domain`.
+    def error(self, unit: np.ndarray) -> np.ndarray:
+        """Return the bounds (..., 6) on the error of each strain over the size of all, of bodies (..., v) in [-1, 1].
+
+        Their logarithms are linear in the share of dimensions at their bounds, as in `softgym_envs.surrogate.domain`.
         """
-        inside, corners = (self.errors.get(place, {}).get("relative_max", 0.0) for place in ("inside", "corners"))
-        share = np.clip((np.abs(unit) - 1.0) / EDGE + 1.0, 0.0, 1.0).mean()
-        return float(max(inside, 1e-300) ** (1.0 - share) * max(corners, inside, 1e-300) ** share)
+        if not self.bounds:
+            return np.zeros((*unit.shape[:-1], 6))
+        share = self.share(unit)[..., None]
+        return self.bounds["inside"] ** (1.0 - share) * self.bounds["corners"] ** share
 
     def cavity(self, design: Mapping[str, float] | None = None) -> CavityVolume:
         """Return how the volume of the cavity of a body grows; see `energy`.
@@ -142,6 +152,7 @@ class LearnedModule:
         """Write the superelement as JSON, for `load_module`."""
         record = {"format": FORMAT, **asdict(self)}
         record |= {name: np.round(getattr(self, name), 8).tolist() for name in _ARRAYS}
+        record["bounds"] = {place: np.round(bound, 8).tolist() for place, bound in self.bounds.items()}
         Path(path).write_text(json.dumps(record) + "\n")
 
 
@@ -158,8 +169,9 @@ def load_module(path: str | Path) -> LearnedModule:
             raise ValueError(f"it does not have format {FORMAT}")
         record["box"] = {name: (float(low), float(high)) for name, (low, high) in record["box"].items()}
         record["degrees"] = tuple(record["degrees"])
-        # Files of earlier versions do not limit strains.
+        # Files of earlier versions do not limit strains, and have no calibrated bounds.
         record.setdefault("largest_strains", [np.inf] * 6)
+        record["bounds"] = {place: np.array(bound) for place, bound in record.get("bounds", {}).items()}
         for name in _ARRAYS:
             if name in record:
                 record[name] = np.array(record[name], dtype=float)

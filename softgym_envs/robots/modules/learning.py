@@ -22,7 +22,7 @@ from softgym_envs.robots.modules.learned import LearnedModule, polynomials
 from softgym_envs.robots.modules.registry import MODULES
 from softgym_envs.robots.modules.states import ModuleStates, solve_states
 
-RIDGE = 1e-3
+RIDGE = 1e-5
 """Weight of the squares of the weights of corrections, against overfitting."""
 
 GUESS_RIDGE = 1e-4
@@ -30,6 +30,9 @@ GUESS_RIDGE = 1e-4
 
 MARGIN = 1.1
 """Bodies are drawn from a box that is wider by this factor than the one that users may use."""
+
+CONFIDENCE, FOLDS = 0.95, 5
+"""Share of the errors of strains that are within their bounds, and parts of the bodies that calibrate these."""
 
 _ROWS, _COLUMNS = np.triu_indices(6)
 
@@ -45,6 +48,7 @@ class Recipe:
         unloaded: number of further bodies, only at rest.
         rays: number of random directions of load for each body.
         degrees: of the polynomials of stiffness and corrections; the first needs many bodies.
+        order: of the corrections; see `softgym_envs.robots.modules.energy.terms`.
     """
 
     box: Mapping[str, tuple[float, float]]
@@ -53,20 +57,26 @@ class Recipe:
     unloaded: int = 32
     rays: int = 3
     degrees: tuple[int, int] = (3, 1)
+    order: int = 3
 
 
 RECIPES = {
-    "leaf_spring": Recipe({"leaf_length": (0.010, 0.025), "width": (0.008, 0.020), "thickness": (0.001, 0.0025)}, 0.4),
+    "leaf_spring": Recipe(
+        {"leaf_length": (0.010, 0.025), "width": (0.008, 0.020), "thickness": (0.001, 0.0025)}, 0.6, 40, 32, 2, order=5
+    ),
     "solid_block": Recipe({"length": (0.010, 0.030), "width": (0.008, 0.020), "depth": (0.008, 0.020)}, 0.3),
     "notch_hinge": Recipe(
-        {"radius": (0.003, 0.006), "width": (0.008, 0.014), "neck": (0.0018, 0.0035)}, 0.3, 16, 16, 2, (2, 1)
+        {"radius": (0.003, 0.006), "width": (0.008, 0.014), "neck": (0.0018, 0.0035)}, 0.3, 16, 32, 2
     ),
-    "torsion_tube": Recipe({"length": (0.015, 0.040), "radius": (0.006, 0.010), "wall": (0.0015, 0.003)}, 0.3),
+    "torsion_tube": Recipe(
+        {"length": (0.015, 0.040), "radius": (0.006, 0.010), "wall": (0.0015, 0.003)}, 0.3, 30, 40, 2
+    ),
     "bellows": Recipe(
-        {"pitch": (0.007, 0.010), "radius": (0.007, 0.010), "amplitude": (0.0012, 0.0024)}, 0.3, 14, 16, 2, (2, 1)
+        {"pitch": (0.007, 0.010), "radius": (0.007, 0.010), "amplitude": (0.0012, 0.0024)}, 0.3, 28, 24, 2, (2, 1)
     ),
+    # Stiffer rotations carry several times the load that turns the softest one.
     "accordion": Recipe(
-        {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)}, 0.4, 14, 16, 2, (2, 1)
+        {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)}, 0.9, 16, 32, 2, (2, 1), 5
     ),
     "crossed_leaves": Recipe(
         {"leaf_length": (0.012, 0.020), "width": (0.012, 0.018), "thickness": (0.001, 0.0018)}, 0.3, 16, 16, 2, (2, 1)
@@ -91,12 +101,12 @@ def _products(strain: np.ndarray, terms: np.ndarray) -> _Products:
         value[:, t] = padded[:, factors].prod(axis=1)
         present = [p for p, f in enumerate(factors) if f >= 0]
         for p in present:
-            others = [factors[k] for k in range(3) if k != p]
+            others = [f for k, f in enumerate(factors) if k != p]
             first[:, t, factors[p]] += padded[:, others].prod(axis=1)
             for q in present:
                 if q != p:
-                    (left,) = (factors[k] for k in range(3) if k not in (p, q))
-                    second[:, t, factors[p], factors[q]] += padded[:, left]
+                    left = [f for k, f in enumerate(factors) if k not in (p, q)]
+                    second[:, t, factors[p], factors[q]] += padded[:, left].prod(axis=1)
     return _Products(value, first, second)
 
 
@@ -214,7 +224,9 @@ def fit(
         np.empty((0, 0)),
         np.abs(states.strain).max(axis=0),
         {},
+        {},
         recipe.degrees,
+        order=recipe.order,
     )
     unit = model.unit(states.designs)
     P, Q = polynomials(unit, recipe.degrees[0]), polynomials(unit, recipe.degrees[1])
@@ -281,28 +293,64 @@ def fit(
     return model
 
 
+def wrong_strains(model: LearnedModule, states: ModuleStates) -> np.ndarray:
+    """Return by how much the strains of states are wrong under their loads, to first order, shape (n, 6)."""
+    found = _corrected(model, states, _products(states.strain, model.terms))
+    return np.einsum("nij,nj->ni", np.linalg.inv(states.hessian), found.gradient() - states.gradient)
+
+
+def wrong_stiffness(model: LearnedModule, states: ModuleStates) -> np.ndarray:
+    """Return the largest relative errors of the stiffness of states over all directions of motion, shape (n,)."""
+    found = _corrected(model, states, _products(states.strain, model.terms))
+    root = _weights(states, 1.0).root
+    relative = root @ (found.hessian() - states.hessian) @ np.swapaxes(root, 1, 2)
+    return np.abs(np.linalg.eigvalsh(relative)).max(axis=1)
+
+
 def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
     """Return the errors on states: those of strains under load and of the stiffness.
 
     Returns:
         ``strain_mean`` and ``strain_max``: error of the strains under the load of a state over the largest strain of
         the states, to first order; ``stiffness_mean`` and ``stiffness_max``: largest relative error of the stiffness
-        over all directions of motion; ``loaded``: the number of states under load, and ``relative_max``: the largest
-        error of their strains relative to the own strains of the state.
+        over all directions of motion; ``loaded``: the number of states under load, and ``covered``: the share of
+        the six errors of their strains that are within the bounds of `LearnedModule.error`.
     """
-    found = _corrected(model, states, _products(states.strain, model.terms))
-    weights = _weights(states, 1.0)
-    strain = np.einsum("nij,nj->ni", weights.compliance, found.gradient() - states.gradient)
-    wrong = np.linalg.norm(strain, axis=1)
-    strain = wrong / np.linalg.norm(states.strain, axis=1).max()
-    relative = weights.root @ (found.hessian() - states.hessian) @ np.swapaxes(weights.root, 1, 2)
-    stiffness = np.abs(np.linalg.eigvalsh(relative)).max(axis=1)
-    values = {"strain_mean": strain.mean(), "strain_max": strain.max()}
+    wrong, stiffness = np.linalg.norm(wrong_strains(model, states), axis=1), wrong_stiffness(model, states)
+    sizes = np.linalg.norm(states.strain, axis=1)
+    values = {"strain_mean": wrong.mean() / sizes.max(), "strain_max": wrong.max() / sizes.max()}
     values |= {"stiffness_mean": stiffness.mean(), "stiffness_max": stiffness.max()}
-    moved = (states.strain != 0.0).any(axis=1)
-    own = wrong[moved] / np.linalg.norm(states.strain[moved], axis=1)
-    values |= {"loaded": moved.sum(), "relative_max": own.max(initial=0.0)}
+    within = np.abs(wrong_strains(model, states)) <= model.error(model.unit(states.designs)) * sizes[:, None]
+    values |= {"loaded": (sizes > 0.0).sum(), "covered": within[sizes > 0.0].mean()}
     return {name: float(value) for name, value in values.items()}
+
+
+def folds(states: ModuleStates) -> np.ndarray:
+    """Return the part of the bodies to which the body of each state belongs, 0 to `FOLDS` - 1, shape (n,)."""
+    bodies, number = np.unique(states.designs, axis=0, return_inverse=True)
+    return (np.random.default_rng(0).permutation(len(bodies)) % FOLDS)[number]
+
+
+def calibrated(model: LearnedModule, recipe: Recipe, states: ModuleStates) -> LearnedModule:
+    """Return a model with bounds on the errors of its strains, from models that did not learn a part of the bodies.
+
+    Each part of the bodies is left out once, and a model of the others predicts their states under load. The logarithm
+    of the errors, relative to the size of the strains, is a line over the share of dimensions at the bounds of the box
+    (`LearnedModule.error`). For each strain the line is raised until `CONFIDENCE` of its errors, and one more, are
+    below it (conformal prediction over folds). States of one body are not independent, so the share holds only about.
+    """
+    fold = folds(states)
+    moved = (states.strain != 0.0).any(axis=1)
+    wrong = np.empty((len(states), 6))
+    for part in range(FOLDS):
+        other = fit(recipe, model.module, states.rows(fold != part), model.others)
+        wrong[fold == part] = wrong_strains(other, states.rows(fold == part))
+    wrong = wrong[moved] / np.linalg.norm(states.strain[moved], axis=1)[:, None]
+    share = model.share(model.unit(states.designs))[moved]
+    slope = max(float(np.polyfit(share, np.log(np.linalg.norm(wrong, axis=1)), 1)[0]), 0.0)
+    above = np.sort(np.abs(wrong) * np.exp(-slope * share)[:, None], axis=0)
+    level = above[min(int(np.ceil(CONFIDENCE * (len(above) + 1))), len(above)) - 1]
+    return replace(model, bounds={"inside": level, "corners": level * np.exp(slope)})
 
 
 def with_cavity(model: LearnedModule, states: ModuleStates) -> LearnedModule:
@@ -347,6 +395,13 @@ def tested(model: LearnedModule) -> LearnedModule:
     return replace(model, errors={place: errors(model, each) for place, each in states.items()})
 
 
+def training_states(module: str, recipe: Recipe) -> ModuleStates:
+    """Return the states from which a module is learned; this takes up to some minutes of finite elements."""
+    variables = len(recipe.box)
+    loaded = _solved(module, recipe, MARGIN * _drawn(recipe.bodies, variables, 1), recipe.rays, 1)
+    return loaded.joined(_solved(module, recipe, MARGIN * _drawn(recipe.unloaded, variables, 2), 0, 2))
+
+
 def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
     """Return the superelement of a module, learned from finite elements; this takes some minutes.
 
@@ -355,11 +410,10 @@ def learn_module(module: str, recipe: Recipe | None = None) -> LearnedModule:
         ValueError: for an unknown module.
     """
     recipe = RECIPES[module] if recipe is None else recipe
-    made, variables = MODULES[module](), len(recipe.box)
-    loaded = _solved(module, recipe, MARGIN * _drawn(recipe.bodies, variables, 1), recipe.rays, 1)
-    states = loaded.joined(_solved(module, recipe, MARGIN * _drawn(recipe.unloaded, variables, 2), 0, 2))
+    made, states = MODULES[module](), training_states(module, recipe)
     others = {v.name: v.baseline for v in made.design_space if v.name not in recipe.box and v.name != "young_modulus"}
-    return tested(with_cavity(fit(recipe, module, states, others), states))
+    model = with_cavity(fit(recipe, module, states, others), states)
+    return tested(calibrated(model, recipe, states))
 
 
 if __name__ == "__main__":
@@ -368,4 +422,4 @@ if __name__ == "__main__":
     for name in sys.argv[1:]:
         learned = learn_module(name)
         learned.save(f"{name}.json")
-        print(f"wrote {name}.json: {learned.errors}")
+        print(f"wrote {name}.json: bounds {learned.bounds}, errors {learned.errors}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from softgym_envs.designs import DesignSpace, DesignVariable
@@ -9,19 +10,39 @@ from softgym_envs.robots.base import Drawing
 from softgym_envs.robots.modules.base import MATERIAL, Module
 from softgym_envs.robots.modules.plates import PLATE
 
+FINER = 3.0
+"""By how much edges are shorter at the neck, in the plane in which it bends."""
+
 
 def draw_notched(*, width: float, neck: float, radius: float, length: float) -> None:
-    """Draw a block without two cylinders along y that leave a neck between them, in mm."""
+    """Draw a block with two half-round notches that leave a neck between them, in mm.
+
+    The mesh is one of the side view in layers along y. Its edges are shorter at the neck, because straight edges
+    between points of a notch leave a thicker neck, which is stiffer by the third power.
+    """
     import gmsh
 
-    occ = gmsh.model.occ
-    depth = neck + 2.0 * radius
-    block = occ.addBox(-depth / 2, -width / 2, 0.0, depth, width, length)
-    notches = [
-        (3, occ.addCylinder(side * (neck / 2 + radius), -width, length / 2, 0.0, 2.0 * width, 0.0, radius))
-        for side in (-1.0, 1.0)
-    ]
-    occ.cut([(3, block)], notches)
+    occ, size, field = gmsh.model.occ, gmsh.option.getNumber("Mesh.MeshSizeMax"), gmsh.model.mesh.field
+    far, middle = neck / 2 + radius, length / 2
+    outline, notches = [], []
+    for side in (1, -1):
+        corners = [(far, 0.0), (far, middle - radius), (neck / 2, middle), (far, middle + radius), (far, length)]
+        points = [occ.addPoint(side * x, -width / 2, z) for x, z in corners[::side]]
+        centre = occ.addPoint(side * far, -width / 2, middle)
+        outline += points
+        notches += [occ.addLine(*points[:2]), occ.addCircleArc(points[1], centre, points[2])]
+        notches += [occ.addCircleArc(points[2], centre, points[3]), occ.addLine(*points[3:])]
+    top, bottom = occ.addLine(outline[4], outline[5]), occ.addLine(outline[9], outline[0])
+    edges = [*notches[:4], top, *notches[4:], bottom]
+    face = occ.addPlaneSurface([occ.addCurveLoop(edges)])
+    occ.extrude([(2, face)], 0.0, width, 0.0, numElements=[math.ceil(width / size)])
+    box = field.add("Box")
+    values = {"VIn": size / FINER, "VOut": size, "Thickness": radius / 2, "XMin": -far, "XMax": far}
+    values |= {"YMin": -width, "YMax": width, "ZMin": middle - radius / 2, "ZMax": middle + radius / 2}
+    for name, value in values.items():
+        field.setNumber(box, name, value)
+    field.setAsBackgroundMesh(box)
+    gmsh.option.setNumber("Mesh.MeshSizeMin", 0.0)
 
 
 class NotchHinge(Module):

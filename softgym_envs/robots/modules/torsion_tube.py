@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from softgym_envs.designs import DesignSpace, DesignVariable
@@ -10,13 +11,19 @@ from softgym_envs.robots.modules.base import MATERIAL, Module
 
 
 def draw_tube(*, radius: float, wall: float, length: float) -> None:
-    """Draw a tube about the z axis, in mm."""
+    """Draw a tube about the z axis, in mm.
+
+    The mesh is one of the ring in layers along z, with edges half as long around it: so bodies of nearly the same
+    dimensions have nearly the same error.
+    """
     import gmsh
 
-    occ = gmsh.model.occ
-    outside = occ.addCylinder(0.0, 0.0, 0.0, 0.0, 0.0, length, radius)
-    inside = occ.addCylinder(0.0, 0.0, -1.0, 0.0, 0.0, length + 2.0, radius - wall)
-    occ.cut([(3, outside)], [(3, inside)])
+    occ, size = gmsh.model.occ, gmsh.option.getNumber("Mesh.MeshSizeMax")
+    outside, inside = (occ.addDisk(0.0, 0.0, 0.0, r, r) for r in (radius, radius - wall))
+    ring, _ = occ.cut([(2, outside)], [(2, inside)])
+    occ.extrude(ring, 0.0, 0.0, length, numElements=[math.ceil(length / size)])
+    gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", math.ceil(2.0 * math.tau * radius / size))
+    gmsh.option.setNumber("Mesh.MeshSizeMin", 0.0)
 
 
 class TorsionTube(Module):
