@@ -86,6 +86,10 @@ STUDIES = {
         steps=3,
         bodies=3,
     ),  # fmt: skip
+    "two_finger_gripper": Study("two_finger_gripper", *scaled(10 * MM), (6 * MM, 4 * MM, 4 * MM, 2 * MM), {}, bodies=1),
+    "three_finger_gripper": Study(
+        "three_finger_gripper", *scaled(10 * MM), (4 * MM, 2 * MM, 4 * MM, 2 * MM, 3 * MM, 3 * MM), {}, bodies=0
+    ),
     "contact_aided_finger": Study("contact_aided_finger", *scaled(8 * MM), (math.radians(10.0),), {}),
     "trunk": Study("trunk", *beams((5, 10, 20)), (20e-9, 0.0, 0.0, 10e-9, 0.0, 0.0), {}),
     "tetrapod": Study("tetrapod", *beams((6, 12, 24)), (0.5, 0.0, 0.0, 0.0), {}),
