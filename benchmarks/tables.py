@@ -238,7 +238,7 @@ def trust() -> str:
             found = results(f"trust_{name}")
             strata = {k: v for k, v in found.items() if isinstance(v, dict)}
             rows += _trust_rows(title, strata, found["goal tolerance [mm]"])
-    return markdown(TRUST_HEAD, rows, "llrrrrrrr")
+    return markdown(TRUST_HEAD, rows, "llrrrrrrrr")
 
 
 def calibrated() -> str:
@@ -250,7 +250,7 @@ def calibrated() -> str:
         if found := card.get("calibration"):
             strata = {k: {n: v * FACTORS.get(n, 1.0) for n, v in row.items()} for k, row in found["strata"].items()}
             rows += _trust_rows(CALIBRATED[name], strata, 1e3 * body.goal_tolerance)
-    return markdown(TRUST_HEAD, rows, "llrrrrrrr")
+    return markdown(TRUST_HEAD, rows, "llrrrrrrrr")
 
 
 CALIBRATED = WEIGHTS | {f"{name}_accurate": f"{title}, accurate mesh" for name, title in WEIGHTS.items()}
@@ -258,7 +258,7 @@ FACTORS = {"mean": 1e3, "worst": 1e3, "worst_trusted": 1e3, "coverage": 100.0, "
 """From metres and shares to millimetres and percent."""
 TRUST_HEAD = [
     *("weights", "stratum", "states", "error, mean [mm]", "worst [mm]", "covered (95 %) [%]", "trusted [%]"),
-    *("worst trusted [mm]", "goal tolerance [mm]"),
+    *("worst trusted [mm]", "goal tolerance [mm]", "no equilibrium: all / trusted"),
 ]
 
 
@@ -270,6 +270,8 @@ def _trust_rows(title: str, strata: Mapping[str, Mapping[str, Any]], tolerance: 
         covered = f"{row['coverage']:.1f} ({100 * interval.low:.0f} to {100 * interval.high:.0f})"
         cells = [str(states), *(short(row[k]) for k in ("mean", "worst")), covered, f"{row['trusted']:.0f}"]
         cells += [short(row["worst_trusted"]) if row["trusted"] else "", f"{tolerance:.3g}"]
+        # Older records count only the trusted ones.
+        cells.append(f"{row['lost']:.0f} / {row['unsolved']:.0f}" if "lost" in row else f"? / {row['unsolved']:.0f}")
         rows.append(["" if rows else title, stratum, *cells])
     return rows
 
