@@ -52,7 +52,7 @@ MESHES = {
 """Meshes by name. No source states the radius of the cables' channels. The whole tension acts on the soft tip where a
 long cable ends, and with a small radius it cuts in: with 2 mm, elements of half the length there move the tip by 4 % of
 its way (one long cable pulled by 15 mm, a short one by 5 mm), and with a third there is no equilibrium. With 3 mm a
-third of the length moves it by 0.3 %. The tips of `coarse` are within 0.7 % of those of `accurate`, and a state takes a
+third of the length moves it by 0.3 %. The tips of `coarse` are within 0.8 % of those of `accurate`, and a state takes a
 tenth of the time, so it is the mesh that surrogates are learned from."""
 
 
@@ -117,7 +117,7 @@ class CableTrunk(Robot):
     as the body.
 
     Args:
-        mesh: ``"published"`` (825 nodes and 3456 linear tetrahedra), ``"coarse"`` (324 nodes, quadratic
+        mesh: ``"published"`` (825 nodes and 3456 linear tetrahedra), ``"coarse"`` (221 nodes, quadratic
             elements), ``"accurate"`` or ``"reference"``.
         layers: number of elements along the trunk, instead of that of the mesh.
         rings: number of rings of elements about the axis, instead of that of the mesh.
