@@ -302,9 +302,10 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             command, self._sent = waiting[0], waiting[1:]
         converged = True
         if self.task.touches:
-            self.backend.touch(self.task.touch(self._step))
+            self.backend.touch(self.plant.touch_on_model(self.task.touch(self._step)))
+        push = self.task.push(self._step)
         try:
-            self.backend.step(command, force=self.task.push(self._step))
+            self.backend.step(command, force=None if push is None else push / self.plant.stiffness)
         except ConvergenceError:
             converged = False
         self._step += 1

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.backends.backend import State
+from softgym_envs.backends.backend import PointForce, State
 from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.base import Robot
@@ -19,7 +19,8 @@ class Plant:
     """How a robot differs from its model.
 
     Attributes:
-        stiffness: factor of the elastic stiffness of the whole body. It multiplies all efforts and divides ``W``.
+        stiffness: factor of the elastic stiffness of the whole body. It multiplies all efforts and divides ``W``; a
+            given force deforms the body as a smaller one deforms the model, see `touch_on_model`.
         cable_friction: coefficient of friction of cables on their guides, by the capstan law; finite elements only.
         delay: control steps between sending a command and its arrival at the drives.
         noise: standard deviation of all sensors: of displacements over their range, of efforts and of sensor rows over
@@ -30,6 +31,15 @@ class Plant:
     cable_friction: float = 0.0
     delay: int = 0
     noise: float = 0.0
+
+    def touch_on_model(self, load: PointForce | None) -> PointForce | None:
+        """Return the force that deforms the model as a force on the plant deforms the plant.
+
+        Both have the same shape if all forces on the stiffer body are larger by the same factor.
+        """
+        if load is None or self.stiffness == 1.0:
+            return load
+        return replace(load, force=load.force / self.stiffness)
 
 
 LIMITS = {"stiffness": (0.1, 10.0), "cable_friction": (0.0, 5.0), "delay": (0, 100), "noise": (0.0, 1.0)}

@@ -13,6 +13,7 @@ from softgym_envs.envs.plant import Plant, Plants
 from softgym_envs.robots.registry import make_robot
 
 FINGER = "SoftGym/FingerReach-v0"
+SENSORIZED = "SoftGym/SensorizedFingerReach-v0"
 
 
 def play(env, actions, **options):
@@ -43,6 +44,22 @@ def test_stiffness_is_that_of_a_stiffer_body(backend, actions):
     np.testing.assert_allclose(first.compliance, second.compliance, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(first.delta.array, second.delta.array, atol=1e-7)
     assert mine["plant_stiffness"] == 1.2
+
+
+@pytest.mark.parametrize("backend", ["surrogate", "fem"])
+def test_a_touch_deforms_a_stiffer_plant_as_a_stiffer_body(backend):
+    """The force of a touch is given: it does not grow with the stiffness, as the forces of the body do."""
+    touched = {"backend": backend, "task_options": {"force": 2.0, "window": 1}}
+    plant = gymnasium.make(SENSORIZED, plant={"stiffness": 1.3}, **touched)
+    young = plant.unwrapped.design["young_modulus"]
+    body = gymnasium.make(SENSORIZED, design={"young_modulus": 1.3 * young}, **touched)
+    goal, half = {"options": {"goal": np.array([0.0, 0.02, -0.06])}}, np.full((3, 1), 0.5)
+    found, expected = (play(env, half, **goal)[1] for env in (plant, body))
+    for mine, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(mine["effort"], theirs["effort"], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(mine["effector"], theirs["effector"], atol=1e-6)
+    first, second = (env.unwrapped.state.condensed.delta.s for env in (plant, body))
+    np.testing.assert_allclose(first, second, rtol=1e-3)
 
 
 @pytest.mark.parametrize("delay", [1, 3])
