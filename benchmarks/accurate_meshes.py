@@ -35,7 +35,7 @@ class AccurateRobot:
         robot: registered name.
         convergence: recorded benchmark with its converged tips and efforts.
         weights: options of the robot for two sets of weights, by name.
-        study: configuration of its study.
+        study: configuration of its study; empty for none.
         meshes: sizes of the meshes on which the study's bodies are judged [m], and the number of unseen goals there.
         proportional: all elements shrink with the size of the mesh. Otherwise the outline keeps some of them small, and
             the cube root of volume per unknown is their size.
@@ -64,6 +64,9 @@ ROBOTS = {
         "diamond_reach_accurate",
         {"accurate": (17e-3, 12), "refined": (10.2e-3, 3)},
         proportional=False,
+    ),
+    "cable_trunk": AccurateRobot(
+        "cable_trunk", "convergence_cable_trunk", {"accurate": {"mesh": "coarse"}, "published": {}}, "", {}
     ),
 }
 """Robots by the last part of the benchmarks' names."""
@@ -299,6 +302,9 @@ TABLES: dict[str, Callable[[], str]] = {
 """Tables of pages by name, of those that have recorded results."""
 
 BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
-    f"{run.__name__}_{name}": _named(run, name) for run in (accurate_weights, accurate_study) for name in ROBOTS
+    f"{run.__name__}_{name}": _named(run, name)
+    for run in (accurate_weights, accurate_study)
+    for name, robot in ROBOTS.items()
+    if run is accurate_weights or robot.study
 }
 """Benchmarks by name."""

@@ -78,7 +78,17 @@ STUDIES = {
     "finger_1cable": Study("finger", *scaled(10 * MM), (10 * MM,), {"cables": 1, "self_contact": False}),
     "diamond": Study("diamond", scaled(17 * MM)[0], None, (15 * MM, 0.0, 0.0, 0.0), {}, steps=4),
     "cable_trunk": Study(
-        "cable_trunk", TRUNK_LEVELS, (1.0, 1 / 2, 1 / 3), (15 * MM, 0.0, 0.0, 0.0, 5 * MM, 0.0, 0.0, 0.0), {}, steps=3
+        "cable_trunk",
+        TRUNK_LEVELS,
+        (1.0, 1 / 2, 1 / 3),
+        (15 * MM, 0.0, 0.0, 0.0, 5 * MM, 0.0, 0.0, 0.0),
+        {},
+        steps=3,
+        bodies=3,
+    ),  # fmt: skip
+    "two_finger_gripper": Study("two_finger_gripper", *scaled(10 * MM), (6 * MM, 4 * MM, 4 * MM, 2 * MM), {}, bodies=1),
+    "three_finger_gripper": Study(
+        "three_finger_gripper", *scaled(10 * MM), (4 * MM, 2 * MM, 4 * MM, 2 * MM, 3 * MM, 3 * MM), {}, bodies=0
     ),
     "contact_aided_finger": Study("contact_aided_finger", *scaled(8 * MM), (math.radians(10.0),), {}),
     "trunk": Study("trunk", *beams((5, 10, 20)), (20e-9, 0.0, 0.0, 10e-9, 0.0, 0.0), {}),

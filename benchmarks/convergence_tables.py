@@ -16,6 +16,8 @@ TITLES = {
     "finger_1cable": "Soft Finger, 1 cable",
     "diamond": "Diamond",
     "cable_trunk": "cable trunk",
+    "two_finger_gripper": "gripper, two fingers",
+    "three_finger_gripper": "gripper, three fingers",
     "contact_aided_finger": "contact-aided finger",
     "trunk": "Stiff-Flop trunk",
     "tetrapod": "Tetrapod",

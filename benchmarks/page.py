@@ -35,6 +35,7 @@ from benchmarks.robustness import TABLES as ROBUSTNESS_TABLES
 from benchmarks.structure_policy import TABLES as POLICY_TABLES
 from benchmarks.structures import TABLES as STRUCTURE_TABLES
 from benchmarks.tables import TABLES as OTHER_TABLES
+from benchmarks.trust_tables import TABLES as TRUST_TABLES
 from benchmarks.zigzag_tables import ZIGZAG_TABLES
 from softgym_envs.errors import DataError
 
@@ -51,6 +52,7 @@ TABLES = (
     | ROBUSTNESS_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
+    | TRUST_TABLES
     | POLICY_TABLES
     | GROWN_TABLES
 )

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from benchmarks.learners import REPORTS, SCORES, TASKS, spread
 from benchmarks.recorded import figure, number, records, results
 from softgym_envs.agents.results import LEARNERS, MODEL_BASED
-from softgym_envs.robots.registry import make_robot
-from softgym_envs.surrogate.pretrained import pretrained_folder, shipped_robots
 
 WEIGHTS = {
     "finger_1cable": "finger, 1 cable",
@@ -225,53 +221,6 @@ def test_set() -> str:
     head = ["weights", "training states", "effector error, mean [mm]", "worst [mm]", "`W_aa`, median error [%]"]
     head += ["`W_ea` [%]", "`W_ee` [%]"]
     return markdown(head, rows, "lrrrrrr")
-
-
-def trust() -> str:
-    """Errors, coverage and trust of calibrated weights on states that the calibration has not seen, by stratum.
-
-    Intervals of the coverage are those of a share of independent states (Clopper and Pearson, 95 %).
-    """
-    rows = []
-    for name, title in CALIBRATED.items():
-        if f"trust_{name}" in records():
-            found = results(f"trust_{name}")
-            strata = {k: v for k, v in found.items() if isinstance(v, dict)}
-            rows += _trust_rows(title, strata, found["goal tolerance [mm]"])
-    return markdown(TRUST_HEAD, rows, "llrrrrrrr")
-
-
-def calibrated() -> str:
-    """The same on the states by which the weights were calibrated, from their cards."""
-    rows = []
-    for name, (robot, options) in shipped_robots().items():
-        body = make_robot(robot, **options)
-        card = json.loads((pretrained_folder(body) / "model.json").read_text())
-        if found := card.get("calibration"):
-            strata = {k: {n: v * FACTORS.get(n, 1.0) for n, v in row.items()} for k, row in found["strata"].items()}
-            rows += _trust_rows(CALIBRATED[name], strata, 1e3 * body.goal_tolerance)
-    return markdown(TRUST_HEAD, rows, "llrrrrrrr")
-
-
-CALIBRATED = WEIGHTS | {f"{name}_accurate": f"{title}, accurate mesh" for name, title in WEIGHTS.items()}
-FACTORS = {"mean": 1e3, "worst": 1e3, "worst_trusted": 1e3, "coverage": 100.0, "trusted": 100.0}
-"""From metres and shares to millimetres and percent."""
-TRUST_HEAD = [
-    *("weights", "stratum", "states", "error, mean [mm]", "worst [mm]", "covered (95 %) [%]", "trusted [%]"),
-    *("worst trusted [mm]", "goal tolerance [mm]"),
-]
-
-
-def _trust_rows(title: str, strata: Mapping[str, Mapping[str, Any]], tolerance: float) -> list[list[str]]:
-    rows = []
-    for stratum, row in strata.items():
-        states = int(row["states"])
-        interval = binomtest(round(row["coverage"] / 100 * states), states).proportion_ci()
-        covered = f"{row['coverage']:.1f} ({100 * interval.low:.0f} to {100 * interval.high:.0f})"
-        cells = [str(states), *(short(row[k]) for k in ("mean", "worst")), covered, f"{row['trusted']:.0f}"]
-        cells += [short(row["worst_trusted"]) if row["trusted"] else "", f"{tolerance:.3g}"]
-        rows.append(["" if rows else title, stratum, *cells])
-    return rows
 
 
 def buckling() -> str:
@@ -567,7 +516,7 @@ TABLES: dict[str, Callable[[], str]] = {
     function.__name__: function
     for function in (
         headlines, codesign, codesign_goals, codesign_bodies, learners, strategies, kills, profile, agents, carry,
-        test_set, trust, calibrated, buckling, predicted_tracking, trajectories, design_gradients, networks,
+        test_set, buckling, predicted_tracking, trajectories, design_gradients, networks,
         design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, sealed_stiffness,
         sealed_estimates, side_by_side, stiff_flop,

@@ -7,6 +7,11 @@ errors. The network is not trained again.
 A state is trusted if its uncertainty is below a limit. The limit is at most the robot's goal tolerance, and lower if a
 search for the worst trusted states, in which finite elements judge states that gradients of the spread propose, finds
 errors above the tolerance.
+
+Some commands have no equilibrium. An error exists only where there is one, so coverage is that of the other states; how
+many commands have none is reported for each stratum. The members of an ensemble may agree there, so the spread does not
+tell them. The stiffness does: where an equilibrium is nearly lost, the actuators are several times softer than at rest.
+A calibration that meets such commands therefore limits the growth of trusted states (see `Domain`).
 """
 
 from __future__ import annotations
@@ -47,6 +52,12 @@ TOUCHING = "touching"
 """Name of all states in which surfaces are in contact, wherever they were drawn. They count in their strata as well: a
 model does not know which states touch."""
 
+LOST = 0.01
+"""If more than this share of the commands has no equilibrium, the growth of trusted states is limited."""
+
+USUAL = 0.98
+"""Share of the states inside whose growth is not above its limit."""
+
 ROUNDS = 4
 POOL = 8
 """Bodies and commands from which an adversary chooses each of its own."""
@@ -84,7 +95,8 @@ class StratumReport:
         coverage: share of the errors below their uncertainty.
         trusted: share of the states that are trusted.
         worst_trusted: largest error of a trusted state [m].
-        unsolved: trusted states without an equilibrium on FEM.
+        lost: commands without an equilibrium on FEM; they do not count in any of the above.
+        unsolved: those of them that are trusted.
     """
 
     states: int
@@ -93,6 +105,7 @@ class StratumReport:
     coverage: float
     trusted: float
     worst_trusted: float
+    lost: int
     unsolved: int
 
 
@@ -138,6 +151,7 @@ def _report(every: Predictions, states: JudgedStates, which: np.ndarray) -> Stra
         coverage=float((every.error <= every.uncertainty)[rows].mean()),
         trusted=float(every.trusted[rows].mean()),
         worst_trusted=float(every.error[rows & every.trusted].max(initial=0.0)),
+        lost=int((which & ~states.found).sum()),
         unsolved=int((every.trusted & ~states.found & which).sum()),
     )
 
@@ -163,11 +177,19 @@ def judged_states(
         folder: where the states of each body are kept; an interrupted run continues with the next body.
         kept_only: take what the folder holds, without solving the rest.
     """
-    robot, bounds, parts = model.robot, learned_bounds(model), []
-    for stratum in strata_of(robot, buckles=model.domain.limits_growth):
-        commands = draw_commands(robot, stratum, bodies, states, seed, softness(model), bounds)
-        parts.append(solve_commands(robot, commands, folder=folder, kept_only=kept_only))
+    parts = [
+        _drawn(model, stratum, bodies, states, seed, folder, kept_only)
+        for stratum in strata_of(model.robot, buckles=model.domain.limits_growth)
+    ]
     return JudgedStates.join(parts)
+
+
+def _drawn(
+    model: SurrogateModel, stratum: str, bodies: int, states: int, seed: int, folder: str | Path | None, kept_only: bool
+) -> JudgedStates:
+    """Return FEM states of one stratum."""
+    commands = draw_commands(model.robot, stratum, bodies, states, seed, softness(model), learned_bounds(model))
+    return solve_commands(model.robot, commands, folder=folder, kept_only=kept_only)
 
 
 def learned_bounds(model: SurrogateModel) -> dict[str, tuple[float, float]]:
@@ -250,12 +272,28 @@ def _calibrated(model: SurrogateModel, calibration: Calibration, limit: float = 
     return with_domain(model, inflation=1.0, limit=limit, calibration=entries)
 
 
+def usual_growth(model: SurrogateModel, states: JudgedStates) -> float | None:
+    """Return the largest growth to be trusted, or None if nearly all commands of judged states have an equilibrium.
+
+    It is a bound on `USUAL` of the states inside that have one.
+    """
+    if (~states.found).mean() <= LOST:
+        return None
+    usual = states.rows(states.found & (states.stratum == "inside"))
+    return float(np.quantile(softness(model)(usual.design, usual.command), USUAL))
+
+
 def safe_limit(judged: Predictions, tolerance: float) -> float:
     """Return the largest uncertainty to be trusted: at most the tolerance [m], below that of all wrong states.
 
-    A state is wrong if its error is above the tolerance, or if it has no equilibrium on FEM and yet is trusted.
+    A state is wrong if its error is above the tolerance or if it has no equilibrium on FEM. It does not count if it is
+    not trusted for another reason than its uncertainty.
+
+    Args:
+        judged: by a model without a limit.
+        tolerance: largest error of a trusted state [m].
     """
-    wrong = (judged.found & (judged.error > tolerance)) | (judged.trusted & ~judged.found)
+    wrong = judged.trusted & (~judged.found | (judged.error > tolerance))
     return min(tolerance, SAFETY * float(judged.uncertainty[wrong].min(initial=np.inf)))
 
 
@@ -286,17 +324,23 @@ def calibrate(
     if not model.ensemble:
         raise WeightsError(f"'{folder}': only an ensemble can be calibrated; these weights are '{model.network}'")
     known = judged_states(model, bodies, states, seed, state_folder, kept_only)
+    if not model.domain.limits_growth and (growth := usual_growth(model, known)) is not None:
+        model = with_domain(model, growth=growth)
+        softest = _drawn(model, "near buckling", bodies, states, seed, state_folder, kept_only)
+        known = JudgedStates.join([known, softest])
     calibration = fit_calibration(model, known)
     model = _calibrated(model, calibration, robot.goal_tolerance)
     searched = [attack(model, attacks, states, seed, state_folder)] if attacks else []
     everything = JudgedStates.join([known, *searched])
-    limit = safe_limit(predict(model, everything), robot.goal_tolerance)
+    limit = safe_limit(predict(_calibrated(model, calibration), everything), robot.goal_tolerance)
     model = _calibrated(model, calibration, limit)
     found = report(model, everything)
     card_path = Path(folder) / "model.json"
     card = json.loads(card_path.read_text())
     entries = {k: v for k, v in asdict(calibration).items() if np.isfinite(v)}
     card["domain"] |= {"inflation": 1.0, "limit": limit, "calibration": entries}
+    if model.domain.limits_growth:
+        card["domain"]["growth"] = model.domain.growth
     card["calibration"] = {
         "bodies": bodies, "states": states, "attacks": attacks, "seed": seed, "kept_only": kept_only,
         "strata": {name: asdict(row) for name, row in found.items()},
@@ -320,7 +364,7 @@ def cross_validated(model: SurrogateModel, states: JudgedStates, folds: int = 16
         left_out = states.body % folds == fold
         known = states.rows(~left_out)
         calibration = fit_calibration(model, known)
-        limit = safe_limit(predict(_calibrated(model, calibration, tolerance), known), tolerance)
+        limit = safe_limit(predict(_calibrated(model, calibration), known), tolerance)
         parts.append(predict(_calibrated(model, calibration, limit), states.rows(left_out)))
         order.append(np.flatnonzero(left_out))
     back = np.argsort(np.concatenate(order))

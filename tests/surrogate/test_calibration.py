@@ -234,16 +234,39 @@ def test_bodies_that_are_left_out_are_judged_by_the_others(trunk):
 
 
 def test_the_limit_is_below_all_wrong_states():
-    def judged(error, uncertainty, found=None):
+    def judged(error, uncertainty, found=None, trusted=None):
         error = np.array(error)
         every = np.ones(len(error), bool)
-        found = every if found is None else np.array(found)
-        return Predictions(error, np.array(uncertainty), np.array(uncertainty), every, np.ones(len(error)), found)
+        found, trusted = (every if which is None else np.array(which) for which in (found, trusted))
+        return Predictions(error, np.array(uncertainty), np.array(uncertainty), trusted, np.ones(len(error)), found)
 
     assert safe_limit(judged([1e-3, 1e-4], [5e-3, 1e-4]), 2e-3) == 2e-3
     assert safe_limit(judged([1e-3, 3e-3, 5e-3], [1e-4, 1e-3, 4e-4]), 2e-3) == pytest.approx(0.8 * 4e-4)
     # The second state is trusted, but has no equilibrium on FEM.
     assert safe_limit(judged([1e-3, np.nan], [1e-4, 6e-4], [True, False]), 2e-3) == pytest.approx(0.8 * 6e-4)
+    # States that softening or the box tells do not lower the limit for all others.
+    told = judged([1e-3, np.nan, 9e-3], [1e-4, 6e-4, 3e-4], [True, False, True], [True, False, False])
+    assert safe_limit(told, 2e-3) == 2e-3
+
+
+def test_commands_without_an_equilibrium_are_told_by_their_softness(trunk, monkeypatch):
+    """Growth is that of a made-up model; FEM finds no equilibrium where it is large."""
+    states = JudgedStates.join([predicted_states(trunk, kind, 50, 2, 3) for kind in ("inside", "faces")])
+    growth = 1.0 + np.arange(len(states)) / len(states)
+    monkeypatch.setattr(module, "softness", lambda model: lambda designs, commands: growth[: len(designs)])
+    # All have an equilibrium, or nearly all: no limit.
+    assert module.usual_growth(trunk, states) is None
+    states.found[-2:] = False
+    assert module.usual_growth(trunk, states) is None
+    states.found[-10:] = False
+    limit = module.usual_growth(trunk, states)
+    # The states inside come first: a bound on 98 % of these 100.
+    assert limit == pytest.approx(np.quantile(growth[:100], 0.98))
+    # Reports count states without an equilibrium, but not in any error.
+    rows = report(trunk, states)
+    assert (rows["inside"].lost, rows["faces"].lost) == (0, 10)
+    assert (rows["inside"].states, rows["faces"].states) == (100, 90)
+    assert rows["faces"].unsolved <= 10 and rows["faces"].worst < 1e-9
 
 
 def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
