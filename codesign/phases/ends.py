@@ -20,6 +20,7 @@ from softgym_envs.agents.policy import Policy
 from softgym_envs.control.settling import settle
 from softgym_envs.errors import ConfigError, ConvergenceError
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.base import Robot
 
 
 @dataclass(frozen=True)
@@ -74,21 +75,24 @@ def run_ends(
     began, cpu = time.perf_counter(), time.process_time()
     points = np.asarray(goals, dtype=float)[:, -1]
     commands = final_commands(agent, start, points, design)
-    make = _settled if agent == "qp" else _followed
-    columns, equilibria, unknowns, motion = make(agent, environment, points, design, commands, last_steps)
+    order = nearest_next(commands, environment.make_robot())
+    found = _Questions(environment, points, commands, order, dict(design))
+    ended, unknowns = _settle(found) if agent == "qp" else _follow(found, agent, last_steps)
+    columns = {name: np.array([getattr(ended[k], name) for k in range(len(points))]) for name in _COLUMNS}
+    motions = [each.motion for each in ended.values() if each.motion is not None]
     unknown = np.full(len(points), np.nan)
     evaluation = Evaluation(
         distances=columns["distance"],
         mean_distances=unknown,
         returns=unknown,
-        successes=columns["success"].astype(bool),
+        successes=columns["success"],
         efforts=columns["effort"],
-        ends=columns["end"],
-        steps=equilibria,
+        ends=columns["effector"],
+        steps=sum(each.equilibria for each in ended.values()),
         seconds=time.perf_counter() - began,
         cpu_seconds=time.process_time() - cpu,
     )
-    return Ends(evaluation, unknowns, motion)
+    return Ends(evaluation, unknowns, max(motions, default=None))
 
 
 def final_commands(
@@ -121,71 +125,95 @@ def episode_commands(
     return found
 
 
-_Found = tuple[dict[str, np.ndarray], int, int, float | None]
-"""Columns of an evaluation by name, numbers of equilibria and of unknowns, last motion."""
+def nearest_next(commands: np.ndarray, robot: Robot) -> list[int]:
+    """Return an order of commands (k, n_a) with short ways: from rest to the nearest one, and so on."""
+    places, here = commands / (robot.upper - robot.lower), np.zeros(commands.shape[1])
+    left, order = list(range(len(places))), []
+    while left:
+        order.append(min(left, key=lambda k: float(np.linalg.norm(places[k] - here))))
+        left.remove(order[-1])
+        here = places[order[-1]]
+    return order
 
 
-def _settled(
-    agent: str | Path,
-    environment: EnvironmentConfig,
-    points: np.ndarray,
-    design: Mapping[str, float],
-    commands: np.ndarray,
-    last_steps: int,
-) -> _Found:
-    """Return where the inverse QP ends."""
-    robot = environment.make_robot()
-    success = environment.make_task(robot).success_distance
-    statics, rows, equilibria = Statics(robot.build(design)), [], 0
-    for k, (point, command) in enumerate(zip(points, commands, strict=True)):
+@dataclass(frozen=True)
+class _Questions:
+    """Goals (k, 3) [m] on finite elements, the commands (k, n_a) to start from, and in which order to take them."""
+
+    environment: EnvironmentConfig
+    points: np.ndarray
+    commands: np.ndarray
+    order: list[int]
+    design: dict[str, float]
+
+    def lost(self, goal: int, error: ConvergenceError) -> ConvergenceError:
+        return ConvergenceError(f"goal {goal + 1} of {len(self.points)}: {error}", fraction=error.fraction)
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where one episode ends; see `Ends` for units."""
+
+    distance: float
+    success: bool
+    effort: float
+    effector: np.ndarray
+    equilibria: int
+    motion: float | None = None
+
+
+_COLUMNS = ("distance", "success", "effort", "effector")
+
+
+def _settle(asked: _Questions) -> tuple[dict[int, _End], int]:
+    """Return where the inverse QP ends by goal, and the number of unknowns."""
+    robot = asked.environment.make_robot()
+    success = asked.environment.make_task(robot).success_distance
+    statics, ends = Statics(robot.build(asked.design)), {}
+    for k in asked.order:
+        point, command = asked.points[k], asked.commands[k]
         try:
-            found = settle(statics, robot, point, command)
+            try:  # on from the last goal
+                found = settle(statics, robot, point, command)
+            except ConvergenceError:  # again from rest
+                statics = Statics(statics.model)
+                found = settle(statics, robot, point, command)
         except ConvergenceError as error:
-            raise _lost(k, len(points), error) from None
-        equilibria += found.equilibria
+            raise asked.lost(k, error) from None
         effort = float(np.abs(found.effort).mean())
-        rows.append((found.distance, found.distance < success, effort, found.effector))
-    return _columns(rows), equilibria, statics.model.equations, None
+        ends[k] = _End(found.distance, found.distance < success, effort, found.effector, found.equilibria)
+    return ends, statics.model.equations
 
 
-def _followed(
-    agent: str | Path,
-    environment: EnvironmentConfig,
-    points: np.ndarray,
-    design: Mapping[str, float],
-    commands: np.ndarray,
-    last_steps: int,
-) -> _Found:
-    """Return where a policy ends in closed loop."""
-    act, env = make_agent(agent), environment.make(sample_design=False)
+def _follow(asked: _Questions, agent: str | Path, last_steps: int) -> tuple[dict[int, _End], int]:
+    """Return where a policy ends in closed loop by goal, and the number of unknowns."""
+    act, env = make_agent(agent), asked.environment.make(sample_design=False)
     inner: Any = env.unwrapped
-    rows, motion = [], 0.0
+    ends, last = {}, None
     try:
-        for k, (point, command) in enumerate(zip(points, commands, strict=True)):
-            env.reset(seed=0, options={"design": dict(design), "goal": point})
+        for k in asked.order:
+            command = asked.commands[k]
+            env.reset(seed=0, options={"design": asked.design, "goal": asked.points[k]})
             try:
-                inner.backend.step(command)
+                try:  # on from the last goal
+                    inner.backend.go_on_from(last or inner.backend.snapshot())
+                    inner.backend.step(command)
+                except ConvergenceError:  # again from rest
+                    inner.backend.reset()
+                    inner.backend.step(command)
+                observation, info = inner.set_state(inner.get_state())  # observed anew
+                for _ in range(last_steps):
+                    before = info["effector"]
+                    observation, _, _, _, info = env.step(act(observation, inner))
+                    if not info["converged"]:
+                        raise ConvergenceError("no equilibrium under the command of the policy")
             except ConvergenceError as error:
-                raise _lost(k, len(points), error) from None
-            observation, info = inner.set_state(inner.get_state())  # observed anew
-            for _ in range(last_steps):
-                before = info["effector"]
-                observation, _, _, _, info = env.step(act(observation, inner))
-                if not info["converged"]:
-                    raise _lost(k, len(points), ConvergenceError("no equilibrium under the command of the policy"))
-            motion = max(motion, float(np.linalg.norm(info["effector"] - before)))
+                raise asked.lost(k, error) from None
+            last = inner.backend.snapshot()
             effort = float(np.abs(info["effort"]).mean())
-            rows.append((float(info["distance"]), bool(info["is_success"]), effort, info["effector"]))
-        unknowns = inner.backend.model.equations
+            motion = float(np.linalg.norm(info["effector"] - before))
+            distance, success = float(info["distance"]), bool(info["is_success"])
+            ends[k] = _End(distance, success, effort, info["effector"], 1 + last_steps, motion)
+        return ends, inner.backend.model.equations
     finally:
         env.close()
-    return _columns(rows), len(points) * (1 + last_steps), unknowns, motion
-
-
-def _columns(rows: list[tuple[float, bool, float, np.ndarray]]) -> dict[str, np.ndarray]:
-    names = ("distance", "success", "effort", "end")
-    return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
-
-
-def _lost(goal: int, count: int, error: ConvergenceError) -> ConvergenceError:
-    return ConvergenceError(f"goal {goal + 1} of {count}: {error}", fraction=error.fraction)

@@ -9,6 +9,7 @@ import pytest
 
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.agents.evaluation import Evaluation, evaluate
+from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.phases import ends
@@ -82,6 +83,26 @@ def test_the_inverse_qp_settles_at_least_as_near(run, followed):
     assert (settled.evaluation.distances <= followed.evaluation.distances + 2e-5).all()
     assert settled.evaluation.efforts == pytest.approx(followed.evaluation.efforts, rel=0.05)
     assert settled.last_motion is None and settled.unknowns == followed.unknowns
+
+
+def test_a_step_that_fails_from_the_last_goal_starts_again_from_rest(run, followed, monkeypatch):
+    step, starts = FEMBackend.step, []
+
+    def once(self, command, *args, **options):
+        starts.append(float(np.abs(self.state.displacement).max()))
+        if len(starts) == 6:  # the first goal takes five
+            raise ConvergenceError("no equilibrium")
+        return step(self, command, *args, **options)
+
+    monkeypatch.setattr(FEMBackend, "step", once)
+    assert run(POLICY).evaluation.distances == pytest.approx(followed.evaluation.distances, abs=1e-6)
+    assert len(starts) == 11 and starts[5] > 1e-3 > 1e-9 > starts[6]
+
+
+def test_commands_are_taken_by_short_ways(diamond):
+    robot = diamond.make_robot()
+    commands = np.outer([0.9, 0.1, 0.5, 0.2], robot.upper)
+    assert ends.nearest_next(commands, robot) == [1, 3, 2, 0]
 
 
 def test_unknown_means_survive_a_file(followed):
