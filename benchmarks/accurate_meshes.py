@@ -108,11 +108,14 @@ def study_table(name: str) -> str:
     rows = []
     for row in results("codesign")[ROBOTS[name].study]["meshes"]:
         change = f"{row['change [mm]']:.2f}"
+        if "change before [mm]" in row:
+            change += f" (mesh above: {row['change before [mm]']:.2f})"
         for key, form in (("interval [mm]", "({} to {})"), ("with the mesh [mm]", "; with the mesh {} to {}")):
             ends = row.get(key)
             change += (" " if form[0] == "(" else "") + form.format(*(f"{end:.2f}" for end in ends)) if ends else ""
         unknowns = f"{row['unknowns']:,}" if row.get("unknowns") else ""
-        efforts = [f"{row[f'{body}, mean effort [N]']:.2f}" for body in BODIES]
+        known = [row.get(f"{body}, mean effort [N]") for body in BODIES]
+        efforts = ["" if effort is None else f"{effort:.2f}" for effort in known]
         cells = [f"{row[f'{body} [mm]']:.2f}" for body in BODIES]
         rows.append([row["judge"], unknowns, str(row["goals"]), *cells, change, *efforts])
     head = [

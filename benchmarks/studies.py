@@ -83,11 +83,19 @@ def study(folder: Path) -> tuple[str, dict[str, Any]]:
     command = COMMANDS.get(found["name"], f"softgym codesign --config {found['name']}")
     title = TITLES.get(found["name"], found["title"])
     entry = {"title": title, "command": command, "commit": commit, "trials": found["trials"]["complete"], "rows": rows}
-    return found["name"], entry if mesh is None else {**entry, "meshes": _meshes(found)}
+    if mesh is not None:
+        entry["meshes"] = _meshes(found, mesh, config.finalists.test == "episodes")
+    return found["name"], entry
 
 
-def _meshes(found: dict[str, Any]) -> list[dict[str, Any]]:
-    """What each physics says of baseline and winner with their own controller, a finer mesh included."""
+def _meshes(found: dict[str, Any], mesh: dict[str, Any], whole: bool) -> list[dict[str, Any]]:
+    """What each physics says of baseline and winner with their own controller, a finer mesh included.
+
+    Args:
+        found: results of the study.
+        mesh: what is left of the mesh's error in the change.
+        whole: whether finite elements ran whole episodes, so that mean efforts of all physics mean the same.
+    """
     agent = found["comparison"][0]["agent"]
     unknowns = {test["backend"]: test.get("unknowns") for test in found["tests"] if "error" not in test}
     rows = []
@@ -96,8 +104,11 @@ def _meshes(found: dict[str, Any]) -> list[dict[str, Any]]:
         row["unknowns"] = unknowns.get(compared["backend"])
         for who in ("baseline", "winner"):
             row[f"{who} [mm]"] = 1e3 * compared[who]["objective"]
-            row[f"{who}, mean effort [N]"] = compared[who]["mean_effort"]
+            if whole or compared["backend"] != "surrogate":
+                row[f"{who}, mean effort [N]"] = compared[who]["mean_effort"]
         row["change [mm]"] = 1e3 * compared["objective_change"]
+        if compared["backend"] == "refined":  # on the other mesh, at the same goals
+            row["change before [mm]"] = row["change [mm]"] - 1e3 * mesh["left"] * (1.0 - mesh["ratio"])
         row["interval [mm]"] = _interval(compared)
         if compared["objective_mesh"]:
             row["with the mesh [mm]"] = [1e3 * end for end in compared["objective_mesh"]["interval"]]

@@ -63,11 +63,12 @@ def headlines() -> str:
         row = study["rows"][0]
         name = f"{study['title']}; {row['controller'].partition(',')[0]}"
         finer = next((r for r in study.get("meshes", ()) if r["judge"] == JUDGES["refined"]), None)
-        checked = "" if finer is None else " ".join(_ends(finer)).replace("\u00a0mm", "", 1)
+        same = None if finer is None else (finer["change before [mm]"], finer["change [mm]"])
+        checked = "" if same is None else "{:.2f}\u00a0→\u00a0{:.2f}\u00a0mm".format(*same)
         interval = row.get("change with the mesh, 95% interval [mm]") or row["change, 95% interval [mm]"]
         change = "{:.1f}\u00a0to\u00a0{:.1f}\u00a0mm".format(*interval)
         rows.append([name, *_ends(row), change, checked, f"`{study['command']}`"])
-    head = ["robot; controller", "baseline", "winner", "change, 95%", "finer mesh", "command"]
+    head = ["robot; controller", "baseline", "winner", "change, 95%", "change on two meshes", "command"]
     return markdown(head, rows, "lrrrrl")
 
 

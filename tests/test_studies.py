@@ -108,3 +108,4 @@ def test_the_entry_of_a_study_on_two_meshes_has_both(tmp_path):
     assert [row["unknowns"] for row in entry["meshes"]] == [27000, 55000, None]
     assert [row["interval [mm]"] is None for row in entry["meshes"]] == [False, True, False]
     assert entry["meshes"][0]["with the mesh [mm]"] == pytest.approx([-2.5, -0.4])
+    assert entry["meshes"][1]["change before [mm]"] == pytest.approx(-1.54 - 0.05)  # half of what is left

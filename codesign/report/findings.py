@@ -81,14 +81,15 @@ def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     if coarse is None or fine is None or coarse.distance_mesh is None:
         return None
     measure, mesh = snapshot.config.distance, coarse.distance_mesh
+    before = fine.distance_change - mesh.left * (1.0 - mesh.ratio)  # on the other mesh, at the same goals
     text = (
-        f"At {fine.goals} goals it finds {measure.number(fine.baseline.mean_distance)} → "
-        f"{measure.text(fine.winner.mean_distance)}. "
+        f"At {fine.goals} goals the change is {measure.text(fine.distance_change, '+')} there, and "
+        f"{measure.text(before, '+')} on the mesh of the study. "
     )
     if mesh.interval is None:
         return Finding("A finer mesh was tested", f"{text}With fewer than {MIN_GOALS} goals there is no interval.")
     low, high = (measure.number(end, "+") for end in mesh.interval)
-    text += f"With what is left of the mesh's error, the change is {low} to {high} {measure.unit}."
+    text += f"With what is left of the mesh's error, the change at all goals is {low} to {high} {measure.unit}."
     if mesh.interval[1] < 0.0:
         return Finding("A finer mesh agrees", text, warns=False)
     return Finding("The mesh's error may be as large as the gain", text)

@@ -218,7 +218,9 @@ def test_a_report_has_the_part_of_the_mesh(written, ratio, left):
     assert fem.distance_mesh.left == fem.objective_mesh.left == pytest.approx(left)
     assert fem.distance_mesh.interval == pytest.approx((-4e-3, -4e-3 + left))
     assert results.winner.trial == 1
-    titles = [finding.title for finding in findings(snapshot, results)]
+    texts = {finding.title: finding.text for finding in findings(snapshot, results)}
+    titles = list(texts)
+    assert any("2 goals the change is -3.00 mm there, and -4.00 mm on" in text for text in texts.values())
     assert ("A finer mesh agrees" in titles) == (left < 4e-3)
     assert ("The mesh's error may be as large as the gain" in titles) == (left >= 4e-3)
 
