@@ -92,7 +92,7 @@ def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     text += f"With what is left of the mesh's error, the change at all goals is {low} to {high} {measure.unit}."
     if mesh.interval[1] < 0.0:
         return Finding("A finer mesh agrees", text, warns=False)
-    return Finding("The mesh's error may be as large as the gain", text)
+    return Finding("With the mesh's error, the gain is not certain", text)
 
 
 def _failures(snapshot: StudySnapshot) -> Finding | None:
