@@ -29,7 +29,7 @@ class Evaluation:
         distances: effector to goal at the end of each episode [m], shape (n,).
         mean_distances: mean of that distance over the steps of each episode [m], shape (n,); on a path, the tracking
             error.
-        returns: sum of rewards, shape (n,).
+        returns: sum of rewards, shape (n,). Like the means over the steps, NaN if only the ends are known.
         successes: whether each episode ended within the task's success distance, shape (n,); in an average of several
             evaluations, the share that did.
         efforts: mean actuator effort over the episode [N, ...], shape (n,).
@@ -104,8 +104,8 @@ class Evaluation:
 
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain data: the summary, the values for each goal and the cost."""
-        summary = {name: getattr(self, name) for name in _SUMMARY}
-        columns = {name: getattr(self, name).tolist() for name in _PER_GOAL}
+        summary = {name: known(getattr(self, name)) for name in _SUMMARY}
+        columns = {name: known(getattr(self, name)) for name in _PER_GOAL}
         return {**summary, **columns, "steps": self.steps, "seconds": self.seconds, "cpu_seconds": self.cpu_seconds}
 
     @classmethod
@@ -116,7 +116,7 @@ class Evaluation:
             DataError: if a field is missing or not an array of numbers with a row for each goal.
         """
         try:
-            columns = {name: np.asarray(data[name]) for name in _PER_GOAL}
+            columns = {name: _column(data[name]) for name in _PER_GOAL}
             cost = int(data["steps"]), float(data["seconds"]), float(data["cpu_seconds"])
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"stored evaluation cannot be read: {type(error).__name__} {error}") from None
@@ -126,6 +126,20 @@ class Evaluation:
         if shapes != expected or any(column.dtype.kind not in "bif" for column in columns.values()):
             raise DataError(f"stored evaluation must hold numbers for each goal, got shapes {shapes}")
         return cls(**columns, steps=cost[0], seconds=cost[1], cpu_seconds=cost[2])
+
+
+def known(values: Any) -> Any:
+    """Return a number, or numbers as lists, with None for NaN, which JSON lacks."""
+    if isinstance(values, np.ndarray):
+        return [known(value) for value in values] if values.ndim else known(values.item())
+    value = values.item() if isinstance(values, np.generic) else values
+    return None if isinstance(value, float) and np.isnan(value) else value
+
+
+def _column(values: Any) -> np.ndarray:
+    """Return an array of what `known` made."""
+    found = np.asarray(values)
+    return found.astype(float) if found.dtype == object else found
 
 
 _PER_GOAL = ("distances", "mean_distances", "returns", "successes", "efforts", "ends")

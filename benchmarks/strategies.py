@@ -140,6 +140,8 @@ def _question(**changes: Any) -> Any:
 
     base = load_config(QUESTION, StudyConfig).model_dump(mode="json")
     base["goals"]["count"], base["training"] = GOALS, SAC
+    # The ground truth is that of the published mesh, whose finite elements are not asked.
+    base["environment"]["robot_options"], base["finalists"] = {}, {"count": 0}
     return StudyConfig.model_validate({**base, **changes})
 
 

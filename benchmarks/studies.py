@@ -38,6 +38,9 @@ TITLES = {
 COMMANDS = {"finger_reach": "make demo"}
 """Commands that run a study, where it is not ``softgym codesign --config NAME``."""
 
+JUDGES = {"fem": "finite elements", "refined": "finite elements, finer mesh", "surrogate": "surrogate"}
+"""Names of the physics that judge finalists."""
+
 SHOWN = {"m": (1e3, "mm"), "Pa": (1e-6, "MPa"), "1": (1.0, "")}
 """Scale and unit of a design variable in text, by its SI unit."""
 
@@ -72,12 +75,45 @@ def study(folder: Path) -> tuple[str, dict[str, Any]]:
     ]
     if not rows:
         raise DataError(f"{file}: neither baseline nor winner was tested by finite elements")
+    mesh = next((row["objective_mesh"] for row in found["comparison"] if row.get("objective_mesh")), None)
+    if mesh is not None:
+        rows[0]["change with the mesh, 95% interval [mm]"] = [1e3 * end for end in mesh["interval"]]
     rows[0]["CPU with FEM check [min]"] = sum(seconds.values()) / 60.0
     rows[0]["winner's body"] = _body(found)
     command = COMMANDS.get(found["name"], f"softgym codesign --config {found['name']}")
     title = TITLES.get(found["name"], found["title"])
     entry = {"title": title, "command": command, "commit": commit, "trials": found["trials"]["complete"], "rows": rows}
+    if mesh is not None:
+        entry["meshes"] = _meshes(found, mesh, config.finalists.test == "episodes")
     return found["name"], entry
+
+
+def _meshes(found: dict[str, Any], mesh: dict[str, Any], whole: bool) -> list[dict[str, Any]]:
+    """What each physics says of baseline and winner with their own controller, a finer mesh included.
+
+    Args:
+        found: results of the study.
+        mesh: what is left of the mesh's error in the change.
+        whole: whether finite elements ran whole episodes, so that mean efforts of all physics mean the same.
+    """
+    agent = found["comparison"][0]["agent"]
+    unknowns = {test["backend"]: test.get("unknowns") for test in found["tests"] if "error" not in test}
+    rows = []
+    for compared in (row for row in found["comparison"] if row["agent"] == agent):
+        row = {"judge": JUDGES[compared["backend"]], "goals": compared["goals"]}
+        row["unknowns"] = unknowns.get(compared["backend"])
+        for who in ("baseline", "winner"):
+            row[f"{who} [mm]"] = 1e3 * compared[who]["objective"]
+            if whole or compared["backend"] != "surrogate":
+                row[f"{who}, mean effort [N]"] = compared[who]["mean_effort"]
+        row["change [mm]"] = 1e3 * compared["objective_change"]
+        if compared["backend"] == "refined":  # on the other mesh, at the same goals
+            row["change before [mm]"] = row["change [mm]"] - 1e3 * mesh["left"] * (1.0 - mesh["ratio"])
+        row["interval [mm]"] = _interval(compared)
+        if compared["objective_mesh"]:
+            row["with the mesh [mm]"] = [1e3 * end for end in compared["objective_mesh"]["interval"]]
+        rows.append(row)
+    return rows
 
 
 def _controller(config: StudyConfig, found: dict[str, Any], agent: str) -> str:

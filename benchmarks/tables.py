@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from benchmarks.learners import REPORTS, SCORES, TASKS, spread
 from benchmarks.recorded import figure, number, records, results
+from benchmarks.studies import JUDGES
 from softgym_envs.agents.results import LEARNERS, MODEL_BASED
 
 WEIGHTS = {
@@ -25,11 +24,6 @@ WEIGHTS = {
 """Readable names of the robots, by name of the shipped weights."""
 
 HEADLINES = ("finger_reach", "diamond_reach", "trunk_reach", "cable_trunk_reach", "tetrapod_reach")
-
-ACCURATE_HEADLINES = {
-    "finger": "Soft Finger, accurate mesh; inverse QP",
-}
-"""Rows of studies on accurate meshes, behind those of the same robots."""
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "") -> str:
@@ -57,19 +51,25 @@ def short(value: float) -> str:
 
 
 def headlines() -> str:
-    """Studies: mean distance to the test goals on FEM, from the baseline to the winner."""
+    """Studies: mean distance to the test goals on FEM, from the baseline to the winner, and on a finer mesh."""
     rows = []
     for key in HEADLINES:
         study = results("codesign")[key]
         row = study["rows"][0]
         name = f"{study['title']}; {row['controller'].partition(',')[0]}"
-        rows.append([name, *_ends(row), f"`{study['command']}`"])
-        robot = key.removesuffix("_reach")
-        if robot in ACCURATE_HEADLINES and f"accurate_study_{robot}" in records():
-            found = results(f"accurate_study_{robot}")
-            ends = {f"{who} [mm]": np.mean(found[f"{who}: accurate: distance [mm]"]) for who in ("baseline", "winner")}
-            rows.append([ACCURATE_HEADLINES[robot], *_ends(ends), f"`softgym codesign --config {key}_accurate`"])
-    return markdown(["robot; controller", "baseline", "winner", "command"], rows, "lrrl")
+        finer = next((r for r in study.get("meshes", ()) if r["judge"] == JUDGES["refined"]), None)
+        same = None if finer is None else (finer["change before [mm]"], finer["change [mm]"])
+        checked = "" if same is None else "{:.2f}\u00a0→\u00a0{:.2f}\u00a0mm".format(*same)
+        interval = _interval(row) or ()
+        change = "{:.1f}\u00a0to\u00a0{:.1f}\u00a0mm".format(*interval)
+        rows.append([name, *_ends(row), change, checked, f"`{study['command']}`"])
+    head = ["robot; controller", "baseline", "winner", "change, 95%", "change on two meshes", "command"]
+    return markdown(head, rows, "lrrrrl")
+
+
+def _interval(row: dict[str, Any]) -> list[float] | None:
+    """Interval of the change [mm], with what is left of the mesh's error if a study asked a finer mesh."""
+    return row.get("change with the mesh, 95% interval [mm]") or row.get("change, 95% interval [mm]")
 
 
 def _ends(row: dict[str, Any]) -> list[str]:
@@ -82,7 +82,7 @@ def codesign() -> str:
     rows = []
     for study in results("codesign").values():
         for index, row in enumerate(study["rows"]):
-            interval = row.get("change, 95% interval [mm]")  # None for a single path
+            interval = _interval(row)  # None for a single path
             name = "" if index else study["title"]
             change = "" if interval is None else "{:.1f} to {:.1f} mm".format(*interval)
             rows.append([name, row["controller"], *_ends(row), change])

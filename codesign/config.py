@@ -10,6 +10,7 @@ from pydantic import Field, field_validator, model_validator
 
 from softgym_envs.agents.config import check_hindsight, check_start
 from softgym_envs.agents.joint import PROPOSERS
+from softgym_envs.codesign.objectives import PATH_OBJECTIVES
 from softgym_envs.codesign.parts import (
     PRUNERS,
     STRATEGIES,
@@ -123,10 +124,7 @@ class StudyConfig(StudyProblem):
             1 + first > self.trials,
             f"trials = {self.trials} is too few for the baseline and {first} bodies found before the trials",
         )
-        refuse(
-            self.finalists.count >= self.trials > 1,
-            f"finalists.count = {self.finalists.count} must be below trials = {self.trials}",
-        )
+        self._check_finalists()
         return self
 
     def _check_goals(self) -> None:
@@ -154,6 +152,52 @@ class StudyConfig(StudyProblem):
             corners = np.array(list(product((-1.0, 1.0), repeat=3))) * goals.zone.half_size
             self.robot.check_point("goals.zone.center", goals.zone.center)
             self.robot.check_point("a corner of goals.zone", np.asarray(goals.zone.center) + corners)
+
+    def _check_finalists(self) -> None:
+        found, unseen = self.finalists, self.goals.unseen_count
+        refuse(found.count >= self.trials > 1, f"finalists.count = {found.count} must be below trials = {self.trials}")
+        if found.refinement is not None:
+            refuse(
+                found.refinement.goals > unseen,
+                f"finalists.refinement.goals = {found.refinement.goals} exceeds goals.unseen_count = {unseen}",
+            )
+        if found.test == "ends":
+            self._check_ends()
+
+    def _check_ends(self) -> None:
+        """Refuse studies whose episodes end elsewhere than a few steps from the end on the surrogate."""
+        environment, robot, row = self.environment, self.robot, self.environment.row
+        ends, allowed = "finalists.test = 'ends'", "; allowed: episodes"
+        refuse(
+            not issubclass(environment.task_class, Reach),
+            f"{ends} needs one position as goal, but task '{row.task}' has others{allowed}",
+        )
+        refuse(
+            "surrogate" not in self.test_backends,
+            f"{ends} starts where episodes end on a surrogate, and there is none for all bodies of robot "
+            f"'{row.robot}'{allowed}",
+        )
+        refuse(
+            len(robot.effectors) != 1,
+            f"{ends} needs one effector, but robot '{row.robot}' has {', '.join(robot.effectors)}{allowed}",
+        )
+        backend = {**environment.on("fem").backend_options, **self.finalists.fem_options}
+        for what, value in (("environment.plant", environment.plant), ("options of the FEM backend", backend)):
+            refuse(bool(value), f"{ends} solves for equilibria without {what}, got {value}{allowed}")
+        refuse(
+            environment.make_task(robot).touches,
+            f"{ends} does not know what touches the body in task '{row.task}'{allowed}",
+        )
+        for name in self.objectives:
+            refuse(
+                name in PATH_OBJECTIVES,
+                f"{ends} knows the ends of episodes only, but '{name}' is a mean over the steps{allowed}",
+            )
+        learner = self.training.learner
+        refuse(
+            learner == "recurrent" and bool(self.plan.trains or self.finalists.seeds),
+            f"{ends} needs policies without memory, but training.learner = {learner}{allowed}",
+        )
 
     def _check_strategy(self) -> None:
         plan, strategy = self.plan, f"strategy '{self.strategy}'"

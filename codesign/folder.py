@@ -23,10 +23,14 @@ if TYPE_CHECKING:
 EXTENSIBLE = (
     *("name", "title", "trials", "workers", "executor", "heartbeat", "patience", "attempts"),
     *("finalists.count", "finalists.choose", "finalists.seeds", "finalists.steps", "finalists.fem_options"),
+    *("finalists.test", "finalists.last_steps", "finalists.refinement"),
 )
 """Keys that may change between two runs of one study."""
 
-TEST_SETTINGS = ("finalists.steps", "finalists.fem_options")
+TEST_SETTINGS = (
+    *("finalists.steps", "finalists.fem_options"),
+    *("finalists.test", "finalists.last_steps", "finalists.refinement"),
+)
 """Keys of `EXTENSIBLE` that must not change once finalists were tested with them."""
 
 

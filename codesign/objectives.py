@@ -165,6 +165,9 @@ OBJECTIVES: dict[str, Objective] = {
 }
 """Registry: name to objective."""
 
+PATH_OBJECTIVES = ("mean_return", "mean_tracking_distance", "mean_effort")
+"""Objectives that are means or sums over the steps of an episode."""
+
 
 def find_objective(name: str, robot: Robot, task: type[Task]) -> Objective:
     """Return an objective, with the units that it has for a robot and a task.

@@ -147,15 +147,40 @@ class ScreenConfig(Config):
         return max(1, round(self.keep * self.candidates)) if self.enabled else 0
 
 
+class RefinementConfig(Config):
+    """A finer mesh, on which baseline and winner are tested too.
+
+    The difference to the mesh of the environment, extrapolated to elements of size zero, widens the intervals of the
+    report.
+    """
+
+    robot_options: dict[str, Any] = Field(
+        min_length=1, description="options of the robot that make the mesh finer, such as {mesh_size: 0.0075} [m]"
+    )
+    goals: int = Field(ge=1, description="how many goals: the first of the unseen ones")
+    ratio: float | None = Field(
+        default=None,
+        gt=0.0,
+        lt=1.0,
+        description="size of its elements over that of the coarser mesh; default: cube root of the ratio of unknowns",
+    )
+
+
 class FinalistsConfig(Config):
     """The check on FEM.
 
     The winner has the best score on the selection goals, by the ``"surrogate"`` in its trial or by ``"fem"`` in the
-    check. The unseen goals never decide.
+    check. The unseen goals never decide. A body that cannot be simulated on FEM cannot win.
     """
 
     count: int = Field(default=3, ge=0, description="best bodies to test besides the baseline; 0: no check")
     choose: Literal["surrogate", "fem"] = "surrogate"
+    test: Literal["episodes", "ends"] = Field(
+        default="episodes",
+        description="whole episodes on FEM; or where they end on the surrogate, for meshes on which steps take seconds",
+    )
+    last_steps: int = Field(default=4, ge=1, description="of 'ends': steps of a policy on FEM; the inverse QP settles")
+    refinement: RefinementConfig | None = None
     fem_options: dict[str, Any] = Field(default_factory=dict, description="options of the FEM backend")
     seeds: int = Field(default=0, ge=0, description="policies to train anew per body; 0: test that of its trial")
     steps: int | None = Field(default=None, ge=1, description="of each of these trainings; default those of a trial")

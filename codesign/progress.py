@@ -7,9 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from softgym_envs.codesign.folder import StudyFolder
-from softgym_envs.codesign.records import FinalistTest, TestGroup, TrialResult
+from softgym_envs.codesign.records import REFINED, FinalistTest, TestGroup, TrialResult
 from softgym_envs.codesign.report.results import Comparison, StudyResults
 from softgym_envs.codesign.report.units import present
+
+PHYSICS = {REFINED: "fem with a finer mesh"}
+"""Names of physics whose key does not say what they are."""
 
 SCREEN_INTERVAL = 10.0
 """Least time between two lines about the screen, whose bodies take a moment each [s]."""
@@ -132,7 +135,7 @@ class Progress:
                 continue
             self._done += 1
             seed = f" (seed {test.seed})" if test.seed else ""
-            which = f"{test.agent}{seed} on {test.backend}, {test.goals} goals"
+            which = f"{test.agent}{seed} on {PHYSICS.get(test.backend, test.backend)}, {test.goals} goals"
             self.say(f"{self._countdown.text(self._done)} test of trial {test.trial}, {which}: {self._test_text(test)}")
 
     def _test_text(self, test: FinalistTest) -> str:
@@ -184,7 +187,10 @@ class Progress:
         if row.distance_change_interval is not None:
             low, high = sorted(row.distance_change_interval)
             interval = f", 95 % interval {measure.number(low, '+')} to {measure.text(high, '+')}"
+        if row.distance_mesh is not None and row.distance_mesh.interval is not None:
+            low, high = sorted(row.distance_mesh.interval)
+            interval += f", with the error of the mesh {measure.number(low, '+')} to {measure.text(high, '+')}"
         return (
-            f"{row.agent} on {row.backend}, {row.goals} test goals: {', '.join(changes)} "
+            f"{row.agent} on {PHYSICS.get(row.backend, row.backend)}, {row.goals} test goals: {', '.join(changes)} "
             f"(change {measure.text(row.distance_change, '+')}{interval})"
         )

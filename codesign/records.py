@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from softgym_envs.agents.evaluation import Evaluation
+from softgym_envs.agents.evaluation import Evaluation, known
 from softgym_envs.codesign.objectives import Measurement
 from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json, write_json
@@ -149,6 +149,10 @@ class FinalistTraining(Record):
     curve: list[list[float]]  # environment steps and score of each report; empty if they do not measure the objective
 
 
+REFINED = "refined"
+"""Physics of tests on FEM with the finer mesh of ``finalists.refinement``."""
+
+
 @dataclass(eq=False)
 class FinalistTest(Record):
     """Evaluation of one finalist with one controller on one backend."""
@@ -157,13 +161,15 @@ class FinalistTest(Record):
 
     trial: int
     agent: str  # "policy" or "qp"
-    backend: str  # "fem" or "surrogate"
+    backend: str  # "fem", "surrogate" or "refined"
     goals: str  # "unseen" or "selection"
     seed: int = 0  # of the training of the policy; 0 for the policy of the trial itself
     evaluation: Evaluation | None = None  # None if the body cannot be simulated
     values: dict[str, float] = field(default_factory=dict)  # of each objective that the study names [SI]
     goal_values: list[float] | None = None  # of the objective for each goal [SI], if it has such values
     error: str | None = None  # why the body cannot be simulated
+    unknowns: int | None = None  # of its mesh, if the study compares meshes
+    last_motion: float | None = None  # of the effector in the last step [m], if only ends are tested; see `Ends`
 
 
 @dataclass(eq=False)
@@ -200,6 +206,11 @@ class PlannedTest:
     backend: str
     goals: str
     seed: int
+
+    @property
+    def key(self) -> tuple[int, str, str, str, int]:
+        """Trial, controller, backend, goals and seed."""
+        return self.finalist.trial, self.agent, self.backend, self.goals, self.seed
 
     @property
     def file(self) -> str:
@@ -249,6 +260,16 @@ class TestGroup:
         return self.evaluations[0] if len(self.evaluations) == 1 else Evaluation.average(self.evaluations)
 
     @property
+    def unknowns(self) -> int | None:
+        """Number of unknowns of the mesh, if it is known."""
+        return self.tests[0].unknowns
+
+    @property
+    def last_motion(self) -> float | None:
+        """Largest last motion of any seed [m], if it is known."""
+        return max((test.last_motion for test in self.tests if test.last_motion is not None), default=None)
+
+    @property
     def worst_distance(self) -> float:
         """Largest final distance of any seed [m]."""
         return max(evaluation.worst_distance for evaluation in self.evaluations)
@@ -260,10 +281,11 @@ class TestGroup:
             return {**data, "error": self.error}
         data |= {**self.mean.to_json(), "worst_distance": self.worst_distance}
         data["values"] = {name: self.value(name) for name in self.tests[0].values}
+        data |= {"unknowns": self.unknowns, "last_motion": self.last_motion}
         if len(self.tests) > 1:
             names = ("distances", "mean_distances", "returns", "successes", "efforts", "ends")
             data["seeds"] = [test.seed for test in self.tests]
-            data["of_seeds"] = {name: self.table(name).tolist() for name in names}
+            data["of_seeds"] = {name: known(self.table(name)) for name in names}
         return data
 
 

@@ -14,6 +14,7 @@ from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY_RECORD, StudyFolder
 from softgym_envs.codesign.objectives import Objective
 from softgym_envs.codesign.records import (
+    REFINED,
     Account,
     Finalist,
     FinalistTest,
@@ -168,7 +169,7 @@ class StudySnapshot:
 
     @cached_property
     def planned_tests(self) -> list[PlannedTest]:
-        """All tests of the present finalists, the slow ones first."""
+        """Tests of all present finalists, the slow ones first."""
         planned = []
         for backend in self.config.test_backends:
             for finalist in self.finalists:
@@ -183,9 +184,25 @@ class StudySnapshot:
         return planned
 
     @cached_property
+    def refinements(self) -> list[PlannedTest]:
+        """Tests of baseline and winner on the finer mesh; none before the `planned_tests` have found the winner."""
+        done = {(test.trial, test.agent, test.backend, test.goals, test.seed) for test in self.all_tests}
+        if self.config.finalists.refinement is None or any(plan.key not in done for plan in self.planned_tests):
+            return []
+        baseline, winner = self.baseline, self.winner
+        if baseline is None or winner is None or winner.trial == baseline.trial:
+            return []
+        return [plan for body in (baseline, winner) for plan in self._refined(body)]
+
+    def _refined(self, body: Finalist) -> list[PlannedTest]:
+        agent = body.agents[0]
+        return [PlannedTest(body, agent, REFINED, "unseen", seed) for seed in self.seeds(agent)]
+
+    @cached_property
     def tests(self) -> list[TestGroup]:
         """Finished tests of the present finalists, those with several training seeds together."""
-        planned = {(p.finalist.trial, p.agent, p.backend, p.goals, p.seed) for p in self.planned_tests}
+        refined = [plan for body in self.finalists for plan in self._refined(body)]
+        planned = {plan.key for plan in (*self.planned_tests, *refined)}
         groups: dict[tuple[int, str, str, str], list[FinalistTest]] = {}
         for test in self.all_tests:
             key = (test.trial, test.agent, test.backend, test.goals)
@@ -205,6 +222,16 @@ class StudySnapshot:
         return [training for training in self.all_trainings if training.trial in numbers]
 
     @cached_property
+    def failures(self) -> dict[int, str]:
+        """Why finalists cannot be simulated on FEM with the controller of their trial, by trial."""
+        agents = {finalist.trial: finalist.agents[0] for finalist in self.finalists}
+        return {
+            test.trial: test.error
+            for test in self.tests
+            if test.backend == "fem" and test.agent == agents[test.trial] and test.error is not None
+        }
+
+    @cached_property
     def verdict(self) -> Verdict:
         """Who wins, decided without the unseen goals."""
         complete = self.ranked
@@ -215,7 +242,11 @@ class StudySnapshot:
             return Verdict(None, f"no body satisfies the constraints; nearest: {self.violations_text(complete[0])}")
         if not self.config.finalists.count:
             return Verdict(None, f"no finalists were requested (finalists.count = 0); best: trial {feasible[0]}")
-        bodies = {finalist.trial: finalist for finalist in self.finalists if finalist.trial in feasible}
+        failed = self.failures
+        bodies = {f.trial: f for f in self.finalists if f.trial in feasible and f.trial not in failed}
+        if failed and not bodies:
+            trial = min(failed)
+            return Verdict(None, f"no finalist can be simulated on FEM; trial {trial}: {failed[trial]}")
         tests = [g for g in self.tests if g.goals == "selection" and g.error is None and g.trial in bodies]
         if self.config.finalists.choose == "fem" and tests:
             return self._verdict_on_fem(bodies, tests)

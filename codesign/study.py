@@ -214,14 +214,21 @@ def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
 
 
 def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
-    snapshot = load_study(study)
-    jobs = finalist_jobs(snapshot)
-    if missing := missing_jobs(study, jobs):
-        backends = " and ".join(study.config.test_backends)
-        count, goals, done = len(snapshot.finalists), len(study.goals["unseen"]), len(jobs) - len(missing)
-        output.tests(quiet=True)
-        output.begin("test", f"{count} bodies on {goals} unseen goals, {backends}", len(jobs), done)
-        _run_jobs(study, "finalists", missing, workers, output.tests)
+    output.tests(quiet=True)
+    refinement = study.config.finalists.refinement
+    while True:  # the tests on a finer mesh are known after the others
+        snapshot = load_study(study)
+        jobs = finalist_jobs(snapshot)
+        if all(job.path.exists() for job in jobs):
+            return
+        if missing := missing_jobs(study, jobs):
+            if refinement is not None and snapshot.refinements:
+                text = f"baseline and winner on {refinement.goals} unseen goals, fem with a finer mesh"
+            else:
+                goals, backends = len(study.goals["unseen"]), " and ".join(study.config.test_backends)
+                text = f"{len(snapshot.finalists)} bodies on {goals} unseen goals, {backends}"
+            output.begin("test", text, len(jobs), len(jobs) - len(missing))
+            _run_jobs(study, "finalists", missing, workers, output.tests)
 
 
 def _require(done: bool, phase: str, stopped: str | None) -> None:

@@ -71,5 +71,5 @@ def test_paths_in_options_and_names_of_policies(tmp_path):
 def test_names_are_completed(monkeypatch):
     parameter = options.ConfigFile("codesign")
     found = parameter.shell_complete(None, None, "finger_reach")
-    names = ["finger_reach", "finger_reach_accurate", "finger_reach_sac", "finger_reach_scratch"]
+    names = ["finger_reach", "finger_reach_sac", "finger_reach_scratch"]
     assert [item.value for item in found] == names

@@ -78,3 +78,34 @@ def test_studies_that_nobody_can_repeat_or_trust_are_refused(tmp_path, changes, 
 def test_unfinished_studies_are_refused(tmp_path):
     with pytest.raises(DataError, match="a study writes it when it has finished"):
         study(tmp_path)
+
+
+def test_the_entry_of_a_study_on_two_meshes_has_both(tmp_path):
+    part = {"goals": 3, "ratio": 0.5, "left": 1e-4, "left_interval": [0.0, 2e-4], "interval": [-2.5e-3, -4e-4]}
+    body = {"objective": 1.6e-3, "success_rate": 0.8, "mean_effort": 2.0}
+    rows = [
+        {
+            "backend": backend,
+            "agent": "policy",
+            "goals": goals,
+            "baseline": body,
+            "winner": {**body, "objective": 6e-5},
+            "objective_change": -1.54e-3,
+            "objective_change_interval": [-2.5e-3, -6e-4] if goals > 5 else None,
+            "objective_mesh": part if backend == "fem" else None,
+        }
+        for backend, goals in (("fem", 20), ("refined", 3), ("surrogate", 20))
+    ]
+    tests = [{"backend": "fem", "unknowns": 27000}, {"backend": "refined", "unknowns": 55000}]
+    _, entry = record(tmp_path, comparison=rows, tests=tests)
+    assert len(entry["rows"]) == 1
+    assert entry["rows"][0]["change with the mesh, 95% interval [mm]"] == pytest.approx([-2.5, -0.4])
+    assert [row["judge"] for row in entry["meshes"]] == [
+        "finite elements",
+        "finite elements, finer mesh",
+        "surrogate",
+    ]
+    assert [row["unknowns"] for row in entry["meshes"]] == [27000, 55000, None]
+    assert [row["interval [mm]"] is None for row in entry["meshes"]] == [False, True, False]
+    assert entry["meshes"][0]["with the mesh [mm]"] == pytest.approx([-2.5, -0.4])
+    assert entry["meshes"][1]["change before [mm]"] == pytest.approx(-1.54 - 0.05)  # half of what is left

@@ -1,4 +1,7 @@
-"""The check on FEM: the best bodies and the baseline, with their controllers and the inverse QP, on unseen goals."""
+"""The check on FEM: the best bodies and the baseline, with their controllers and the inverse QP, on unseen goals.
+
+If the study names a finer mesh, baseline and winner are then tested on it too.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,21 @@ from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.training import train
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
-from softgym_envs.codesign.phases.trial import assess, training_config
-from softgym_envs.codesign.records import Finalist, FinalistTest, FinalistTraining, Job, PlannedTest
+from softgym_envs.codesign.phases.ends import check_policy, run_ends
+from softgym_envs.codesign.phases.trial import assess, measure, training_config
+from softgym_envs.codesign.records import REFINED, Finalist, FinalistTest, FinalistTraining, Job, PlannedTest
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import read_json
 
 
 def finalist_jobs(snapshot: StudySnapshot) -> list[Job]:
-    """Return one job per body, controller, backend and seed, the slow ones first."""
-    folder = snapshot.folder
-    return [Job(folder.path / plan.file, partial(_test, folder, plan)) for plan in snapshot.planned_tests]
+    """Return one job per body, controller, backend and seed, the slow ones first.
+
+    The last jobs are those on the finer mesh; they are there once the others are done.
+    """
+    folder, plans = snapshot.folder, [*snapshot.planned_tests, *snapshot.refinements]
+    return [Job(folder.path / plan.file, partial(_test, folder, plan)) for plan in plans]
 
 
 def fetch_policies(snapshot: StudySnapshot) -> None:
@@ -59,24 +66,42 @@ def check_tests(config: StudyConfig) -> None:
     """Build the baseline on FEM as for the tests of the finalists, if these have options of their own (seconds).
 
     Raises:
-        ConfigError: for an option that the backend does not take.
+        ConfigError: for an option that the backend or the robot does not take, a mesh that is not finer, and a policy
+            that a test of ends cannot use.
     """
-    options = config.finalists.fem_options
-    if not (options and config.finalists.count):
+    found = config.finalists
+    if not found.count:
         return
+    if found.test == "ends" and config.policy is not None:
+        check_policy(config.policy)
+    if found.fem_options:
+        _try(config, "fem", f"finalists.fem_options = {found.fem_options}")
+    if found.refinement is not None:
+        options = found.refinement.robot_options
+        _try(config, REFINED, f"finalists.refinement.robot_options = {options}")
+
+
+def _try(config: StudyConfig, backend: str, key: str) -> None:
+    environment = finalist_environment(config, backend, {})
     try:
-        finalist_environment(config, "fem", {}).make(sample_design=False).close()
-    except ValueError as error:
-        raise ConfigError(f"finalists cannot be tested with finalists.fem_options = {options}: {error}") from None
+        if backend == "fem":
+            environment.make(sample_design=False).close()
+        else:
+            environment.make_robot()  # meshing it would take long
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"finalists cannot be tested with {key}: {error}") from None
     except (InfeasibleDesign, ConvergenceError):  # of the baseline: a result of the test
         pass
 
 
 def finalist_environment(config: StudyConfig, backend: str, options: Mapping[str, float]) -> EnvironmentConfig:
-    """Return the environment in which finalists are tested on a backend."""
-    found = config.environment_of(options).on(backend)
-    if backend == "fem":
+    """Return the environment in which finalists are tested: on a backend, or on FEM with the finer mesh."""
+    refinement = config.finalists.refinement if backend == REFINED else None
+    found = config.environment_of(options).on("fem" if backend == REFINED else backend)
+    if found.backend == "fem":
         found = found.model_copy(update={"backend_options": {**found.backend_options, **config.finalists.fem_options}})
+    if refinement is not None:
+        found = found.model_copy(update={"robot_options": {**found.robot_options, **refinement.robot_options}})
     return found
 
 
@@ -87,8 +112,20 @@ def _test(folder: StudyFolder, plan: PlannedTest) -> FinalistTest:
         controller = _trained_policy(folder, finalist, plan.seed) if plan.seed else folder.path / finalist.policy
     test = FinalistTest(finalist.trial, plan.agent, plan.backend, plan.goals, plan.seed)
     environment = finalist_environment(config, plan.backend, finalist.options)
+    goals, refinement = folder.goals[plan.goals], config.finalists.refinement
+    if refinement is not None and plan.backend == REFINED:
+        goals = goals[: refinement.goals]
     try:
-        found = assess(controller, config, environment, folder.goals[plan.goals], finalist.design)
+        if config.finalists.test == "ends" and plan.backend != "surrogate":
+            start = finalist_environment(config, "surrogate", finalist.options)
+            steps = config.finalists.last_steps
+            ends = run_ends(controller, environment, goals, finalist.design, start=start, last_steps=steps)
+            test.unknowns, test.last_motion = ends.unknowns, ends.last_motion
+            found = measure(config, environment, ends.evaluation, finalist.design)
+        else:
+            found = assess(controller, config, environment, goals, finalist.design)
+            if refinement is not None and plan.backend != "surrogate":
+                test.unknowns = environment.make_robot().build(finalist.design).equations
     except (InfeasibleDesign, ConvergenceError) as error:
         test.error = str(error)
         return test

@@ -43,12 +43,13 @@ def assess(
         ConvergenceError: if it cannot be simulated.
     """
     evaluation = evaluate(agent, environment, goals, design=dict(design), seed=0)
-    return _measured(config, environment, evaluation, design)
+    return measure(config, environment, evaluation, design)
 
 
-def _measured(
+def measure(
     config: StudyProblem, environment: EnvironmentConfig, evaluation: Evaluation, design: Mapping[str, float]
 ) -> Assessment:
+    """Measure the objectives of a study in an evaluation of one body."""
     outcome = Outcome(evaluation, design, environment.make_robot())
     return Assessment(evaluation, {name: each.measure(outcome) for name, each in config.objectives.items()})
 
@@ -187,7 +188,7 @@ class _Runner:
                 self.result.state = "pruned"
                 self.result.reason = f"stopped by the pruner after {seen} of {count} goals"
                 break
-        return _measured(self.config, self.environment, Evaluation.merge(parts), self.result.design)
+        return measure(self.config, self.environment, Evaluation.merge(parts), self.result.design)
 
     def _train(self) -> Path | None:
         """Train the policy of the body; None if the pruner stopped the training."""

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from softgym_envs.agents.evaluation import known
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.objectives import Objective
-from softgym_envs.codesign.records import Finalist, TestGroup
+from softgym_envs.codesign.records import REFINED, Finalist, TestGroup
 from softgym_envs.codesign.report.results import (
     BodyStatistics,
     Comparison,
@@ -17,7 +20,14 @@ from softgym_envs.codesign.report.results import (
     Transfer,
     VariableResult,
 )
-from softgym_envs.codesign.report.statistics import Interval, mean_interval, rank_correlation, rate_interval
+from softgym_envs.codesign.report.statistics import (
+    Interval,
+    MeshPart,
+    mean_interval,
+    mesh_part,
+    rank_correlation,
+    rate_interval,
+)
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.config import provenance
 
@@ -90,13 +100,53 @@ def _comparisons(snapshot: StudySnapshot) -> list[Comparison]:
     if winner is None or baseline is None:
         return []
     found = {group.key: group for group in snapshot.unseen_tests}
+    finer = snapshot.config.finalists.refinement
     rows = []
     for backend in snapshot.config.test_backends:
-        for agent in winner.agents:
-            before, after = (found.get((body.trial, agent, backend)) for body in (baseline, winner))
-            if before is not None and after is not None:
-                rows.append(_compare(before, after, snapshot.objective))
+        for physics in (backend, REFINED) if backend == "fem" and finer is not None else (backend,):
+            for agent in winner.agents:
+                before, after = (found.get((body.trial, agent, physics)) for body in (baseline, winner))
+                if before is not None and after is not None:
+                    rows.append(_compare(before, after, snapshot.objective))
+    if finer is not None:
+        rows = [_with_mesh(row, found, (baseline.trial, winner.trial), finer.ratio) for row in rows]
     return rows
+
+
+def _with_mesh(
+    row: Comparison, found: Mapping[tuple[int, str, str], TestGroup], trials: tuple[int, int], ratio: float | None
+) -> Comparison:
+    """Return the comparison on FEM with what is left of the mesh's error, if the finer mesh was tested; else as it is.
+
+    Args:
+        row: the comparison.
+        found: tests on unseen goals.
+        trials: of baseline and winner.
+        ratio: of the sizes of elements, or None for the cube root of the ratio of unknowns.
+    """
+    coarse = [found.get((trial, row.agent, "fem")) for trial in trials]
+    fine = [found.get((trial, row.agent, REFINED)) for trial in trials]
+    if row.backend != "fem" or None in coarse or None in fine:
+        return row
+    both = [[group for group in groups if group is not None] for groups in (coarse, fine)]
+    if ratio is None:
+        few, many = (groups[0].unknowns for groups in both)
+        if few is None or many is None or few >= many:
+            return row
+        ratio = (few / many) ** (1.0 / 3.0)
+
+    def part(tables: Sequence[Sequence[np.ndarray]], interval: Interval) -> MeshPart:
+        (before, after), (before_fine, after_fine) = ([table.mean(axis=0) for table in pair] for pair in tables)
+        fine = after_fine - before_fine
+        return mesh_part((after - before)[: len(fine)], fine, ratio, interval)
+
+    distances = [[group.table("distances") for group in groups] for groups in both]
+    own = [[table for group in groups if (table := group.objective_table) is not None] for groups in both]
+    return replace(
+        row,
+        distance_mesh=part(distances, row.distance_change_interval),
+        objective_mesh=part(own, row.objective_change_interval) if all(len(pair) == 2 for pair in own) else None,
+    )
 
 
 def _statistics(group: TestGroup, objective: Objective) -> BodyStatistics:
@@ -107,7 +157,7 @@ def _statistics(group: TestGroup, objective: Objective) -> BodyStatistics:
         mean_distance=mean.mean_distance,
         distance_interval=mean_interval(group.table("distances")),
         worst_distance=group.worst_distance,
-        mean_return=mean.mean_return,
+        mean_return=known(mean.mean_return),
         mean_effort=mean.mean_effort,
         objective=group.value(objective.name),
         objective_interval=None if own is None else mean_interval(own),
@@ -198,8 +248,8 @@ def _cost(snapshot: StudySnapshot) -> Cost:
     tests, retrained = snapshot.all_tests, snapshot.all_trainings
     points = sum(len(trial.curve) for trial in trials)
 
-    def test_steps(backend: str) -> int:
-        return sum(test.evaluation.steps for test in tests if test.backend == backend and test.evaluation is not None)
+    def test_steps(*backends: str) -> int:
+        return sum(test.evaluation.steps for test in tests if test.backend in backends and test.evaluation is not None)
 
     return Cost(
         joint_steps=shared.training_steps if shared else 0,
@@ -211,7 +261,7 @@ def _cost(snapshot: StudySnapshot) -> Cost:
         selection_steps=sum(trial.steps_of_scores for trial in trials),
         screen_steps=sum(evaluation.steps for evaluation in screened),
         test_steps_surrogate=test_steps("surrogate"),
-        test_steps_fem=test_steps("fem"),
+        test_steps_fem=test_steps("fem", REFINED),
         cpu_seconds={
             "screen": sum(evaluation.cpu_seconds for evaluation in screened),
             "shared_policy": shared.cpu_seconds if shared else 0.0,

@@ -9,6 +9,7 @@ import numpy as np
 
 from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.backends.backend import State
+from softgym_envs.codesign.phases.ends import episode_commands
 from softgym_envs.codesign.phases.finalists import finalist_environment, policy_file
 from softgym_envs.codesign.records import Finalist
 from softgym_envs.codesign.report.results import StudyResults
@@ -17,6 +18,9 @@ from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
+
+MOMENTS = 6
+"""Most states of an episode that are computed by finite elements, if these test only where episodes end."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class Episode:
         states: mechanical states, that of the reset first.
         goals: goal of each state, in the unit of the task.
         distances: distance to the goal in each state, as the task measures it.
-        rewards: reward of each step to a state; None after the reset.
+        rewards: reward of each step to a state; None after the reset, and if a study tests only ends.
     """
 
     role: str
@@ -94,14 +98,38 @@ def run_episodes(snapshot: StudySnapshot, results: StudyResults) -> list[Episode
     return [_run(snapshot, role, body, path) for role, body in bodies.values()]
 
 
+def moments(commands: np.ndarray) -> list[int]:
+    """Return indices of at most `MOMENTS` commands (k, n_a) after the first, evenly along their way, the last included.
+
+    Most of an episode often stands still, so equal parts of the way show more than equal times.
+    """
+    lengths = np.linalg.norm(np.diff(commands, axis=0), axis=1).cumsum()
+    if not len(lengths) or lengths[-1] == 0.0:
+        return [len(commands) - 1]
+    parts = lengths[-1] * np.arange(1, MOMENTS + 1) / MOMENTS
+    found = np.searchsorted(lengths, parts * (1.0 - 1e-9)) + 1
+    return list(dict.fromkeys([*found[:-1].tolist(), len(commands) - 1]))
+
+
 def _run(snapshot: StudySnapshot, role: str, body: Finalist, path: np.ndarray) -> Episode:
     environment = finalist_environment(snapshot.config, "fem", body.options)
     policy = policy_file(snapshot, body)
     if policy is None:  # the QP alone, not on top of another one
         environment = environment.model_copy(update={"residual_scale": 0.0})
-    agent = make_agent("qp" if policy is None else policy)
-    env = environment.make(sample_design=False)
+    controller = "qp" if policy is None else policy
+    commands = None
+    if snapshot.config.finalists.test == "ends":
+        start = finalist_environment(snapshot.config, "surrogate", body.options)
+        commands = episode_commands(controller, start, path, body.design)[0]
+    agent, env = make_agent(controller), environment.make(sample_design=False)
     inner: Any = env.unwrapped
+
+    def add(info: dict[str, Any], reward: float | None) -> None:
+        episode.states.append(inner.state)
+        episode.goals.append(inner.goal)
+        episode.distances.append(float(info["distance"]))
+        episode.rewards.append(reward)
+
     try:
         observation, info = env.reset(seed=0, options={"design": body.design, "goal": path})
         episode = Episode(
@@ -116,13 +144,15 @@ def _run(snapshot: StudySnapshot, role: str, body: Finalist, path: np.ndarray) -
             [float(info["distance"])],
             [None],
         )
+        if commands is not None:  # a step takes seconds
+            for index in moments(commands):
+                inner.backend.step(commands[index])
+                add(inner.set_state(inner.get_state())[1], None)
+            return episode
         ended = False
         while not ended:
             observation, reward, terminated, truncated, info = env.step(agent(observation, inner))
-            episode.states.append(inner.state)
-            episode.goals.append(inner.goal)
-            episode.distances.append(float(info["distance"]))
-            episode.rewards.append(float(reward))
+            add(info, float(reward))
             ended = terminated or truncated
         return episode
     finally:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.codesign.records import REFINED
 from softgym_envs.codesign.report.results import StudyResults
-from softgym_envs.codesign.report.statistics import mean_interval
+from softgym_envs.codesign.report.statistics import MIN_GOALS, mean_interval
 from softgym_envs.codesign.report.units import present
 from softgym_envs.codesign.snapshot import StudySnapshot
 
@@ -34,7 +35,14 @@ def findings(snapshot: StudySnapshot, results: StudyResults) -> list[Finding]:
     """Return the findings of a study, the most important ones first; none without a winner."""
     if results.winner is None:
         return []
-    found = [_goals(snapshot, results), _limit(snapshot, results), _bounds(results), _alternatives(snapshot, results)]
+    found = [
+        _goals(snapshot, results),
+        _mesh(snapshot, results),
+        _failures(snapshot),
+        _limit(snapshot, results),
+        _bounds(results),
+        _alternatives(snapshot, results),
+    ]
     if results.few_goals:
         found.append(Finding("Few test goals", f"{results.few_goals} Raise goals.unseen_count."))
     return [finding for finding in found if finding is not None]
@@ -56,6 +64,44 @@ def _goals(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     worst = f"The largest {scale.name} is {scale.text(row.winner.worst_distance, 2)}."
     title = f"{missed} of {row.goals} test goals are not reached"
     return Finding(title, f"A goal is reached with a final {scale.name} of at most {limit}. {worst}")
+
+
+def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
+    """Return whether a finer mesh agrees that the winner is nearer to the goals."""
+    finer = snapshot.config.finalists.refinement
+    if finer is None or results.winner is None or results.winner.role == "baseline":
+        return None
+    failed = next((test for test in results.tests if test.backend == REFINED and test.error is not None), None)
+    if failed is not None:
+        text = f"Trial {failed.trial} cannot be simulated there: {failed.error}. No interval contains the mesh's error."
+        return Finding("The finer mesh has no result", text)
+    rows = {(row.backend, row.agent): row for row in results.comparison}
+    agent = results.winner.agents[0]
+    coarse, fine = (rows.get((backend, agent)) for backend in ("fem", REFINED))
+    if coarse is None or fine is None or coarse.distance_mesh is None:
+        return None
+    measure, mesh = snapshot.config.distance, coarse.distance_mesh
+    before = fine.distance_change - mesh.left * (1.0 - mesh.ratio)  # on the other mesh, at the same goals
+    text = (
+        f"At {fine.goals} goals the change is {measure.text(fine.distance_change, '+')} there, and "
+        f"{measure.text(before, '+')} on the mesh of the study. "
+    )
+    if mesh.interval is None:
+        return Finding("A finer mesh was tested", f"{text}With fewer than {MIN_GOALS} goals there is no interval.")
+    low, high = (measure.number(end, "+") for end in mesh.interval)
+    text += f"With what is left of the mesh's error, the change at all goals is {low} to {high} {measure.unit}."
+    if mesh.interval[1] < 0.0:
+        return Finding("A finer mesh agrees", text, warns=False)
+    return Finding("With the mesh's error, the gain is not certain", text)
+
+
+def _failures(snapshot: StudySnapshot) -> Finding | None:
+    """Return which finalists cannot be simulated on FEM."""
+    failed = snapshot.failures
+    if not failed:
+        return None
+    texts = "; ".join(f"trial {trial}: {error}" for trial, error in failed.items())
+    return Finding(f"{len(failed)} of {len(snapshot.finalists)} bodies fail on FEM", f"They cannot win. {texts}.")
 
 
 def _limit(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:

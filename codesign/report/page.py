@@ -18,7 +18,7 @@ from softgym_envs.codesign.report.exports import Download, write_exports
 from softgym_envs.codesign.report.files import write_results
 from softgym_envs.codesign.report.findings import findings
 from softgym_envs.codesign.report.results import Comparison, StudyResults
-from softgym_envs.codesign.report.statistics import MIN_GOALS, kendall_tau, rank_correlation
+from softgym_envs.codesign.report.statistics import MIN_GOALS, MeshPart, kendall_tau, rank_correlation
 from softgym_envs.codesign.report.tables import BACKENDS, SHOWN_ALWAYS, percent
 from softgym_envs.codesign.report.units import present
 from softgym_envs.codesign.snapshot import StudySnapshot, load_study
@@ -97,6 +97,8 @@ def _context(snapshot: StudySnapshot, results: StudyResults, episodes: Sequence[
         "goals_note": "The goals are those of the search, because the task has no others."
         if _same_goals(snapshot)
         else "These goals were used neither to train the controllers nor to choose the winner.",
+        "no_comparison": results.no_winner or _untested(snapshot, results),
+        "mesh_note": _mesh_note(snapshot, results),
         "interval_note": _interval_note(snapshot, results),
         "figures": {
             "reached": plots.reached(snapshot, results),
@@ -127,9 +129,11 @@ def _headline(snapshot: StudySnapshot, results: StudyResults) -> str:
     if baseline is None:
         return "The baseline body is infeasible, so there is nothing to compare the winner with."
     if winner.trial == baseline.trial:
-        return "No body scores better than the baseline, so the baseline itself wins."
+        failed = snapshot.failures
+        wins = "No body scores better than the baseline" if not failed else "No better body can be simulated on FEM"
+        return f"{wins}, so the baseline itself wins."
     if not results.comparison:
-        return f"Trial {winner.trial} scored best. It has not been tested on FEM yet."
+        return f"Trial {winner.trial} scored best. There is no comparison: {_untested(snapshot, results)}."
     row, measure = results.comparison[0], snapshot.config.distance
     scale = snapshot.config.distance_scale
     sentences = [
@@ -137,25 +141,38 @@ def _headline(snapshot: StudySnapshot, results: StudyResults) -> str:
         f"On {BACKENDS[row.backend]}, with {'its own policy' if row.agent == 'policy' else 'the inverse QP'}, its "
         f"{measure.label.lower()} over {row.goals} test goals is {measure.text(row.winner.mean_distance)} instead of "
         f"{measure.text(row.baseline.mean_distance)} (difference {measure.text(row.distance_change, '+')}"
-        f"{_interval(row.distance_change_interval, measure)}). It reaches {percent(row.winner.success_rate)} of the "
-        f"goals with a final {scale.name} of at most {scale.limit_text(results.success_distance)}, the baseline "
-        f"{percent(row.baseline.success_rate)}.",
+        f"{_interval(row.distance_change_interval, measure, row.distance_mesh)}). It reaches "
+        f"{percent(row.winner.success_rate)} of the goals with a final {scale.name} of at most "
+        f"{scale.limit_text(results.success_distance)}, the baseline {percent(row.baseline.success_rate)}.",
         results.few_goals,
     ]
     return " ".join(sentence for sentence in sentences if sentence)
 
 
-def _interval(interval: tuple[float, float] | None, measure: Objective) -> str:
+def _untested(snapshot: StudySnapshot, results: StudyResults) -> str:
+    """Return why baseline and winner are not compared."""
+    baseline, failed = results.baseline, snapshot.failures
+    if baseline is not None and baseline.trial in failed:
+        return f"the baseline cannot be simulated on FEM ({failed[baseline.trial]})"
+    return "the tests of winner and baseline are not finished"
+
+
+def _interval(interval: tuple[float, float] | None, measure: Objective, mesh: MeshPart | None = None) -> str:
     if interval is None:
         return ""
     low, high = (measure.number(end, "+") for end in sorted(interval))
-    return f", 95 % interval {low} to {high}"
+    text = f", 95 % interval {low} to {high}"
+    if mesh is None or mesh.interval is None:
+        return text
+    low, high = (measure.number(end, "+") for end in sorted(mesh.interval))
+    return f"{text}, with the error of the mesh {low} to {high}"
 
 
 def _finding(snapshot: StudySnapshot, row: Comparison) -> str:
     """Return whether the winner is better, and by how much in an objective other than distance and success."""
-    objective, interval = snapshot.objective, row.objective_change_interval
-    low, high = sorted(objective.sign * value for value in interval or (0.0, 0.0))
+    objective, interval, mesh = snapshot.objective, row.objective_change_interval, row.objective_mesh
+    whole = interval if mesh is None or mesh.interval is None else mesh.interval
+    low, high = sorted(objective.sign * value for value in whole or (0.0, 0.0))
     if row.goals < FEW_GOALS:
         finding = "The optimised body scored better than the baseline in the search"
     elif low > 0.0:
@@ -167,7 +184,7 @@ def _finding(snapshot: StudySnapshot, row: Comparison) -> str:
     if objective.name == "mean_distance":
         return f"{finding}."
     before, after = objective.text(row.baseline.objective), objective.text(row.winner.objective)
-    change = f"change {objective.text(row.objective_change, '+')}{_interval(interval, objective)}"
+    change = f"change {objective.text(row.objective_change, '+')}{_interval(interval, objective, mesh)}"
     return f"{finding}. Its {objective.label.lower()} in the test is {after} instead of {before} ({change})."
 
 
@@ -231,7 +248,7 @@ def _question(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str,
         labels = ", ".join(config.objectives[name].axis_inside for name in config.secondary_objectives)
         rows.append(("Secondary objectives", f"{labels}; {len(results.pareto)} bodies on the Pareto front"))
     rows += [
-        ("Physics", f"{backend} in the search, FEM in the test"),
+        ("Physics", f"{backend} in the search; {_tested(snapshot)}"),
         ("Controller", CONTROLLERS[config.strategy]),
         ("Goals", f"{_origin_of_goals(snapshot)}; {others}"),
         ("Budget", f"{config.trials} bodies ({done})"),
@@ -248,6 +265,39 @@ def _question(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str,
         steps = config.finalists.steps or config.training.steps
         rows.append(("Final test", f"{config.finalists.seeds} policies trained anew for each body, {steps:,} steps"))
     return rows
+
+
+def _tested(snapshot: StudySnapshot) -> str:
+    """Return on which physics the finalists are tested."""
+    finalists = snapshot.config.finalists
+    text = "FEM in the test"
+    if finalists.test == "ends":
+        text += (
+            ", where episodes end: from the command at which an episode on the surrogate ends the inverse QP settles, "
+            f"and a policy takes {finalists.last_steps} more steps"
+        )
+    if (finer := finalists.refinement) is not None:
+        options = ", ".join(f"{name} = {value}" for name, value in finer.robot_options.items())
+        text += f"; baseline and winner also on a finer mesh ({options})"
+    return text
+
+
+def _mesh_note(snapshot: StudySnapshot, results: StudyResults) -> str:
+    """Return how the intervals contain the error of the mesh; empty without a finer mesh."""
+    row = next((row for row in results.comparison if row.distance_mesh is not None), None)
+    if row is None or row.distance_mesh is None:
+        return ""
+    mesh, measure = row.distance_mesh, snapshot.config.distance
+    low, high = (measure.number(end, "+") for end in mesh.left_interval)
+    note = (
+        f"“With the mesh” adds what is left of the mesh's error: the change on {mesh.goals} goals on both meshes, "
+        f"extrapolated linearly to elements of size zero (those of the finer mesh are {mesh.ratio:.2f} times as "
+        f"large), would be {measure.text(mesh.left, '+')} more ({low} to {high})."
+    )
+    motions = [test.last_motion for test in results.tests if test.last_motion is not None]
+    if motions:
+        note += f" The last step of a policy moved the effector by at most {1e3 * max(motions):.2f} mm."
+    return note
 
 
 def _origin_of_goals(snapshot: StudySnapshot) -> str:
@@ -365,10 +415,13 @@ def _episode_text(episodes: Sequence[Episode]) -> str:
     if not episodes:
         return ""
     ends = " and ".join(f"{episode.distance_text(-1)} for the {episode.role}" for episode in episodes)
-    return (
+    text = (
         f"Computed with finite elements at a typical goal, where the winner gains the median of all goals: "
         f"{episodes[-1].goal_text}. The {episodes[-1].task.distance_scale.name} at the end is {ends}."
     )
+    if all(reward is None for reward in episodes[-1].rewards):
+        text += f" The {len(episodes[-1].states)} moments have the commands of an episode on the surrogate."
+    return text
 
 
 def _search_notes(snapshot: StudySnapshot, results: StudyResults) -> list[str]:

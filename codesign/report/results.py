@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.codesign.records import Finalist, FinalistTraining, Record, TestGroup
-from softgym_envs.codesign.report.statistics import Interval
+from softgym_envs.codesign.report.statistics import Interval, MeshPart
 
 LIMIT_MARGIN = 0.02
 """A variable this close to an end of its range, as a fraction of the range, is at its limit."""
@@ -56,7 +56,7 @@ class BodyStatistics(Record):
     mean_distance: float
     distance_interval: Interval
     worst_distance: float
-    mean_return: float
+    mean_return: float | None  # unknown if only the ends of episodes were tested
     mean_effort: float
     objective: float
     objective_interval: Interval
@@ -64,7 +64,10 @@ class BodyStatistics(Record):
 
 @dataclass(frozen=True, eq=False)
 class Comparison(Record):
-    """Winner against baseline on the same test goals, with one controller on one backend [SI]; intervals of 95 %."""
+    """Winner against baseline on the same test goals, with one controller on one backend [SI]; intervals of 95 %.
+
+    The backend ``"refined"`` is FEM with a finer mesh, on the first of the test goals.
+    """
 
     backend: str
     agent: str
@@ -79,6 +82,8 @@ class Comparison(Record):
     objective_change_interval: Interval
     goals_closer: int
     goals_farther: int
+    distance_mesh: MeshPart | None = None  # of the change, if a finer mesh was tested
+    objective_mesh: MeshPart | None = None
 
 
 @dataclass(frozen=True, eq=False)

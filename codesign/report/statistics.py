@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.codesign.records import Record
+
 CONFIDENCE = 0.95
+RESAMPLES = 10_000
 MIN_GOALS = 5
 """Fewest goals for an interval: from fewer goals it would be meaningless."""
 
@@ -42,6 +46,45 @@ def mean_interval(table: np.ndarray, minus: np.ndarray | None = None) -> Interva
     freedom = variance**2 / sum(v * v / f for v, f in parts)
     half = float(t.ppf(0.5 + 0.5 * CONFIDENCE, freedom) * np.sqrt(variance))
     return mean - half, mean + half
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart(Record):
+    """What is left of a mesh's error in a change [SI].
+
+    Attributes:
+        goals: number of goals on the finer mesh.
+        ratio: size of its elements over that of the coarser mesh.
+        left: mean of what is left.
+        left_interval: interval of this mean over goals; with few goals it reaches from the smallest to the largest.
+        interval: interval of the change on the coarser mesh, widened by `left_interval`.
+    """
+
+    goals: int
+    ratio: float
+    left: float
+    left_interval: tuple[float, float]
+    interval: Interval
+
+
+def mesh_part(coarse: np.ndarray, fine: np.ndarray, ratio: float, interval: Interval) -> MeshPart:
+    """Return what is left of a mesh's error in a change, from the same change on a finer mesh.
+
+    The error is taken as linear in the size of the elements, as sharp edges make it: at each goal
+    ``(fine - coarse) / (1 - ratio)`` is left. The scatter of its mean over goals comes from bootstrapping them.
+
+    Args:
+        coarse: the change at the goals of the finer mesh, on the coarser one, shape (k,).
+        fine: the same on the finer mesh.
+        ratio: size of the finer mesh's elements over that of the coarser mesh's, below 1.
+        interval: of the change at all goals, on the coarser mesh.
+    """
+    left = (np.asarray(fine) - np.asarray(coarse)) / (1.0 - ratio)
+    drawn = np.random.default_rng(0).integers(len(left), size=(RESAMPLES, len(left)))
+    tails = 0.5 * (1.0 - CONFIDENCE)
+    low, high = (float(end) for end in np.quantile(left[drawn].mean(axis=1), (tails, 1.0 - tails)))
+    whole = None if interval is None else (interval[0] + min(low, 0.0), interval[1] + max(high, 0.0))
+    return MeshPart(len(left), ratio, float(left.mean()), (low, high), whole)
 
 
 def rate_interval(successes: np.ndarray) -> Interval:

@@ -8,13 +8,14 @@ from typing import Any
 
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.objectives import Objective
-from softgym_envs.codesign.records import TrialResult
+from softgym_envs.codesign.records import REFINED, TrialResult
 from softgym_envs.codesign.report.results import Comparison, Cost, StudyResults, Transfer, VariableResult
+from softgym_envs.codesign.report.statistics import MeshPart
 from softgym_envs.codesign.report.units import present, shown_unit
 from softgym_envs.codesign.snapshot import StudySnapshot
 
 AGENTS = {"policy": "Policy", "qp": "Inverse QP"}
-BACKENDS = {"fem": "FEM", "surrogate": "Surrogate"}
+BACKENDS = {"fem": "FEM", REFINED: "FEM, finer mesh", "surrogate": "Surrogate"}
 SHOWN_ALWAYS = ("mean_distance", "success_rate")
 """Objectives that every comparison shows, whatever the objective of the study."""
 
@@ -46,13 +47,23 @@ def design_row(variable: VariableResult) -> dict[str, Any]:
 
 
 def _cell(
-    value: str, interval: Sequence[float] | None, show: Callable[[float], str], better: int = 0
+    value: str,
+    interval: Sequence[float] | None,
+    show: Callable[[float], str],
+    better: int = 0,
+    mesh: MeshPart | None = None,
 ) -> dict[str, Any]:
     """Return a cell; ``better`` is the sign of an improvement, 0 for a value that is not a change."""
     if interval is None:
-        return {"value": value, "interval": "", "good": False}
+        return {"value": value, "interval": "", "mesh": "", "good": False}
+    whole = mesh.interval if mesh is not None and mesh.interval is not None else None
     low, high = (show(end) for end in interval)
-    return {"value": value, "interval": f"{low} to {high}", "good": min(better * end for end in interval) > 0.0}
+    return {
+        "value": value,
+        "interval": f"{low} to {high}",
+        "mesh": "" if whole is None else f"with the mesh {show(whole[0])} to {show(whole[1])}",
+        "good": min(better * end for end in whole or interval) > 0.0,
+    }
 
 
 def comparison_columns(config: StudyConfig) -> list[str]:
@@ -78,10 +89,13 @@ def comparison_row(row: Comparison, config: StudyConfig) -> dict[str, Any]:
             text, interval = measure.text(getattr(body, mean)), getattr(body, f"{prefix}_interval")
             cells.append(_cell(text, interval, measure.number))
         change, interval = getattr(row, f"{prefix}_change"), getattr(row, f"{prefix}_change_interval")
-        cells.append(_cell(measure.text(change, "+"), interval, partial(measure.number, sign="+"), measure.sign))
+        mesh = getattr(row, f"{prefix}_mesh", None)
+        show = partial(measure.number, sign="+")
+        cells.append(_cell(measure.text(change, "+"), interval, show, measure.sign, mesh))
     return {
         "backend": BACKENDS[row.backend],
         "agent": AGENTS[row.agent],
+        "goals": row.goals,
         "cells": cells,
         "closer": row.goals_closer,
         "farther": row.goals_farther,

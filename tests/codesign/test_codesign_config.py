@@ -164,6 +164,68 @@ BAD = {
         "joint.sac.learning_starts = 1000",
         "joint.steps = 800",
     ),
+    "more goals on the finer mesh than there are": (
+        {"finalists": {"count": 1, "refinement": {"robot_options": {"mesh_size": 0.005}, "goals": 4}}},
+        "finalists.refinement.goals = 4",
+        "goals.unseen_count = 3",
+    ),
+    "a finer mesh without options": (
+        {"finalists": {"count": 1, "refinement": {"robot_options": {}, "goals": 2}}},
+        "finalists.refinement.robot_options",
+        "at least 1",
+    ),
+    "a finer mesh with larger elements": (
+        {"finalists": {"count": 1, "refinement": {"robot_options": {"mesh_size": 0.01}, "goals": 2, "ratio": 1.2}}},
+        "finalists.refinement.ratio",
+        "less than 1",
+    ),
+    "an unknown test": ({"finalists": {"count": 1, "test": "starts"}}, "finalists.test", "'episodes' or 'ends'"),
+    "ends of paths": (
+        {
+            "environment": {"id": "SoftGym/FingerTrack-v0"},
+            "goals": {"source": "task", "count": 2, "unseen_count": 2},
+            "finalists": {"count": 1, "test": "ends"},
+        },
+        "task 'track'",
+        "allowed: episodes",
+    ),
+    "ends without a surrogate": (
+        {
+            "environment": {"id": "SoftGym/TetrapodReach-v0"},
+            "variables": ["leg_length"],
+            "goals": {"source": "task", "count": 2, "unseen_count": 2},
+            "finalists": {"count": 1, "test": "ends"},
+        },
+        "robot 'tetrapod'",
+        "allowed: episodes",
+    ),
+    "ends of plants": (
+        {
+            "environment": {"id": "SoftGym/FingerReach-v0", "plant": {"stiffness": 1.1}},
+            "finalists": {"count": 1, "test": "ends"},
+        },
+        "environment.plant",
+        "allowed: episodes",
+    ),
+    "ends of motions": (
+        {"finalists": {"count": 1, "test": "ends", "fem_options": {"dynamics": True}}},
+        "'dynamics': True",
+        "allowed: episodes",
+    ),
+    "ends of an objective of the path": (
+        {"objective": "mean_return", "finalists": {"count": 1, "test": "ends"}},
+        "'mean_return'",
+        "allowed: episodes",
+    ),
+    "ends of policies with memory": (
+        {
+            "strategy": "scratch",
+            "training": {"learner": "recurrent", "steps": 2000},
+            "finalists": {"count": 1, "test": "ends"},
+        },
+        "training.learner = recurrent",
+        "allowed: episodes",
+    ),
     "joint training on FEM": (
         {
             "strategy": "critic",
@@ -205,7 +267,7 @@ def test_shipped_configs_and_their_policies(path):
 def test_shipped_studies_train_a_policy_for_each_body(path):
     config = load_config(path, StudyConfig)
     # FEM at every step, or a question about the body that training would blur; their headers say so.
-    untrained = {"finger_grasp", "tetrapod_reach", "finger_reach_accurate", "modular_reach", "modular_reach_fixed"}
+    untrained = {"finger_grasp", "tetrapod_reach", "modular_reach", "modular_reach_fixed"}
     if config.name in untrained:
         assert config.strategy == "qp"
     elif config.name == "modular_reach_policy":  # compares one policy with the inverse QP
