@@ -46,11 +46,13 @@ class Table:
         problem: the problem.
         points: bodies in the unit box [-1, 1]^n, shape (bodies, n): the first of a scrambled Sobol sequence.
         values: by judge, `COLUMNS` of each body [SI], shape (bodies, 3); NaN where a judge has not scored a body.
+        longest: largest step towards rest, relative to the range of a command, of the judges at rest.
     """
 
     problem: FrozenProblem
     points: np.ndarray
     values: Mapping[str, np.ndarray]
+    longest: float = LONGEST
 
     @classmethod
     def read(cls, name: str, path: Path | None = None) -> Table:
@@ -68,8 +70,8 @@ class Table:
             table = parquet.read_table(path)
         except (OSError, ArrowException) as error:
             raise DataError(f"the table '{path}' cannot be read: {error}") from None
-        stored = (table.schema.metadata or {}).get(b"hash", b"").decode()
-        if stored != problem.hash:
+        meta = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
+        if meta.get("hash") != problem.hash:
             raise DataError(f"the table '{path}' is for another version of '{name}'; run: softgym benchmark tabulate")
         columns = {key: table[key].to_numpy().astype(float) for key in table.column_names}
         points = np.stack([columns[f"unit_{key}"] for key in problem.variables], axis=1)
@@ -78,6 +80,7 @@ class Table:
             problem,
             points,
             {judge: np.stack([columns[f"{judge}.{key}"] for key in COLUMNS], axis=1) for judge in judges},
+            float(meta["longest"]),
         )
 
     def __len__(self) -> int:
@@ -269,6 +272,8 @@ def tabulate(
 ) -> Path:
     """Score bodies of a problem and write the table; an interrupted call continues where it stopped.
 
+    A table that is there already is extended: its scores are kept, and only missing ones are computed.
+
     Args:
         name: a problem with the objective ``mean_distance``, on a batched surrogate.
         counts: by judge of `TABLE_JUDGES`, how many bodies it scores: the first ones of the sequence.
@@ -285,16 +290,39 @@ def tabulate(
     for judge in counts:
         if judge not in TABLE_JUDGES or (judge == "shared" and problem.definition.policy is None):
             raise ValueError(f"problem '{name}': {unknown_name('judge of tables', judge, TABLE_JUDGES)}")
-    bodies = max(counts.values())
+    path = output or DATA / "tables" / f"{name}.parquet"
+    known = _extendable(name, path, longest)
+    bodies = max([*counts.values(), *(len(table) for table in known.values())])
     points = _points(len(problem.variables), bodies)
-    values: dict[str, np.ndarray] = {}
+    values = {judge: np.full((bodies, len(COLUMNS)), np.nan) for judge in dict.fromkeys([*known, *counts])}
+    for judge, table in known.items():
+        values[judge][: len(table)] = table
     for judge, count in counts.items():
         chunk = TABLE_JUDGES[judge].chunk
-        values[judge] = np.full((bodies, len(COLUMNS)), np.nan)
-        for start in range(0, count, chunk):
+        done = _scored(known.get(judge, values[judge][:0]))
+        for start in range(done - done % chunk, count, chunk):
             rows = slice(start, min(start + chunk, count))
-            values[judge][rows] = tabulated(tabulation, judge, points[rows], folder, start)
-    return _write(problem, points, values, output or DATA / "tables" / f"{name}.parquet", longest)
+            if rows.stop > done:
+                values[judge][rows] = tabulated(tabulation, judge, points[rows], folder, start)
+    return _write(problem, points, values, path, longest)
+
+
+def _extendable(name: str, path: Path, longest: float) -> dict[str, np.ndarray]:
+    """Return the values of a table that is there, by judge; none if it is for another version or another step."""
+    if not path.is_file():
+        return {}
+    try:
+        found = Table.read(name, path)
+    except DataError:
+        return {}
+    same = found.longest == longest and np.allclose(found.points, _points(found.points.shape[1], len(found)), atol=1e-6)
+    return dict(found.values) if same else {}
+
+
+def _scored(values: np.ndarray) -> int:
+    """Return how many bodies a judge has scored: up to the last one with a value."""
+    rows = np.flatnonzero(np.isfinite(values[:, 0]))
+    return int(rows[-1]) + 1 if len(rows) else 0
 
 
 def _points(dimension: int, count: int) -> np.ndarray:
