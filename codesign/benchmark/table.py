@@ -28,6 +28,7 @@ from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_npz
 
 if TYPE_CHECKING:
+    from softgym_envs.envs.env import SoftRobotEnv
     from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 CHUNK = 64
@@ -234,10 +235,15 @@ class Tabulation:
             options = {**environment.robot_options, "mesh": mesh}
             environment = environment.model_copy(update={"robot_options": options})
         _, commands = self._at_rest(points)
-        rows = [
-            settle_on_fem(environment, design, self.goals[:, 0], command, self.longest).mean(axis=0)
-            for design, command in zip(self.designs(points), commands, strict=True)
-        ]
+        made = environment.make(sample_design=False)
+        env = cast("SoftRobotEnv", made.unwrapped)
+        try:
+            rows = [
+                settle_on_fem(env, design, self.goals[:, 0], command, self.longest).mean(axis=0)
+                for design, command in zip(self.designs(points), commands, strict=True)
+            ]
+        finally:
+            made.close()
         return np.array(rows)
 
 
@@ -259,7 +265,7 @@ TABLE_JUDGES: dict[str, TableJudge] = {
         lambda t, points: t.episodes(str(t.problem.definition.policy), points),
     ),
     "trained": TableJudge("a policy trained for each body, whole episodes", 1, Tabulation.trained),
-    "fem": TableJudge("inverse QP, at rest on finite elements", 1, lambda t, points: t.fem(None, points)),
+    "fem": TableJudge("inverse QP, at rest on finite elements", 8, lambda t, points: t.fem(None, points)),
     "fem_accurate": TableJudge(
         "inverse QP, at rest on the accurate mesh", 1, lambda t, points: t.fem("accurate", points)
     ),
