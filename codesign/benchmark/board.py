@@ -16,6 +16,7 @@ from softgym_envs.codesign.benchmark.scoring import DATA, normalised, reference
 from softgym_envs.codesign.benchmark.submission import Submission
 from softgym_envs.codesign.benchmark.table import TABLE_JUDGES, Table, shipped_tables
 from softgym_envs.codesign.benchmark.winners import rank_correlation, stored_winners
+from softgym_envs.codesign.objectives import Objective
 
 SUBMISSIONS = DATA / "submissions"
 """Accepted submissions, one JSON file each."""
@@ -195,18 +196,27 @@ def leaderboard(folder: Path = SUBMISSIONS, data: Path = DATA) -> str:
 
 
 def reference_table(data: Path = DATA) -> str:
-    """Return what is known about each problem on finite elements."""
+    """Return what the 0 and the 1 of each problem are on finite elements, on its test goals."""
     rows = []
     for name in problem_names():
         known = reference(load_problem(name, check=False), data)
         if known is None:
             continue
-        best = "-" if not known.best else ", ".join(f"{value:.4g}" for value in known.best[0])
-        found = f"{known.found.get('method')}, judge {known.found.get('judge')}" if known.found else "-"
-        rows.append([f"`{name}`", ", ".join(f"{value:.4g}" for value in known.baseline), best, found])
+        unit = load_definition(name).primary
+
+        def shown(score: float, unit: Objective = unit) -> str:
+            return f"{unit.sign * unit.scale * score:.4g} {unit.unit}"
+
+        best, found = "none better is known", "-"
+        if known.best:
+            best = shown(known.best[0][0]) if len(known.baseline) == 1 else f"a front of {len(known.best)} bodies"
+            found = f"{known.found.get('method')}, judge {known.found.get('judge')}"
+        accurate = " and ".join(shown(score) for score in known.accurate) or "-"
+        rows.append([f"`{name}`", shown(known.baseline[0]), best, known.controller, found, accurate])
     if not rows:
         return "No references are stored."
-    return _table(["problem", "baseline [SI]", "best known [SI]", "found by"], rows)
+    header = ["problem", "0: the baseline", "1: the best known", "controlled by", "found by"]
+    return _table([*header, "both at rest on the accurate mesh"], rows)
 
 
 def winners_table(data: Path = DATA) -> str:

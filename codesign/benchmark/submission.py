@@ -158,6 +158,7 @@ def verify(path: str | Path, *, data: Path | None = None, record: bool = False) 
     better = is_better(known, scores)
     if better:
         known.best, known.designs, known.controller = scores, submission.designs, submission.controller
+        known.accurate = []
         known.found = {
             "method": submission.method,
             "author": submission.author,

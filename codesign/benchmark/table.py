@@ -167,6 +167,7 @@ class Tabulation:
     Args:
         problem: a problem with the objective ``mean_distance``, on a batched surrogate.
         longest: largest step towards rest, see `softgym_envs.codesign.benchmark.rest`.
+        goal_set: name of the goals.
 
     Raises:
         ValueError: for a problem that has no such table.
@@ -174,6 +175,7 @@ class Tabulation:
 
     problem: FrozenProblem
     longest: float = LONGEST
+    goal_set: str = "search"
 
     def __post_init__(self) -> None:
         definition = self.problem.definition
@@ -186,8 +188,8 @@ class Tabulation:
 
     @property
     def goals(self) -> np.ndarray:
-        """The search goals [m], shape (g, p, 3)."""
-        return self.problem.goals["search"]
+        """The goals [m], shape (g, p, 3)."""
+        return self.problem.goals[self.goal_set]
 
     def designs(self, points: np.ndarray) -> list[dict[str, float]]:
         """Return the complete designs [SI] of points (k, n) of the unit box."""
