@@ -17,6 +17,7 @@ from softgym_envs.codesign.benchmark.submission import Submission
 from softgym_envs.codesign.benchmark.table import TABLE_JUDGES, Table, shipped_tables
 from softgym_envs.codesign.benchmark.winners import rank_correlation, stored_winners
 from softgym_envs.codesign.objectives import Objective
+from softgym_envs.errors import DataError
 
 SUBMISSIONS = DATA / "submissions"
 """Accepted submissions, one JSON file each."""
@@ -146,14 +147,24 @@ def _interval(estimate: Estimate, scale: float, digits: int) -> str:
     return f"{value} ({scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f})"
 
 
-def leaderboard(folder: Path = SUBMISSIONS, data: Path = DATA) -> str:
+def leaderboard(folder: Path = SUBMISSIONS, data: Path = DATA, more: Sequence[Path] = ()) -> str:
     """Return the leaderboard: the accepted submissions by problem, the best first.
 
     Submissions to a former version of a problem are left out.
+
+    Args:
+        folder: of the accepted submissions.
+        data: folder of the references.
+        more: files of further submissions, which are shown by the scores that they claim.
+
+    Raises:
+        DataError: if a further submission claims no scores.
     """
     rows: list[tuple[str, float, list[str]]] = []
-    for path in sorted(folder.glob("*.json")):
+    for path in (*sorted(folder.glob("*.json")), *more):
         submission = Submission.read(path)
+        if path in more and not submission.claimed:
+            raise DataError(f"the submission '{path}' claims no scores; write it with submit(..., test=True)")
         if submission.problem not in problem_names():
             continue
         known = reference(load_problem(submission.problem, check=False), data)

@@ -216,11 +216,12 @@ def table_(folder: Path, store: bool) -> None:
 
 
 @benchmark.command(name="board")
-def board_() -> None:
-    """Show the leaderboard of the stored submissions."""
+@click.argument("paths", nargs=-1, type=options.PATH)
+def board_(paths: tuple[Path, ...]) -> None:
+    """Show the leaderboard of the stored submissions, and where those of the files PATHS would stand."""
     from softgym_envs.codesign.benchmark import board
 
-    click.echo(board.leaderboard())
+    click.echo(board.leaderboard(more=paths))
 
 
 @benchmark.command()
