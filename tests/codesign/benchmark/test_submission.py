@@ -50,6 +50,13 @@ def test_a_true_submission_is_accepted_and_recorded(submission, tiny, tmp_path, 
     refused(submission, tmp_path, r"the score on the test goals is .*, but running the body again gives", data)
 
 
+def test_steps_behind_the_shared_policy_are_counted(submission, tiny):
+    assert submission.pretraining_steps == 80_000 + 10 * 200 * 50  # training and learning curve, in its card
+    search = Search(tiny, judge="qp")
+    search.evaluate(tiny.definition.baseline_values)
+    assert submit(search, "by hand").pretraining_steps == 0
+
+
 def test_a_forged_ledger(submission, tmp_path, data):
     for row in submission.ledger:
         row["scores"] = [0.9 * row["scores"][0]]
