@@ -220,7 +220,7 @@ def reference_table(data: Path = DATA) -> str:
 
         best, found = "none better is known", "-"
         if known.best:
-            best = shown(known.best[0][0]) if len(known.baseline) == 1 else f"a front of {len(known.best)} bodies"
+            best = shown(known.best[0][0]) if len(known.baseline) == 1 else f"a front of {len(set(map(tuple, known.best)))} bodies"
             found = f"{known.found.get('method')}, judge {known.found.get('judge')}"
         accurate = " and ".join(shown(score) for score in known.accurate) or "-"
         rows.append([f"`{name}`", shown(known.baseline[0]), best, known.controller, found, accurate])

@@ -146,8 +146,11 @@ def bounds_share(problem: FrozenProblem, design: dict[str, float]) -> float:
 
 
 def front(rows: Sequence[Score], limit: int = 8) -> list[Score]:
-    """Return bodies that no other one dominates, spread over the front if there are more than a limit."""
-    feasible = [row for row in rows if row.feasible and row.share == 1.0]
+    """Return bodies that no other one dominates, spread over the front if there are more than a limit.
+
+    Of bodies with equal scores, which optimisers ask for again and again, the first is kept.
+    """
+    feasible = list({tuple(row.scores): row for row in reversed(rows) if row.feasible and row.share == 1.0}.values())
     kept = [
         row
         for row in feasible

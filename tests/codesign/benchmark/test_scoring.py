@@ -39,7 +39,7 @@ def test_normalised_scores():
 
 
 def test_front_leaves_out_what_is_dominated():
-    rows = [Score({"x": i}, "qp", scores=list(s)) for i, s in enumerate([(1.0, 0.0), (0.0, 1.0), (0.0, 0.5)])]
+    rows = [Score({"x": i}, "qp", scores=list(s)) for i, s in enumerate([(1.0, 0.0), (0.0, 1.0), (0.0, 0.5), (1.0, 0.0)])]
     assert [row.design["x"] for row in front(rows)] == [0, 1]
 
 
