@@ -22,6 +22,12 @@ from softgym_envs.errors import DataError
 SUBMISSIONS = DATA / "submissions"
 """Accepted submissions, one JSON file each."""
 
+BEST = 0.1
+"""Share of the bodies of a table among which judges are compared once more."""
+
+FEWEST_RANKED = 10
+"""Bodies below which no rank correlation among the best is shown."""
+
 
 def problem_table() -> str:
     """Return the table of all problems."""
@@ -220,7 +226,11 @@ def reference_table(data: Path = DATA) -> str:
 
         best, found = "none better is known", "-"
         if known.best:
-            best = shown(known.best[0][0]) if len(known.baseline) == 1 else f"a front of {len(set(map(tuple, known.best)))} bodies"
+            best = (
+                shown(known.best[0][0])
+                if len(known.baseline) == 1
+                else f"a front of {len(set(map(tuple, known.best)))} bodies"
+            )
             found = f"{known.found.get('method')}, judge {known.found.get('judge')}"
         accurate = " and ".join(shown(score) for score in known.accurate) or "-"
         rows.append([f"`{name}`", shown(known.baseline[0]), best, known.controller, found, accurate])
@@ -263,14 +273,17 @@ def bodies_table() -> str:
             scored = int(np.isfinite(table.values[judge][:, 0]).sum())
             cells = [f"`{name}`", f"`{judge}`", TABLE_JUDGES[judge].about, f"{scored:,}"]
             if judge == "rest":
-                rows.append([*cells, "-", "-"])
+                rows.append([*cells, "-", "-", "-"])
                 continue
             _, tau, bias = table.agreement("rest", judge)
             ranked = "-" if np.isnan(tau) else f"{tau:.3f}"  # of two bodies
-            rows.append([*cells, ranked, f"{unit.scale * bias:+.4f}"])
+            count, tau, _ = table.agreement("rest", judge, best=BEST)
+            among = f"{tau:.3f}" if count >= FEWEST_RANKED else "-"
+            rows.append([*cells, ranked, among, f"{unit.scale * bias:+.4f}"])
     if not rows:
         return "No tables are shipped."
-    return _table(["problem", "judge", "about", "bodies", "Kendall's tau with `rest`", "mean difference [mm]"], rows)
+    ranks = ["Kendall's tau with `rest`", "among the best tenth"]
+    return _table(["problem", "judge", "about", "bodies", *ranks, "mean difference [mm]"], rows)
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -109,15 +109,18 @@ class Table:
         """Return `COLUMNS` [SI] of the nearest listed bodies, shape (k, 3), for points (k, n) of the unit box."""
         return self.values[judge][self.nearest(points, judge)]
 
-    def agreement(self, first: str, second: str) -> tuple[int, float, float]:
+    def agreement(self, first: str, second: str, best: float = 1.0) -> tuple[int, float, float]:
         """Return on how many bodies two judges can be compared, Kendall's tau of their mean distances, and the bias.
 
-        The bias is the mean of the distances [m] of the second judge minus those of the first.
+        The bias is the mean of the distances [m] of the second judge minus those of the first. With a share ``best``
+        only that share of the bodies counts, those that the first judge finds best: there searches go.
         """
         from scipy.stats import kendalltau
 
         a, b = self.values[first][:, 0], self.values[second][:, 0]
         both = np.isfinite(a) & np.isfinite(b)
+        if best < 1.0 and both.any():
+            both &= a <= np.quantile(a[both], best)
         tau = float(kendalltau(a[both], b[both]).statistic) if both.sum() > 2 else np.nan
         return int(both.sum()), tau, float(np.mean(b[both] - a[both])) if both.any() else np.nan
 

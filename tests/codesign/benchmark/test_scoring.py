@@ -39,7 +39,9 @@ def test_normalised_scores():
 
 
 def test_front_leaves_out_what_is_dominated():
-    rows = [Score({"x": i}, "qp", scores=list(s)) for i, s in enumerate([(1.0, 0.0), (0.0, 1.0), (0.0, 0.5), (1.0, 0.0)])]
+    rows = [
+        Score({"x": i}, "qp", scores=list(s)) for i, s in enumerate([(1.0, 0.0), (0.0, 1.0), (0.0, 0.5), (1.0, 0.0)])
+    ]
     assert [row.design["x"] for row in front(rows)] == [0, 1]
 
 
@@ -140,6 +142,7 @@ def test_tables(tiny, tmp_path):
     assert count == 2 and np.isnan(tau) and abs(bias) < 1e-4
     distances = {"rest": np.array([[1.0], [2.0], [3.0], [np.nan]]), "qp": np.array([[2.0], [4.0], [3.0], [1.0]])}
     assert Table(tiny, table.points[:4], distances).agreement("rest", "qp") == (3, pytest.approx(1 / 3), 1.0)
+    assert Table(tiny, table.points[:4], distances).agreement("rest", "qp", best=0.5)[::2] == (2, 1.5)
     search = TableSearch.on(table, "small", "shared")
     solve(search, make_optimiser("tpe", tiny, 0))
     assert len(search.ledger) == 7 and search.best is not None
