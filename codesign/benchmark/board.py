@@ -16,9 +16,17 @@ from softgym_envs.codesign.benchmark.scoring import DATA, normalised, reference
 from softgym_envs.codesign.benchmark.submission import Submission
 from softgym_envs.codesign.benchmark.table import TABLE_JUDGES, Table, shipped_tables
 from softgym_envs.codesign.benchmark.winners import rank_correlation, stored_winners
+from softgym_envs.codesign.objectives import Objective
+from softgym_envs.errors import DataError
 
 SUBMISSIONS = DATA / "submissions"
 """Accepted submissions, one JSON file each."""
+
+BEST = 0.1
+"""Share of the bodies of a table among which judges are compared once more."""
+
+FEWEST_RANKED = 10
+"""Bodies below which no rank correlation among the best is shown."""
 
 
 def problem_table() -> str:
@@ -145,14 +153,24 @@ def _interval(estimate: Estimate, scale: float, digits: int) -> str:
     return f"{value} ({scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f})"
 
 
-def leaderboard(folder: Path = SUBMISSIONS, data: Path = DATA) -> str:
+def leaderboard(folder: Path = SUBMISSIONS, data: Path = DATA, more: Sequence[Path] = ()) -> str:
     """Return the leaderboard: the accepted submissions by problem, the best first.
 
     Submissions to a former version of a problem are left out.
+
+    Args:
+        folder: of the accepted submissions.
+        data: folder of the references.
+        more: files of further submissions, which are shown by the scores that they claim.
+
+    Raises:
+        DataError: if a further submission claims no scores.
     """
     rows: list[tuple[str, float, list[str]]] = []
-    for path in sorted(folder.glob("*.json")):
+    for path in (*sorted(folder.glob("*.json")), *more):
         submission = Submission.read(path)
+        if path in more and not submission.claimed:
+            raise DataError(f"the submission '{path}' claims no scores; write it with submit(..., test=True)")
         if submission.problem not in problem_names():
             continue
         known = reference(load_problem(submission.problem, check=False), data)
@@ -195,18 +213,31 @@ def leaderboard(folder: Path = SUBMISSIONS, data: Path = DATA) -> str:
 
 
 def reference_table(data: Path = DATA) -> str:
-    """Return what is known about each problem on finite elements."""
+    """Return what the 0 and the 1 of each problem are on finite elements, on its test goals."""
     rows = []
     for name in problem_names():
         known = reference(load_problem(name, check=False), data)
         if known is None:
             continue
-        best = "-" if not known.best else ", ".join(f"{value:.4g}" for value in known.best[0])
-        found = f"{known.found.get('method')}, judge {known.found.get('judge')}" if known.found else "-"
-        rows.append([f"`{name}`", ", ".join(f"{value:.4g}" for value in known.baseline), best, found])
+        unit = load_definition(name).primary
+
+        def shown(score: float, unit: Objective = unit) -> str:
+            return f"{unit.sign * unit.scale * score:.4g} {unit.unit}"
+
+        best, found = "none better is known", "-"
+        if known.best:
+            best = (
+                shown(known.best[0][0])
+                if len(known.baseline) == 1
+                else f"a front of {len(set(map(tuple, known.best)))} bodies"
+            )
+            found = f"{known.found.get('method')}, judge {known.found.get('judge')}"
+        accurate = " and ".join(shown(score) for score in known.accurate) or "-"
+        rows.append([f"`{name}`", shown(known.baseline[0]), best, known.controller, found, accurate])
     if not rows:
         return "No references are stored."
-    return _table(["problem", "baseline [SI]", "best known [SI]", "found by"], rows)
+    header = ["problem", "0: the baseline", "1: the best known", "controlled by", "found by"]
+    return _table([*header, "both at rest on the accurate mesh"], rows)
 
 
 def winners_table(data: Path = DATA) -> str:
@@ -242,14 +273,17 @@ def bodies_table() -> str:
             scored = int(np.isfinite(table.values[judge][:, 0]).sum())
             cells = [f"`{name}`", f"`{judge}`", TABLE_JUDGES[judge].about, f"{scored:,}"]
             if judge == "rest":
-                rows.append([*cells, "-", "-"])
+                rows.append([*cells, "-", "-", "-"])
                 continue
             _, tau, bias = table.agreement("rest", judge)
             ranked = "-" if np.isnan(tau) else f"{tau:.3f}"  # of two bodies
-            rows.append([*cells, ranked, f"{unit.scale * bias:+.4f}"])
+            count, tau, _ = table.agreement("rest", judge, best=BEST)
+            among = f"{tau:.3f}" if count >= FEWEST_RANKED else "-"
+            rows.append([*cells, ranked, among, f"{unit.scale * bias:+.4f}"])
     if not rows:
         return "No tables are shipped."
-    return _table(["problem", "judge", "about", "bodies", "Kendall's tau with `rest`", "mean difference [mm]"], rows)
+    ranks = ["Kendall's tau with `rest`", "among the best tenth"]
+    return _table(["problem", "judge", "about", "bodies", *ranks, "mean difference [mm]"], rows)
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
@@ -13,12 +13,7 @@ import numpy as np
 
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem
 from softgym_envs.codesign.benchmark.problem import Judge, Score
-from softgym_envs.codesign.benchmark.scoring import (
-    DATA,
-    Reference,
-    front,
-    make_reference,
-)
+from softgym_envs.codesign.benchmark.scoring import DATA, front
 from softgym_envs.codesign.benchmark.search import Search, make_optimiser, solve
 from softgym_envs.codesign.benchmark.table import Table, TableSearch
 from softgym_envs.codesign.records import Record
@@ -172,29 +167,6 @@ def tested(
     found = problem.evaluator(goals, backend)(design, judge, seed=seed)
     found.write(path)
     return found
-
-
-# -- on finite elements -----------------------------------------------------------------------------------------------
-
-
-def check_winners(folder: Path, runs: Iterable[Run], data: Path = DATA) -> None:
-    """Test the winners of runs on finite elements, on test goals, and keep the best known body of each problem."""
-    from softgym_envs.codesign.benchmark.scoring import write_reference
-    from softgym_envs.codesign.benchmark.submission import is_better
-
-    for each in runs:
-        problem = load_problem(each.problem)
-        known = make_reference(problem, data)
-        judge = problem.definition.judge
-        scores = [tested(problem, design, judge, "test", "fem", folder, each.seed) for design in each.designs]
-        values = [score.scores for score in scores if score.feasible]
-        if values and is_better(known, values):
-            designs = [score.design for score in scores if score.feasible]
-            where = {"method": each.method, "judge": each.judge, "seed": each.seed, "level": each.level}
-            known = Reference(
-                known.problem, known.hash, known.baseline, values, designs, judge, {**where, "commit": each.commit}
-            )
-            write_reference(known, data)
 
 
 # -- stored results ---------------------------------------------------------------------------------------------------

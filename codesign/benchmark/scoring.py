@@ -28,7 +28,9 @@ class Reference(Record):
     """What is known about a problem on finite elements, on its test goals.
 
     ``baseline`` holds the scores of the baseline body under the inverse QP, ``best`` those of the best body known (of
-    several objectives: of each body of the best front). ``found`` says how the best was found.
+    several objectives: of each body of the best front). ``found`` says how the best was found. ``accurate``, if not
+    empty, holds the scores of the baseline and of the best body where the inverse QP comes to rest on the accurate
+    mesh.
     """
 
     problem: str
@@ -38,6 +40,7 @@ class Reference(Record):
     designs: list[dict[str, float]] = field(default_factory=list)
     controller: str = "qp"
     found: dict[str, Any] = field(default_factory=dict)
+    accurate: list[float] = field(default_factory=list)
 
 
 def reference(problem: FrozenProblem, folder: Path = DATA) -> Reference | None:
@@ -143,8 +146,11 @@ def bounds_share(problem: FrozenProblem, design: dict[str, float]) -> float:
 
 
 def front(rows: Sequence[Score], limit: int = 8) -> list[Score]:
-    """Return bodies that no other one dominates, spread over the front if there are more than a limit."""
-    feasible = [row for row in rows if row.feasible and row.share == 1.0]
+    """Return bodies that no other one dominates, spread over the front if there are more than a limit.
+
+    Of bodies with equal scores, which optimisers ask for again and again, the first is kept.
+    """
+    feasible = list({tuple(row.scores): row for row in reversed(rows) if row.feasible and row.share == 1.0}.values())
     kept = [
         row
         for row in feasible

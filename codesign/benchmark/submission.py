@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.agents.policy import Policy
+from softgym_envs.agents.policy import Policy, policy_path
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem, file_hash, load_problem
 from softgym_envs.codesign.benchmark.problem import JUDGES, LEVELS, Budget, Score, goal_key
 from softgym_envs.codesign.benchmark.scoring import DATA, Reference, front, make_reference, normalised, write_reference
@@ -17,6 +17,7 @@ from softgym_envs.codesign.benchmark.search import Search
 from softgym_envs.codesign.records import Record
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError, DesignError, InfeasibleDesign
+from softgym_envs.storage import read_json
 
 TOLERANCE = {"qp": 1e-3, "shared": 1e-3, "trained": 5e-2, "policy": 1e-3}
 """Controller -> largest difference between a claimed score and the verified one, relative to the larger of both.
@@ -48,7 +49,8 @@ class Submission(Record):
         claimed: scores of each body on the test goals, on finite elements; empty if they were not computed.
         ledger: all scores of the search.
         optimiser_seconds: CPU time of the optimiser itself [s].
-        pretraining_steps: environment steps behind whatever the method knew before it saw the problem.
+        pretraining_steps: environment steps behind whatever the method knew before it saw the problem; `submit` counts
+            those of the problem's own policy.
         provenance: versions, commit, time and machine.
     """
 
@@ -118,11 +120,22 @@ def submit(
         controller=problem.definition.judge,
         ledger=[row.to_json() for row in search.ledger],
         optimiser_seconds=optimiser_seconds,
+        pretraining_steps=_pretraining(problem, str(search.judge)),
         provenance=provenance(),
     )
     if test:
         submission.claimed = _tested(problem, submission, None)
     return submission
+
+
+def _pretraining(problem: FrozenProblem, judge: str) -> int:
+    """Return the environment steps behind the policy that a judge has from the start, its learning curve included."""
+    definition = problem.definition
+    if judge == "qp" or definition.policy is None:
+        return 0
+    card = read_json(policy_path(definition.policy).with_suffix(".json"))
+    episodes = len(card["curve"]) * int(card["config"]["evaluation_episodes"])
+    return int(card["steps"]) + episodes * definition.episode_steps
 
 
 def verify(path: str | Path, *, data: Path | None = None, record: bool = False) -> Verdict:
@@ -158,6 +171,7 @@ def verify(path: str | Path, *, data: Path | None = None, record: bool = False) 
     better = is_better(known, scores)
     if better:
         known.best, known.designs, known.controller = scores, submission.designs, submission.controller
+        known.accurate = []
         known.found = {
             "method": submission.method,
             "author": submission.author,

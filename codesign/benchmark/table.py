@@ -28,6 +28,7 @@ from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_npz
 
 if TYPE_CHECKING:
+    from softgym_envs.envs.env import SoftRobotEnv
     from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 CHUNK = 64
@@ -46,11 +47,13 @@ class Table:
         problem: the problem.
         points: bodies in the unit box [-1, 1]^n, shape (bodies, n): the first of a scrambled Sobol sequence.
         values: by judge, `COLUMNS` of each body [SI], shape (bodies, 3); NaN where a judge has not scored a body.
+        longest: largest step towards rest, relative to the range of a command, of the judges at rest.
     """
 
     problem: FrozenProblem
     points: np.ndarray
     values: Mapping[str, np.ndarray]
+    longest: float = LONGEST
 
     @classmethod
     def read(cls, name: str, path: Path | None = None) -> Table:
@@ -68,8 +71,8 @@ class Table:
             table = parquet.read_table(path)
         except (OSError, ArrowException) as error:
             raise DataError(f"the table '{path}' cannot be read: {error}") from None
-        stored = (table.schema.metadata or {}).get(b"hash", b"").decode()
-        if stored != problem.hash:
+        meta = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
+        if meta.get("hash") != problem.hash:
             raise DataError(f"the table '{path}' is for another version of '{name}'; run: softgym benchmark tabulate")
         columns = {key: table[key].to_numpy().astype(float) for key in table.column_names}
         points = np.stack([columns[f"unit_{key}"] for key in problem.variables], axis=1)
@@ -78,6 +81,7 @@ class Table:
             problem,
             points,
             {judge: np.stack([columns[f"{judge}.{key}"] for key in COLUMNS], axis=1) for judge in judges},
+            float(meta["longest"]),
         )
 
     def __len__(self) -> int:
@@ -105,15 +109,18 @@ class Table:
         """Return `COLUMNS` [SI] of the nearest listed bodies, shape (k, 3), for points (k, n) of the unit box."""
         return self.values[judge][self.nearest(points, judge)]
 
-    def agreement(self, first: str, second: str) -> tuple[int, float, float]:
+    def agreement(self, first: str, second: str, best: float = 1.0) -> tuple[int, float, float]:
         """Return on how many bodies two judges can be compared, Kendall's tau of their mean distances, and the bias.
 
-        The bias is the mean of the distances [m] of the second judge minus those of the first.
+        The bias is the mean of the distances [m] of the second judge minus those of the first. With a share ``best``
+        only that share of the bodies counts, those that the first judge finds best: there searches go.
         """
         from scipy.stats import kendalltau
 
         a, b = self.values[first][:, 0], self.values[second][:, 0]
         both = np.isfinite(a) & np.isfinite(b)
+        if best < 1.0 and both.any():
+            both &= a <= np.quantile(a[both], best)
         tau = float(kendalltau(a[both], b[both]).statistic) if both.sum() > 2 else np.nan
         return int(both.sum()), tau, float(np.mean(b[both] - a[both])) if both.any() else np.nan
 
@@ -163,6 +170,7 @@ class Tabulation:
     Args:
         problem: a problem with the objective ``mean_distance``, on a batched surrogate.
         longest: largest step towards rest, see `softgym_envs.codesign.benchmark.rest`.
+        goal_set: name of the goals.
 
     Raises:
         ValueError: for a problem that has no such table.
@@ -170,6 +178,7 @@ class Tabulation:
 
     problem: FrozenProblem
     longest: float = LONGEST
+    goal_set: str = "search"
 
     def __post_init__(self) -> None:
         definition = self.problem.definition
@@ -182,8 +191,8 @@ class Tabulation:
 
     @property
     def goals(self) -> np.ndarray:
-        """The search goals [m], shape (g, p, 3)."""
-        return self.problem.goals["search"]
+        """The goals [m], shape (g, p, 3)."""
+        return self.problem.goals[self.goal_set]
 
     def designs(self, points: np.ndarray) -> list[dict[str, float]]:
         """Return the complete designs [SI] of points (k, n) of the unit box."""
@@ -231,10 +240,15 @@ class Tabulation:
             options = {**environment.robot_options, "mesh": mesh}
             environment = environment.model_copy(update={"robot_options": options})
         _, commands = self._at_rest(points)
-        rows = [
-            settle_on_fem(environment, design, self.goals[:, 0], command, self.longest).mean(axis=0)
-            for design, command in zip(self.designs(points), commands, strict=True)
-        ]
+        made = environment.make(sample_design=False)
+        env = cast("SoftRobotEnv", made.unwrapped)
+        try:
+            rows = [
+                settle_on_fem(env, design, self.goals[:, 0], command, self.longest).mean(axis=0)
+                for design, command in zip(self.designs(points), commands, strict=True)
+            ]
+        finally:
+            made.close()
         return np.array(rows)
 
 
@@ -256,7 +270,7 @@ TABLE_JUDGES: dict[str, TableJudge] = {
         lambda t, points: t.episodes(str(t.problem.definition.policy), points),
     ),
     "trained": TableJudge("a policy trained for each body, whole episodes", 1, Tabulation.trained),
-    "fem": TableJudge("inverse QP, at rest on finite elements", 1, lambda t, points: t.fem(None, points)),
+    "fem": TableJudge("inverse QP, at rest on finite elements", 8, lambda t, points: t.fem(None, points)),
     "fem_accurate": TableJudge(
         "inverse QP, at rest on the accurate mesh", 1, lambda t, points: t.fem("accurate", points)
     ),
@@ -268,6 +282,8 @@ def tabulate(
     name: str, counts: Mapping[str, int], folder: Path, output: Path | None = None, longest: float = LONGEST
 ) -> Path:
     """Score bodies of a problem and write the table; an interrupted call continues where it stopped.
+
+    A table that is there already is extended: its scores are kept, and only missing ones are computed.
 
     Args:
         name: a problem with the objective ``mean_distance``, on a batched surrogate.
@@ -285,16 +301,39 @@ def tabulate(
     for judge in counts:
         if judge not in TABLE_JUDGES or (judge == "shared" and problem.definition.policy is None):
             raise ValueError(f"problem '{name}': {unknown_name('judge of tables', judge, TABLE_JUDGES)}")
-    bodies = max(counts.values())
+    path = output or DATA / "tables" / f"{name}.parquet"
+    known = _extendable(name, path, longest)
+    bodies = max([*counts.values(), *(len(table) for table in known.values())])
     points = _points(len(problem.variables), bodies)
-    values: dict[str, np.ndarray] = {}
+    values = {judge: np.full((bodies, len(COLUMNS)), np.nan) for judge in dict.fromkeys([*known, *counts])}
+    for judge, table in known.items():
+        values[judge][: len(table)] = table
     for judge, count in counts.items():
         chunk = TABLE_JUDGES[judge].chunk
-        values[judge] = np.full((bodies, len(COLUMNS)), np.nan)
-        for start in range(0, count, chunk):
+        done = _scored(known.get(judge, values[judge][:0]))
+        for start in range(done - done % chunk, count, chunk):
             rows = slice(start, min(start + chunk, count))
-            values[judge][rows] = tabulated(tabulation, judge, points[rows], folder, start)
-    return _write(problem, points, values, output or DATA / "tables" / f"{name}.parquet", longest)
+            if rows.stop > done:
+                values[judge][rows] = tabulated(tabulation, judge, points[rows], folder, start)
+    return _write(problem, points, values, path, longest)
+
+
+def _extendable(name: str, path: Path, longest: float) -> dict[str, np.ndarray]:
+    """Return the values of a table that is there, by judge; none if it is for another version or another step."""
+    if not path.is_file():
+        return {}
+    try:
+        found = Table.read(name, path)
+    except DataError:
+        return {}
+    same = found.longest == longest and np.allclose(found.points, _points(found.points.shape[1], len(found)), atol=1e-6)
+    return dict(found.values) if same else {}
+
+
+def _scored(values: np.ndarray) -> int:
+    """Return how many bodies a judge has scored: up to the last one with a value."""
+    rows = np.flatnonzero(np.isfinite(values[:, 0]))
+    return int(rows[-1]) + 1 if len(rows) else 0
 
 
 def _points(dimension: int, count: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Verbs of the benchmark of co-design: list, show, run, winners, verify, table, board, judges, freeze."""
+"""Verbs of the benchmark of co-design: list, show, run, winners, reference, verify, table, board, judges, freeze."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def run(
 
     An interrupted call continues where it stopped.
     """
-    from softgym_envs.codesign.benchmark import runs
+    from softgym_envs.codesign.benchmark import references, runs
     from softgym_envs.codesign.benchmark.table import Table
 
     listed = None if table is None else Table.read(names[0], table)
@@ -109,7 +109,7 @@ def run(
                         f"{found.spent['cpu_seconds']:.1f} CPU s, best {_scores(found.search_scores[:1])}"
                     )
                     if fem:
-                        runs.check_winners(folder, [found])
+                        references.check_winners(folder, [found])
 
 
 @benchmark.command()
@@ -156,6 +156,29 @@ def winners(names: tuple[str, ...], every: tuple[str, ...], rest: bool, store: b
             click.echo(f"wrote {module.store(rows)}")
 
 
+@benchmark.command(name="reference")
+@click.argument("names", nargs=-1, required=True)
+@click.option("--accurate", is_flag=True, help="Score the baseline and the best body on the accurate mesh too.")
+@results
+def reference_(names: tuple[str, ...], accurate: bool, folder: Path) -> None:
+    """Find the 0 and the 1 of the scores of problems NAMES (source checkout, seconds to minutes each).
+
+    They are the baseline body and the most promising winner of the stored searches, tested on finite elements on the
+    test goals. Most promising is the winner that is best on the validation goals. A better body that is already known
+    stays.
+    """
+    from softgym_envs.codesign.benchmark import references
+    from softgym_envs.codesign.benchmark.frozen import load_problem
+    from softgym_envs.codesign.benchmark.scoring import make_reference
+
+    for name in names:
+        with options.resumable():
+            references.check_winners(folder, [references.promising(name)])
+            known = references.check_accurate(name) if accurate else make_reference(load_problem(name))
+        line = f"{name}: baseline {_scores([known.baseline])}, best known {_scores(known.best)}"
+        click.echo(line + (f"; accurate mesh {_scores([known.accurate])}" if accurate else ""))
+
+
 @benchmark.command()
 @click.argument("path", type=options.PATH)
 @click.option("--record", is_flag=True, help="Store the bodies as the best known if they are (source checkout).")
@@ -193,11 +216,12 @@ def table_(folder: Path, store: bool) -> None:
 
 
 @benchmark.command(name="board")
-def board_() -> None:
-    """Show the leaderboard of the stored submissions."""
+@click.argument("paths", nargs=-1, type=options.PATH)
+def board_(paths: tuple[Path, ...]) -> None:
+    """Show the leaderboard of the stored submissions, and where those of the files PATHS would stand."""
     from softgym_envs.codesign.benchmark import board
 
-    click.echo(board.leaderboard())
+    click.echo(board.leaderboard(more=paths))
 
 
 @benchmark.command()

@@ -39,7 +39,9 @@ def test_normalised_scores():
 
 
 def test_front_leaves_out_what_is_dominated():
-    rows = [Score({"x": i}, "qp", scores=list(s)) for i, s in enumerate([(1.0, 0.0), (0.0, 1.0), (0.0, 0.5)])]
+    rows = [
+        Score({"x": i}, "qp", scores=list(s)) for i, s in enumerate([(1.0, 0.0), (0.0, 1.0), (0.0, 0.5), (1.0, 0.0)])
+    ]
     assert [row.design["x"] for row in front(rows)] == [0, 1]
 
 
@@ -99,12 +101,26 @@ def test_runs_resume_and_become_a_table(tiny, tmp_path):
     assert "| `tiny-v1` | shared | random | 1 |" in text and "not tested" in text
 
 
+def test_a_table_is_extended(tiny, tmp_path):
+    output = tmp_path / "tiny.parquet"
+    tabulate("tiny-v1", {"rest": 3, "qp": 1}, tmp_path / "first", output, longest=0.5)
+    first = Table.read("tiny-v1", output)
+    again = tmp_path / "again"
+    tabulate("tiny-v1", {"rest": 2, "qp": 2}, again, output, longest=0.5)
+    assert [path.name for path in again.glob("tables/**/*.npz")] == ["qp-0000000-2.npz"]
+    table = Table.read("tiny-v1", output)
+    assert np.array_equal(table.values["rest"], first.values["rest"]) and np.array_equal(table.points, first.points)
+    assert np.isfinite(table.values["qp"][:, 0]).tolist() == [True, True, False]
+    tabulate("tiny-v1", {"rest": 1}, again, output, longest=0.25)  # other steps may end elsewhere: begins anew
+    assert len(Table.read("tiny-v1", output)) == 1
+
+
 def test_tables(tiny, tmp_path):
     output = tmp_path / "tiny.parquet"
     counts = {"shared": 70, "qp": 2, "rest": 3, "trained": 1, "fem": 2}
     tabulate("tiny-v1", counts, tmp_path, output, longest=0.5)
     parts = {path: path.stat().st_mtime_ns for path in tmp_path.glob("tables/**/*.npz")}
-    assert len(parts) == 7  # two of the shared policy and of finite elements, one of each other judge
+    assert len(parts) == 6  # two of the shared policy, one of each other judge
     tabulate("tiny-v1", counts, tmp_path, output, longest=0.5)
     assert {path: path.stat().st_mtime_ns for path in parts} == parts
     table = Table.read("tiny-v1", output)
@@ -126,6 +142,7 @@ def test_tables(tiny, tmp_path):
     assert count == 2 and np.isnan(tau) and abs(bias) < 1e-4
     distances = {"rest": np.array([[1.0], [2.0], [3.0], [np.nan]]), "qp": np.array([[2.0], [4.0], [3.0], [1.0]])}
     assert Table(tiny, table.points[:4], distances).agreement("rest", "qp") == (3, pytest.approx(1 / 3), 1.0)
+    assert Table(tiny, table.points[:4], distances).agreement("rest", "qp", best=0.5)[::2] == (2, 1.5)
     search = TableSearch.on(table, "small", "shared")
     solve(search, make_optimiser("tpe", tiny, 0))
     assert len(search.ledger) == 7 and search.best is not None

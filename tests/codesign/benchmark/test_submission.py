@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from softgym_envs.agents.policy import policy_path
-from softgym_envs.codesign.benchmark import Search, submit, verify
+from softgym_envs.codesign.benchmark import Search, board, submit, verify
 from softgym_envs.codesign.benchmark.frozen import file_hash
 from softgym_envs.codesign.benchmark.problem import goal_key
 from softgym_envs.codesign.benchmark.scoring import reference
 from softgym_envs.codesign.benchmark.submission import SubmissionRefused
+from softgym_envs.errors import DataError
 
 
 @pytest.fixture
@@ -38,12 +39,22 @@ def test_a_true_submission_is_accepted_and_recorded(submission, tiny, tmp_path, 
     better = verdict.scores[0][0] > known.baseline[0]
     assert verdict.record == better and verdict.normalised == (1.0 if better else None)
     assert abs(verdict.exploitation) < 2e-3
+    with pytest.raises(DataError, match=r"claims no scores; write it with submit\(..., test=True\)"):
+        board.leaderboard(tmp_path / "none", data, [path])
     submission.claimed = verdict.scores
     submission.write(path)
+    assert "| by hand | a test | small |" in board.leaderboard(tmp_path / "none", data, [path])
     again = verify(path, data=data)
     assert again.scores == verdict.scores and not again.record
     submission.claimed = [[verdict.scores[0][0] * 0.9]]
     refused(submission, tmp_path, r"the score on the test goals is .*, but running the body again gives", data)
+
+
+def test_steps_behind_the_shared_policy_are_counted(submission, tiny):
+    assert submission.pretraining_steps == 80_000 + 10 * 200 * 50  # training and learning curve, in its card
+    search = Search(tiny, judge="qp")
+    search.evaluate(tiny.definition.baseline_values)
+    assert submit(search, "by hand").pretraining_steps == 0
 
 
 def test_a_forged_ledger(submission, tmp_path, data):

@@ -1,10 +1,11 @@
 """Winners on finite elements."""
 
+import dataclasses
 import math
 
 import pytest
 
-from softgym_envs.codesign.benchmark import board, frozen, refreeze, runs, winners
+from softgym_envs.codesign.benchmark import board, frozen, references, refreeze, runs, scoring, winners
 from softgym_envs.errors import DataError
 
 
@@ -51,3 +52,23 @@ def test_a_problem_frozen_again_keeps_results_that_are_still_true(tiny, problems
 def test_problems_without_stored_searches_are_refused(tiny, tmp_path):
     with pytest.raises(ValueError, match="no searches"):
         winners.check(tmp_path, "tiny-v1", data=tmp_path)
+
+
+def test_the_most_promising_winner_becomes_the_best_known(tiny, tmp_path):
+    with pytest.raises(ValueError, match="no searches are stored"):
+        references.promising("tiny-v1", tmp_path)
+    good, poor = {"length": 0.038, "height": 0.022, "joint_height": 0.005}, tiny.definition.baseline_values
+    for seed, (design, score, unseen) in enumerate([(poor, -1.0, -4.0), (good, -2.0, -3.0)]):  # unseen goals decide
+        curve = [[100, 1.0, -5.0], [200, 2.0, score]]
+        made = runs.Run("tiny-v1", tiny.hash, "random", "qp", "small", seed, [design], [[score]], curve, [-4.0, unseen])
+        made.write(tmp_path / "runs" / "tiny-v1" / f"{seed}.json")
+    runs.collect(tmp_path, tmp_path)
+    best = references.promising("tiny-v1", tmp_path)
+    assert best.designs == [good]
+    references.check_winners(tmp_path, [best], tmp_path)
+    known = scoring.reference(tiny, tmp_path)
+    assert known.designs == [good] and known.best[0] > known.baseline
+    worse = dataclasses.replace(best, designs=[poor])
+    references.check_winners(tmp_path, [worse], tmp_path)
+    assert scoring.reference(tiny, tmp_path) == known  # the better body stays
+    assert "| random, judge qp | - |" in board.reference_table(tmp_path)
