@@ -29,7 +29,7 @@ EQUAL = 0.001
 """Regrets are rounded to this before methods are compared, so that differences without a meaning are ties."""
 
 FEWEST_SEEDS = 3
-"""Seeds of each method below which a problem does not count for its track."""
+"""Seeds of random search below which a problem does not count for its track."""
 
 Stored = tuple[Run, Any]
 """A run and the scores of its winners on finite elements, or None."""
@@ -225,13 +225,14 @@ class TrackRow:
 
 
 def track_rows(runs: Sequence[Stored]) -> list[TrackRow]:
-    """Return one row per track, judge and method, over the problems on which each method and random search ran."""
+    """Return one row per track, judge, number of seeds and method.
+
+    Problems on which random search has equally many seeds are taken together, and the methods that have at least as
+    many on each of them.
+    """
     rows = []
-    for (track, judge, listed), members in _tracks(runs):
-        methods = [m for m in members[0].runs if all(m in contest.runs for contest in members)]
-        if "random" not in methods:
-            continue
-        seeds = min(len(contest.runs[method]) for contest in members for method in methods)
+    for (track, judge, listed, seeds), members in _tracks(runs):
+        methods = [m for m in members[0].runs if all(len(contest.runs.get(m, ())) >= seeds for contest in members)]
         table = {m: np.stack([contest.regrets(m)[:seeds] for contest in members], axis=1) for m in methods}
         rounded = {m: np.round(values / EQUAL) for m, values in table.items()}
         means = {m: [interquartile_mean(column) for column in values.T] for m, values in rounded.items()}
@@ -256,13 +257,14 @@ def track_rows(runs: Sequence[Stored]) -> list[TrackRow]:
     return rows
 
 
-def _tracks(runs: Sequence[Stored]) -> Iterator[tuple[tuple[str, str, bool], list[Contest]]]:
-    groups: dict[tuple[str, str, bool], list[Contest]] = defaultdict(list)
+def _tracks(runs: Sequence[Stored]) -> Iterator[tuple[tuple[str, str, bool, int], list[Contest]]]:
+    groups: dict[tuple[str, str, bool, int], list[Contest]] = defaultdict(list)
     for contest in contests(runs):
-        if min(len(members) for members in contest.runs.values()) < FEWEST_SEEDS:
+        seeds = len(contest.runs.get("random", ()))
+        if seeds < FEWEST_SEEDS:
             continue
         track = load_problem(contest.problem, check=False).definition.track
-        groups[track, contest.judge, contest.listed].append(contest)
+        groups[track, contest.judge, contest.listed, seeds].append(contest)
     yield from sorted(groups.items())
 
 

@@ -49,8 +49,9 @@ class Search:
         level: name of the budget: small, medium or large.
         judge: who controls the bodies; default that of the problem.
         seed: added to those of trainings.
-        limit: largest number of bodies; default none besides the budget. A search also ends when it has spent the
-            environment steps of so many baselines, for methods whose bodies cost more than a score.
+        limit: largest number of bodies; default none besides the budget. A body scored on a share of the goals counts
+            as that share. A search also ends when it has spent the environment steps of so many baselines, for methods
+            whose bodies cost more than a score.
     """
 
     problem: FrozenProblem
@@ -78,7 +79,7 @@ class Search:
     @property
     def open(self) -> bool:
         """Whether budget is left. The score that crosses a limit is the last one, and it counts."""
-        if self.limit is not None and len(self.ledger) >= self.limit:
+        if self.limit is not None and sum(row.share for row in self.ledger) >= self.limit:
             return False
         if self.ledger and self.steps_left <= 0:
             return False

@@ -132,6 +132,14 @@ def test_points_of_the_unit_box(tiny):
         assert (low[name], high[name]) == (pytest.approx(variable.low), pytest.approx(variable.high))
 
 
+def test_a_limit_of_bodies_counts_shares():
+    search = Search(load_problem("finger-zone-v1"), limit=2)
+    search.ledger = [Score({}, "qp"), *(Score({}, "qp", share=0.25) for _ in range(3))]
+    assert search.open
+    search.ledger.append(Score({}, "qp", share=0.25))
+    assert not search.open
+
+
 @pytest.mark.parametrize("method", ["halving", "hyperband"])
 def test_halving_scores_only_promising_bodies_on_all_goals(method):
     problem = load_problem("finger-zone-v1")
