@@ -188,7 +188,7 @@ class LearnedEstimator:
         if not self._tried and self.load is not None and misfit > chi2.ppf(IMPROBABLE, len(spread)):
             # Beyond a slack cable there may be a better explanation, which steps from small forces do not reach.
             self._tried, strong = True, at.copy()
-            strong[:, -1] = self._largest
+            strong[:, -1] = self.largest_force
             other = self._search(command, spread, strong, self.steps)
             if np.logaddexp.reduce(_logarithms(other[0])) > np.logaddexp.reduce(_logarithms(found)):
                 found, response, at = other
@@ -246,16 +246,16 @@ class LearnedEstimator:
     def _limited(self, parameters: np.ndarray) -> np.ndarray:
         """Return errors and forces (q, n_a + 1) at which the model is evaluated: forces that it has learned."""
         found = parameters.copy()
-        found[:, -1] = np.clip(found[:, -1], 0.0, self._largest)
+        found[:, -1] = np.clip(found[:, -1], 0.0, self.largest_force)
         return found
 
     @property
-    def _largest(self) -> float:
+    def largest_force(self) -> float:
         """The largest force that the model has learned, for this body [N]."""
-        return self.model.robot.design_space["touch_force"].high * self._stiffness
+        return self.model.robot.design_space["touch_force"].high * self.stiffness
 
     @property
-    def _stiffness(self) -> float:
+    def stiffness(self) -> float:
         """Young's modulus over that of the baseline."""
         return float(self.model.features.stiffness(self._body[None])[0, 0])
 
@@ -273,7 +273,7 @@ class LearnedEstimator:
         # Forces of which each place has a second one, by whose difference the answer to the force is found.
         more = designs.copy()
         more[:, self._columns[0]] += STEP
-        step, places = STEP * self._stiffness, len(designs)
+        step, places = STEP * self.stiffness, len(designs)
         context = model.context(np.vstack([designs, more]))
         here, there = (context.rows(np.arange(places) + first) for first in (0, places))
         target, unilateral = command + parameters[:, :-1], self.robot.unilateral
