@@ -20,7 +20,7 @@ from softgym_envs.version import __version__
 
 _HERE = Path(__file__).parent
 
-COMPILE = "cc -std=c99 -O3 -fno-math-errno loop.c -o loop -lm"
+COMPILE_LOOP = "cc -std=c99 -O3 -fno-math-errno loop.c -o loop -lm"
 """Compiles the example, beside the header of a controller."""
 
 
@@ -59,7 +59,7 @@ def export_estimator_c(
     header = _header(estimator, grid, expected_force, name)
     folder.mkdir(parents=True, exist_ok=True)
     program = Template((_HERE / "loop.c.in").read_text()).substitute(
-        p=name, P=name.upper(), compile=COMPILE, **_example(estimator, grid)
+        p=name, P=name.upper(), compile=COMPILE_LOOP, **_example(estimator, grid)
     )
     paths = folder / "estimator.h", folder / "loop.c"
     for path, text in zip(paths, (header, program), strict=True):
