@@ -3,7 +3,8 @@
 The model has force and place of a touch among its inputs (`Robot.under_touch`). So the equilibrium at each place and
 force is its own, not extrapolated from another place: at each place, Gauss-Newton finds the most probable errors of the
 actuators and force. The answer to the actuators is the learned ``W``; the answer to the force is the change of the
-model under held actuators, after which ``W`` puts slack ones back to no effort. The sum over places is that of `Mixture`.
+model under held actuators, after which ``W`` puts slack ones back to no effort. The sum over places is that of
+`Mixture`.
 """
 
 from __future__ import annotations

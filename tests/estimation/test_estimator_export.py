@@ -139,8 +139,9 @@ def test_estimates_are_those_of_python(exported, real):
             np.abs(found.array("effector") - expected.effector).max() / scale,
             np.abs(found.array("effector_covariance") - expected.effector_covariance).max() / scale**2,
             np.abs(found.array("displacement") - expected.displacement).max() / estimator.noise.displacement,
-            abs(found.misfit - expected.misfit) / (1.0 + expected.misfit),
         ]
+        # That of the most probable place, which may be another one of two that are as good as equally probable.
+        assert found.misfit == pytest.approx(expected.misfit, rel=5e-3, abs=0.05)
         if cell is None:
             assert not found.array("load").any() and not found.array("load_covariance").any()
         else:
