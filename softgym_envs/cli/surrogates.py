@@ -141,7 +141,9 @@ def deploy(
     """Write a surrogate as a C header or an ONNX graph, or a whole controller in C.
 
     FILES end with .h (a C header of one body) or .onnx (a graph that takes the design as an input). --controller writes
-    one header with the model, the inverse QP and its PI correction, and a program that steps it.
+    one header with the model, the inverse QP and its PI correction, and a program that steps it. For a robot whose
+    touch is learned and that is commanded in displacement, it also writes estimator.h, which finds the effector from
+    the volumes of cavities and the touched cell, and loop.c, the closed loop of both.
     """
     from softgym_envs.surrogate.export.c import export_c
     from softgym_envs.surrogate.export.common import FORMATS
@@ -157,11 +159,13 @@ def deploy(
             raise ConfigError(f"'{file}' must end with {' or '.join(FORMATS)}")
     if design and files and controller is None and all(file.suffix == ".onnx" for file in files):
         raise ConfigError("--design applies to C headers (.h) only: an .onnx graph takes the design as an input")
-    model = pretrained_model(options.robot_of(robot, options_), weights)
+    body = options.robot_of(robot, options_)
+    learned = body.under_touch()
+    model = pretrained_model(learned, weights)
     chosen = options.design_of(design)
     for file in files:
         if file.suffix == ".h":
-            export_c(model, chosen, file, members=members, name=name)
+            export_c(model, chosen, file, members=members, name=name, robot=body)
         else:
             export_onnx(model, file, members=members)
         click.echo(f"wrote {file}")
@@ -172,13 +176,24 @@ def deploy(
 
         if effort_rate is not None and max_effort is None:
             raise ConfigError("--effort-rate needs --max-effort: without it the controller commands displacements")
-        qp = InverseQP.for_robot(model.robot)
+        qp = InverseQP.for_robot(body)
         if max_effort is not None:
-            qp = InverseQP.by_efforts(model.robot, max_effort, effort_rate or max_effort / 40.0)
+            qp = InverseQP.by_efforts(body, max_effort, effort_rate or max_effort / 40.0)
         correction = None if gains is None else PICorrection(*gains)
         paths = export_controller_c(
-            model, chosen, controller, controller=qp, correction=correction, members=members, name=name
+            model, chosen, controller, controller=qp, correction=correction, members=members, name=name, robot=body
         )
+        commands = [COMPILE]
+        if learned is not body and max_effort is None:
+            from softgym_envs.estimation import finger_grid
+            from softgym_envs.estimation.export.c import COMPILE_LOOP, export_estimator_c
+            from softgym_envs.estimation.learned import LearnedEstimator
+            from softgym_envs.surrogate.export.common import exportable
+
+            estimator = LearnedEstimator(body, design=chosen, model=exportable(model, members))
+            paths += export_estimator_c(estimator, finger_grid(), controller, name=name)
+            commands += [COMPILE_LOOP]
         for path in paths:
             click.echo(f"wrote {path}")
-        click.echo(f"compile with: cd {controller} && {COMPILE}")
+        for command in commands:
+            click.echo(f"compile with: cd {controller} && {command}")

@@ -2,8 +2,9 @@
 
 The model has force and place of a touch among its inputs (`Robot.under_touch`). So the equilibrium at each place and
 force is its own, not extrapolated from another place: at each place, Gauss-Newton finds the most probable errors of the
-actuators and force. The answer to the actuators is the learned ``W``, the answer to the force is the difference of two
-equilibria of the model: so it is consistent with them. The sum over places is that of `Mixture`.
+actuators and force. The answer to the actuators is the learned ``W``; the answer to the force is the change of the
+model under held actuators, after which ``W`` puts slack ones back to no effort. The sum over places is that of
+`Mixture`.
 """
 
 from __future__ import annotations
@@ -178,7 +179,7 @@ class LearnedEstimator:
                 self._before = self._mixture
             self._command, self._count, self._mean = command, 0, np.zeros_like(volumes)
             assert self._before is not None
-            self._at, self._tried = self._before.means.copy(), False
+            self._at, self._tried = self._limited(self._before.means), False
         self._count += 1
         self._mean = self._mean + (volumes - self._mean) / self._count
         spread = np.full(len(volumes), np.hypot(self.noise.volume / np.sqrt(self._count), self.volume_error))
@@ -188,7 +189,7 @@ class LearnedEstimator:
         if not self._tried and self.load is not None and misfit > chi2.ppf(IMPROBABLE, len(spread)):
             # Beyond a slack cable there may be a better explanation, which steps from small forces do not reach.
             self._tried, strong = True, at.copy()
-            strong[:, -1] = self._largest
+            strong[:, -1] = self.largest_force
             other = self._search(command, spread, strong, self.steps)
             if np.logaddexp.reduce(_logarithms(other[0])) > np.logaddexp.reduce(_logarithms(found)):
                 found, response, at = other
@@ -246,16 +247,16 @@ class LearnedEstimator:
     def _limited(self, parameters: np.ndarray) -> np.ndarray:
         """Return errors and forces (q, n_a + 1) at which the model is evaluated: forces that it has learned."""
         found = parameters.copy()
-        found[:, -1] = np.clip(found[:, -1], 0.0, self._largest)
+        found[:, -1] = np.clip(found[:, -1], 0.0, self.largest_force)
         return found
 
     @property
-    def _largest(self) -> float:
+    def largest_force(self) -> float:
         """The largest force that the model has learned, for this body [N]."""
-        return self.model.robot.design_space["touch_force"].high * self._stiffness
+        return self.model.robot.design_space["touch_force"].high * self.stiffness
 
     @property
-    def _stiffness(self) -> float:
+    def stiffness(self) -> float:
         """Young's modulus over that of the baseline."""
         return float(self.model.features.stiffness(self._body[None])[0, 0])
 
@@ -273,24 +274,27 @@ class LearnedEstimator:
         # Forces of which each place has a second one, by whose difference the answer to the force is found.
         more = designs.copy()
         more[:, self._columns[0]] += STEP
-        step, places = STEP * self._stiffness, len(designs)
+        step, places = STEP * self.stiffness, len(designs)
         context = model.context(np.vstack([designs, more]))
-        target = np.tile(command + parameters[:, :-1], (2, 1))
-        unilateral = self.robot.unilateral
-        reached, effort, found = model.search(context, target, target, unilateral, TOLERANCE, 25)
+        here, there = (context.rows(np.arange(places) + first) for first in (0, places))
+        target, unilateral = command + parameters[:, :-1], self.robot.unilateral
+        displacement, effort, found = model.search(here, target, target, unilateral, TOLERANCE, 25)
         if not found.all():
             raise ConvergenceError(f"the learned model finds no equilibrium under displacements {command.tolist()}")
-        passive = np.concatenate([model.effector(context, reached)[0], model.sensed(context, reached)], axis=1)
-        by_force = np.concatenate([np.zeros((places, n)), (passive[places:] - passive[:places]) / step], axis=1)
-        displacement, effort = reached[:places], effort[:places]
-        slack = unilateral & (displacement > target[:places] + 10.0 * TOLERANCE * model.span)
+        slack = unilateral & (displacement > target + 10.0 * TOLERANCE * model.span)
         effort = np.where(slack, 0.0, effort)
-        condensed = model.condensed(context.rows(np.arange(places)), displacement)
-        delta, W = condensed.delta.array, condensed.compliance
+        condensed = model.condensed(here, displacement)
+        delta, W, held = condensed.delta.array, condensed.compliance, condensed.lambda_.a
         taut = ~slack
         both = taut[:, :, None] & taut[:, None, :]
         K = np.linalg.inv(np.where(both, W[:, :n, :n], np.eye(n))) * both
-        slopes = np.concatenate([np.matmul(W[:, :, :n], K), by_force[:, :, None]], axis=2)
+        # More force changes efforts and passive rows of held actuators. Slack ones then move until they have no effort.
+        passive = np.concatenate([model.effector(there, displacement)[0], model.sensed(there, displacement)], axis=1)
+        change = np.where(slack, held - model.effort(there, displacement), 0.0)
+        change -= np.einsum("qij,qjk,qk->qi", K, W[:, :n, :n], change)
+        by_force = np.einsum("qij,qj->qi", W[:, :, :n], change)
+        by_force[:, n:] += passive - delta[:, n:]
+        slopes = np.concatenate([np.matmul(W[:, :, :n], K), by_force[:, :, None] / step], axis=2)
         own, sensors = slice(n, n + 3 * len(self.robot.effectors)), slice(n + model.effectors, None)
         return _Responses(
             sensors=delta[:, sensors],

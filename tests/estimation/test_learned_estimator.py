@@ -47,6 +47,22 @@ def test_slopes_by_force_agree_with_differences_of_the_model(robot):
     np.testing.assert_allclose(slope, difference, rtol=0.02)
 
 
+def test_slopes_by_force_let_slack_cables_follow(robot):
+    """A strong push near the tip slackens the cable at all places; differences are of equilibria, found anew."""
+    point = np.array([0.005, 0.0, -0.112])
+    estimator = LearnedEstimator(robot, load=Touch(GRID, GRID.cell(point), 1.0), noise=NOISE, exact=True)
+    at, command = np.tile([0.0, 1.7], (16, 1)), np.array([0.002])
+    response = estimator.respond(command, at)
+    ends = [estimator.respond(command, at + [0.0, step]) for step in (0.1, -0.1)]
+    assert response.slack.all() and ends[0].slack.all() and ends[1].slack.all()
+    for name in ("sensors", "effectors"):
+        slope = getattr(response, f"{name.removesuffix('s')}_slopes")[:, :, 1]
+        difference = (getattr(ends[0], name) - getattr(ends[1], name)) / 0.2
+        np.testing.assert_allclose(slope, difference, rtol=0, atol=2e-2 * np.abs(slope).max())
+    held = estimator.respond(response.displacement[0], at - [0.0, 0.1])
+    assert not held.slack.all() or np.abs(held.effector_slopes - response.effector_slopes).max() > 0.0
+
+
 def test_force_and_tip_are_found_on_the_model(robot):
     plant = SurrogateBackend(robot)
     plant.touch(PointForce(POINT, np.array([0.0, 0.8, 0.0])))

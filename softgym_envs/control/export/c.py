@@ -12,9 +12,10 @@ from softgym_envs.backends.surrogate import solve_displacements
 from softgym_envs.control.embedded import MAX_SETTLING_STEPS, SETTLED, SLACK, PICorrection, settling_span
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.mechanics.condensation import effort_unit
+from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.export.c import header_text
-from softgym_envs.surrogate.export.c_text import check_identifier, comment
+from softgym_envs.surrogate.export.c_text import check_identifier, comment, functions, names_of
 from softgym_envs.surrogate.export.common import exportable
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
@@ -29,42 +30,13 @@ COMPILE = "cc -std=c99 -O3 -fno-math-errno main.c -o main -lm"
 #: What the two drives do differently, as C.
 _STATE = {
     "displacement": """\
+    if (${p}_settle(controller->command, controller->displacement, effort, effector, W, K, slack))
+        return 2;
     for (i = 0; i < N; ++i)
-        if (!(${p}_unilateral[i] && controller->displacement[i] > controller->command[i] + $slack * ${p}_rate[i]))
-            controller->displacement[i] = controller->command[i];
-    for (k = 0;; ++k) { /* the least energy with no cable shorter than commanded */
-        double farthest = 0.0;
-        if (k == $most_steps || ${p}_evaluate(controller, effort, effector, W) || ${p}_stiffness(W, K))
-            return 2;
-        for (i = 0, norm = 0.0; i < N; ++i)
-            norm += ${p}_rate[i] * K[i][i] * ${p}_rate[i];
-        for (i = 0; i < N; ++i) {
-            g[i] = ${p}_rate[i] * effort[i] / norm;
-            low[i] = (controller->command[i] - controller->displacement[i]) / ${p}_rate[i];
-            high[i] = ${p}_unilateral[i] ? 1e6 : low[i];
-            low[N + i] = -1.0;
-            high[N + i] = 1.0;
-            for (j = 0; j < N; ++j) {
-                H[i][j] = ${p}_rate[i] * K[i][j] * ${p}_rate[j] / norm;
-                R[i][j] = 0.0;
-            }
-        }
-        if (${p}_qp(H, g, low, high, R, x))
-            return 2;
-        for (i = 0; i < N; ++i)
-            farthest = fmax(farthest, fabs(x[i]));
-        if (farthest <= $settled)
-            break;
-        for (i = 0; i < N; ++i)
-            controller->displacement[i] += ${p}_clip(x[i] * ${p}_rate[i], -${p}_span[i], ${p}_span[i]);
-    }
-    for (i = 0, norm = 0.0; i < N; ++i) {
-        slack[i] = ${p}_unilateral[i] && controller->displacement[i] > controller->command[i] + $slack * ${p}_rate[i];
         if (slack[i] || (${p}_unilateral[i] && effort[i] < 0.0))
-            effort[i] = 0.0;
-    }""",
+            effort[i] = 0.0;""",
     "effort": """\
-    if (${p}_evaluate(controller, effort, effector, W) || ${p}_stiffness(W, K))
+    if (${p}_evaluate(controller->displacement, effort, effector, W) || ${p}_stiffness(W, K))
         return 2;""",
 }
 _BOUNDS = {
@@ -104,7 +76,7 @@ _START = {
         float W[(${P}_ACTUATORS + ${P}_COORDINATES) * (${P}_ACTUATORS + ${P}_COORDINATES)];
         double effort[${P}_ACTUATORS];
         int j;
-        if (${p}_evaluate(controller, effort, controller->effector, W))
+        if (${p}_evaluate(controller->displacement, effort, controller->effector, W))
             return 1;
         for (i = 0; i < ${P}_ACTUATORS; ++i) /* the displacements without effort, to first order */
             for (j = 0; j < ${P}_ACTUATORS; ++j)
@@ -129,6 +101,7 @@ def export_controller_c(
     correction: PICorrection | None = None,
     members: int | None = None,
     name: str = "softgym",
+    robot: Robot | None = None,
 ) -> tuple[Path, Path]:
     """Write the controller of one body as ``controller.h``, and ``main.c``, an example that steps it.
 
@@ -145,6 +118,8 @@ def export_controller_c(
         correction: gains and limits of the closed loop; default `PICorrection` with the gains of the thesis.
         members: how many members of the ensemble are averaged; default all that the model uses.
         name: prefix of everything the header defines, a C identifier.
+        robot: whose design and effectors are controlled; default that of the model. A robot whose touch is learned has
+            a model with more of both.
 
     Returns:
         The paths of header and program.
@@ -156,17 +131,17 @@ def export_controller_c(
     """
     check_identifier(name)
     folder = Path(folder)
-    potential = exportable(model, members)
-    controller = InverseQP.for_robot(potential.robot) if controller is None else controller
+    potential, robot = exportable(model, members), robot or model.robot
+    controller = InverseQP.for_robot(robot) if controller is None else controller
     if len(controller.rates) != potential.count:
         raise ValueError(f"the controller has {len(controller.rates)} actuators, the model {potential.count}")
     if controller.by_effort.any() != controller.by_effort.all():
         raise ValueError("the controller commands displacements and efforts; allowed: one quantity for all actuators")
     drive = "effort" if controller.by_effort.all() else "displacement"
-    header = _header(potential, design, controller, correction or PICorrection(), drive, name)
+    header = _header(potential, robot, design, controller, correction or PICorrection(), drive, name)
     folder.mkdir(parents=True, exist_ok=True)
     paths = folder / "controller.h", folder / "main.c"
-    for path, text in zip(paths, (header, _program(potential, design, controller, drive, name)), strict=True):
+    for path, text in zip(paths, (header, _program(potential, robot, design, controller, drive, name)), strict=True):
         with atomic_write(path, "w") as stream:
             stream.write(text)
     return paths
@@ -174,6 +149,7 @@ def export_controller_c(
 
 def _header(
     model: Model,
+    robot: Robot,
     design: Mapping[str, float] | None,
     controller: InverseQP,
     correction: PICorrection,
@@ -181,7 +157,7 @@ def _header(
     name: str,
 ) -> str:
     """Return the text of the header."""
-    n, e, upper = model.count, model.effectors, name.upper()
+    n, e, upper = model.count, 3 * len(robot.effectors), name.upper()
     goal_weights = np.ones(e) if controller.goal_weights is None else controller.goal_weights
     constants = {
         "lower": controller.lower,
@@ -214,16 +190,7 @@ def _header(
         "All quantities are in SI units. Nothing is allocated; the only state is in the struct. Do not compile with",
         "-ffast-math, which removes the checks for values that are not finite.",
     ]
-    names = {"p": name, "P": upper}
-
-    def filled(text: str) -> str:
-        return Template(text).substitute(
-            names,
-            slack=repr(SLACK),
-            settled=repr(SETTLED),
-            most_steps=MAX_SETTLING_STEPS,
-        )
-
+    names = names_of(name) | {"slack": repr(SLACK), "settled": repr(SETTLED), "most_steps": str(MAX_SETTLING_STEPS)}
     numbers = {
         "proportional": correction.proportional,
         "integral": correction.integral,
@@ -239,11 +206,11 @@ def _header(
         names,
         quantity=f"{drive}s [{unit}]",
         **{key: repr(float(value)) for key, value in numbers.items()},
-        **{key: filled(piece[drive]) for key, piece in pieces.items()},
+        **{key: Template(piece[drive]).substitute(names) for key, piece in pieces.items()},
     )
     parts = [
         comment(about),
-        header_text(model, design, name),
+        header_text(model, design, name, robot),
         f"#ifndef {upper}_CONTROLLER_H\n#define {upper}_CONTROLLER_H\n",
         *(
             f"static const double {name}_{key}[{len(value)}] = {{{', '.join(map(_literal, value))}}};"
@@ -255,20 +222,24 @@ def _header(
             else []
         ),
         "",
-        filled((_HERE / "qp.h.in").read_text()),
+        functions("qp", names),
+        functions("evaluate", names),
+        *([functions("settle", names)] if drive == "displacement" else []),
         body,
         f"#endif /* {upper}_CONTROLLER_H */\n",
     ]
     return "\n".join(parts)
 
 
-def _program(model: Model, design: Mapping[str, float] | None, controller: InverseQP, drive: str, name: str) -> str:
+def _program(
+    model: Model, robot: Robot, design: Mapping[str, float] | None, controller: InverseQP, drive: str, name: str
+) -> str:
     """Return the text of the example: its goal is where 30 % of every second actuator's range moves the effector."""
-    robot = model.robot
+    space, e = model.robot.design_space, 3 * len(robot.effectors)
     command = (robot.lower + 0.3 * (robot.upper - robot.lower) * (np.arange(model.count) % 2 == 0))[None]
-    context = model.context(robot.design_space.complete(design).array[None])
-    goal = solve_displacements(model, context, command, np.zeros_like(command), robot.unilateral).effector
-    weights = np.ones(model.effectors) if controller.goal_weights is None else controller.goal_weights
+    context = model.context(space.complete(robot.design_space.complete(design)).array[None])
+    goal = solve_displacements(model, context, command, np.zeros_like(command), robot.unilateral).effector[:, :e]
+    weights = np.ones(e) if controller.goal_weights is None else controller.goal_weights
     return Template((_HERE / "main.c.in").read_text()).substitute(
         p=name,
         P=name.upper(),

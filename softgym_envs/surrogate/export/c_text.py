@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from string import Template
 
 import numpy as np
+
+_HERE = Path(__file__).parent
 
 
 def check_identifier(name: str) -> None:
@@ -41,3 +45,55 @@ def comment(lines: Iterable[str]) -> str:
     """Return a C comment; ``/*`` and ``*/`` in the text are separated by a space."""
     text = "\n".join(f" * {line}".rstrip() for line in (x.replace("*/", "* /").replace("/*", "/ *") for x in lines))
     return f"/*\n{text}\n */\n"
+
+
+def names_of(name: str, many: bool = False) -> dict[str, str]:
+    """Return what templates call their prefix and, for functions of ``many`` bodies, the argument that holds one."""
+    names = {"p": name, "P": name.upper(), "of": f"{name}_", "takes": "", "gives": ""}
+    if many:
+        names |= {"of": "body->", "takes": f"const {name}_body *body, ", "gives": "body, "}
+    return names
+
+
+def functions(file: str, names: Mapping[str, object]) -> str:
+    """Return C functions from a template of this folder."""
+    return Template((_HERE / f"{file}.h.in").read_text()).substitute(names)
+
+
+def definitions(constants: Mapping[str, tuple[str, np.ndarray]], sizes: Mapping[str, str], name: str) -> list[str]:
+    """Return constants in single precision as C.
+
+    Args:
+        constants: name to shape and values; a shape names its sizes by letters, ``"[N][H]"``.
+        sizes: letter to the macro, without prefix.
+        name: prefix.
+    """
+    lines = []
+    for key, (shape, array) in constants.items():
+        value = initialiser(array) if array.ndim else number(float(array))
+        lines.append(f"static const float {name}_{key}{dimensions(shape, sizes, name)} = {value};")
+    return lines
+
+
+def dimensions(shape: str, sizes: Mapping[str, str], name: str) -> str:
+    """Return a shape with its sizes by their macros."""
+    return re.sub(r"\w", lambda letter: f"{name.upper()}_{sizes[letter.group()]}", shape)
+
+
+def single_precision(
+    constants: Mapping[str, tuple[str, np.ndarray]], sizes: Mapping[str, int]
+) -> dict[str, tuple[str, np.ndarray]]:
+    """Return constants in single precision.
+
+    Raises:
+        ValueError: for values that are not finite then.
+    """
+    singles = {}
+    with np.errstate(over="ignore"):
+        for key, (shape, array) in constants.items():
+            single = np.asarray(array).astype(np.float32)
+            if not np.isfinite(single).all():
+                raise ValueError(f"'{key}' holds values that are not finite in single precision")
+            assert single.shape == tuple(sizes[letter] for letter in re.findall(r"\w", shape)), key
+            singles[key] = (shape, single)
+    return singles

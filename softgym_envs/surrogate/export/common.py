@@ -25,14 +25,12 @@ def exportable(model: SurrogateModel, members: int | None) -> Model:
     """Return the model with its first members only.
 
     Raises:
-        ValueError: for an unsupported network, an energy that is not convex, sensors, or a wrong number of members.
+        ValueError: for an unsupported network, an energy that is not convex, or a wrong number of members.
     """
     if not isinstance(model, Model):
         raise ValueError(f"a model of network '{model.network}' cannot be exported; allowed: 'potential'")
     if not model.robot.convex:
         raise ValueError(f"robot '{model.robot.name}' cannot be exported: its energy is not convex")
-    if model.sensors:
-        raise ValueError(f"robot '{model.robot.name}' cannot be exported: its sensor rows are not part of an export")
     return model if members is None else Model(model.robot, model.tensors, model.card, members)
 
 

@@ -41,6 +41,8 @@ def export_onnx(model: SurrogateModel, path: str | Path, *, members: int | None 
     """
     path = check_path(path, ".onnx")
     potential = exportable(model, members)
+    if model.sensors:
+        raise ValueError(f"robot '{model.robot.name}' cannot be exported: its sensor rows are not part of a graph")
     try:
         import onnx
     except ImportError:
