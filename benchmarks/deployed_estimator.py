@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.recorded import results
+from benchmarks.tables import markdown
 from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.estimation import Noise, Readings, Touch, finger_grid
@@ -190,3 +192,25 @@ def deployed_estimator() -> dict[str, object]:
         result[f"C, {real}: stack [bytes]"] = stacks[real]
     result["constants [kB]"] = int(constants[1]) / 1e3
     return result
+
+
+def estimators_table() -> str:
+    """Rates, memory and differences of the estimator in C with both types, and in Python."""
+    found = results("deployed_estimator")
+    columns = ("Python", *(f"C, {real}" for real in REALS))
+    rows = []
+    for name, form in (
+        ("first readings of a touch [1/CPU s]", ".0f"),
+        ("later readings of a touch [1/CPU s]", ".0f"),
+        ("largest difference from Python [standard deviations]", ".1e"),
+        ("state [bytes]", ".0f"),
+        ("stack [bytes]", ".0f"),
+    ):
+        values = (found.get(f"{column}: {name}") for column in columns)
+        rows.append([name, *("" if value is None else f"{value:{form}}" for value in values)])
+    rows.append(["constants [kB]", "", *(f"{found['constants [kB]']:.0f}" for _ in REALS)])
+    return markdown(["", *columns], rows, "lrrr")
+
+
+TABLES = {"deployed_estimators": estimators_table}
+"""Tables of pages by name."""
