@@ -180,9 +180,11 @@ def deploy(
         if max_effort is not None:
             qp = InverseQP.by_efforts(body, max_effort, effort_rate or max_effort / 40.0)
         correction = None if gains is None else PICorrection(*gains)
-        paths = export_controller_c(
-            model, chosen, controller, controller=qp, correction=correction, members=members, name=name, robot=body
-        )
+        paths = [
+            *export_controller_c(
+                model, chosen, controller, controller=qp, correction=correction, members=members, name=name, robot=body
+            )
+        ]
         commands = [COMPILE]
         if learned is not body and max_effort is None:
             from softgym_envs.estimation import finger_grid

@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from softgym_envs.estimation.estimator import Estimator as Estimator
     from softgym_envs.estimation.estimator import Noise as Noise
     from softgym_envs.estimation.estimator import Readings as Readings
-    from softgym_envs.estimation.export.c import export_estimator_c as export_estimator_c
     from softgym_envs.estimation.loads import Payload as Payload
     from softgym_envs.estimation.loads import Touch as Touch
     from softgym_envs.estimation.loads import TouchGrid as TouchGrid
@@ -18,7 +17,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "estimator": ["Estimator", "Noise", "Readings"],
-        "export.c": ["export_estimator_c"],
         "loads": ["Payload", "Touch", "TouchGrid", "finger_grid"],
     },
 )

@@ -13,7 +13,8 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.surrogate import SurrogateBackend
-from softgym_envs.estimation import Noise, Readings, Touch, TouchGrid, export_estimator_c, finger_grid
+from softgym_envs.estimation import Noise, Readings, Touch, TouchGrid, finger_grid
+from softgym_envs.estimation.export.c import export_estimator_c
 from softgym_envs.estimation.learned import LearnedEstimator
 
 CC = shutil.which("cc") or shutil.which("gcc")
