@@ -59,8 +59,6 @@ def test_slopes_by_force_let_slack_cables_follow(robot):
         slope = getattr(response, f"{name.removesuffix('s')}_slopes")[:, :, 1]
         difference = (getattr(ends[0], name) - getattr(ends[1], name)) / 0.2
         np.testing.assert_allclose(slope, difference, rtol=0, atol=2e-2 * np.abs(slope).max())
-    held = estimator.respond(response.displacement[0], at - [0.0, 0.1])
-    assert not held.slack.all() or np.abs(held.effector_slopes - response.effector_slopes).max() > 0.0
 
 
 def test_force_and_tip_are_found_on_the_model(robot):

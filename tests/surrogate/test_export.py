@@ -20,6 +20,7 @@ from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.training import stack_members
+from softgym_envs.surrogate.pretrained import pretrained_model
 from softgym_envs.testing import random_states
 
 CC = shutil.which("cc") or shutil.which("gcc")
@@ -260,3 +261,25 @@ def test_the_command_line_writes_both(tmp_path, monkeypatch, softgym):
         status, _, err = softgym("deploy", "finger", *arguments, *weights)
         assert status == 2 and message in err
     assert sorted(tmp_path.iterdir()) == [header, graph]
+
+
+@needs_compiler
+def test_the_header_of_a_robot_with_sensors_has_its_effectors(tmp_path):
+    """The model of a touched finger has a touched point and sensors, which the header of the finger leaves out."""
+    robot = make_robot("sensorized_finger")
+    model = pretrained_model(robot.under_touch(), members=1)
+    design = {"joint_height": 0.0063, "young_modulus": 2.4e6}
+    compiled = Compiled(export_c(model, design, tmp_path / "model.h", name="finger", robot=robot))
+    displacement = np.linspace(0.0, 0.012, 7)[:, None]
+    (effort, effector, W), status = compiled(displacement, 3)
+    assert not any(status)
+    body = model.robot.design_space.complete(design).array[None]
+    expected = model.condensed(model.context(np.tile(body, (7, 1))), displacement)
+    for ours, theirs in (
+        (effort, expected.lambda_.a),
+        (effector, expected.delta.e[:, :3]),
+        (W, expected.compliance[:, :4, :4]),
+    ):
+        assert np.abs(ours - theirs).max() <= 2e-5 * np.abs(theirs).max()
+    with pytest.raises(ValueError, match="sensor rows are not part of a graph"):
+        export_onnx(model, tmp_path / "model.onnx")
