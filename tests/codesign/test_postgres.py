@@ -243,7 +243,7 @@ def test_policies_come_from_the_machine_that_trained_them(machine, monkeypatch):
     (a.path / name).with_suffix(".json").write_bytes(b"{}")
     tested = []
     monkeypatch.setattr(worker, "run_pending", lambda folder, jobs: tested.append(folder))
-    snapshot = SimpleNamespace(folder=b, finalists=[SimpleNamespace(policy=name)], planned_tests=[])
+    snapshot = SimpleNamespace(folder=b, finalists=[SimpleNamespace(policy=name)], planned_tests=[], refinements=[])
     monkeypatch.setattr(worker, "load_study", lambda folder: snapshot)
     with TrialQueue(a) as queue:
         trial = queue.claim()

@@ -380,7 +380,7 @@ def search(
     kept = np.empty((len(A1), 3, size, A1.shape[2]), np.float32)
     u, g, K = np.empty((size, n), np.float32), np.empty((size, n), np.float32), np.empty((size, n, n), np.float32)
     moving, asked, part = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
-    W, gap, taut = np.empty((size, n, n)), np.empty(n), np.empty(n)
+    W, gap, taut, step = np.empty((size, n, n)), np.empty(n), np.empty(n), np.empty(n)
     work, index = np.empty((n, n + 1)), np.empty(n, np.int64)
     for start in range(0, len(target), ROWS_PER_BLOCK):
         # Displacements, efforts, and the rows of this block that still move.
@@ -432,15 +432,19 @@ def search(
                         gap[i] -= W[row, i, j] * e[row, j]
                 if not solve_row(W[row], gap, unilateral, taut, work, index):
                     continue
+                share = 1.0
+                for i in range(n):
+                    step[i] = 0.0
+                    for j in range(n):
+                        step[i] += W[row, i, j] * (taut[j] - e[row, j])
+                    # A long step is shortened as a whole, so that the network is evaluated near known states only. Cut
+                    # one by one, cables that pull against each other would leave the direction of the solution.
+                    if abs(step[i]) * share > limit[i]:
+                        share = limit[i] / abs(step[i])
                 far = False
                 for i in range(n):
-                    step = 0.0
-                    for j in range(n):
-                        step += W[row, i, j] * (taut[j] - e[row, j])
-                    # Long steps are cut, so that the network is evaluated near known states only.
-                    step = min(max(step, -limit[i]), limit[i])
-                    d[row, i] += step
-                    far = far or abs(step) > tolerance[i]
+                    d[row, i] += share * step[i]
+                    far = far or abs(step[i]) > tolerance[i]
                 if far:
                     moving[left] = row
                     left += 1
