@@ -3,21 +3,30 @@
 ``softgym bench carry`` compares them. ``python -m benchmarks.carry PAYLOAD GENERATIONS SEED`` searches for the swing:
 servo angles through a few knots, optimised by CMA-ES on batched finite elements so that the centre gets as far as
 possible. It shows what is possible at all. The search begins at the best of one generation of random swings, and what
-it finds is kept if it gets farther than the stored swing.
+it finds is kept if it gets farther than the stored swing. ``python -m benchmarks.carry imitate PAYLOAD FILE`` trains a
+small policy to imitate the stored swing, from which evolution can begin.
 """
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
 
 DATA = Path(__file__).parent / "data" / "tetrapod_swing.json"
-POLICIES = {"SAC": "tetrapod_carry", "evolution": "tetrapod_carry_evolution"}
-"""Shipped policies, by learner; both were trained with 1 kg."""
+POLICIES = {
+    "SAC, trained with 1 kg": "tetrapod_carry",
+    "evolution, trained with 1 kg": "tetrapod_carry_evolution",
+    "evolution, trained with 0 kg": "tetrapod_carry_empty",
+}
+"""Shipped policies, by learner and payload."""
 PAYLOADS = (0.0, 1.0)
+CONFIG = Path(__file__).parents[1] / "configs" / "agents" / "tetrapod_carry_empty.yaml"
+"""Evolution that begins at an imitated swing."""
+
 KNOTS = 8
 STEPS = 100
 
@@ -100,18 +109,76 @@ def search(
     return {"payload": payload, "parameters": best.tolist(), "episodes": episodes, "seed": seed}
 
 
+def imitate(payload: float, path: Path, members: int = 32, hidden: int = 16, seed: int = 0) -> None:
+    """Train a policy to imitate the stored swing, and save it with the configuration of the evolution it is for.
+
+    The swing is a sequence of commands, the policy sees the state. Its examples are episodes whose actions are the
+    swing's with different noise, each labelled with the action of the swing at its step.
+
+    Args:
+        payload: of the swing [kg].
+        path: the policy, a ``.safetensors`` file.
+        members: episodes for each size of the noise.
+        hidden: units of the policy.
+        seed: of the noise and the first weights.
+    """
+    import torch
+
+    from softgym_envs.agents.config import TrainConfig
+    from softgym_envs.agents.policy import save_policy
+    from softgym_envs.config import load_config, provenance
+
+    parameters = {entry["payload"]: entry["parameters"] for entry in _stored()}[payload]
+    commands = swing_commands(np.array(parameters))
+    env = gymnasium.make_vec(
+        "SoftGym/TetrapodCarry-v0", members, robot_options={"payload": payload}, max_episode_steps=10**6
+    )
+    batch, rng = env.unwrapped, np.random.default_rng(seed)
+    seen, done = [], []
+    for noise in (0.0, 0.02, 0.05, 0.1):
+        observation, _ = env.reset(seed=seed)
+        for command in commands:
+            action = np.clip(batch.spaces.action(np.tile(command, (members, 1)), batch.backend.command), -1.0, 1.0)
+            seen.append(observation.copy())
+            done.append(action)
+            observation, *_ = env.step(np.clip(action + noise * rng.standard_normal(action.shape), -1.0, 1.0))
+    env.close()
+    inputs, labels = (torch.tensor(np.concatenate(part), dtype=torch.float32) for part in (seen, done))
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)
+    layers = torch.nn.Linear(inputs.shape[1], hidden), torch.nn.Linear(hidden, labels.shape[1])
+    network = torch.nn.Sequential(layers[0], torch.nn.ReLU(), layers[1], torch.nn.Tanh())
+    optimiser = torch.optim.Adam(network.parameters(), 3e-3)
+    for _ in range(6000):
+        rows = torch.randint(len(inputs), (256,))
+        loss = ((network(inputs[rows]) - labels[rows]) ** 2).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    names = zip(("actor.latent_pi.0", "actor.mu"), layers, strict=True)
+    tensors = {f"{n}.{part}": getattr(layer, part).detach().numpy() for n, layer in names for part in ("weight", "bias")}
+    config = load_config(CONFIG, TrainConfig)
+    config = config.model_copy(update={"initial": None})
+    save_policy(path, tensors, {"config": config.model_dump(mode="json"), "provenance": provenance()})
+
+
+def _stored() -> list[dict[str, Any]]:
+    """Return the stored swings."""
+    return json.loads(DATA.read_text())
+
+
 def carry() -> dict[str, object]:
     """TetrapodCarry: farthest position to the right, position at the end [mm] and return, by agent and payload."""
     from softgym_envs.agents.evaluation import make_agent
     from softgym_envs.agents.policy import policy_path
 
-    swings = {entry["payload"]: entry["parameters"] for entry in json.loads(DATA.read_text())}
+    swings = {entry["payload"]: entry["parameters"] for entry in _stored()}
     results: dict[str, object] = {}
     for payload in PAYLOADS:
         env = make(payload)
         agents = {"quasi-static QP": make_agent("qp_static"), "one-step dynamic QP": make_agent("qp")}
         agents["optimised swing"] = swing(swings[payload])
-        agents |= {f"{name}, trained with 1 kg": make_agent(policy_path(policy)) for name, policy in POLICIES.items()}
+        agents |= {name: make_agent(policy_path(policy)) for name, policy in POLICIES.items()}
         for name, act in agents.items():
             farthest, last, total = episode(env, act)
             results[f"{payload:g} kg, {name}: farthest, end [mm], return"] = f"{farthest:.1f}, {last:.1f}, {total:.2f}"
@@ -124,9 +191,12 @@ if __name__ == "__main__":
 
     from softgym_envs.storage import write_json
 
+    if sys.argv[1] == "imitate":
+        imitate(float(sys.argv[2]), Path(sys.argv[3]))
+        sys.exit()
     payload, generations = float(sys.argv[1]), int(sys.argv[2])
     seed = int(sys.argv[3]) if sys.argv[3:] else 0
-    entries = json.loads(DATA.read_text())
+    entries = _stored()
     found = search(payload, generations, seed=seed)
     env = make(payload)
     for k, entry in enumerate(entries):
