@@ -156,7 +156,9 @@ def imitate(payload: float, path: Path, members: int = 32, hidden: int = 16, see
         loss.backward()
         optimiser.step()
     names = zip(("actor.latent_pi.0", "actor.mu"), layers, strict=True)
-    tensors = {f"{n}.{part}": getattr(layer, part).detach().numpy() for n, layer in names for part in ("weight", "bias")}
+    tensors = {
+        f"{name}.{part}": value.detach().numpy() for name, layer in names for part, value in layer.named_parameters()
+    }
     config = load_config(CONFIG, TrainConfig)
     config = config.model_copy(update={"initial": None})
     save_policy(path, tensors, {"config": config.model_dump(mode="json"), "provenance": provenance()})
