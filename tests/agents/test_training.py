@@ -330,7 +330,14 @@ def test_goals_repeat_and_belong_to_the_body():
 
 @pytest.mark.parametrize(
     "name",
-    ["finger_reach", "finger_reach_designs", "tetrapod_carry", "tetrapod_carry_evolution", "tetrapod_reach_analytic"],
+    [
+        "finger_reach",
+        "finger_reach_designs",
+        "tetrapod_carry",
+        "tetrapod_carry_evolution",
+        "tetrapod_carry_empty",
+        "tetrapod_reach_analytic",
+    ],
 )
 def test_shipped_policies_were_made_by_the_shipped_configs(name):
     config = load_config(CONFIGS / "agents" / f"{name}.yaml", TrainConfig)
