@@ -181,8 +181,7 @@ class TorchBatch:
             ahead = target - u
             q = gradient + (hessian * ahead[:, None, :]).sum(dim=2)
             z, taut, slack, solved = complementarity(hessian, q, slack, self.unilateral)
-            step = torch.clamp(ahead + z, -SPAN, SPAN)
-            still = (step.abs() <= TOLERANCE * SPAN).all(dim=1)
+            step, still = _shortened(ahead + z)
             # A last step below the tolerance is taken without evaluating the model again.
             u = torch.where(found[:, None], u, u + step)
             effort = torch.where(found[:, None], effort, taut)
@@ -194,12 +193,17 @@ class TorchBatch:
         u = start
         for _ in range(50):
             gradient, hessian = self._ensemble.derivatives(bodies, u)
-            step = -torch.linalg.solve_ex(hessian, gradient)[0]
-            moving = (step.abs() > TOLERANCE * SPAN).any(dim=1, keepdim=True)
-            if not bool(moving.any()):
+            step, still = _shortened(-torch.linalg.solve_ex(hessian, gradient)[0])
+            if bool(still.all()):
                 break
-            u = torch.where(moving, u + step.clamp(-SPAN, SPAN), u)
+            u = torch.where(still[:, None], u, u + step)
         return u
+
+
+def _shortened(step: Tensor) -> tuple[Tensor, Tensor]:
+    """Shorten long steps (B, n) as a whole, as `SurrogateModel.search` does; return also which are below tolerance."""
+    longest = step.abs().amax(dim=1) / SPAN
+    return step / longest.clamp(min=1.0)[:, None], longest <= TOLERANCE
 
 
 def complementarity(

@@ -235,10 +235,12 @@ class SurrogateModel(ABC):
                 converged[rows[~solved]] = False
                 rows, d, e, wanted, W, taut = (x[solved] for x in (rows, d, e, wanted, W, taut))
                 part = part.rows(solved)
-            # Long steps are cut, so that the network is evaluated near known states only.
-            step = np.clip(np.matmul(W, (taut - e)[:, :, None])[:, :, 0], -self.span, self.span)
-            d = d + step
-            moving = (np.abs(step) > tolerance * self.span).any(axis=1)
+            step = np.matmul(W, (taut - e)[:, :, None])[:, :, 0]
+            longest = np.max(np.abs(step) / self.span, axis=1)
+            # A long step is shortened as a whole, so that the network is evaluated near known states only. Cut one by
+            # one, cables that pull against each other would leave the direction of the solution.
+            d = d + step / np.maximum(longest, 1.0)[:, None]
+            moving = longest > tolerance
             # A last step below the tolerance is taken without evaluating the model again.
             displacement[rows[~moving]], effort[rows[~moving]] = d[~moving], taut[~moving]
             rows, d, wanted, W, part = rows[moving], d[moving], wanted[moving], W[moving], part.rows(moving)

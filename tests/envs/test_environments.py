@@ -270,6 +270,14 @@ def test_design_in_make_and_reset(backend):
     assert (info["goal"] == goal).all()
 
 
+def test_an_environment_works_after_a_first_reset_that_refused_its_design():
+    env = gymnasium.make("SoftGym/FingerReach-v0")
+    with pytest.raises(DesignError, match="length"):
+        env.reset(options={"design": {"length": 1.0}})
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+
+
 def test_reset_does_not_rebuild_the_same_design(monkeypatch):
     env = gymnasium.make("SoftGym/FingerReach-v0", backend="fem")
     built = []

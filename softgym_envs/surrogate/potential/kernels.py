@@ -369,9 +369,10 @@ def search(
 ):  # fmt: skip
     """Newton's method on the complementarity problem of each row; see `SurrogateModel.search`.
 
-    The steps use the curvature of the first member alone, whose quadratic part is ``first``. One row in five
+    The first four steps use the curvature of the first member alone, whose quadratic part is ``first``. One row in five
     therefore needs one more step (cable trunk; up to one in four elsewhere). That costs less than the curvature of
-    all members, which took half of the time.
+    all members, which took half of the time. Rows that are still on the way then use all members: where these disagree
+    about the stiffness by half, steps with one of them would oscillate.
 
     The rows of a block take their steps together, so that one evaluation of the network serves all rows that move.
     """
@@ -381,16 +382,17 @@ def search(
     u, g, K = np.empty((size, n), np.float32), np.empty((size, n), np.float32), np.empty((size, n, n), np.float32)
     moving, asked, part = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
     W, gap, taut, step = np.empty((size, n, n)), np.empty(n), np.empty(n), np.empty(n)
+    last, damping = np.empty((size, n)), np.empty(size)
     work, index = np.empty((n, n + 1)), np.empty(n, np.int64)
     for start in range(0, len(target), ROWS_PER_BLOCK):
         # Displacements, efforts, and the rows of this block that still move.
         d, e = displacement[start : start + ROWS_PER_BLOCK], effort[start : start + ROWS_PER_BLOCK]
         count = len(d)
         for row in range(count):
-            moving[row] = row
+            moving[row], damping[row] = row, 1.0
             converged[start + row] = False
             for i in range(n):
-                d[row, i] = guess[start + row, i]
+                d[row, i], last[row, i] = guess[start + row, i], 0.0
         for iteration in range(iterations + 1):
             for k in range(count):
                 row = moving[k]
@@ -416,7 +418,10 @@ def search(
             renew = iteration % 4 == 0
             if renew:
                 # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
-                _curvatures(asked[:count], part, A1[:1], A2[:1], PT[:1], first, kept, K)
+                if iteration == 0:
+                    _curvatures(asked[:count], part, A1[:1], A2[:1], PT[:1], first, kept, K)
+                else:
+                    _curvatures(asked[:count], part, A1, A2, PT, quadratic, kept, K)
             left = 0
             for k in range(count):
                 row = moving[k]
@@ -432,7 +437,7 @@ def search(
                         gap[i] -= W[row, i, j] * e[row, j]
                 if not solve_row(W[row], gap, unilateral, taut, work, index):
                     continue
-                share = 1.0
+                share, turned = 1.0, 0.0
                 for i in range(n):
                     step[i] = 0.0
                     for j in range(n):
@@ -441,9 +446,14 @@ def search(
                     # one by one, cables that pull against each other would leave the direction of the solution.
                     if abs(step[i]) * share > limit[i]:
                         share = limit[i] / abs(step[i])
+                    turned += step[i] * last[row, i] / limit[i] ** 2
+                if iteration >= 4:
+                    # A step that leads back has gone too far: on a convex energy, halving such steps ends the cycle.
+                    damping[row] = 0.5 * damping[row] if turned < 0.0 else min(1.0, 2.0 * damping[row])
                 far = False
                 for i in range(n):
-                    d[row, i] += share * step[i]
+                    last[row, i] = step[i]
+                    d[row, i] += damping[row] * share * step[i]
                     far = far or abs(step[i]) > tolerance[i]
                 if far:
                     moving[left] = row
