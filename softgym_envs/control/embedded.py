@@ -224,7 +224,7 @@ def settle(
         step = condensed.W.aa @ change
         if (np.abs(step) <= SETTLED * rates).all():
             break
-        displacement = displacement + np.clip(step, -span, span)
+        displacement = displacement + step / max(1.0, (np.abs(step) / span).max())  # a long step, shortened as a whole
     else:
         raise ConvergenceError(f"the model finds no equilibrium under displacements {command.tolist()}")
     slack = unilateral & (displacement > command + SLACK * rates)
