@@ -12,9 +12,11 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.elements.beams import are_folded
 from softgym_envs.mechanics.solvers.beam_batch import BeamBatch, BeamStates
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.domain import FOLDED
 
 
 class FEMBatch(BatchBackend):
@@ -65,6 +67,7 @@ class FEMBatch(BatchBackend):
         numbers = {design: k for k, design in enumerate(used)}
         self._numbers = np.array([numbers[design] for design in self._designs])
         solvers = [_beams(owner) for owner in self._owners.values()]
+        self._frames = solvers[0].body.elements.frames
         self._beams = BeamBatch([s.body for s in solvers], [owner.model.loads for owner in self._owners.values()])
 
     def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
@@ -168,7 +171,7 @@ class FEMBatch(BatchBackend):
             slack,
             converged,
             np.zeros(count),
-            np.zeros(count, dtype=np.int64),
+            np.where(are_folded(states.x, self._frames), FOLDED, 0),
         )
 
     @property

@@ -15,6 +15,7 @@ from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.solvers.beam_batch import BeamBatch
 from softgym_envs.robots.tetrapod import Tetrapod
+from softgym_envs.surrogate.domain import FOLDED
 
 TETRAPOD, TRUNK = "SoftGym/TetrapodReach-v0", "SoftGym/TrunkReach-v0"
 STEPS = 6
@@ -95,6 +96,16 @@ def test_rows_that_the_compiled_solver_leaves_go_to_the_general_one(monkeypatch)
 
     monkeypatch.setattr(BeamBatch, "march", fails_first)
     assert compare_with_singles(TETRAPOD, {"robot_options": {"elements": 2}}, [{}, {}]) < 0.999
+
+
+def test_rows_with_folded_legs_are_not_trusted():
+    env = gymnasium.make_vec("SoftGym/TetrapodCarry-v0", 2)
+    env.reset(seed=0)
+    right = np.array([[1.0, 1.0, -1.0, 1.0], [1.0, 0.0, -1.0, 0.0]], dtype=np.float32)
+    for _ in range(12):
+        info = env.step(right)[4]
+    np.testing.assert_array_equal(info["trusted"], [False, True])
+    np.testing.assert_array_equal(info["doubt"], [FOLDED, 0])
 
 
 def test_tasks_that_push_step_in_processes():
