@@ -428,7 +428,9 @@ def test_folds_of_many_bodies_and_around_every_axis():
         bodies = []
         for angle in (59.0, 61.0):
             turn = Rotation.from_rotvec(np.radians(angle) * axis).as_matrix()
-            bodies.append(np.vstack([frame_rows([s, 0, 0], r) for s, r in ((0.0, np.eye(3)), (0.1, turn), (0.2, turn))]))
+            bodies.append(
+                np.vstack([frame_rows([s, 0, 0], r) for s, r in ((0.0, np.eye(3)), (0.1, turn), (0.2, turn))])
+            )
         np.testing.assert_array_equal(are_folded(np.array(bodies), rows), [False, True])
 
 
