@@ -181,7 +181,7 @@ def _stored() -> dict[tuple[str, float], dict[str, Any]]:
 
 
 def carry() -> dict[str, object]:
-    """TetrapodCarry: farthest and last position to the right [mm], return and folded steps of 100, by mesh and agent."""
+    """TetrapodCarry: farthest and last position [mm], return and folded steps of 100, by mesh, payload and agent."""
     from softgym_envs.agents.evaluation import make_agent
     from softgym_envs.agents.policy import policy_path
     from softgym_envs.robots.tetrapod import MESHES

@@ -48,8 +48,9 @@ class FEMBatch(BatchBackend):
         count, size = len(designs), len(_rest(first)[1])
         self._slices = first.state.condensed.slices
         self._is_driven = np.arange(size) < len(robot.actuators)
-        self._present = _empty(count, len(first.model.nodes), size)
-        self._balanced = _empty(count, len(first.model.nodes), size) if self.moving else self._present
+        body = _beams(first).body
+        self._present = BeamStates.of(body, size, count, factors=self.moving)
+        self._balanced = BeamStates.of(body, size, count, factors=False) if self.moving else self._present
         self._is_balanced = np.ones(count, dtype=bool)
         self.command = np.zeros((count, len(robot.actuators)))
         self._converged = np.ones(count, dtype=bool)
@@ -93,6 +94,7 @@ class FEMBatch(BatchBackend):
             for states in (self._present, self._balanced):
                 states.x[i], states.effort[i], states.delta[i], states.compliance[i] = x, effort, delta, compliance
                 states.velocity[i] = 0.0
+                states.is_factored[i] = False
         self._stable[index] = True
         self._is_balanced[index] = True
 
@@ -140,6 +142,7 @@ class FEMBatch(BatchBackend):
         present.x[i], present.effort[i] = state.nodes, state.condensed.effort
         present.velocity[i] = 0.0 if state.motion is None else state.motion.velocity
         present.delta[i], present.compliance[i] = state.condensed.delta.array, state.condensed.compliance
+        present.is_factored[i] = False
         self._stable[i] = state.stable
         return True
 
@@ -241,13 +244,3 @@ def _rest(owner: FEMBackend) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     state = owner.reset()
     assert state.nodes is not None
     return state.nodes, state.condensed.effort, state.condensed.delta.array, state.condensed.compliance
-
-
-def _empty(count: int, rows: int, size: int) -> BeamStates:
-    return BeamStates(
-        x=np.zeros((count, rows, 3)),
-        velocity=np.zeros((count, rows, 3)),
-        effort=np.zeros((count, size)),
-        delta=np.zeros((count, size)),
-        compliance=np.zeros((count, size, size)),
-    )

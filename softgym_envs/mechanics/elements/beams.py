@@ -8,8 +8,8 @@ frame,
 
 with d_1 along the axis. They are objective (a rigid motion causes no strain), independent of the path, and quadratic in
 the rows of ``x``, so that energy, forces and exact tangent are polynomials of low degree; the frames replace directors
-by rotations. Reduced integration (one Gauss point for two nodes, two for three) avoids shear locking. An element resists
-a limited moment, beyond which it folds: see `are_folded`.
+by rotations. Reduced integration (one Gauss point for two nodes, two for three) avoids shear locking. An element
+resists a limited moment, beyond which it folds: see `are_folded`.
 """
 
 from __future__ import annotations
