@@ -27,6 +27,7 @@ from softgym_envs.mechanics.solvers.beam_equations import (
     motion_of,
     move,
     multiply_mass,
+    orthonormalise,
     point_strains,
 )
 from softgym_envs.mechanics.solvers.beam_newton import approach, factorise_tangent, invert_driven, make_factor, solve
@@ -189,6 +190,7 @@ def _march(
     """
     kept, kept_velocity, kept_effort, kept_totals = x.copy(), velocity.copy(), effort.copy(), totals.copy()
     first, goal = np.empty(effort.shape[0]), np.empty(effort.shape[0])
+    orthonormalise(body.frames, x)
     add_constraints(body, x, effort, equations, False)
     delta[:] = equations.delta
     kept_delta = delta.copy()
