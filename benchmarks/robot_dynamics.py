@@ -57,12 +57,13 @@ def quasi_static(names: Sequence[str] = tuple(ROBOTS), rest: int = 60) -> list[R
     return rows
 
 
-def workspace(values: Sequence[float] = (-1.0, 0.0, 1.0)) -> list[Row]:
+def workspace(values: Sequence[float] = (-1.0, 0.0, 1.0), mesh: str = "accurate") -> list[Row]:
     """Static positions of the Tetrapod's centre [mm] with each servo at one of these values times 90 degrees.
 
-    Published: -63 to 63 sideways, -181 to -85 in height, -150 at rest. Equilibria are followed from rest.
+    Published: -63 to 63 sideways, -181 to -85 in height, -150 at rest. Equilibria are followed from rest. On the
+    published mesh elements fold on the way to some commands.
     """
-    statics = Statics(make_robot("tetrapod").build())
+    statics = Statics(make_robot("tetrapod", mesh=mesh).build())
     rest = statics.solve(np.zeros(4))
     found = {}
     missing = 0
@@ -85,6 +86,12 @@ def workspace(values: Sequence[float] = (-1.0, 0.0, 1.0)) -> list[Row]:
             {s: p for s, p in found.items() if s[1] == s[3] == 0.0 and s[0] == -s[2]},
             63.0,
         ),
+        "furthest to the right, two neighbouring pairs [mm]": (
+            max,
+            0,
+            {s: p for s, p in found.items() if s[0] == s[1] == -s[2] == -s[3]},
+            63.0,
+        ),
     }
     for name, (choose, axis, places, published) in extremes.items():
         if places:
@@ -93,6 +100,11 @@ def workspace(values: Sequence[float] = (-1.0, 0.0, 1.0)) -> list[Row]:
     rows = [replace(row, error=row.value / row.reference - 1.0) for row in rows]
     rows.append(Row("Tetrapod: commands without equilibrium", f"of {len(found) + missing}", missing))
     return rows
+
+
+def tetrapod() -> dict[str, object]:
+    """Static workspace of the Tetrapod within a quarter turn of its servos, on the accurate mesh [mm]."""
+    return {row.case.removeprefix("Tetrapod: "): row.value for row in workspace()}
 
 
 def fall(solver: Dynamics, seconds: float = 4.0) -> Motion:

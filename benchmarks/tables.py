@@ -190,16 +190,19 @@ def agents() -> str:
 
 
 def carry() -> str:
-    """How far to the right the Tetrapod moves."""
-    found: dict[str, dict[str, str]] = {}
+    """How far to the right the Tetrapod moves, by controller and mesh."""
+    found: dict[str, dict[str, list[str]]] = {}
     for key, value in results("carry").items():
-        payload, _, name = key.partition(", ")
-        values = [float(v) for v in value.split(",")] if isinstance(value, str) else value
-        found.setdefault(name.partition(":")[0], {})[payload] = f"{values[0]:.1f} | {values[1]:.1f}"
-    rows = [[name, row.get("0 kg", " | "), row.get("1 kg", " | ")] for name, row in found.items()]
-    head = ["controller", "no payload: farthest [mm]", "end [mm]", "1 kg: farthest [mm]", "end [mm]"]
-    lines = markdown(head, [], "lrrrr").splitlines()
-    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
+        mesh, _, name = key.partition(":")[0].split(", ", 2)
+        farthest, last, _, folded = value.split(", ")
+        found.setdefault(name, {}).setdefault(mesh, []).extend([farthest, last, folded])
+    rows = [
+        [name if k == 0 else "", mesh, *cells]
+        for name, meshes in found.items()
+        for k, (mesh, cells) in enumerate(meshes.items())
+    ]
+    head = ["controller", "mesh", "no payload: farthest [mm]", "end [mm]", "folded steps"]
+    return markdown([*head, "1 kg: farthest [mm]", "end [mm]", "folded steps"], rows, "llrrrrrr")
 
 
 # -- surrogates -----------------------------------------------------------------------------------------------------

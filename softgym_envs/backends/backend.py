@@ -49,7 +49,8 @@ class State:
             surrogate). In dynamics: the tangent of the time step, including inertia, is positive definite.
         uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM without
             learned superelements.
-        trusted: the state lies where the learned model may be trusted; always True for FEM without superelements.
+        trusted: the model may be trusted at the state. FEM is trusted unless a beam folds or a superelement is loaded
+            beyond what it has learned.
         doubt: why it is not trusted, 0 if it is: a sum of numbers in `softgym_envs.surrogate.domain.DOUBTS`.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
         contacts: where the body touches, with forces and gaps; None if it cannot touch anything.

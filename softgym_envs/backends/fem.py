@@ -20,7 +20,7 @@ from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import TOUCH_RADIUS, Robot
-from softgym_envs.surrogate.domain import LOADED, SOFT, SPREAD
+from softgym_envs.surrogate.domain import FOLDED, LOADED, SOFT, SPREAD
 
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
@@ -340,6 +340,8 @@ class FEMBackend(Backend):
             assert self._dynamics is not None
             velocity = self._dynamics.effector_velocity().reshape(-1, 3)
         doubt = 0 if all(block.knows(equilibrium.x) for block in self.model.blocks) else LOADED
+        if any(block.is_folded(equilibrium.x) for block in self.model.blocks):
+            doubt |= FOLDED
         uncertainty = 0.0
         learned = any(block.learned for block in self.model.blocks)
         if learned and not equilibrium.stable:

@@ -12,9 +12,11 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.elements.beams import are_folded
 from softgym_envs.mechanics.solvers.beam_batch import BeamBatch, BeamStates
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.domain import FOLDED
 
 
 class FEMBatch(BatchBackend):
@@ -46,8 +48,9 @@ class FEMBatch(BatchBackend):
         count, size = len(designs), len(_rest(first)[1])
         self._slices = first.state.condensed.slices
         self._is_driven = np.arange(size) < len(robot.actuators)
-        self._present = _empty(count, len(first.model.nodes), size)
-        self._balanced = _empty(count, len(first.model.nodes), size) if self.moving else self._present
+        body = _beams(first).body
+        self._present = BeamStates.of(body, size, count, factors=self.moving)
+        self._balanced = BeamStates.of(body, size, count, factors=False) if self.moving else self._present
         self._is_balanced = np.ones(count, dtype=bool)
         self.command = np.zeros((count, len(robot.actuators)))
         self._converged = np.ones(count, dtype=bool)
@@ -65,6 +68,7 @@ class FEMBatch(BatchBackend):
         numbers = {design: k for k, design in enumerate(used)}
         self._numbers = np.array([numbers[design] for design in self._designs])
         solvers = [_beams(owner) for owner in self._owners.values()]
+        self._frames = solvers[0].body.elements.frames
         self._beams = BeamBatch([s.body for s in solvers], [owner.model.loads for owner in self._owners.values()])
 
     def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
@@ -90,6 +94,7 @@ class FEMBatch(BatchBackend):
             for states in (self._present, self._balanced):
                 states.x[i], states.effort[i], states.delta[i], states.compliance[i] = x, effort, delta, compliance
                 states.velocity[i] = 0.0
+                states.is_factored[i] = False
         self._stable[index] = True
         self._is_balanced[index] = True
 
@@ -137,6 +142,7 @@ class FEMBatch(BatchBackend):
         present.x[i], present.effort[i] = state.nodes, state.condensed.effort
         present.velocity[i] = 0.0 if state.motion is None else state.motion.velocity
         present.delta[i], present.compliance[i] = state.condensed.delta.array, state.condensed.compliance
+        present.is_factored[i] = False
         self._stable[i] = state.stable
         return True
 
@@ -168,7 +174,7 @@ class FEMBatch(BatchBackend):
             slack,
             converged,
             np.zeros(count),
-            np.zeros(count, dtype=np.int64),
+            np.where(are_folded(states.x, self._frames), FOLDED, 0),
         )
 
     @property
@@ -238,13 +244,3 @@ def _rest(owner: FEMBackend) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     state = owner.reset()
     assert state.nodes is not None
     return state.nodes, state.condensed.effort, state.condensed.delta.array, state.condensed.compliance
-
-
-def _empty(count: int, rows: int, size: int) -> BeamStates:
-    return BeamStates(
-        x=np.zeros((count, rows, 3)),
-        velocity=np.zeros((count, rows, 3)),
-        effort=np.zeros((count, size)),
-        delta=np.zeros((count, size)),
-        compliance=np.zeros((count, size, size)),
-    )

@@ -80,7 +80,7 @@ class _Announcement(event.Listener):
     """Prints one line before the first kernel of the package is compiled."""
 
     def on_start(self, event: event.Event) -> None:
-        module = getattr(event.data["dispatcher"].py_func, "__module__", "")
+        module = getattr(event.data["dispatcher"].py_func, "__module__", None) or ""  # None where code made it
         if module.startswith("softgym_envs.") and ANNOUNCED not in os.environ:
             os.environ[ANNOUNCED] = "1"
             print(

@@ -15,6 +15,7 @@ from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.solvers.beam_batch import BeamBatch
 from softgym_envs.robots.tetrapod import Tetrapod
+from softgym_envs.surrogate.domain import FOLDED
 
 TETRAPOD, TRUNK = "SoftGym/TetrapodReach-v0", "SoftGym/TrunkReach-v0"
 STEPS = 6
@@ -95,6 +96,40 @@ def test_rows_that_the_compiled_solver_leaves_go_to_the_general_one(monkeypatch)
 
     monkeypatch.setattr(BeamBatch, "march", fails_first)
     assert compare_with_singles(TETRAPOD, {"robot_options": {"elements": 2}}, [{}, {}]) < 0.999
+
+
+def test_factors_serve_the_next_step_of_the_same_motion_only():
+    env = gymnasium.make_vec(TETRAPOD, 3, robot_options={"elements": 2}, max_episode_steps=10**6)
+    env.reset(seed=0)
+    backend = env.unwrapped.backend
+    states = backend._present
+    assert not states.is_factored.any()
+    env.step(np.full((3, 4), 0.5, dtype=np.float32))
+    assert states.is_factored.all()
+    backend._step_alone(2, backend.command[2])
+    env.reset(options={"reset_mask": np.array([True, False, False])})
+    np.testing.assert_array_equal(states.is_factored, [False, True, False])
+    start, command = states.copy(), backend.command + 0.1
+    backend.step(command)
+    found = states.copy()
+    for name, array in vars(start).items():
+        getattr(states, name)[:] = array
+    states.is_factored[:] = False
+    backend.command = command - 0.1
+    backend.step(command)
+    np.testing.assert_allclose(found.x, states.x, atol=1e-9)
+    np.testing.assert_allclose(found.compliance, states.compliance, atol=1e-7 * np.abs(states.compliance).max())
+    assert (found.x[1] != states.x[1]).any() and (found.x[[0, 2]] == states.x[[0, 2]]).all()
+
+
+def test_rows_with_folded_legs_are_not_trusted():
+    env = gymnasium.make_vec("SoftGym/TetrapodCarry-v0", 2)
+    env.reset(seed=0)
+    right = np.array([[1.0, 1.0, -1.0, 1.0], [1.0, 0.0, -1.0, 0.0]], dtype=np.float32)
+    for _ in range(12):
+        info = env.step(right)[4]
+    np.testing.assert_array_equal(info["trusted"], [False, True])
+    np.testing.assert_array_equal(info["doubt"], [FOLDED, 0])
 
 
 def test_tasks_that_push_step_in_processes():

@@ -14,7 +14,7 @@ from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements import averaged, beams, quadratic, superelement, tetrahedra
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
-from softgym_envs.mechanics.elements.beams import Beam, Section
+from softgym_envs.mechanics.elements.beams import Beam, Section, are_folded
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, add_midside_nodes, split_triangles
 from softgym_envs.mechanics.elements.superelement import Superelement
@@ -394,6 +394,44 @@ def test_a_curved_rest_shape_is_free_of_strain(make_beam):
         model = make_beam(order, "curved")
         np.testing.assert_allclose(model.blocks[0].strains(model.nodes), 0.0, atol=1e-14)
         np.testing.assert_allclose(Statics(model).solve([]).x, model.nodes, atol=1e-14)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_beam_counts_as_folded_before_its_moment_falls(order):
+    places = np.linspace(0.0, 0.1, order + 1)
+    angles = np.radians(np.arange(1.0, 90.0))
+    energies, folded = [], []
+    nodes = np.vstack([frame_rows([s, 0.0, 0.0]) for s in places])
+    beam = Beam(
+        nodes,
+        4 * np.arange(order + 1),
+        section=Section.rectangle(0.01, 0.005),
+        young_modulus=1e7,
+        order=order,
+    )
+    for angle in angles:
+        turns = Rotation.from_rotvec(angle * (np.arange(order + 1) - 0.5 * order)[:, None] * [0.0, 0.0, 1.0])
+        bent = np.vstack([frame_rows([s, 0.0, 0.0], turn) for s, turn in zip(places, turns.as_matrix(), strict=True)])
+        bending = beam.strains(bent)[..., 3:]
+        energies.append(0.5 * (beam.weights[..., None] * beam.element_stiffness[:, None, 3:] * bending**2).sum())
+        folded.append(beam.is_folded(bent))
+    moments = np.gradient(energies, angles)
+    largest, first = angles[moments.argmax()], angles[np.argmax(folded)]
+    print(np.degrees([first, largest]))
+    assert not folded[0] and folded[-1]
+    assert 0.0 <= np.degrees(largest - first) + 1.1 <= 4.0
+
+
+def test_folds_of_many_bodies_and_around_every_axis():
+    rows = np.array([[0, 4, 8]])
+    for axis in np.eye(3):
+        bodies = []
+        for angle in (59.0, 61.0):
+            turn = Rotation.from_rotvec(np.radians(angle) * axis).as_matrix()
+            bodies.append(
+                np.vstack([frame_rows([s, 0, 0], r) for s, r in ((0.0, np.eye(3)), (0.1, turn), (0.2, turn))])
+            )
+        np.testing.assert_array_equal(are_folded(np.array(bodies), rows), [False, True])
 
 
 def test_malformed_beams_are_rejected():

@@ -14,7 +14,8 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError, DesignError
 from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.tetrapod import CENTRE_MASS
+from softgym_envs.robots.tetrapod import CENTRE_MASS, MESHES
+from softgym_envs.surrogate.domain import doubt_text
 
 
 @pytest.fixture(scope="module")
@@ -50,23 +51,32 @@ def test_published_robot(robot):
 def test_rest_and_workspace():
     """Published: -150 mm at rest, -181 to -85 mm in height, 63 mm to the side.
 
-    With one servo against the three others the centre goes further to the side than published.
+    The mesh is the accurate one: on the published one legs fold on the way to some commands, see below.
     """
     rows = {row.case: row for row in cases.workspace((-1.0, 1.0))}
     for row in rows.values():
         print(f"{row.case} {row.setting}: {row.value:.2f} ({row.reference})")
-    assert rows["Tetrapod: height at rest [mm]"].value == pytest.approx(-147.83, abs=0.01)
+    assert rows["Tetrapod: height at rest [mm]"].value == pytest.approx(-147.83, abs=0.3)
     assert rows["Tetrapod: lowest [mm]"].error == pytest.approx(0.0, abs=0.01)
     assert rows["Tetrapod: highest [mm]"].error == pytest.approx(0.0, abs=0.03)
-    assert rows["Tetrapod: furthest to the right [mm]"].value == pytest.approx(87.8, abs=0.1)
-    statics = Statics(make_robot("tetrapod").build())
-    statics.solve(np.zeros(4))
-    for command in ([1.0, 0.0, -1.0, 0.0], [1.0, 1.0, -1.0, -1.0]):
-        statics.reset()
-        for k in range(7):
-            end = statics.solve(k / 6.0 * 0.5 * np.pi * np.array(command)).delta[4:7]
-        print(command, end)
-        assert end[0] == pytest.approx(0.063, rel=0.1)
+    assert rows["Tetrapod: furthest to the right [mm]"].error == pytest.approx(0.0, abs=0.05)
+    assert rows["Tetrapod: commands without equilibrium"].value == 0
+
+
+def test_a_leg_that_folds_is_not_trusted():
+    """On the published mesh a slow motion to the right folds a leg; on finer ones it does not, and they agree."""
+    ends = {}
+    for mesh in MESHES:
+        backend = FEMBackend(make_robot("tetrapod", mesh=mesh))
+        assert backend.state.trusted
+        for k in range(1, 13):
+            state = backend.step(k / 12 * 0.5 * np.pi * np.array([1.0, 1.0, -1.0, 1.0]))
+        ends[mesh] = state.effector[0]
+        assert state.trusted == (mesh != "published")
+        assert doubt_text(state.doubt) == ("folded beam" if mesh == "published" else "")
+    assert ends["published"][0] == pytest.approx(0.088, abs=1e-3)
+    assert ends["accurate"][0] == pytest.approx(0.063, abs=1e-3)
+    np.testing.assert_allclose(ends["accurate"], ends["reference"], atol=4e-4)
 
 
 def test_a_quarter_turn_of_the_commands_turns_the_motion(robot):

@@ -15,8 +15,8 @@ from softgym_envs.robots.base import Robot
 class Carry(Task):
     """A goal far to the right (+x) that slow motions do not reach; only x counts (thesis, sec. 5.3).
 
-    With a mass at the effector, momentum carries it further than a straight motion to the goal. An episode succeeds if
-    the effector ends beyond the goal or within the robot's goal tolerance of it; the reward goes on growing beyond it.
+    With a mass at the effector, momentum may carry it further than a straight motion to the goal. An episode succeeds
+    if the effector ends beyond the goal or within the robot's goal tolerance of it; the reward goes on growing beyond.
 
     Args:
         robot: the robot.

@@ -14,20 +14,20 @@ from softgym_envs.mechanics.compilation import FAST, njit
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def interpolate(x, rows, shape, slope, z):
-    """Fill ``z`` at rows ``x`` (n, 3)."""
+    """Fill ``z`` at rows ``x`` (n, 3); elements have two or three frames."""
+    last = rows.shape[0] - 1
+    i, j, k = rows[0], rows[1], rows[last]
+    a, b, c = shape[0], shape[1], shape[last]
+    p, q, r = slope[0], slope[1], slope[last]
+    if last == 1:
+        c = r = 0.0
     for d in range(3):
-        t, a, b, c, u, v, w = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for f in range(rows.shape[0]):
-            row, h, s = rows[f], shape[f], slope[f]
-            p, q, r = x[row + 1, d], x[row + 2, d], x[row + 3, d]
-            t += s * x[row, d]
-            a += h * p
-            b += h * q
-            c += h * r
-            u += s * p
-            v += s * q
-            w += s * r
-        z[0, d], z[1, d], z[2, d], z[3, d], z[4, d], z[5, d], z[6, d] = t, a, b, c, u, v, w
+        z[0, d] = p * x[i, d] + q * x[j, d] + r * x[k, d]
+    for m in range(1, 4):
+        for d in range(3):
+            u, v, w = x[i + m, d], x[j + m, d], x[k + m, d]
+            z[m, d] = a * u + b * v + c * w
+            z[3 + m, d] = p * u + q * v + r * w
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -63,15 +63,13 @@ def pull_back(z, stress, gradient):
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def add_forces(gradient, rows, shape, slope, out):
     """Add the derivative by the rows to ``out`` (n, 3), given that by ``z``, ``gradient`` (7, 3)."""
-    for d in range(3):
-        t, a, b, c = gradient[0, d], gradient[1, d], gradient[2, d], gradient[3, d]
-        u, v, w = gradient[4, d], gradient[5, d], gradient[6, d]
-        for f in range(rows.shape[0]):
-            row, h, s = rows[f], shape[f], slope[f]
-            out[row, d] += s * t
-            out[row + 1, d] += h * a + s * u
-            out[row + 2, d] += h * b + s * v
-            out[row + 3, d] += h * c + s * w
+    for f in range(rows.shape[0]):
+        row, h, s = rows[f], shape[f], slope[f]
+        for d in range(3):
+            out[row, d] += s * gradient[0, d]
+            out[row + 1, d] += h * gradient[1, d] + s * gradient[4, d]
+            out[row + 2, d] += h * gradient[2, d] + s * gradient[5, d]
+            out[row + 3, d] += h * gradient[3, d] + s * gradient[6, d]
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)

@@ -8,7 +8,8 @@ frame,
 
 with d_1 along the axis. They are objective (a rigid motion causes no strain), independent of the path, and quadratic in
 the rows of ``x``, so that energy, forces and exact tangent are polynomials of low degree; the frames replace directors
-by rotations. Reduced integration (one Gauss point for two nodes, two for three) avoids shear locking.
+by rotations. Reduced integration (one Gauss point for two nodes, two for three) avoids shear locking. An element
+resists a limited moment, beyond which it folds: see `are_folded`.
 """
 
 from __future__ import annotations
@@ -87,6 +88,29 @@ class Section:
                 young_modulus * self.inertia[1],
             ]
         )
+
+
+LARGEST_TURNS = {1: 0.25 * np.pi, 2: np.pi / 3.0}
+"""Angle between neighbouring frames [rad], by order of the element, up to which its moment grows. Directors between
+frames are interpolated and become shorter, so bending counts less and less: with one Gauss point the moment of frames
+that are an angle t apart is as sin(2 t); with two it is largest at 62 degrees."""
+
+
+def are_folded(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return whether neighbouring frames of an element are farther apart than `LARGEST_TURNS`.
+
+    Such an element has yielded: the farther it bends, the less it resists. A finer mesh does not fold there.
+
+    Args:
+        x: rows of one or many bodies [m], shape (..., n, 3).
+        rows: first rows of the frames of each element, shape (m, order + 1).
+
+    Returns:
+        Shape (...).
+    """
+    directors = x[..., rows[:, :, None] + np.arange(1, 4), :]
+    cosines = 0.5 * np.einsum("...mkid,...mkid->...mk", directors[..., :-1, :, :], directors[..., 1:, :, :]) - 0.5
+    return (cosines < np.cos(LARGEST_TURNS[rows.shape[1] - 1])).any(axis=(-2, -1))
 
 
 # Quantities of a cross-section that are linear in the rows: r', d1..d3, d1'..d3'; which row of a frame each belongs to.
@@ -338,6 +362,9 @@ class Beam(ElementBlock):
         out = np.empty((*self.weights.shape, 6))
         _strains_at(x, self.rows, self.shape, self.slope, out)
         return out
+
+    def is_folded(self, x: np.ndarray) -> bool:
+        return bool(are_folded(x, self.rows))
 
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
         rows = self.rows[:, :, None] + np.arange(4)

@@ -65,6 +65,10 @@ class ElementBlock(ABC):
         """Whether the energy is known at rows ``x`` (n, 3); learned ones are known where they were learned."""
         return True
 
+    def is_folded(self, x: np.ndarray) -> bool:
+        """Whether an element is bent beyond what it can resist at rows ``x`` (n, 3), which depends on the mesh."""
+        return False
+
     def possible_errors(self, x: np.ndarray, fields: np.ndarray) -> np.ndarray:
         """Return the work of possible errors of the forces at rows ``x`` (n, 3) along motions of the rows.
 

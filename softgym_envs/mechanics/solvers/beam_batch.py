@@ -20,10 +20,10 @@ from softgym_envs.mechanics.solvers.beam_body import (
     Rows,
     Servos,
 )
-from softgym_envs.mechanics.solvers.beam_equations import make_equations
+from softgym_envs.mechanics.solvers.beam_equations import Equations, make_equations
 from softgym_envs.mechanics.solvers.beam_motion import drive
-from softgym_envs.mechanics.solvers.beam_newton import make_factor
-from softgym_envs.mechanics.solvers.block_cholesky import BlockPattern
+from softgym_envs.mechanics.solvers.beam_newton import Factor, make_factor
+from softgym_envs.mechanics.solvers.block_cholesky import SIZE, BlockPattern
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,11 @@ class BeamStates:
         effort: of all constraint rows, shape (B, size).
         delta: their values, shape (B, size).
         compliance: ``W`` at the end of the last step, shape (B, size, size).
+        tangent: factorised tangents at the end of the last step, with which the next one begins, shape (B, blocks, 6,
+            6). States without them, shape (0, blocks, 6, 6), factorise anew.
+        half: what follows from them, see `Factor`, shape (B, size, b, 6) or (0, size, b, 6).
+        signs: of their pivots, shape (B, b, 6) or (0, b, 6).
+        is_factored: which states have a tangent, shape (B,). Whoever changes a state must clear it.
     """
 
     x: np.ndarray
@@ -43,6 +48,26 @@ class BeamStates:
     effort: np.ndarray
     delta: np.ndarray
     compliance: np.ndarray
+    tangent: np.ndarray
+    half: np.ndarray
+    signs: np.ndarray
+    is_factored: np.ndarray
+
+    @classmethod
+    def of(cls, body: BeamBody, size: int, count: int, *, factors: bool) -> BeamStates:
+        """Return ``count`` states of a body with ``size`` constraint rows, all zero, which may keep their factors."""
+        frames, rows, kept = len(body.components.free), len(body.rows.kind), count if factors else 0
+        return cls(
+            x=np.zeros((count, rows, 3)),
+            velocity=np.zeros((count, rows, 3)),
+            effort=np.zeros((count, size)),
+            delta=np.zeros((count, size)),
+            compliance=np.zeros((count, size, size)),
+            tangent=np.zeros((kept, body.pattern.blocks, SIZE, SIZE)),
+            half=np.zeros((kept, size, frames, SIZE)),
+            signs=np.zeros((kept, frames, SIZE)),
+            is_factored=np.zeros(count, dtype=bool),
+        )
 
     def copy(self) -> BeamStates:
         """Return a copy."""
@@ -114,6 +139,10 @@ class BeamBatch:
             states.effort,
             states.delta,
             states.compliance,
+            states.tangent,
+            states.half,
+            states.signs,
+            states.is_factored,
             targets,
             is_driven,
             unilateral,
@@ -169,6 +198,10 @@ def _march_all(
     efforts,
     deltas,
     compliances,
+    tangents,
+    halves,
+    signs,
+    is_factored,
     targets,
     is_driven,
     unilateral,
@@ -183,12 +216,28 @@ def _march_all(
 ):
     """Do what `BeamBatch.march` says; ``solved`` and ``stable`` (B,) are what it returns."""
     totals, delta = np.zeros(7), np.zeros(efforts.shape[1])
+    keeps = tangents.shape[0] > 0
+    q, f = equations, factor
     for k in range(numbers.shape[0]):
+        if keeps:  # the solver works in the arrays of the state
+            q = Equations(
+                equations.gradient,
+                equations.momentum,
+                equations.residual,
+                tangents[k],
+                equations.delta,
+                equations.H,
+                equations.energy,
+            )
+            f = Factor(
+                halves[k], factor.compliance, factor.driven, signs[k], factor.step, factor.efforts, factor.turned
+            )
+            f.compliance[:] = compliances[k]
         x, velocity, effort = xs[k].copy(), velocities[k].copy(), efforts[k].copy()
         taken = drive(
             _body(bodies, numbers[k]),
-            equations,
-            factor,
+            q,
+            f,
             strains,
             x,
             velocity,
@@ -205,7 +254,9 @@ def _march_all(
             tolerance,
             cuts,
             totals,
+            is_factored[k] and h < np.inf,
         )
+        is_factored[k] = keeps and taken == targets.shape[1] and totals[6] == 1.0  # not for a part of a time step
         if taken == targets.shape[1]:
             solved[k], stable[k] = True, totals[5] == 0.0
             xs[k] = x

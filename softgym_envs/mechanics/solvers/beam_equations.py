@@ -513,12 +513,31 @@ def assemble(body, x, effort, step, equations, full):
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
+def orthonormalise(frames, x):
+    """Orthonormalise the directors of the frames in place, so that round-off does not accumulate over a long motion."""
+    turned, gram = np.empty((3, 3)), np.empty((3, 3))
+    for f in range(frames.rows.shape[0]):
+        row = frames.rows[f]
+        for k in range(3):
+            for d in range(3):
+                turned[k, d] = x[row + 1 + k, d]
+        for k in range(3):
+            for m in range(3):
+                gram[k, m] = turned[k, 0] * turned[m, 0] + turned[k, 1] * turned[m, 1] + turned[k, 2] * turned[m, 2]
+        for k in range(3):
+            for d in range(3):
+                value = 1.5 * turned[k, d]
+                for m in range(3):
+                    value -= 0.5 * gram[k, m] * turned[m, d]
+                x[row + 1 + k, d] = value
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def move(frames, x, motion, turned):
     """Move the frames in place by ``motion`` (b, 6): displacements of their origins [m], and spins [rad].
 
-    ``turned`` (3, 3) is a work array.
+    ``turned`` (3, 3) is a work array. Call `orthonormalise` from time to time.
     """
-    gram = np.empty((3, 3))
     for f in range(frames.rows.shape[0]):
         row, step = frames.rows[f], motion[frames.block[f]]
         a, b, c = step[3], step[4], step[5]
@@ -536,16 +555,9 @@ def move(frames, x, motion, turned):
             turned[k, 0] = p + first * u + second * (b * w - c * v)
             turned[k, 1] = q + first * v + second * (c * u - a * w)
             turned[k, 2] = r + first * w + second * (a * v - b * u)
-        # Orthonormalise, so that round-off does not accumulate over a long motion.
-        for k in range(3):
-            for m in range(3):
-                gram[k, m] = turned[k, 0] * turned[m, 0] + turned[k, 1] * turned[m, 1] + turned[k, 2] * turned[m, 2]
         for k in range(3):
             for d in range(3):
-                value = 1.5 * turned[k, d]
-                for m in range(3):
-                    value -= 0.5 * gram[k, m] * turned[m, d]
-                x[row + 1 + k, d] = value
+                x[row + 1 + k, d] = turned[k, d]
         for d in range(3):
             x[row, d] += step[d]
     for c in range(frames.mounted.shape[0]):

@@ -27,9 +27,10 @@ from softgym_envs.mechanics.solvers.beam_equations import (
     motion_of,
     move,
     multiply_mass,
+    orthonormalise,
     point_strains,
 )
-from softgym_envs.mechanics.solvers.beam_newton import approach, factorise_tangent, make_factor, solve
+from softgym_envs.mechanics.solvers.beam_newton import approach, factorise_tangent, invert_driven, make_factor, solve
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED
 
 INCREMENTS = 4
@@ -177,20 +178,25 @@ def _march(
     cuts,
     totals,
     finish,
+    known,
 ):
     """Take time steps in place until one fails or exceeds a limit, which is undone; the number of steps taken.
 
     A time step that fails is halved up to ``cuts`` times, along with the way to its target. ``totals`` (7,) receives
     kinetic and elastic energy, work, dissipation, the iterations of the last step, the number of negative eigenvalues
     of the tangent at its end, and the number of its parts. Only if ``finish``, this one and the compliances are those
-    at the end of the last step.
+    at the end of the last step. ``known`` says that ``factor`` is that of the tangent at the start, with ``W`` of all
+    rows and for the same ``h``.
     """
     kept, kept_velocity, kept_effort, kept_totals = x.copy(), velocity.copy(), effort.copy(), totals.copy()
     first, goal = np.empty(effort.shape[0]), np.empty(effort.shape[0])
+    orthonormalise(body.frames, x)
     add_constraints(body, x, effort, equations, False)
     delta[:] = equations.delta
     kept_delta = delta.copy()
-    fresh = True
+    fresh = not known
+    if known:
+        invert_driven(factor, driven)
     for k in range(targets.shape[0]):
         kept[:] = x
         kept_effort[:] = effort
@@ -277,11 +283,12 @@ def drive(
     tolerance,
     cuts,
     totals,
+    known,
 ):
     """Take time steps as `_march`, in which driven actuators stop at their largest effort ``limit`` (l,).
 
     An actuator that would exceed its limit is driven by that effort instead, until its command asks for less than it
-    has reached. Returns the number of steps taken.
+    has reached. Returns the number of steps taken, all of them only with the factor of the tangent at the end.
     """
     count, steps = limit.shape[0], targets.shape[0]
     driven, forced = np.flatnonzero(is_driven), np.flatnonzero(~is_driven)
@@ -324,6 +331,7 @@ def drive(
                 cuts,
                 totals,
                 True,
+                known and taken == 0 and not one_way.any(),
             )
             taken += done
             if done or count == 0:
@@ -367,6 +375,7 @@ def drive(
                 cuts,
                 totals,
                 taken == steps - 1,
+                False,
             )
             if not done:
                 break
@@ -472,6 +481,7 @@ class BeamMotion:
             tolerance,
             cuts,
             totals,
+            False,  # what follows from a state must not depend on what was computed before
         )
         kinetic, elastic, work, dissipated, iterations, negative, parts = totals.tolist()
         delta = self.equations.delta.copy() if count else delta

@@ -95,6 +95,17 @@ def factorise_tangent(body, equations, factor, rows):
     return negative
 
 
+@njit(cache=True, error_model="numpy")
+def invert_driven(factor, driven):
+    """Fill the inverse of the part of ``W`` that belongs to driven rows (d,)."""
+    count = driven.shape[0]
+    among = np.empty((count, count))
+    for i in range(count):
+        for j in range(count):
+            among[i, j] = factor.compliance[driven[i], driven[j]]
+    factor.driven[:count, :count] = np.linalg.inv(among)
+
+
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def _correct(body, equations, factor, effort, target, driven, forced, one_way):
     """Solve the linearised equations for the steps of the motions and of the efforts, as `Statics` does.
@@ -160,12 +171,7 @@ def _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, 
     if negative < 0 or (negative and (definite or one_way.any())):
         return -1
     if not one_way.any():
-        count = driven.shape[0]
-        among = np.empty((count, count))
-        for i in range(count):
-            for j in range(count):
-                among[i, j] = factor.compliance[driven[i], driven[j]]
-        factor.driven[:count, :count] = np.linalg.inv(among)
+        invert_driven(factor, driven)
     return negative
 
 
