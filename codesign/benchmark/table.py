@@ -26,8 +26,10 @@ from softgym_envs.config import provenance
 from softgym_envs.errors import DataError, unknown_name
 from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_npz
+from softgym_envs.surrogate.pretrained import ships_weights
 
 if TYPE_CHECKING:
+    from softgym_envs.agents.config import EnvironmentConfig
     from softgym_envs.envs.env import SoftRobotEnv
     from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
@@ -206,15 +208,22 @@ class Tabulation:
         columns = np.stack([found.distances, found.efforts, found.successes.astype(float)], axis=1)
         return columns.reshape(len(points), len(self.goals), -1).mean(axis=1)
 
-    def at_rest(self, points: np.ndarray) -> np.ndarray:
-        """Return `COLUMNS` where the inverse QP comes to rest on the learned model."""
-        return self._at_rest(points)[0]
+    def environment(self, mesh: str | None) -> EnvironmentConfig:
+        """Return the environment of the problem on a mesh of its robot; None: the mesh of the problem."""
+        environment = self.problem.definition.environment
+        if mesh is None:
+            return environment
+        return environment.model_copy(update={"robot_options": {**environment.robot_options, "mesh": mesh}})
 
-    def _at_rest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def at_rest(self, mesh: str | None, points: np.ndarray) -> np.ndarray:
+        """Return `COLUMNS` where the inverse QP comes to rest on the learned model of a mesh."""
+        return self._at_rest(mesh, points)[0]
+
+    def _at_rest(self, mesh: str | None, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `COLUMNS` of each body, and the last commands, shape (k, g, n_a)."""
         count, goals = len(points), self.goals
         tiled = np.tile(goals, (count, 1, 1))
-        made = self.problem.definition.environment.make_vec(len(tiled), sample_design=False)
+        made = self.environment(mesh).make_vec(len(tiled), sample_design=False)
         env = cast("SoftRobotVectorEnv", made.unwrapped)
         try:
             designs = [design for design in self.designs(points) for _ in goals]
@@ -234,13 +243,15 @@ class Tabulation:
         return np.array([[values.get(name, np.nan) for name in COLUMNS] for values in rows])
 
     def fem(self, mesh: str | None, points: np.ndarray) -> np.ndarray:
-        """Return `COLUMNS` where the inverse QP comes to rest on finite elements; default the mesh of the robot."""
-        environment = self.problem.definition.environment.on("fem")
-        if mesh is not None:
-            options = {**environment.robot_options, "mesh": mesh}
-            environment = environment.model_copy(update={"robot_options": options})
-        _, commands = self._at_rest(points)
-        made = environment.make(sample_design=False)
+        """Return `COLUMNS` where the inverse QP comes to rest on finite elements of a mesh.
+
+        Bodies begin with the commands that the learned model of this mesh rests at; without one, with those of the
+        problem's.
+        """
+        environment = self.environment(mesh)
+        robot = self.problem.definition.model_copy(update={"environment": environment}).robot
+        _, commands = self._at_rest(mesh if ships_weights(robot) else None, points)
+        made = environment.on("fem").make(sample_design=False)
         env = cast("SoftRobotEnv", made.unwrapped)
         try:
             rows = [
@@ -262,7 +273,12 @@ class TableJudge:
 
 
 TABLE_JUDGES: dict[str, TableJudge] = {
-    "rest": TableJudge("inverse QP, at rest on the learned model", 256, Tabulation.at_rest),
+    "rest": TableJudge("inverse QP, at rest on the learned model", 256, lambda t, points: t.at_rest(None, points)),
+    "rest_accurate": TableJudge(
+        "inverse QP, at rest on the learned model of the accurate mesh",
+        256,
+        lambda t, points: t.at_rest("accurate", points),
+    ),
     "qp": TableJudge("inverse QP, whole episodes", CHUNK, lambda t, points: t.episodes("qp", points)),
     "shared": TableJudge(
         "one policy for all bodies, whole episodes",

@@ -24,7 +24,6 @@ def benchmark() -> None:
 
     Scores of submissions are those on finite elements.
     """
-    require("codesign")
 
 
 @benchmark.command(name="list")
@@ -96,6 +95,7 @@ def run(
     from softgym_envs.codesign.benchmark import references, runs
     from softgym_envs.codesign.benchmark.table import Table
 
+    require("codesign")
     listed = None if table is None else Table.read(names[0], table)
     if listed is not None and len(names) > 1:
         raise ValueError("--table is of one problem; give one name")
@@ -250,7 +250,8 @@ def freeze(names: tuple[str, ...], keep: bool) -> None:
     metavar="JUDGE=N",
     default=("rest=100000", "qp=1000"),
     show_default=True,
-    help="Judge and how many bodies it scores: rest, qp, shared, trained, fem or fem_accurate; several with several.",
+    help="Judge and how many bodies it scores: rest, rest_accurate, qp, shared, trained, fem or fem_accurate; several "
+    "with several.",
 )
 @click.option(
     "--longest",
