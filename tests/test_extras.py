@@ -39,6 +39,7 @@ def without(monkeypatch):
         ("rerun", "viewer", ["rollout", "SoftGym/FingerReach-v0", "--record", "x.rrd"]),
         ("optuna", "codesign", ["codesign", "--config", "finger_reach"]),
         ("markupsafe", "codesign", ["codesign", "--config", "finger_reach"]),
+        ("optuna", "codesign", ["benchmark", "run", "finger-zone-v1", "--method", "tpe"]),
         ("gmsh", "geometry", ["show", "finger", "--option", "mesh_size=0.0061"]),
     ],
 )

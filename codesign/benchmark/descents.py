@@ -5,7 +5,6 @@ A descent does not run whole episodes: it goes to the states where the inverse Q
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, cast
 
@@ -14,6 +13,7 @@ import torch
 from scipy.stats import qmc
 from torch import Tensor
 
+from softgym_envs.codesign.benchmark.clock import working_seconds
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem
 from softgym_envs.codesign.benchmark.problem import Score
 from softgym_envs.codesign.benchmark.rest import settle
@@ -165,7 +165,7 @@ class GradientOptimiser:
 
     def ask(self) -> Mapping[str, float]:
         """Return the best body of a new descent."""
-        began, cost = time.process_time(), self._cost
+        began, cost = working_seconds(), self._cost
         start = 2.0 * self._starts.random(1)[0] - 1.0
         cost.best, cost.steps_left = None, self._charged + self.steps_left
         try:
@@ -173,7 +173,7 @@ class GradientOptimiser:
         except StepsSpent:
             pass
         point = start if cost.best is None else cost.best[0]
-        self._seconds += time.process_time() - began
+        self._seconds += working_seconds() - began
         design = cost.box.design(point)
         return {name: design[name] for name in self._names}
 

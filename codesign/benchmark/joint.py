@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import time
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.joint import PROPOSERS
 from softgym_envs.agents.training import train
+from softgym_envs.codesign.benchmark.clock import working_seconds
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem
 from softgym_envs.codesign.benchmark.problem import Score
 from softgym_envs.codesign.parts import JointConfig
@@ -93,7 +93,7 @@ class JointOptimiser:
         return charge
 
     def _train(self) -> list[dict[str, float]]:
-        began, definition = time.process_time(), self._problem.definition
+        began, definition = working_seconds(), self._problem.definition
         whole = REPORTS * EPISODES * definition.episode_steps
         steps = int(min(self._steps, self.steps_left / 2 - whole))
         if steps < SHORTEST:
@@ -123,7 +123,7 @@ class JointOptimiser:
         proposer = PROPOSERS[self._proposer](**settings)
         train(config, folder.path / "training", proposer=proposer, progress=False)
         found = read_json(folder.path / "training" / "bodies.json")
-        self._charge = steps + whole, time.process_time() - began
+        self._charge = steps + whole, working_seconds() - began
         order = [found["names"].index(name) for name in self._problem.variables]
         # A search by the critic ends in a corner of the box again and again.
         points = dict.fromkeys(tuple(np.round(np.array(body)[order], 4)) for body in found["bodies"])

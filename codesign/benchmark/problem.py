@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -15,6 +14,7 @@ from pydantic import Field, model_validator
 
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.training import train
+from softgym_envs.codesign.benchmark.clock import working_seconds
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.goals import draw_goals
 from softgym_envs.codesign.parts import GoalsConfig, TrainingConfig, ZoneConfig
@@ -229,7 +229,7 @@ class Evaluator:
         goals = self.goals[: max(1, round(share * len(self.goals)))]
         environment = problem.environment_of(options)
         tested = environment if self.backend is None else environment.on(self.backend)
-        began = time.process_time()
+        began = working_seconds()
         try:
             with tempfile.TemporaryDirectory() as folder:
                 agent: str | Path = {"qp": "qp", "shared": problem.policy or ""}.get(judge, "")
@@ -252,7 +252,7 @@ class Evaluator:
                 result.reason, result.scores = broken, []
         except (InfeasibleDesign, ConvergenceError) as error:
             result.reason = str(error)
-        result.cpu_seconds = time.process_time() - began
+        result.cpu_seconds = working_seconds() - began
         return result
 
     def _training(

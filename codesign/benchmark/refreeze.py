@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from softgym_envs.codesign.benchmark.frozen import freeze, load_definition, load_problem
+from softgym_envs.codesign.benchmark.frozen import freeze, frozen_parts, load_definition, load_problem
 from softgym_envs.codesign.benchmark.problem import Judge
 from softgym_envs.codesign.benchmark.runs import stored_runs
 from softgym_envs.codesign.benchmark.scoring import DATA
@@ -33,10 +33,14 @@ def refreeze(name: str, bodies: int = 5, data: Path = DATA) -> list[Path]:
         The files in which the hash was renamed.
 
     Raises:
-        DataError: if no winner is stored, or a score differs; then nothing is changed.
+        DataError: if no winner is stored, a score differs, or the policy for all bodies is another one; then nothing is
+            changed.
     """
-    load_definition(name)  # an unknown name is an error of its own
+    definition = load_definition(name)  # an unknown name is an error of its own
     problem = load_problem(name, check=False)
+    if frozen_parts(definition, problem.goals).get("policy") != problem.parts.get("policy"):
+        # It decides what the judges shared and trained say of every body, whichever judge the stored searches had.
+        raise DataError(f"problem '{name}': the policy for all bodies is another one; this needs a new version")
     winners = [
         (run, design, scores)
         for run, _ in stored_runs(data)

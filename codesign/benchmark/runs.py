@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem
+from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem, problem_names
 from softgym_envs.codesign.benchmark.problem import Judge, Score
 from softgym_envs.codesign.benchmark.scoring import DATA, front
 from softgym_envs.codesign.benchmark.search import Search, make_optimiser, solve
@@ -177,10 +177,13 @@ def collect(folder: Path, data: Path = DATA) -> Path:
 
     A run replaces the stored one with the same problem, method, judge, budget and seed.
     """
-    rows = {_key(each): (each, test) for each, test in stored_runs(data)}
+    names = problem_names()  # a version that is no longer offered is not among them
+    rows = {_key(each): (each, test) for each, test in stored_runs(data) if each.problem in names}
     problems: dict[str, FrozenProblem] = {}
     for path in sorted(folder.glob("runs/*/*.json")):
         each = Run.read(path)
+        if each.problem not in names:
+            continue
         problem = problems.setdefault(each.problem, load_problem(each.problem))
         if each.hash == problem.hash:
             rows[_key(each)] = each, _stored_test(problem, each, folder)

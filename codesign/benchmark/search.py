@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from softgym_envs.codesign.benchmark.clock import working_seconds
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem
 from softgym_envs.codesign.benchmark.problem import LEVELS, Budget, Judge, Score
 from softgym_envs.codesign.sampling import SamplerConfig, construct, make_sampler
@@ -127,7 +127,7 @@ def solve(search: Search, optimiser: Optimiser) -> float:
 
     The first body is the baseline, for every optimiser.
     """
-    began = time.process_time()
+    began = working_seconds()
     if not search.ledger:
         search.evaluate(search.problem.definition.baseline_values)
     charges = hasattr(optimiser, "take_charge")
@@ -141,7 +141,7 @@ def solve(search: Search, optimiser: Optimiser) -> float:
             steps, seconds = optimiser.take_charge()  # type: ignore[attr-defined]
             row.environment_steps, row.cpu_seconds = row.environment_steps + steps, row.cpu_seconds + seconds
         optimiser.tell(row)
-    return time.process_time() - began - search.spent["cpu_seconds"]
+    return working_seconds() - began - search.spent["cpu_seconds"]
 
 
 class OptunaOptimiser:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -26,8 +26,10 @@ from softgym_envs.config import provenance
 from softgym_envs.errors import DataError, unknown_name
 from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_npz
+from softgym_envs.surrogate.pretrained import ships_weights
 
 if TYPE_CHECKING:
+    from softgym_envs.agents.config import EnvironmentConfig
     from softgym_envs.envs.env import SoftRobotEnv
     from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
@@ -48,12 +50,14 @@ class Table:
         points: bodies in the unit box [-1, 1]^n, shape (bodies, n): the first of a scrambled Sobol sequence.
         values: by judge, `COLUMNS` of each body [SI], shape (bodies, 3); NaN where a judge has not scored a body.
         longest: largest step towards rest, relative to the range of a command, of the judges at rest.
+        first: by judge, how many bodies from the beginning it has scored; others were chosen, see `tabulate`.
     """
 
     problem: FrozenProblem
     points: np.ndarray
     values: Mapping[str, np.ndarray]
     longest: float = LONGEST
+    first: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
     def read(cls, name: str, path: Path | None = None) -> Table:
@@ -77,12 +81,12 @@ class Table:
         columns = {key: table[key].to_numpy().astype(float) for key in table.column_names}
         points = np.stack([columns[f"unit_{key}"] for key in problem.variables], axis=1)
         judges = sorted({key.partition(".")[0] for key in columns if "." in key})
-        return cls(
-            problem,
-            points,
-            {judge: np.stack([columns[f"{judge}.{key}"] for key in COLUMNS], axis=1) for judge in judges},
-            float(meta["longest"]),
-        )
+        values = {judge: np.stack([columns[f"{judge}.{key}"] for key in COLUMNS], axis=1) for judge in judges}
+        if "first" in meta:
+            first = json.loads(meta["first"])
+        else:  # a table from before bodies were chosen
+            first = {judge: _scored(rows) for judge, rows in values.items()}
+        return cls(problem, points, values, float(meta["longest"]), first)
 
     def __len__(self) -> int:
         """Number of bodies."""
@@ -206,15 +210,22 @@ class Tabulation:
         columns = np.stack([found.distances, found.efforts, found.successes.astype(float)], axis=1)
         return columns.reshape(len(points), len(self.goals), -1).mean(axis=1)
 
-    def at_rest(self, points: np.ndarray) -> np.ndarray:
-        """Return `COLUMNS` where the inverse QP comes to rest on the learned model."""
-        return self._at_rest(points)[0]
+    def environment(self, mesh: str | None) -> EnvironmentConfig:
+        """Return the environment of the problem on a mesh of its robot; None: the mesh of the problem."""
+        environment = self.problem.definition.environment
+        if mesh is None:
+            return environment
+        return environment.model_copy(update={"robot_options": {**environment.robot_options, "mesh": mesh}})
 
-    def _at_rest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def at_rest(self, mesh: str | None, points: np.ndarray) -> np.ndarray:
+        """Return `COLUMNS` where the inverse QP comes to rest on the learned model of a mesh."""
+        return self._at_rest(mesh, points)[0]
+
+    def _at_rest(self, mesh: str | None, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `COLUMNS` of each body, and the last commands, shape (k, g, n_a)."""
         count, goals = len(points), self.goals
         tiled = np.tile(goals, (count, 1, 1))
-        made = self.problem.definition.environment.make_vec(len(tiled), sample_design=False)
+        made = self.environment(mesh).make_vec(len(tiled), sample_design=False)
         env = cast("SoftRobotVectorEnv", made.unwrapped)
         try:
             designs = [design for design in self.designs(points) for _ in goals]
@@ -234,13 +245,15 @@ class Tabulation:
         return np.array([[values.get(name, np.nan) for name in COLUMNS] for values in rows])
 
     def fem(self, mesh: str | None, points: np.ndarray) -> np.ndarray:
-        """Return `COLUMNS` where the inverse QP comes to rest on finite elements; default the mesh of the robot."""
-        environment = self.problem.definition.environment.on("fem")
-        if mesh is not None:
-            options = {**environment.robot_options, "mesh": mesh}
-            environment = environment.model_copy(update={"robot_options": options})
-        _, commands = self._at_rest(points)
-        made = environment.make(sample_design=False)
+        """Return `COLUMNS` where the inverse QP comes to rest on finite elements of a mesh.
+
+        Bodies begin with the commands that the learned model of this mesh rests at; without one, with those of the
+        problem's.
+        """
+        environment = self.environment(mesh)
+        robot = self.problem.definition.model_copy(update={"environment": environment}).robot
+        _, commands = self._at_rest(mesh if ships_weights(robot) else None, points)
+        made = environment.on("fem").make(sample_design=False)
         env = cast("SoftRobotEnv", made.unwrapped)
         try:
             rows = [
@@ -262,7 +275,12 @@ class TableJudge:
 
 
 TABLE_JUDGES: dict[str, TableJudge] = {
-    "rest": TableJudge("inverse QP, at rest on the learned model", 256, Tabulation.at_rest),
+    "rest": TableJudge("inverse QP, at rest on the learned model", 256, lambda t, points: t.at_rest(None, points)),
+    "rest_accurate": TableJudge(
+        "inverse QP, at rest on the learned model of the accurate mesh",
+        256,
+        lambda t, points: t.at_rest("accurate", points),
+    ),
     "qp": TableJudge("inverse QP, whole episodes", CHUNK, lambda t, points: t.episodes("qp", points)),
     "shared": TableJudge(
         "one policy for all bodies, whole episodes",
@@ -279,7 +297,12 @@ TABLE_JUDGES: dict[str, TableJudge] = {
 
 
 def tabulate(
-    name: str, counts: Mapping[str, int], folder: Path, output: Path | None = None, longest: float = LONGEST
+    name: str,
+    counts: Mapping[str, int],
+    folder: Path,
+    output: Path | None = None,
+    longest: float = LONGEST,
+    best: Mapping[str, int] | None = None,
 ) -> Path:
     """Score bodies of a problem and write the table; an interrupted call continues where it stopped.
 
@@ -291,6 +314,8 @@ def tabulate(
         folder: where the parts are kept.
         output: the Parquet file; default the shipped one.
         longest: largest step towards rest, relative to the range of a command.
+        best: by judge, how many of the best bodies of each judge at rest on a learned model it scores besides: there
+            searches go, and few bodies are enough for a judge that takes minutes for each.
 
     Raises:
         ValueError: for a problem that has no such table, or an unknown judge.
@@ -298,36 +323,47 @@ def tabulate(
     require("benchmark")
     problem = load_problem(name)
     tabulation = Tabulation(problem, longest)
-    for judge in counts:
+    best = best or {}
+    for judge in (*counts, *best):
         if judge not in TABLE_JUDGES or (judge == "shared" and problem.definition.policy is None):
             raise ValueError(f"problem '{name}': {unknown_name('judge of tables', judge, TABLE_JUDGES)}")
     path = output or DATA / "tables" / f"{name}.parquet"
-    known = _extendable(name, path, longest)
+    known, first = _extendable(name, path, longest)
     bodies = max([*counts.values(), *(len(table) for table in known.values())])
     points = _points(len(problem.variables), bodies)
-    values = {judge: np.full((bodies, len(COLUMNS)), np.nan) for judge in dict.fromkeys([*known, *counts])}
+    values = {judge: np.full((bodies, len(COLUMNS)), np.nan) for judge in dict.fromkeys([*known, *counts, *best])}
     for judge, table in known.items():
         values[judge][: len(table)] = table
     for judge, count in counts.items():
-        chunk = TABLE_JUDGES[judge].chunk
-        done = _scored(known.get(judge, values[judge][:0]))
+        chunk, done = TABLE_JUDGES[judge].chunk, first.get(judge, 0)
+        first[judge] = max(done, count)
         for start in range(done - done % chunk, count, chunk):
             rows = slice(start, min(start + chunk, count))
             if rows.stop > done:
                 values[judge][rows] = tabulated(tabulation, judge, points[rows], folder, start)
-    return _write(problem, points, values, path, longest)
+    for judge, count in best.items():
+        for index in _leading(values, count):
+            if np.isnan(values[judge][index, 0]):
+                values[judge][index] = tabulated(tabulation, judge, points[index : index + 1], folder, index)[0]
+    return _write(Table(problem, points, values, longest, first), path)
 
 
-def _extendable(name: str, path: Path, longest: float) -> dict[str, np.ndarray]:
-    """Return the values of a table that is there, by judge; none if it is for another version or another step."""
+def _leading(values: Mapping[str, np.ndarray], count: int) -> list[int]:
+    """Return the places of the best bodies of each judge at rest on a learned model."""
+    judges = [judge for judge in ("rest", "rest_accurate") if judge in values]
+    return sorted({int(place) for judge in judges for place in np.argsort(values[judge][:, 0])[:count]})
+
+
+def _extendable(name: str, path: Path, longest: float) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Return values and `Table.first` of a table that is there; none if it is for another version or another step."""
     if not path.is_file():
-        return {}
+        return {}, {}
     try:
         found = Table.read(name, path)
     except DataError:
-        return {}
+        return {}, {}
     same = found.longest == longest and np.allclose(found.points, _points(found.points.shape[1], len(found)), atol=1e-6)
-    return dict(found.values) if same else {}
+    return (dict(found.values), dict(found.first)) if same else ({}, {})
 
 
 def _scored(values: np.ndarray) -> int:
@@ -367,12 +403,11 @@ def tabulated(
     return values
 
 
-def _write(
-    problem: FrozenProblem, points: np.ndarray, values: Mapping[str, np.ndarray], path: Path, longest: float
-) -> Path:
+def _write(found: Table, path: Path) -> Path:
     import pyarrow
     from pyarrow import parquet
 
+    problem, points, values = found.problem, found.points, found.values
     columns = {f"unit_{name}": points[:, i].astype(np.float32) for i, name in enumerate(problem.variables)}
     for judge, table in values.items():
         if np.isfinite(table).any():
@@ -381,10 +416,10 @@ def _write(
         "problem": problem.name,
         "hash": problem.hash,
         "columns": json.dumps(list(columns)),
-        "longest": f"{longest:g}",
+        "longest": f"{found.longest:g}",
+        "first": json.dumps(dict(found.first)),
         "commit": str(provenance()["commit"]),
     }
-    found = pyarrow.table(columns).replace_schema_metadata(meta)
     with atomic_write(path) as stream:
-        parquet.write_table(found, stream, compression="zstd")
+        parquet.write_table(pyarrow.table(columns).replace_schema_metadata(meta), stream, compression="zstd")
     return path

@@ -24,7 +24,6 @@ def benchmark() -> None:
 
     Scores of submissions are those on finite elements.
     """
-    require("codesign")
 
 
 @benchmark.command(name="list")
@@ -96,6 +95,7 @@ def run(
     from softgym_envs.codesign.benchmark import references, runs
     from softgym_envs.codesign.benchmark.table import Table
 
+    require("codesign")
     listed = None if table is None else Table.read(names[0], table)
     if listed is not None and len(names) > 1:
         raise ValueError("--table is of one problem; give one name")
@@ -250,7 +250,14 @@ def freeze(names: tuple[str, ...], keep: bool) -> None:
     metavar="JUDGE=N",
     default=("rest=100000", "qp=1000"),
     show_default=True,
-    help="Judge and how many bodies it scores: rest, qp, shared, trained, fem or fem_accurate; several with several.",
+    help="Judge and how many bodies it scores: rest, rest_accurate, qp, shared, trained, fem or fem_accurate; several "
+    "with several.",
+)
+@click.option(
+    "--best",
+    multiple=True,
+    metavar="JUDGE=N",
+    help="Judge that also scores the N best bodies of each judge at rest on a learned model; several with several.",
 )
 @click.option(
     "--longest",
@@ -261,7 +268,9 @@ def freeze(names: tuple[str, ...], keep: bool) -> None:
 )
 @click.option("--output", type=options.PATH, help="Parquet file (default: the shipped table of the problem).")
 @results
-def tabulate(name: str, judges: tuple[str, ...], longest: float, output: Path | None, folder: Path) -> None:
+def tabulate(
+    name: str, judges: tuple[str, ...], best: tuple[str, ...], longest: float, output: Path | None, folder: Path
+) -> None:
     """Score many bodies of a problem by several judges and write them as a table.
 
     Each judge scores the first bodies of one Sobol sequence. An interrupted call continues where it stopped, and a call
@@ -269,14 +278,23 @@ def tabulate(name: str, judges: tuple[str, ...], longest: float, output: Path | 
     """
     from softgym_envs.codesign.benchmark.table import tabulate as run
 
+    with options.resumable():
+        click.echo(f"wrote {run(name, _counts('--judge', judges), folder, output, longest, _counts('--best', best))}")
+
+
+def _counts(option: str, values: Sequence[str]) -> dict[str, int]:
+    """Return the number of bodies by judge.
+
+    Raises:
+        ValueError: for a text that is not a judge and a positive number.
+    """
     counts = {}
-    for each in judges:
+    for each in values:
         judge, _, count = each.partition("=")
         if not count.isdigit() or int(count) < 1:
-            raise ValueError(f"--judge {each}: give a judge and a number of bodies, such as rest=100000")
+            raise ValueError(f"{option} {each}: give a judge and a number of bodies, such as rest=100000")
         counts[judge] = int(count)
-    with options.resumable():
-        click.echo(f"wrote {run(name, counts, folder, output, longest)}")
+    return counts
 
 
 def _scores(bodies: Sequence[Sequence[float]]) -> str:

@@ -115,6 +115,19 @@ def test_a_table_is_extended(tiny, tmp_path):
     assert len(Table.read("tiny-v1", output)) == 1
 
 
+def test_the_best_bodies_of_the_learned_models_are_scored_besides(tiny, tmp_path):
+    output = tmp_path / "tiny.parquet"
+    tabulate("tiny-v1", {"rest": 6, "rest_accurate": 5}, tmp_path, output, longest=0.5, best={"qp": 1})
+    table = Table.read("tiny-v1", output)
+    best = {int(np.nanargmin(table.values[judge][:, 0])) for judge in ("rest", "rest_accurate")}
+    assert set(np.flatnonzero(np.isfinite(table.values["qp"][:, 0]))) == best
+    assert table.first == {"rest": 6, "rest_accurate": 5}
+    # Another mesh is another body.
+    assert not np.allclose(table.values["rest"][:5, 0], table.values["rest_accurate"][:5, 0], rtol=0.02)
+    tabulate("tiny-v1", {"qp": 2}, tmp_path, output, longest=0.5)  # the first ones, whatever was chosen before
+    assert np.isfinite(Table.read("tiny-v1", output).values["qp"][:, 0]).nonzero()[0].tolist() == sorted({0, 1} | best)
+
+
 def test_tables(tiny, tmp_path):
     output = tmp_path / "tiny.parquet"
     counts = {"shared": 70, "qp": 2, "rest": 3, "trained": 1, "fem": 2}

@@ -49,6 +49,26 @@ def test_a_problem_frozen_again_keeps_results_that_are_still_true(tiny, problems
         refreeze.refreeze("tiny-v1", data=tmp_path)
 
 
+def test_another_policy_for_all_bodies_needs_a_new_version(tiny, problems, tmp_path):
+    runs.run(tmp_path, "tiny-v1", "random", "qp", "small", 0)  # the inverse QP does not notice the policy
+    stored = runs.collect(tmp_path, tmp_path)
+    path = problems / "tiny-v1.json"
+    path.write_text(path.read_text().replace(tiny.parts["policy"], "0" * 32))
+    stale = frozen.load_problem("tiny-v1", check=False).hash
+    stored.write_text(stored.read_text().replace(tiny.hash, stale))
+    with pytest.raises(DataError, match="the policy for all bodies is another one"):
+        refreeze.refreeze("tiny-v1", data=tmp_path)
+    assert stale in stored.read_text()
+
+
+def test_runs_of_a_version_that_is_no_longer_offered_are_dropped(tiny, problems, tmp_path):
+    runs.run(tmp_path, "tiny-v1", "random", "shared", "small", 0)
+    stored = runs.collect(tmp_path, tmp_path)
+    assert len(runs.stored_runs(tmp_path)) == 1
+    (problems / "tiny-v1.yaml").rename(problems / "tiny-v2.yaml")
+    assert runs.collect(tmp_path, tmp_path) == stored and runs.stored_runs(tmp_path) == []
+
+
 def test_problems_without_stored_searches_are_refused(tiny, tmp_path):
     with pytest.raises(ValueError, match="no searches"):
         winners.check(tmp_path, "tiny-v1", data=tmp_path)
