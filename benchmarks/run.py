@@ -105,6 +105,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "contact": contact.contact,
     "dynamics": dynamics.dynamics,
     "learned_sensors": learned_sensors.learned_sensors,
+    "learned_sensors_4cavities": learned_sensors.learned_sensors_4cavities,
     "learners": learners.learners,
     "strategies": strategies.strategies,
     "codesign_kills": codesign_scale.kills,
