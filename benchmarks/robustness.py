@@ -66,8 +66,11 @@ SENSED = {
     "inverse QP, open loop": "qp_model",
     "inverse QP with estimator": "qp_estimated",
     "policy with memory": "sensorized_finger_reach_recurrent",
+    "SAC": "sensorized_finger_reach_sac",
+    "SAC, randomised": "sensorized_finger_reach_randomised",
 }
-"""Controllers of SensorizedFingerReach, which hides the tip; the policy was trained with 1 % of noise."""
+"""Controllers of SensorizedFingerReach, which hides the tip; policies were trained with noise, the last on plants that
+differ from the model."""
 
 
 def sensed() -> dict[str, object]:

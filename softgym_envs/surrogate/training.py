@@ -67,6 +67,7 @@ class DataConfig(Config):
     bounds: dict[str, tuple[float, float]] = {}
     alike: tuple[str, ...] = ()
     boundary: float = Field(default=0.0, ge=0.0, le=1.0)
+    one_mesh: bool = False
     groups_per_shard: int = Field(default=10, gt=0)
 
     @model_validator(mode="before")
