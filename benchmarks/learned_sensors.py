@@ -30,7 +30,7 @@ from softgym_envs.robots.registry import make_robot
 from softgym_envs.surrogate.calibration import learned_bounds
 from softgym_envs.surrogate.pretrained import pretrained_model
 
-BODIES, STATES, TOUCHES, READINGS, FORCE = 16, 4, 200, 10, 1.0
+BODIES, STATES, TOUCHES, READINGS, FORCE = 16, 4, 150, 10, 1.0
 STRATA = {"untouched": None, "touch, 15 to 65 mm": (0.015, 0.065), "touch, 65 to 115 mm": (0.065, 0.115)}
 
 
