@@ -1,6 +1,7 @@
 """The sensorized finger on its learned model: errors by stratum, and the estimator with a plant of finite elements.
 
-``softgym bench learned_sensors`` records both; ``python -m benchmarks.learned_sensors`` prints them.
+``softgym bench learned_sensors learned_sensors_4cavities`` records both; ``python -m benchmarks.learned_sensors 4``
+prints those of the finger with four cavities.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
@@ -16,28 +18,30 @@ from scipy.stats import chi2
 from benchmarks.estimation import LARGEST_PULL, LENGTH
 from benchmarks.recorded import results
 from benchmarks.tables import markdown
+from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.estimation import Noise, Readings, Touch, finger_grid
 from softgym_envs.estimation.learned import LearnedEstimator
+from softgym_envs.estimation.model_errors import measured_errors
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import MeshedRobot, Robot
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.surrogate.calibration import learned_bounds
 from softgym_envs.surrogate.pretrained import pretrained_model
 
-BODIES, STATES, TOUCHES, READINGS, FORCE = 16, 4, 60, 10, 1.0
+BODIES, STATES, TOUCHES, READINGS, FORCE = 16, 4, 150, 10, 1.0
 STRATA = {"untouched": None, "touch, 15 to 65 mm": (0.015, 0.065), "touch, 65 to 115 mm": (0.065, 0.115)}
 
 
-def bodies(learner: MeshedRobot) -> Iterator[tuple[bool, dict[str, float]]]:
-    """Yield bodies of the learned box: inside of it, then vertices, and whether they are vertices.
+def bodies(learner: MeshedRobot, count: int = BODIES // 2) -> Iterator[tuple[bool, dict[str, float]]]:
+    """Yield bodies of the learned box: ``count`` inside of it, then as many vertices, and whether they are vertices.
 
     Vertices to which the mesh of the baseline does not move are left out: they are not those that are learned.
     """
     rng, bounds = np.random.default_rng(7), learned_bounds(pretrained_model(learner))
-    for number in range(BODIES):
-        at_bounds = number >= BODIES // 2
+    for number in range(2 * count):
+        at_bounds = number >= count
         while True:
             shares = rng.integers(2, size=len(bounds)) if at_bounds else rng.random(len(bounds))
             values = zip(bounds.items(), shares, strict=True)
@@ -93,20 +97,48 @@ def strata(robot: Robot) -> dict[str, float]:
     return result
 
 
-def estimates(robot: Robot, plant: str) -> dict[str, float]:
-    """Errors, coverage and speed of the estimator on the learned model; the plant is finite elements or the model.
+@dataclass(frozen=True)
+class Setting:
+    """What the estimator reads, and what it knows of its model's errors.
 
-    Noise of the volumes is 1 % of their change under the full pull; touches are random points of the 5 mm grid.
+    Attributes:
+        fem: whether the plant is finite elements; otherwise it is the model itself.
+        many: whether each touch is on another body of the learned box; otherwise all are on the baseline.
+        calibrated: whether the errors of the model were measured on the body; otherwise they are those of the weights.
     """
-    rng, grid = np.random.default_rng(3), finger_grid()
-    body = robot.build()
-    change = Statics(body).solve([LARGEST_PULL]).condensed.delta.s
+
+    fem: bool = True
+    many: bool = False
+    calibrated: bool = False
+
+
+SETTINGS = {
+    "unseen bodies": Setting(many=True),
+    "baseline": Setting(),
+    "baseline, calibrated": Setting(calibrated=True),
+    "the model itself": Setting(fem=False),
+}
+"""Plants by name."""
+
+
+def estimates(robot: MeshedRobot, setting: Setting) -> dict[str, float]:
+    """Errors, coverage and speed of the estimator on the learned model.
+
+    Noise of the volumes is 1 % of their change under the full pull; touches are random points of the 5 mm grid. Those
+    of the calibration have another seed.
+    """
+    rng, grid, learner = np.random.default_rng(3), finger_grid(), robot.under_touch()
+    assert isinstance(learner, MeshedRobot)
+    change = Statics(robot.build()).solve([LARGEST_PULL]).condensed.delta.s
     noise = Noise(displacement=1e-4, volume=0.01 * float(np.abs(change).mean()))
-    exact = plant != "fem"
-    estimator = LearnedEstimator(robot, noise=noise, exact=exact)
-    names = ("tip", "force", "inside", "force inside", "known", "first", "later")
+    model, errors = pretrained_model(learner), None
+    if setting.calibrated:
+        errors = measured_errors(SurrogateBackend(robot), FEMBackend(robot), grid)
+    names = ("tip", "force", "inside", "force inside", "known", "below", "first", "later")
     kept: dict[str, list[float]] = {name: [] for name in names}
+    others = (design for at_bounds, design in bodies(learner, TOUCHES) if not at_bounds)
     for _ in range(TOUCHES):
+        design = robot.design_space.complete(next(others) if setting.many else None)
         cell = (int(rng.integers(grid.cells[0])), int(rng.integers(grid.cells[1])))
         place = rng.uniform(-1.0, 1.0, (1, 2))
         point = grid.inside(cell, place)[0]
@@ -115,19 +147,20 @@ def estimates(robot: Robot, plant: str) -> dict[str, float]:
         force = 0.0
         while not 0.2 <= force <= 2.0:
             force = abs(FORCE * float(rng.standard_normal()))
-        load = robot.touch_design(robot.design_space.baseline, point, force * np.array(grid.normal))
-        if plant == "fem":
+        load = {**design, **robot.touch_design(design, point, force * np.array(grid.normal))}
+        if setting.fem:
             try:
-                state = Statics(robot.under_touch().build(load)).solve(pull)
+                state = Statics(learner.build(load)).solve(pull)
             except ConvergenceError:
                 continue
             volumes, tip = state.condensed.delta.s, state.condensed.delta.e[:3]
         else:
-            model = estimator.model
-            context = model.context(model.robot.design_space.complete(load).array[None])
+            context = model.context(learner.design_space.complete(load).array[None])
             reached = model.search(context, pull[None], pull[None], robot.unilateral, 5e-5, 25)[0]
             volumes, tip = model.sensed(context, reached)[0], model.effector(context, reached)[0][0, :3]
-        estimator = LearnedEstimator(robot, noise=noise, exact=exact, model=estimator.model)
+        estimator = LearnedEstimator(
+            robot, design=design, noise=noise, model=model, exact=not setting.fem, errors=errors
+        )
         estimator.touch(Touch(grid, cell, FORCE))
         for number in range(READINGS):
             measured = estimator.rest_volumes + volumes + noise.volume * rng.standard_normal(len(volumes))
@@ -143,8 +176,8 @@ def estimates(robot: Robot, plant: str) -> dict[str, float]:
         kept["inside"].append(float(inside))
         kept["force inside"].append(float(abs(found.load[0] - force) <= 1.96 * spread))
         kept["known"].append(float(spread <= 0.1 * found.load[0]))
-    certain = np.array(kept["known"], dtype=bool)
-    sizes = np.array(kept["force"])
+        kept["below"].append(-float(point[2]))
+    certain, sizes, far = np.array(kept["known"], dtype=bool), np.array(kept["force"]), np.array(kept["below"]) > 0.055
     return {
         "touches": len(sizes),
         "tip error, mean [% of length]": 100 * float(np.mean(kept["tip"])),
@@ -152,7 +185,9 @@ def estimates(robot: Robot, plant: str) -> dict[str, float]:
         "tip error, worst [% of length]": 100 * float(np.max(kept["tip"])),
         "force error, median [%]": 100 * float(np.median(sizes)),
         "force error, mean [%]": 100 * float(sizes.mean()),
-        "force told to 10 % [% of touches]": 100 * float(certain.mean()),
+        "force error, mean, 55 to 115 mm below the flange [%]": 100 * float(sizes[far].mean()),
+        "force claimed to 10 % [% of touches]": 100 * float(certain.mean()),
+        "force error of these, mean [%]": 100 * float(sizes[certain].mean()) if certain.any() else float("nan"),
         "coverage, tip [%]": 100 * float(np.mean(kept["inside"])),
         "coverage, force [%]": 100 * float(np.mean(kept["force inside"])),
         "first readings of a touch [1/CPU s]": 1.0 / float(np.mean(kept["first"][1:])),
@@ -160,39 +195,59 @@ def estimates(robot: Robot, plant: str) -> dict[str, float]:
     }
 
 
-def learned_sensors() -> dict[str, object]:
+def _record(cavities: int) -> dict[str, object]:
     """Errors of the learned sensorized finger by stratum, and of the estimator on it."""
-    robot = make_robot("sensorized_finger")
-    result: dict[str, object] = {f"stratum: {name}": value for name, value in strata(robot).items()}
-    for plant in ("fem", "model"):
-        result |= {f"plant {plant}: {name}": value for name, value in estimates(robot, plant).items()}
+    robot = make_robot("sensorized_finger", cavities=cavities, meshing="morph")
+    assert isinstance(robot, MeshedRobot)
+    result: dict[str, object] = {
+        f"stratum: {name}": value for name, value in strata(make_robot("sensorized_finger", cavities=cavities)).items()
+    }
+    for name, setting in SETTINGS.items():
+        result |= {f"plant: {name}: {key}": value for key, value in estimates(robot, setting).items()}
     return result
+
+
+def learned_sensors() -> dict[str, object]:
+    """Errors of the learned sensorized finger with two cavities by stratum, and of the estimator on it."""
+    return _record(2)
+
+
+def learned_sensors_4cavities() -> dict[str, object]:
+    """Errors of the learned sensorized finger with four cavities by stratum, and of the estimator on it."""
+    return _record(4)
+
+
+GROUPS = {2: "learned_sensors", 4: "learned_sensors_4cavities"}
+"""Recorded results by the number of cavities."""
 
 
 def strata_table() -> str:
     """Mean and worst errors of each stratum."""
-    found, quantities = results("learned_sensors"), ("tip [mm]", "volume [mm3]", "tension [N]")
+    quantities = ("tip [mm]", "volume [mm3]", "tension [N]")
     rows = []
-    for name in (*STRATA, "slack cable", "vertices", "new mesh"):
-        if not found[f"stratum: {name}: states"]:
-            continue
-        errors = [[found[f"stratum: {name}: {q}, {kind}"] for kind in ("mean", "worst")] for q in quantities]
-        rows.append(
-            [name, str(found[f"stratum: {name}: states"]), *(f"{mean:.2f}, {worst:.2f}" for mean, worst in errors)]
-        )
-    return markdown(["stratum", "states", *(f"{quantity}: mean, worst" for quantity in quantities)], rows, "lrrrr")
+    for cavities, group in GROUPS.items():
+        found = results(group)
+        for name in (*STRATA, "slack cable", "vertices", "new mesh"):
+            if not found[f"stratum: {name}: states"]:
+                continue
+            errors = [[found[f"stratum: {name}: {q}, {kind}"] for kind in ("mean", "worst")] for q in quantities]
+            cells = (f"{mean:.2f}, {worst:.2f}" for mean, worst in errors)
+            rows.append([str(cavities), name, str(found[f"stratum: {name}: states"]), *cells])
+    heads = [f"{quantity}: mean, worst" for quantity in quantities]
+    return markdown(["cavities", "stratum", "states", *heads], rows, "rlrrrr")
 
 
 def estimates_table() -> str:
-    """Results of the estimator with both plants."""
-    found = results("learned_sensors")
-    names = [name.removeprefix("plant fem: ") for name in found if name.startswith("plant fem: ")]
-    rows = [[name, *(f"{found[f'plant {plant}: {name}']:.3g}" for plant in ("fem", "model"))] for name in names]
-    return markdown(["", "plant on finite elements", "plant is the model"], rows, "lrr")
+    """Results of the estimator with all plants."""
+    plants = [(group, cavities, name) for cavities, group in GROUPS.items() for name in SETTINGS]
+    first = f"plant: {next(iter(SETTINGS))}: "
+    names = [name.removeprefix(first) for name in results(GROUPS[2]) if name.startswith(first)]
+    rows = [[name, *(f"{results(g)[f'plant: {plant}: {name}']:.3g}" for g, _, plant in plants)] for name in names]
+    return markdown(["", *(f"{cavities}: {plant}" for _, cavities, plant in plants)], rows, "l" + "r" * len(plants))
 
 
 TABLES = {"learned_sensors_strata": strata_table, "learned_sensors_estimates": estimates_table}
 """Tables of pages by name."""
 
 if __name__ == "__main__":
-    json.dump(learned_sensors(), sys.stdout, indent=2)
+    json.dump(_record(int(sys.argv[1]) if len(sys.argv) > 1 else 2), sys.stdout, indent=2)

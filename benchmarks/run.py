@@ -107,6 +107,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "dynamics": dynamics.dynamics,
     "tetrapod": robot_dynamics.tetrapod,
     "learned_sensors": learned_sensors.learned_sensors,
+    "learned_sensors_4cavities": learned_sensors.learned_sensors_4cavities,
     "learners": learners.learners,
     "strategies": strategies.strategies,
     "codesign_kills": codesign_scale.kills,

@@ -17,7 +17,7 @@ from scipy.special import log_ndtr
 from scipy.stats import chi2
 
 from softgym_envs.backends.surrogate import TOLERANCE
-from softgym_envs.errors import ConvergenceError
+from softgym_envs.errors import ConvergenceError, WeightsError
 from softgym_envs.estimation.estimator import IMPROBABLE, Noise, Readings, checked_readings
 from softgym_envs.estimation.loads import Touch, cell_nodes
 from softgym_envs.estimation.places import Mixture, Moments, Places
@@ -27,6 +27,7 @@ from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_model
+from softgym_envs.surrogate.row_errors import RowErrors
 
 PLACES = 4
 """Places along each edge of a cell: the response is nearly quadratic in a cell, which four describe."""
@@ -78,8 +79,9 @@ class LearnedEstimator:
     """Finds the shape of a body and a touch on it from a stream of readings, on its learned model.
 
     Readings in a row under one command are explained together by their mean. What they tell about the errors of the
-    actuators stays known when the command or the touch changes. The errors of the learned volumes do not become smaller
-    with the number of readings, so they are added to the noise of their mean.
+    actuators stays known when the command or the touch changes. The errors of learned volumes and effectors depend on
+    the command. Their means are subtracted; their deviations do not become smaller with the number of readings, so they
+    are added to the noise of the mean.
 
     Args:
         robot: the body, whose touch is learned; its cavities are sensors.
@@ -87,18 +89,19 @@ class LearnedEstimator:
         load: the touch; None while nothing is touched.
         noise: of sensors and actuators; loads do not drift, and efforts are not read.
         model: the learned model of ``robot.under_touch()``; default the shipped one.
-        exact: whether the body is the learned model itself, so that its errors in the test of the weights do not count.
+        exact: whether the body is the learned model itself, so that its errors do not count.
+        errors: of the model on this body, from `measured_errors`, for effectors and then sensors; default those on the
+            many bodies that the weights were validated on.
         steps: largest number of Gauss-Newton steps of the first reading under a command or touch; later ones take one.
         accuracy: a step ends the search that moves no place by more than this part of its standard deviation.
 
     Attributes:
         rest_volumes: of the cavities at rest [m3], shape (n_s,).
-        volume_error: standard deviation of the errors of learned volumes [m3].
-        tip_error: standard deviation of the errors of a learned effector along each axis [m].
+        errors: of the robot's own effectors [m] and then its sensors [m3].
 
     Raises:
         DesignError: for a malformed design.
-        WeightsError: if there are no weights.
+        WeightsError: if there are no weights, or their card does not tell the errors.
         ValueError: for a robot whose touch is not learned, or noise that is not supported.
     """
 
@@ -111,6 +114,7 @@ class LearnedEstimator:
         noise: Noise | None = None,
         model: SurrogateModel | None = None,
         exact: bool = False,
+        errors: RowErrors | None = None,
         steps: int = 5,
         accuracy: float = 0.2,
     ) -> None:
@@ -127,13 +131,25 @@ class LearnedEstimator:
         # The first load variable is the force, which the others do not depend on.
         self._loads = self.model.robot.load_variables
         self._columns = [space.names.index(name) for name in self._loads]
-        rows = robot.build(self.design).constraints["s"]
-        self.rest_volumes = np.array([row.rest_volume for row in rows if isinstance(row, Cavity)])
-        # Errors with a normal distribution have a standard deviation of 1.25 times their mean size.
-        # In space, the mean length of errors is 1.6 times their deviation along each axis.
-        errors = {"sensor_mean": 0.0, "effector_mean": 0.0} if exact else self.model.card["test"]
-        self.volume_error = np.sqrt(0.5 * np.pi) * errors["sensor_mean"] * float(robot.sensor_scale.mean())
-        self.tip_error = np.sqrt(np.pi / 8.0) * errors["effector_mean"]
+        cavities = robot.build(self.design).constraints["s"]
+        self.rest_volumes = np.array([row.rest_volume for row in cavities if isinstance(row, Cavity)])
+        self._own = 3 * len(robot.effectors)
+        rows = self._own + len(self.rest_volumes)
+        if exact:
+            errors = RowErrors.none(rows)
+        elif errors is None:
+            if "errors" not in self.model.card:
+                raise WeightsError(
+                    f"the card of the weights of '{self.model.robot.weights_name}' has no 'errors': fit them again, or "
+                    "pass errors=measured_errors(...)"
+                )
+            # Of the rows of the model, those of touched points are left out.
+            own, touched = np.arange(self._own), self.model.effectors - self._own
+            sensors = np.arange(self._own, rows) + touched
+            errors = RowErrors.from_card(self.model.card["errors"]).rows(np.r_[own, sensors])
+        if errors.mean.shape[1] != rows:
+            raise ValueError(f"errors must have {rows} rows (effectors, then sensors), got {errors.mean.shape[1]}")
+        self.errors = errors
         n_a = self.model.count
         self._actuators = np.zeros(n_a), self.noise.displacement**2 * np.eye(n_a)
         self._before: Mixture | None = None
@@ -182,7 +198,9 @@ class LearnedEstimator:
             self._at, self._tried = self._limited(self._before.means), False
         self._count += 1
         self._mean = self._mean + (volumes - self._mean) / self._count
-        spread = np.full(len(volumes), np.hypot(self.noise.volume / np.sqrt(self._count), self.volume_error))
+        bias, deviation = self.errors.at(self._share(command))
+        spread = np.hypot(self.noise.volume / np.sqrt(self._count), deviation[self._own :])
+        self._measured = self._mean + bias[self._own :]
         steps = self.steps if self._count == 1 else 1
         found, response, at = self._search(command, spread, self._at, steps)
         misfit, best = self._misfit(found, response, at, spread)
@@ -195,9 +213,14 @@ class LearnedEstimator:
                 found, response, at = other
                 misfit, best = self._misfit(found, response, at, spread)
         self._mixture, self._at = found, self._limited(found.means)
-        tips = response.effectors - np.einsum("qon,qn->qo", response.effector_slopes, at)
+        tips = response.effectors - bias[: self._own] - np.einsum("qon,qn->qo", response.effector_slopes, at)
         moments = found.moments(tips, response.effector_slopes)
-        return self._estimate(command, moments, misfit, response, best)
+        return self._estimate(command, moments, misfit, response, best, deviation[: self._own])
+
+    def _share(self, command: np.ndarray) -> float:
+        """Return how far the actuators are commanded, as a mean share of their ranges."""
+        robot = self.robot
+        return float(np.mean((command - robot.lower) / (robot.upper - robot.lower)))
 
     def _search(
         self, command: np.ndarray, spread: np.ndarray, start: np.ndarray, steps: int
@@ -208,7 +231,7 @@ class LearnedEstimator:
         for _ in range(steps):
             at, response = now, self.respond(command, now)
             base = response.sensors - np.einsum("qkn,qn->qk", response.sensor_slopes, at)
-            found = before.after(self._mean, spread, base, response.sensor_slopes)
+            found = before.after(self._measured, spread, base, response.sensor_slopes)
             now = self._limited(found.means)
             deviation = np.sqrt(np.einsum("qnn->qn", found.covariances))
             likely = _logarithms(found) > _logarithms(found).max() - 8.0
@@ -220,11 +243,17 @@ class LearnedEstimator:
         """Return the sum of the squared residuals at the most probable place, and the number of that place."""
         best = int(np.argmax(_logarithms(found)))
         expected = response.sensors[best] + response.sensor_slopes[best] @ (found.means[best] - at[best])
-        residual = (self._mean - expected) / spread
+        residual = (self._measured - expected) / spread
         return float(residual @ residual), best
 
     def _estimate(
-        self, command: np.ndarray, moments: Moments, misfit: float, response: _Responses, best: int
+        self,
+        command: np.ndarray,
+        moments: Moments,
+        misfit: float,
+        response: _Responses,
+        best: int,
+        deviation: np.ndarray,
     ) -> LearnedEstimate:
         loaded = slice(0, None if self.load is not None else 0)
         every, size = response.condensed, self.model.size
@@ -238,7 +267,7 @@ class LearnedEstimator:
             load=moments.load[loaded],
             load_covariance=moments.load_covariance[loaded, loaded],
             effector=moments.outputs,
-            effector_covariance=moments.output_covariance + self.tip_error**2 * np.eye(len(moments.outputs)),
+            effector_covariance=moments.output_covariance + np.diag(deviation**2),
             misfit=misfit,
             condensed=CondensedModel(W, delta - W @ effort, effort, roles, tuple(every.rows[k] for k in kept)),
             slack=response.slack[best],

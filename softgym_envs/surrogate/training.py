@@ -26,6 +26,7 @@ from softgym_envs.surrogate.data.states import full_compliance, stable_rows, tra
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel, definite
 from softgym_envs.surrogate.networks import NETWORKS, network_module
+from softgym_envs.surrogate.row_errors import RowErrors
 from softgym_envs.surrogate.trainer import Trainer
 from softgym_envs.surrogate.weight_files import card_of, load_model, save_model
 
@@ -66,6 +67,7 @@ class DataConfig(Config):
     bounds: dict[str, tuple[float, float]] = {}
     alike: tuple[str, ...] = ()
     boundary: float = Field(default=0.0, ge=0.0, le=1.0)
+    one_mesh: bool = False
     groups_per_shard: int = Field(default=10, gt=0)
 
     @model_validator(mode="before")
@@ -245,6 +247,17 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
     }
 
 
+def row_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> RowErrors:
+    """Return the errors of effectors [m] and sensors under the displacements of a dataset."""
+    data = {name: column[stable_rows(model.robot, data)] for name, column in data.items()}
+    context, robot = model.context(data["design"]), model.robot
+    rows = [model.effector(context, data["displacement"])[0]]
+    if model.sensors:
+        rows.append(model.sensed(context, data["displacement"]))
+    shares = (data["displacement"] - robot.lower) / (robot.upper - robot.lower)
+    return RowErrors.fit(shares.mean(axis=1), np.concatenate(rows, axis=1) - data["effector"])
+
+
 def domain_of(
     model: SurrogateModel, training: dict[str, np.ndarray], validation: dict[str, np.ndarray]
 ) -> dict[str, Any]:
@@ -393,6 +406,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         "training_seconds": round(seconds, 1),
         "best_validation": {part: min(row["validation"] for row in rows) for part, rows in histories.items()},
         "test": errors,
+        **({"errors": row_errors(model, data["validation"]).to_card()} if model.sensors else {}),
         "correction": correction,
     }
     save_model(module.Model(robot, tensors, card), folder)

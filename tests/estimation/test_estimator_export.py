@@ -124,7 +124,7 @@ def test_estimates_are_those_of_python(exported, real):
     estimator, folder = exported
     reference = LearnedEstimator(
         estimator.robot, design=estimator.design, noise=estimator.noise, model=estimator.model,
-        exact=estimator.volume_error == 0.0,
+        errors=estimator.errors,
     )  # fmt: skip
     machine = Compiled(folder, f"-DBOT_ESTIMATOR_REAL={real}")
     differences, misfits, slack = [], [], 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,9 @@ from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.estimation import Noise, Readings, Touch, finger_grid
 from softgym_envs.estimation.learned import LearnedEstimator
+from softgym_envs.estimation.model_errors import measured_errors
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.surrogate.row_errors import KNOTS, RowErrors
 
 GRID = finger_grid()
 POINT = np.array([0.001, 0.0, -0.093])
@@ -99,10 +103,47 @@ def test_errors_of_the_model_keep_the_truth_of_finite_elements_likely(robot):
     load = robot.touch_design(robot.design_space.baseline, POINT, np.array([0.0, 0.8, 0.0]))
     state = Statics(robot.under_touch().build(load)).solve(COMMAND)
     estimator = touched(robot, exact=False)
-    assert estimator.volume_error > 0.0 and estimator.tip_error > 0.0
+    assert (estimator.errors.deviation > 0.0).all()
     found = estimator.update(Readings(COMMAND, estimator.rest_volumes + state.condensed.delta.s))
     assert abs(found.load[0] - 0.8) < 4.0 * np.sqrt(found.load_covariance[0, 0])
     assert np.abs(found.effector - state.condensed.delta.e[:3]).max() < 5e-3
+
+
+def test_a_constant_error_of_the_model_on_one_body_is_measured_and_taken_back(robot):
+    """The plant is the model with wrong volumes and tips; measured on it, the errors leave no trace."""
+    wrong = np.array([0.0, 3e-4, -2e-4]), np.array([2e-9, -1.5e-9])
+
+    class Plant(SurrogateBackend):
+        def step(self, command, mode="displacement", *, force=None):
+            state = super().step(command, mode, force=force)
+            shift = np.concatenate([[0.0], *wrong])
+            return replace(
+                state, condensed=replace(state.condensed, free=state.condensed.free + shift), slack=state.slack
+            )
+
+    errors = measured_errors(SurrogateBackend(robot), Plant(robot), GRID, states=20)
+    np.testing.assert_allclose(errors.mean, np.tile(-np.concatenate(wrong), (KNOTS, 1)), rtol=1e-6, atol=1e-12)
+    assert np.abs(errors.deviation).max() < 1e-9
+    plant = SurrogateBackend(robot)
+    plant.touch(PointForce(POINT, np.array([0.0, 0.8, 0.0])))
+    state = plant.step(COMMAND)
+    exact = touched(robot)
+    corrected = LearnedEstimator(robot, load=exact.load, noise=NOISE, errors=errors)
+    volumes = exact.rest_volumes + state.condensed.delta.s
+    expected = exact.update(Readings(COMMAND, volumes))
+    found = corrected.update(Readings(COMMAND, volumes + wrong[1]))
+    np.testing.assert_allclose(found.load, expected.load, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(found.effector, expected.effector + wrong[0], rtol=0, atol=1e-7)
+
+
+def test_larger_errors_of_the_model_leave_the_force_less_certain(robot):
+    load = Touch(GRID, GRID.cell(POINT), 1.0)
+    spreads = []
+    for size in (0.2e-9, 1e-9):
+        rows = np.tile([0.0, 0.0, 0.0, size, size], (KNOTS, 1))
+        estimator = LearnedEstimator(robot, load=load, noise=NOISE, errors=RowErrors(0.0 * rows, rows))
+        spreads.append(estimator.update(Readings(COMMAND, estimator.rest_volumes - 2e-8)).load_covariance[0, 0])
+    assert spreads[1] > 1.5 * spreads[0]
 
 
 def test_wrong_inputs_are_named(robot):
@@ -112,3 +153,5 @@ def test_wrong_inputs_are_named(robot):
         LearnedEstimator(robot, noise=Noise(drift=0.1))
     with pytest.raises(ValueError, match="volumes"):
         touched(robot).update(Readings(COMMAND, np.array([1.0])))
+    with pytest.raises(ValueError, match="errors must have 5 rows"):
+        LearnedEstimator(robot, errors=RowErrors.none(4))

@@ -310,6 +310,16 @@ def test_infeasible_designs_are_left_out(monkeypatch):
     assert sample_group(robot, PLAN, 0) == (None, PLAN.states)
 
 
+def test_bodies_with_meshes_of_their_own_are_left_out_on_request():
+    robot = make_robot("sensorized_finger", touch=True, meshing="morph")
+    bodies = {"morphed": {}, "remeshed": {"slope": 0.2}}
+    for origin, design in bodies.items():
+        assert robot.body(design).origin == origin
+        for one_mesh in (False, True):
+            plan = SamplingPlan(groups=1, states=0, vary=(), design=design, one_mesh=one_mesh)
+            assert (sample_group(robot, plan, 0)[0] is None) == (one_mesh and origin == "remeshed")
+
+
 # -- datasets ---------------------------------------------------------------------------------------------------------
 
 

@@ -16,6 +16,7 @@ from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.export.c_loads import loaded_text
 from softgym_envs.surrogate.export.c_text import check_identifier, comment, functions, names_of
 from softgym_envs.surrogate.export.common import exportable
+from softgym_envs.surrogate.row_errors import KNOTS
 from softgym_envs.version import __version__
 
 _HERE = Path(__file__).parent
@@ -118,6 +119,10 @@ def _header(estimator: LearnedEstimator, grid: TouchGrid, expected_force: float,
         f"unit[{k}]": units,
         f"log_shares[{len(shares)}]": np.log(shares),
         f"coordinates[{len(shares)}][2]": 0.5 * (coordinates + 1.0),
+        f"lower[{n}]": robot.lower,
+        f"range[{n}]": robot.upper - robot.lower,
+        f"bias[{KNOTS}][{own + k}]": estimator.errors.mean,
+        f"deviation[{KNOTS}][{own + k}]": estimator.errors.deviation,
         "largest_force": np.array(estimator.largest_force),
     }
     bytes_ += 8 * sum(array.size for array in constants.values())
@@ -125,14 +130,13 @@ def _header(estimator: LearnedEstimator, grid: TouchGrid, expected_force: float,
         "slack": 10.0 * TOLERANCE,
         "settled": TOLERANCE,
         "accuracy": estimator.accuracy,
-        "tip_error": estimator.tip_error,
-        "volume_error": estimator.volume_error,
         "volume_noise": noise.volume,
         "displacement_noise": noise.displacement,
         "expected_force": expected_force,
         "improbable": float(chi2.ppf(IMPROBABLE, k)),
     }
-    counts = {"most_steps": 26, "steps": estimator.steps, "columns": grid.cells[0], "rows": grid.cells[1]}
+    counts = {"most_steps": 26, "steps": estimator.steps, "knots": KNOTS}
+    counts |= {"columns": grid.cells[0], "rows": grid.cells[1]}
     names = names_of(p, many=True) | {key: repr(float(value)) for key, value in numbers.items()}
     names |= {key: str(value) for key, value in counts.items()}
     about = [

@@ -19,7 +19,7 @@ from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign, unknown_name
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.base import Robot
+from softgym_envs.robots.base import MeshedRobot, Robot
 from softgym_envs.surrogate.features import learned_variables
 
 SEQUENCES = ("halton", "sobol", "latin", "random", "vertices")
@@ -47,6 +47,8 @@ class SamplingPlan:
         share: part of the ranges of the commands, from their lower ends, that is drawn from.
         loads: groups in a row that share a body and differ in what acts on it (`Robot.load_variables`): a mesh costs
             more than the states under one more load.
+        one_mesh: leave out bodies to which the mesh of the baseline does not move well: their own meshes have errors of
+            their own, which no smooth function of the design describes.
     """
 
     groups: int
@@ -61,6 +63,7 @@ class SamplingPlan:
     boundary: float = 0.0
     share: float = 1.0
     loads: int = 1
+    one_mesh: bool = False
 
     def __post_init__(self) -> None:
         if self.sequence not in SEQUENCES:
@@ -221,14 +224,16 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str
     Returns:
         Arrays with one row per solved state: ``design`` (all variables), ``displacement``, ``effort``, ``effector``,
         ``compliance`` (upper triangle of W, row by row) and ``rest`` (1 for the state at rest), or None for a design
-        that is infeasible or has no equilibrium at rest; and the number of commands without an equilibrium, which are
-        left out. Sensor rows are the last columns of ``effector``.
+        that is infeasible, has a mesh that the plan leaves out, or has no equilibrium at rest; and the number of
+        commands without an equilibrium, which are left out. Sensor rows are the last columns of ``effector``.
     """
     space = robot.design_space
     count = len(robot.actuators)
     zero = np.zeros(count)
     try:
         design = plan.designs(robot, group, 1)[0]
+        if plan.one_mesh and isinstance(robot, MeshedRobot) and robot.body(design).origin != "morphed":
+            return None, plan.states
         model = robot.build(design)
         statics = Statics(model)
         rest = statics.solve(zero, robot.rest_mode)

@@ -20,12 +20,21 @@ if TYPE_CHECKING:
 
 
 class Options(TrainingOptions):
-    """Hyper-parameters of the potential network."""
+    """Hyper-parameters of the potential network.
+
+    Attributes:
+        kind: names this network.
+        width: hidden units of the layers of the actuation.
+        body_width: hidden units of the layers of the design.
+        members: of the ensemble.
+        sensor_weight: of the squared errors of sensor rows, relative to those of effectors.
+    """
 
     kind: Literal["potential"] = "potential"
     width: int = Field(default=64, gt=0)
     body_width: int = Field(default=64, gt=0)
     members: int = Field(default=5, gt=0)
+    sensor_weight: float = Field(default=1.0, gt=0.0)
 
 
 def train(
@@ -61,7 +70,10 @@ def train(
     if training.unloaded:
         middle = 0.5 * (robot.upper + robot.lower)
         rest = (0.0 - middle) / (robot.upper - middle)
-    arguments = [(trainer, member, data, rest, robot.convex, states[member]) for member in range(options.members)]
+    weights = np.ones(training.effector.shape[1], dtype=np.float32)
+    weights[len(weights) - len(robot.sensor_scale) :] = options.sensor_weight
+    shared = data, rest, robot.convex, weights / weights.mean()
+    arguments = [(trainer, member, *shared, states[member]) for member in range(options.members)]
     found = sorted(parallel_map(_train_member, arguments, trainer.workers), key=lambda result: result[0])
     return stack_members([state for _, state, _ in found], scales), {f"member {k}": rows for k, _, rows in found}
 
@@ -72,6 +84,7 @@ def _train_member(
     data: tuple[Targets, Targets],
     rest: np.ndarray | None,
     convex: bool,
+    weights: np.ndarray,
     start: dict[str, np.ndarray] | None,
 ) -> tuple[int, dict[str, np.ndarray], History]:
     """Train one member; return its number, weights and history."""
@@ -88,10 +101,11 @@ def _train_member(
     net = PotentialNet(*sizes, options.width, options.body_width, rest, convex=convex)
     if start is not None:
         net.load_state_dict({k: torch.tensor(v) for k, v in start.items()})
-    effort_spread = training.effort_spread
+    effort_spread, row_weights = training.effort_spread, torch.as_tensor(weights)
 
     def loss(rows: Tensor | None) -> Tensor:
-        return potential_loss(net, validation if rows is None else training.rows(rows), effort_spread)
+        batch = validation if rows is None else training.rows(rows)
+        return potential_loss(net, batch, effort_spread, row_weights)
 
     history = trainer.optimise(f"member {member}", net, loss, len(training.design), seed=seed)
     return member, {k: v.detach().numpy().copy() for k, v in net.state_dict().items()}, history
@@ -195,18 +209,19 @@ def make_targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) ->
     return Targets(*(torch.as_tensor(np.ascontiguousarray(part), dtype=torch.float32) for part in parts))
 
 
-def potential_loss(net: PotentialNet, batch: Targets, effort_spread: float) -> Tensor:
+def potential_loss(net: PotentialNet, batch: Targets, effort_spread: float, weights: Tensor | float = 1.0) -> Tensor:
     """Return the sum of five mean squared errors of a network.
 
-    Efforts and Hessian are measured in their metric, the held compliance in its own, effector and Jacobian as they are.
+    Efforts and Hessian are measured in their metric, the held compliance in its own, effector and Jacobian as they are,
+    their rows with weights (e,).
     """
     gradient, hessian, x, jacobian, L = net(batch.design, batch.actuation)
     S, whitening = batch.metric, batch.whitening
     terms = (
         ((S.mT @ (gradient - batch.effort)[:, :, None]) ** 2).mean() / effort_spread,
         ((S.mT @ hessian @ S - batch.hessian) ** 2).mean(),
-        ((x - batch.effector) ** 2).mean(),
-        ((jacobian - batch.jacobian) ** 2).mean(),
+        ((x - batch.effector) ** 2 * weights).mean(),
+        ((jacobian - batch.jacobian).mT ** 2 * weights).mean(),
         ((whitening @ (L @ L.mT - batch.held) @ whitening.mT) ** 2).mean(),
     )
     return sum(terms[1:], terms[0])
