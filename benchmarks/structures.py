@@ -107,7 +107,7 @@ def search(kind: str, seed: int) -> dict[str, Any]:
     study.optimize(value, n_trials=TRIALS)
     best = np.minimum.accumulate([trial.value for trial in study.trials]).tolist()
     design = robot.design_space.complete(study.best_trial.user_attrs["design"])
-    return {"search": kind, "seed": seed, "design": design, "score [mm]": study.best_value, "best so far [mm]": best}
+    return {"search": kind, "seed": seed, "design": dict(design), "score [mm]": study.best_value, "best so far [mm]": best}
 
 
 def _drawn(trial: Any, variable: DesignVariable) -> float:
