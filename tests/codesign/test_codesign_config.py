@@ -267,7 +267,7 @@ def test_shipped_configs_and_their_policies(path):
 def test_shipped_studies_train_a_policy_for_each_body(path):
     config = load_config(path, StudyConfig)
     # FEM at every step, or a question about the body that training would blur; their headers say so.
-    untrained = {"finger_grasp", "tetrapod_reach", "modular_reach", "modular_reach_fixed"}
+    untrained = {"finger_grasp", "tetrapod_reach", "modular_reach"}
     if config.name in untrained:
         assert config.strategy == "qp"
     elif config.name == "modular_reach_policy":  # compares one policy with the inverse QP

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -59,12 +59,14 @@ class Module(ABC):
         symmetry: reflections about its middle that map any body onto itself: the axes that each of them reverses.
             ``"x"`` is the plane normal to x, ``"xz"`` half a turn about y.
         closed: whether the middle of the body is a closed cavity, which takes a pressure.
+        helpers: functions that the drawing calls, whose meshes are made anew when they are edited.
     """
 
     name: ClassVar[str]
     design_space: ClassVar[DesignSpace]
     symmetry: ClassVar[tuple[str, ...]] = ("x", "y", "z")
     closed: ClassVar[bool] = False
+    helpers: ClassVar[tuple[Callable[..., object], ...]] = ()
 
     @abstractmethod
     def drawing(self, design: Mapping[str, float]) -> Drawing:
@@ -87,7 +89,7 @@ class Module(ABC):
         """
         complete = self.design_space.complete(design)
         draw, parameters = self.drawing(complete)
-        return mesh_geometry(draw, parameters, mesh_size=2.0 * self.thinnest(complete) / refine)
+        return mesh_geometry(draw, parameters, mesh_size=2.0 * self.thinnest(complete) / refine, uses=self.helpers)
 
     def add_to(
         self,

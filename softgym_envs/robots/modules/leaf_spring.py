@@ -7,23 +7,21 @@ from collections.abc import Mapping
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.robots.base import Drawing
 from softgym_envs.robots.modules.base import MATERIAL, Module
-from softgym_envs.robots.modules.plates import PLATE, add_plates
+from softgym_envs.robots.modules.plates import PLATE, add_layers
 
 
 def draw_leaf(*, depth: float, width: float, thickness: float, length: float, plate: float) -> None:
     """Draw two plates and the leaf between them, in mm."""
-    import gmsh
-
-    occ = gmsh.model.occ
-    leaf = occ.addBox(-thickness / 2, -width / 2, plate, thickness, width, length - 2.0 * plate)
-    first, last = add_plates(depth, width, length, plate)
-    occ.fuse([first], [(3, leaf), last])
+    half, edge, top = thickness / 2, depth / 2, length - plate
+    right = [(edge, 0.0), (edge, plate), (half, plate), (half, top), (edge, top), (edge, length)]
+    add_layers(right + [(-x, z) for x, z in reversed(right)], width)
 
 
 class LeafSpring(Module):
     """A leaf between two plates; it bends about y."""
 
     name = "leaf_spring"
+    helpers = (add_layers,)
     design_space = DesignSpace(
         DesignVariable("leaf_length", 0.010, 0.040, 0.020, "m", "free length of the leaf"),
         DesignVariable("width", 0.005, 0.030, 0.020, "m", "along y"),
