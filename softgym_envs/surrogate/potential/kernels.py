@@ -13,6 +13,8 @@ _FAST: Any = {"cache": True, "error_model": "numpy", "fastmath": FAST}
 #: Rows evaluated together: each weight is then fetched once for all of them, and the weights and results of one member
 #: stay in the fast caches.
 ROWS_PER_BLOCK = 48
+#: Steps of a search for slack cables with the curvature of one member; two to four usually suffice.
+PATIENCE = 8
 
 
 @njit(**_FAST)
@@ -371,7 +373,8 @@ def search(
 
     The steps use the curvature of the first member alone, whose quadratic part is ``first``. One row in five
     therefore needs one more step (cable trunk; up to one in four elsewhere). That costs less than the curvature of
-    all members, which took half of the time.
+    all members, which took half of the time. Where members disagree by more than a factor of two such steps do not
+    converge, so rows that still move after `PATIENCE` of them take Newton steps with all members.
 
     The rows of a block take their steps together, so that one evaluation of the network serves all rows that move.
     """
@@ -413,10 +416,12 @@ def search(
                     moving[left], asked[left] = row, k
                     left += 1
             count = left
-            renew = iteration % 4 == 0
-            if renew:
-                # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
+            # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
+            renew = iteration % 4 == 0 or iteration >= PATIENCE
+            if renew and iteration < PATIENCE:
                 _curvatures(asked[:count], part, A1[:1], A2[:1], PT[:1], first, kept, K)
+            elif renew:
+                _curvatures(asked[:count], part, A1, A2, PT, quadratic, kept, K)
             left = 0
             for k in range(count):
                 row = moving[k]
