@@ -76,7 +76,7 @@ def study(folder: Path) -> tuple[str, dict[str, Any]]:
     if not rows:
         raise DataError(f"{file}: neither baseline nor winner was tested by finite elements")
     mesh = next((row["objective_mesh"] for row in found["comparison"] if row.get("objective_mesh")), None)
-    if mesh is not None:
+    if mesh is not None and mesh["interval"] is not None:  # a single path has none
         rows[0]["change with the mesh, 95% interval [mm]"] = [1e3 * end for end in mesh["interval"]]
     rows[0]["CPU with FEM check [min]"] = sum(seconds.values()) / 60.0
     rows[0]["winner's body"] = _body(found)
@@ -110,7 +110,7 @@ def _meshes(found: dict[str, Any], mesh: dict[str, Any], whole: bool) -> list[di
         if compared["backend"] == "refined":  # on the other mesh, at the same goals
             row["change before [mm]"] = row["change [mm]"] - 1e3 * mesh["left"] * (1.0 - mesh["ratio"])
         row["interval [mm]"] = _interval(compared)
-        if compared["objective_mesh"]:
+        if compared["objective_mesh"] and compared["objective_mesh"]["interval"]:
             row["with the mesh [mm]"] = [1e3 * end for end in compared["objective_mesh"]["interval"]]
         rows.append(row)
     return rows

@@ -197,8 +197,11 @@ class StudyFolder:
 def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str, fixed: tuple[str, ...]) -> None:
     """Raise ConfigError unless the study at ``where`` can continue with a new configuration.
 
-    The keys ``fixed`` of `EXTENSIBLE` must stay. To start another study, the message says to use another ``use``.
+    The keys ``fixed`` of `EXTENSIBLE` must stay, except that a finer mesh may be added: no test has depended on it. To
+    start another study, the message says to use another ``use``.
     """
+    if old.finalists.refinement is None:
+        fixed = tuple(key for key in fixed if key != "finalists.refinement")
     fixed = fixed if new.storage == JOURNAL else ("name", *fixed)
     extensible = [key for key in EXTENSIBLE if key not in fixed] + ["storage"] * (new.storage != JOURNAL)
     if (old.storage == JOURNAL) != (new.storage == JOURNAL):

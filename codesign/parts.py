@@ -162,7 +162,8 @@ class RefinementConfig(Config):
         default=None,
         gt=0.0,
         lt=1.0,
-        description="size of its elements over that of the coarser mesh; default: cube root of the ratio of unknowns",
+        description="size of its elements over that of the coarser mesh; default: the ratio of the numbers of unknowns "
+        "for robots made of beams, its cube root for others",
     )
 
 

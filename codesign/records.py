@@ -168,7 +168,7 @@ class FinalistTest(Record):
     values: dict[str, float] = field(default_factory=dict)  # of each objective that the study names [SI]
     goal_values: list[float] | None = None  # of the objective for each goal [SI], if it has such values
     error: str | None = None  # why the body cannot be simulated
-    unknowns: int | None = None  # of its mesh, if the study compares meshes
+    unknowns: int | None = None  # of its mesh, on finite elements
     last_motion: float | None = None  # of the effector in the last step [m], if only ends are tested; see `Ends`
 
 

@@ -124,7 +124,7 @@ def _test(folder: StudyFolder, plan: PlannedTest) -> FinalistTest:
             found = measure(config, environment, ends.evaluation, finalist.design)
         else:
             found = assess(controller, config, environment, goals, finalist.design)
-            if refinement is not None and plan.backend != "surrogate":
+            if plan.backend != "surrogate":
                 test.unknowns = environment.make_robot().build(finalist.design).equations
     except (InfeasibleDesign, ConvergenceError) as error:
         test.error = str(error)

@@ -109,12 +109,17 @@ def _comparisons(snapshot: StudySnapshot) -> list[Comparison]:
                 if before is not None and after is not None:
                     rows.append(_compare(before, after, snapshot.objective))
     if finer is not None:
-        rows = [_with_mesh(row, found, (baseline.trial, winner.trial), finer.ratio) for row in rows]
+        dimension = 1 if snapshot.config.robot.made_of_beams else 3
+        rows = [_with_mesh(row, found, (baseline.trial, winner.trial), finer.ratio, dimension) for row in rows]
     return rows
 
 
 def _with_mesh(
-    row: Comparison, found: Mapping[tuple[int, str, str], TestGroup], trials: tuple[int, int], ratio: float | None
+    row: Comparison,
+    found: Mapping[tuple[int, str, str], TestGroup],
+    trials: tuple[int, int],
+    ratio: float | None,
+    dimension: int,
 ) -> Comparison:
     """Return the comparison on FEM with what is left of the mesh's error, if the finer mesh was tested; else as it is.
 
@@ -122,7 +127,8 @@ def _with_mesh(
         row: the comparison.
         found: tests on unseen goals.
         trials: of baseline and winner.
-        ratio: of the sizes of elements, or None for the cube root of the ratio of unknowns.
+        ratio: of the sizes of elements, or None for what follows from the unknowns.
+        dimension: of the elements: with half their size there are about 2 ** dimension times as many.
     """
     coarse = [found.get((trial, row.agent, "fem")) for trial in trials]
     fine = [found.get((trial, row.agent, REFINED)) for trial in trials]
@@ -133,7 +139,7 @@ def _with_mesh(
         few, many = (groups[0].unknowns for groups in both)
         if few is None or many is None or few >= many:
             return row
-        ratio = (few / many) ** (1.0 / 3.0)
+        ratio = (few / many) ** (1.0 / dimension)
 
     def part(tables: Sequence[Sequence[np.ndarray]], interval: Interval) -> MeshPart:
         (before, after), (before_fine, after_fine) = ([table.mean(axis=0) for table in pair] for pair in tables)

@@ -35,19 +35,21 @@ class TrunkMesh:
         rings: number of rings of elements about its axis.
         element: name of the solid element.
         guide_radius: radius of the channels on which cables act [m]; 0 for single points.
+        strokes: largest displacement of the long and of the short cables [m].
     """
 
     layers: int
     rings: int
     element: str
     guide_radius: float
+    strokes: tuple[float, float]
 
 
 MESHES = {
-    "published": TrunkMesh(24, 2, "linear", 0.0),
-    "coarse": TrunkMesh(12, 1, "quadratic", 3.0e-3),
-    "accurate": TrunkMesh(24, 2, "quadratic", 3.0e-3),
-    "reference": TrunkMesh(36, 3, "quadratic", 3.0e-3),
+    "published": TrunkMesh(24, 2, "linear", 0.0, (0.035, 0.020)),
+    "coarse": TrunkMesh(12, 1, "quadratic", 3.0e-3, (0.021, 0.012)),
+    "accurate": TrunkMesh(24, 2, "quadratic", 3.0e-3, (0.021, 0.012)),
+    "reference": TrunkMesh(36, 3, "quadratic", 3.0e-3, (0.021, 0.012)),
 }
 """Meshes by name. No source states the radius of the cables' channels. The whole tension acts on the soft tip where a
 long cable ends, and with a small radius it cuts in: with 2 mm, elements of half the length there move the tip by 4 % of
@@ -123,9 +125,10 @@ class CableTrunk(Robot):
         rings: number of rings of elements about the axis, instead of that of the mesh.
         element: name of the solid element, instead of that of the mesh.
         material: name of a material of `softgym_envs.mechanics.materials`.
-        strokes: largest displacement of the long and of the short cables [m]. The default is half of the public model's
-            (0.070, 0.040): from 37 mm on, two opposite long cables crush the thin tip and no equilibrium is found; one
-            long cable alone can be pulled by 57 mm.
+        strokes: largest displacement of the long and of the short cables [m], instead of those of the mesh. On the
+            published one they are half of the public model's (0.070, 0.040): from 37 mm on, two opposite long cables
+            crush the thin tip and no equilibrium is found; one long cable alone can be pulled by 57 mm. On the others
+            they are (0.021, 0.012), because their elements, as soft as the body, are crushed earlier.
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
         gravity: acceleration [m/s2]; the baseline body weighs 42 g.
         **options: options of `Robot`.
@@ -147,7 +150,7 @@ class CableTrunk(Robot):
         rings: int | None = None,
         element: str | None = None,
         material: str = "corotational",
-        strokes: tuple[float, float] = (0.035, 0.020),
+        strokes: tuple[float, float] | None = None,
         unilateral: bool = True,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         **options: Any,
@@ -161,6 +164,7 @@ class CableTrunk(Robot):
         if not (isinstance(layers, int) and layers >= 1 and isinstance(rings, int) and rings >= 1):
             raise ValueError(f"layers = {layers!r} and rings = {rings!r} must be positive integers")
         resolve_material(material)
+        strokes = tier.strokes if strokes is None else strokes
         if len(strokes) != 2 or not all(0.0 < stroke < np.inf for stroke in strokes):
             raise ValueError(f"strokes must be two positive lengths [m], got {strokes!r}")
         super().__init__(gravity=gravity, **options)

@@ -6,7 +6,8 @@ errors. The network is not trained again.
 
 A state is trusted if its uncertainty is below a limit. The limit is at most the robot's goal tolerance, and lower if a
 search for the worst trusted states, in which finite elements judge states that gradients of the spread propose, finds
-errors above the tolerance.
+errors above the tolerance. A search proposes states just below the limit, so nothing has been searched below a lower
+one: searches are repeated, each below the limit that the last one left, until one finds no error above the tolerance.
 
 Some commands have no equilibrium. An error exists only where there is one, so coverage is that of the other states; how
 many commands have none is reported for each stratum. The members of an ensemble may agree there, so the spread does not
@@ -57,6 +58,9 @@ LOST = 0.01
 
 USUAL = 0.98
 """Share of the states inside whose growth is not above its limit."""
+
+SEARCHES = 6
+"""Most searches of a calibration."""
 
 ROUNDS = 4
 POOL = 8
@@ -308,7 +312,7 @@ def calibrate(
         robot: their robot.
         bodies: bodies of each stratum.
         states: commands of each body.
-        attacks: states of the search for the worst trusted ones; 0 for no search.
+        attacks: states of each search for the worst trusted ones; 0 for no search.
         seed: of all random numbers.
         state_folder: where the FEM states are kept, so that an interrupted run continues.
         kept_only: calibrate on the states that the folder holds, without solving the rest; only those of the search
@@ -329,10 +333,13 @@ def calibrate(
         softest = _drawn(model, "near buckling", bodies, states, seed, state_folder, kept_only)
         known = JudgedStates.join([known, softest])
     calibration = fit_calibration(model, known)
-    model = _calibrated(model, calibration, robot.goal_tolerance)
-    searched = [attack(model, attacks, states, seed, state_folder)] if attacks else []
-    everything = JudgedStates.join([known, *searched])
-    limit = safe_limit(predict(_calibrated(model, calibration), everything), robot.goal_tolerance)
+    unlimited, everything, limits = _calibrated(model, calibration), known, []
+    limit = safe_limit(predict(unlimited, known), robot.goal_tolerance)
+    while attacks and len(limits) < SEARCHES and (not limits or limit < limits[-1]):
+        limits.append(limit)
+        found_states = attack(_calibrated(model, calibration, limit), attacks, states, seed, state_folder, len(limits))
+        everything = JudgedStates.join([everything, found_states])
+        limit = safe_limit(predict(unlimited, everything), robot.goal_tolerance)
     model = _calibrated(model, calibration, limit)
     found = report(model, everything)
     card_path = Path(folder) / "model.json"
@@ -342,7 +349,7 @@ def calibrate(
     if model.domain.limits_growth:
         card["domain"]["growth"] = model.domain.growth
     card["calibration"] = {
-        "bodies": bodies, "states": states, "attacks": attacks, "seed": seed, "kept_only": kept_only,
+        "bodies": bodies, "states": states, "attacks": attacks, "seed": seed, "kept_only": kept_only, "limits": limits,
         "strata": {name: asdict(row) for name, row in found.items()},
     }  # fmt: skip
     write_json(card_path, card)
@@ -384,14 +391,21 @@ def calibration_states(model: SurrogateModel, folder: str | Path) -> JudgedState
     known = judged_states(model, made["bodies"], *sizes, made.get("kept_only", False))
     if not made["attacks"]:
         return known
-    searched = with_domain(model, limit=model.robot.goal_tolerance)
-    return JudgedStates.join([known, attack(searched, made["attacks"], *sizes)])
+    if "limits" not in made:  # calibrated before searches were repeated
+        made = {**made, "limits": [model.robot.goal_tolerance], "first": 0}
+    searched = [
+        attack(with_domain(model, limit=limit), made["attacks"], *sizes, number)
+        for number, limit in enumerate(made["limits"], start=made.get("first", 1))
+    ]
+    return JudgedStates.join([known, *searched])
 
 
 # -- the worst trusted states --------------------------------------------------------------------------------------
 
 
-def attack(model: SurrogateModel, count: int, states: int, seed: int, folder: str | Path | None = None) -> JudgedStates:
+def attack(
+    model: SurrogateModel, count: int, states: int, seed: int, folder: str | Path | None = None, number: int = 0
+) -> JudgedStates:
     """Search for trusted states with large errors; return all that were judged, in the stratum ``adversarial``.
 
     In each of `ROUNDS` rounds, gradients of the spread move bodies and commands from anywhere in their boxes to where
@@ -404,8 +418,9 @@ def attack(model: SurrogateModel, count: int, states: int, seed: int, folder: st
         states: commands of each body.
         seed: of the random numbers.
         folder: where the states of each body are kept; an interrupted search continues with the next body.
+        number: of the search: each has random numbers of its own.
     """
-    rng = np.random.default_rng([seed, 99])
+    rng = np.random.default_rng([seed, 99 + number])
     robot = model.robot
     d, n, bodies = len(learned_variables(robot)), len(robot.actuators), max(1, count // (ROUNDS * states))
     parts: list[JudgedStates] = []

@@ -225,6 +225,12 @@ def test_a_report_has_the_part_of_the_mesh(written, ratio, left):
     assert ("With the mesh's error, the gain is not certain" in titles) == (left >= 4e-3)
 
 
+def test_elements_of_beams_are_lines(written, monkeypatch):
+    snapshot = written(REFINED)
+    monkeypatch.setattr(type(snapshot.config.robot), "made_of_beams", True)
+    assert collect(snapshot).comparison[0].distance_mesh.ratio == pytest.approx(1000 / 8000)
+
+
 def test_refinements_wait_for_the_winner(written):
     snapshot = written(None)
     assert [(plan.finalist.trial, plan.backend) for plan in snapshot.refinements] == [(0, "refined"), (1, "refined")]
@@ -315,6 +321,28 @@ def test_whole_episodes_on_a_finer_mesh(tmp_path, tiny):
     assert tests[0, "fem"].unknowns < tests[0, "refined"].unknowns
     assert np.isfinite(tests[0, "refined"].mean.returns).all() and tests[0, "refined"].last_motion is None
     assert tests[0, "refined"].mean.distances == pytest.approx(tests[0, "fem"].mean.distances[:1], rel=0.5)
+
+
+def test_a_finer_mesh_can_be_added_to_a_finished_study(tmp_path, tiny):
+    def config(**finalists):
+        data = tiny(
+            trials=2,
+            goals={"count": 2, "unseen_count": 2, "training_count": 1},
+            finalists={"count": 1, "choose": "fem", **finalists},
+        )
+        return StudyConfig.model_validate(data)
+
+    before = run_study(config(), tmp_path / "study", progress=False)
+    assert before.winner.role == "finalist" and before.comparison[0].objective_mesh is None
+    kept = {file: file.read_bytes() for file in (tmp_path / "study" / "finalists").glob("*.json")}
+    finer = {"refinement": {**FINER, "goals": 1}}
+    after = run_study(config(**finer), tmp_path / "study", progress=False)
+    assert {file: file.read_bytes() for file in kept} == kept  # nothing was tested again
+    fem, refined = after.comparison[:2]
+    assert (fem.backend, refined.backend) == ("fem", "refined") and 0.0 < fem.objective_mesh.ratio < 1.0
+    assert fem.objective_change == before.comparison[0].objective_change
+    with pytest.raises(ConfigError, match=r"holds a study with finalists\.refinement"):
+        run_study(config(), tmp_path / "study", progress=False)
 
 
 def test_a_wrong_option_of_the_finer_mesh_is_found_first(tmp_path, tiny):

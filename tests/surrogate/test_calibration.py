@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -306,10 +306,37 @@ def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
     np.testing.assert_array_equal(again.design, found.design)
 
 
+def test_searches_go_on_below_the_limit_that_the_last_one_left(trunk, tmp_path, monkeypatch):
+    """The first search finds errors of 3 mm, the second none."""
+    folder = tmp_path / "weights"
+    shutil.copytree(pretrained_folder(trunk.robot), folder)
+
+    def errors(size):
+        return lambda spread, rng: np.full(len(spread), size)
+
+    known = [
+        predicted_states(trunk, s, 10, 4, k, errors(1e-4)) for k, s in enumerate(strata_of(trunk.robot, buckles=False))
+    ]
+    monkeypatch.setattr(module, "judged_states", lambda *_, **__: JudgedStates.join(known))
+    limits = []
+
+    def search(model, count, states, seed, folder, number):
+        limits.append(model.domain.limit)
+        found = predicted_states(model, "corners", 10, 4, 50 + number, errors(3e-3 if number == 1 else 1e-4))
+        return replace(found, stratum=np.full(40, "adversarial"))
+
+    monkeypatch.setattr(module, "attack", search)
+    calibrate(folder, trunk.robot, bodies=10, states=4, attacks=40)
+    card = load_model(folder, trunk.robot).card
+    assert limits[0] == trunk.robot.goal_tolerance > limits[1] > 0.0 and len(limits) == 2
+    assert card["calibration"]["limits"] == limits and card["domain"]["limit"] == limits[1]
+
+
 def test_calibration_of_weights_from_start_to_end(tmp_path, monkeypatch):
     robot = make_robot("trunk")
     folder = tmp_path / "weights"
     shutil.copytree(pretrained_folder(robot), folder)
+    monkeypatch.setattr(module, "SEARCHES", 1)  # each takes seconds; for more see above
     arguments = ["trunk", "--weights", str(folder), "--folder", str(tmp_path / "states")]
     arguments += ["--bodies", "6", "--states", "2", "--attacks", "16"]
     result = CliRunner().invoke(calibrate_trust, arguments, catch_exceptions=False)

@@ -162,6 +162,22 @@ def test_search_of_a_batch_equals_the_search_of_each_row(name):
     assert np.abs(found[1][well] - expected[1]).max() < 1e-3 * np.abs(expected[1]).max()
 
 
+def test_search_converges_where_members_disagree():
+    """Steps with the curvature of one member do not converge if it is several times softer than the others."""
+    robot = make_robot("cable_trunk")
+    model = pretrained_model(robot)
+    designs, target = random_states(robot, 40)
+    context = model.context(designs)
+    expected = model.search(context, target, target, robot.unilateral, 1e-6, 25)
+    assert expected[2].all()
+    context.arrays["first"] = 0.3 * context.arrays["first"]
+    early = model.search(context, target, target, robot.unilateral, 1e-6, kernels.PATIENCE)
+    assert early[2].mean() < 0.2
+    found = model.search(context, target, target, robot.unilateral, 1e-6, 25)
+    assert found[2].all()
+    assert np.abs(found[0] - expected[0]).max() < 1e-4 * model.span.max()
+
+
 def test_definite_matrices_are_recognised_in_any_units():
     """As of volumes in m3 and effectors in m: eigenvalues of such a W are round-off."""
     rng = np.random.default_rng(0)

@@ -13,6 +13,8 @@ _FAST: Any = {"cache": True, "error_model": "numpy", "fastmath": FAST}
 #: Rows evaluated together: each weight is then fetched once for all of them, and the weights and results of one member
 #: stay in the fast caches.
 ROWS_PER_BLOCK = 48
+#: Steps of a search for slack cables after which none is simplified; two to four usually suffice.
+PATIENCE = 8
 
 
 @njit(**_FAST)
@@ -371,8 +373,8 @@ def search(
 
     The first four steps use the curvature of the first member alone, whose quadratic part is ``first``. One row in five
     therefore needs one more step (cable trunk; up to one in four elsewhere). That costs less than the curvature of
-    all members, which took half of the time. Rows that are still on the way then use all members: where these disagree
-    about the stiffness by half, steps with one of them would oscillate.
+    all members, which took half of the time. Rows that are still on the way then use all members, from step `PATIENCE`
+    on anew in each step: where members disagree about the stiffness by half, steps with one of them would oscillate.
 
     The rows of a block take their steps together, so that one evaluation of the network serves all rows that move.
     """
@@ -415,13 +417,12 @@ def search(
                     moving[left], asked[left] = row, k
                     left += 1
             count = left
-            renew = iteration % 4 == 0
-            if renew:
-                # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
-                if iteration == 0:
-                    _curvatures(asked[:count], part, A1[:1], A2[:1], PT[:1], first, kept, K)
-                else:
-                    _curvatures(asked[:count], part, A1, A2, PT, quadratic, kept, K)
+            # W changes slowly along the search; a simplified Newton step is cheaper than a new one.
+            renew = iteration % 4 == 0 or iteration >= PATIENCE
+            if renew and iteration == 0:
+                _curvatures(asked[:count], part, A1[:1], A2[:1], PT[:1], first, kept, K)
+            elif renew:
+                _curvatures(asked[:count], part, A1, A2, PT, quadratic, kept, K)
             left = 0
             for k in range(count):
                 row = moving[k]
