@@ -7,7 +7,8 @@ What is compared was decided before the runs. All searches use the same sampler,
 the zone of ``configs/codesign/modular_reach.yaml``; all begin with the baseline, whose leaves take turns. A body's
 score is the mean distance at which the inverse QP settles. A state in which a module is loaded or strained more than it
 was learned, or which is unstable, does not count: then the arm stays at rest. Winners are judged at `UNSEEN` other
-goals, and at some of these on quadratic finite elements of the whole body, also on a finer mesh.
+goals. Those of a search that gains something are judged at some of these on quadratic finite elements of the whole body,
+too, and on a finer mesh.
 """
 
 from __future__ import annotations
@@ -167,21 +168,27 @@ def judge_all(folder: Path) -> list[dict[str, Any]]:
             write_json(place, row)
             export_body(arm(kind), place.with_suffix(".stl"), row["design"])
             print(kind, seed, row["cells"], np.mean(row["distances [mm]"]), file=sys.stderr, flush=True)
-    rows = []
-    for (kind, seed), place in places.items():
-        row = json.loads(place.read_text())
-        if kind != BASELINE and "solid [mm]" not in row:
+    found = {key: json.loads(place.read_text()) for key, place in places.items()}
+    means = {kind: np.mean([found[kind, seed]["distances [mm]"] for seed in SEEDS]) for kind in SEARCHES}
+    for (kind, seed), row in found.items():
+        if means.get(kind, np.inf) > means[DIMENSIONS]:
+            continue  # nothing was gained that finite elements could take away
+        if "solid [mm]" not in row:
             row["solid [mm]"] = on_solid(row)
-            write_json(place, row)
-        if kind != BASELINE and seed == SEEDS[0] and "finer [mm]" not in row:
+            write_json(places[kind, seed], row)
+        if seed == SEEDS[0] and "finer [mm]" not in row:
             row["finer [mm]"] = on_solid(row, REFINE, 1)
-            write_json(place, row)
-        rows.append(row)
-    return rows
+            write_json(places[kind, seed], row)
+    return list(found.values())
 
 
 def mesh_error(row: Mapping[str, Any]) -> float:
-    """Return by how much finite elements, and their finer mesh if there is one, change distances [mm]: sum of both."""
+    """Return by how much finite elements, and their finer mesh if there is one, change distances [mm]: sum of both.
+
+    NaN for a body that finite elements did not judge.
+    """
+    if "solid [mm]" not in row:
+        return float("nan")
     coarse, fine = np.array(row["solid [mm]"]), np.array(row.get("finer [mm]", []))
     learned = np.array(row["distances [mm]"])[: len(coarse)]
     return float(np.abs(coarse - learned).max() + np.abs(fine - coarse[: len(fine)]).max(initial=0.0))
@@ -200,7 +207,7 @@ def structures_table() -> str:
     for row in _rows():
         title = row["search"] if row["search"] == BASELINE else f"{row['search']}, seed {row['seed']}"
         score = f"{row['score [mm]']:.2f}" if "score [mm]" in row else ""
-        mesh = f"{mesh_error(row):.2f}" if "solid [mm]" in row else ""
+        mesh = "" if np.isnan(mesh_error(row)) else f"{mesh_error(row):.2f}"
         found = [score, f"{np.mean(row['distances [mm]']):.2f}", mesh, f"{row['untrusted']} of {UNSEEN}"]
         rows.append([title, ", ".join(row["cells"]), *found])
     head = ["search", "cells", "search [mm]", "unseen [mm]", "finite elements and mesh [mm]", "not trusted"]
@@ -219,6 +226,7 @@ def more_table() -> str:
             gain = ttest_ind(means[DIMENSIONS], each, equal_var=False).confidence_interval()
             off = mesh[kind] + mesh[DIMENSIONS]
             gains = [f"{low:.2f} to {high:.2f}" for low, high in (gain, (gain.low - off, gain.high + off))]
+            gains[1] = "" if np.isnan(off) else gains[1]
             gains[0] = f"{means[DIMENSIONS].mean() - each.mean():.2f} ({gains[0]})"
         rows.append([kind, *(f"{mean:.2f}" for mean in each), f"{each.mean():.2f}", *gains])
     head = ["search", *(f"seed {seed} [mm]" for seed in SEEDS), "mean [mm]", "gain (95 % interval over seeds) [mm]"]
