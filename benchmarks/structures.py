@@ -3,12 +3,12 @@
 ``python -m benchmarks.structures FOLDER`` runs all searches with three seeds each, judges the best body of each, and
 writes ``benchmarks/data/structures.json``. What is finished is in the folder, so that it may be stopped and go on.
 
-What is compared was decided before the runs. All searches use the same sampler, `TRIALS` bodies, and `GOALS` goals of
-the zone of ``configs/codesign/modular_reach.yaml``; all begin with the baseline, whose leaves take turns. A body's
-score is the mean distance at which the inverse QP settles. A state in which a module is loaded or strained more than it
-was learned, or which is unstable, does not count: then the arm stays at rest. Winners are judged at `UNSEEN` other
-goals. Those of a search that gains something are judged at some of these on quadratic finite elements of the whole body,
-too, and on a finer mesh.
+Goals, sampler and budget were decided before the runs; the search over three kinds, which repeats an older one with new
+energies, was added when that over seven kinds had lost. All searches use the same sampler, `TRIALS` bodies, and `GOALS` goals of the
+zone of ``configs/codesign/modular_reach.yaml``; all begin with the baseline, whose leaves take turns. A body's score is
+the mean distance at which the inverse QP settles. A state in which a module is loaded or strained more than it was
+learned, or which is unstable, does not count: then the arm stays at rest. Winners are judged at `UNSEEN` other goals.
+If a search gains something, finite elements of the whole body judge its winners at some of these, also on a finer mesh.
 """
 
 from __future__ import annotations
