@@ -333,7 +333,8 @@ def calibrate(
         softest = _drawn(model, "near buckling", bodies, states, seed, state_folder, kept_only)
         known = JudgedStates.join([known, softest])
     calibration = fit_calibration(model, known)
-    unlimited, everything, limits = _calibrated(model, calibration), known, []
+    unlimited, everything = _calibrated(model, calibration), known
+    limits: list[float] = []  # below which searches were made
     limit = safe_limit(predict(unlimited, known), robot.goal_tolerance)
     while attacks and len(limits) < SEARCHES and (not limits or limit < limits[-1]):
         limits.append(limit)
