@@ -334,7 +334,7 @@ def calibrate(
         known = JudgedStates.join([known, softest])
     calibration = fit_calibration(model, known)
     unlimited, everything = _calibrated(model, calibration), known
-    limits: list[float] = []
+    limits: list[float] = []  # below which searches were made
     limit = safe_limit(predict(unlimited, known), robot.goal_tolerance)
     while attacks and len(limits) < SEARCHES and (not limits or limit < limits[-1]):
         limits.append(limit)
