@@ -32,6 +32,7 @@ TITLES = {
     "tetrapod_reach": "Tetrapod",
     "finger_press": "Press finger",
     "gripper_manipulate": "Three-finger hand",
+    "tetrapod_carry": "Tetrapod with 1 kg",
 }
 """Studies of the tables in their order, and the readable names of their robots."""
 
@@ -41,7 +42,7 @@ COMMANDS = {"finger_reach": "make demo"}
 JUDGES = {"fem": "finite elements", "refined": "finite elements, finer mesh", "surrogate": "surrogate"}
 """Names of the physics that judge finalists."""
 
-SHOWN = {"m": (1e3, "mm"), "Pa": (1e-6, "MPa"), "1": (1.0, "")}
+SHOWN = {"m": (1e3, "mm"), "1/m": (1.0, "1/m"), "Pa": (1e-6, "MPa"), "1": (1.0, "")}
 """Scale and unit of a design variable in text, by its SI unit."""
 
 
@@ -60,12 +61,15 @@ def study(folder: Path) -> tuple[str, dict[str, Any]]:
         raise DataError(f"{file}: commit is {commit!r}; results are recorded from clean commits only")
     config = load_config(folder / "config.yaml", StudyConfig)
     seconds = found["cost"]["cpu_seconds"]
+    measured, change = "objective", "objective_change_interval"
+    if config.objective == "mean_return":  # tables hold lengths
+        measured, change = "mean_distance", "distance_change_interval"
     rows = [
         {
             "controller": _controller(config, found, compared["agent"]),
-            "baseline [mm]": 1e3 * compared["baseline"]["objective"],
-            "winner [mm]": 1e3 * compared["winner"]["objective"],
-            "change, 95% interval [mm]": _interval(compared),
+            "baseline [mm]": 1e3 * compared["baseline"][measured],
+            "winner [mm]": 1e3 * compared["winner"][measured],
+            "change, 95% interval [mm]": _interval(compared, change),
             "goals reached by the baseline [%]": 100.0 * compared["baseline"]["success_rate"],
             "goals reached by the winner [%]": 100.0 * compared["winner"]["success_rate"],
             "test goals": compared["goals"],
@@ -124,9 +128,9 @@ def _controller(config: StudyConfig, found: dict[str, Any], agent: str) -> str:
     return f"{LEARNERS[config.training.learner]}, a policy for each body{trainings}"
 
 
-def _interval(compared: dict[str, Any]) -> list[float] | None:
-    """Interval of the change [mm]; None for a single goal, which has none."""
-    interval = compared["objective_change_interval"]
+def _interval(compared: dict[str, Any], name: str = "objective_change_interval") -> list[float] | None:
+    """Interval of a change [mm]; None for a single goal, which has none."""
+    interval = compared[name]
     return [1e3 * end for end in interval] if interval and compared["goals"] > 1 else None
 
 

@@ -58,6 +58,21 @@ def test_the_entry_of_a_study_has_its_finite_elements_only(tmp_path):
     assert policy["winner's body"] == "leg width 1 → 0.8 (lower bound), top height 126 → 137 mm"
 
 
+def test_studies_of_the_return_are_recorded_by_their_distances(tmp_path):
+    config = (ROOT / "configs" / "codesign" / "tetrapod_carry.yaml").read_text()
+    assert "objective: mean_return" in config
+    (tmp_path / "config.yaml").write_text(config)
+    ends = [{"objective": 1e3 * d, "mean_distance": d, "success_rate": 0.0} for d in (0.05, 0.03)]
+    compared = {"backend": "fem", "agent": "qp", "goals": 1, "baseline": ends[0], "winner": ends[1]}
+    changes = {"objective_change_interval": None, "distance_change_interval": None}
+    found = copy.deepcopy(FOUND) | {"name": "tetrapod_carry", "comparison": [compared | changes]}
+    (tmp_path / "results.json").write_text(json.dumps(found))
+    name, entry = study(tmp_path)
+    assert name == "tetrapod_carry" and entry["title"] == "Tetrapod with 1 kg"
+    assert entry["rows"][0]["baseline [mm]"] == pytest.approx(50.0)
+    assert entry["rows"][0]["winner [mm]"] == pytest.approx(30.0)
+
+
 def test_a_baseline_that_wins_is_said_to(tmp_path):
     assert record(tmp_path, winner={"role": "baseline"})[1]["rows"][0]["winner's body"].startswith("the baseline: none")
 
