@@ -8,15 +8,20 @@ if TYPE_CHECKING:
     from softgym_envs.estimation.estimator import Estimator as Estimator
     from softgym_envs.estimation.estimator import Noise as Noise
     from softgym_envs.estimation.estimator import Readings as Readings
+    from softgym_envs.estimation.learned import LearnedEstimator as LearnedEstimator
     from softgym_envs.estimation.loads import Payload as Payload
     from softgym_envs.estimation.loads import Touch as Touch
     from softgym_envs.estimation.loads import TouchGrid as TouchGrid
     from softgym_envs.estimation.loads import finger_grid as finger_grid
+    from softgym_envs.estimation.model_errors import RowErrors as RowErrors
+    from softgym_envs.estimation.model_errors import measured_errors as measured_errors
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "estimator": ["Estimator", "Noise", "Readings"],
+        "learned": ["LearnedEstimator"],
         "loads": ["Payload", "Touch", "TouchGrid", "finger_grid"],
+        "model_errors": ["RowErrors", "measured_errors"],
     },
 )

@@ -379,7 +379,9 @@ def test_shipped_weights_hold_what_trust_promises(variant):
     assert rows.keys() == set(strata_of(robot, buckles=model.domain.limits_growth))
     for row in rows.values():
         covered = conformal_quantile(np.arange(1.0, row["states"] + 1.0)) / row["states"]
-        assert row["coverage"] == pytest.approx(covered, abs=max(0.01, 1.01 / row["states"]))
+        # At the corners of a symmetric body, up to four mirrored states have the same error and lie on the quantile.
+        one = 1.01 / row["states"]
+        assert covered - max(0.01, one) <= row["coverage"] <= covered + max(0.01, 4 * one)
 
 
 def test_the_trunk_is_right_where_it_is_trusted(trunk):
