@@ -369,7 +369,7 @@ def test_options_of_fem(study, tmp_path, tiny):
     assert (
         "holds a study with finalists.fem_options" in message and "use another folder, or change only: name" in message
     )
-    assert message.endswith("finalists.count, finalists.choose, finalists.seeds")
+    assert message.endswith("finalists.count, finalists.choose, finalists.seeds, finalists.refinement")
     assert asked(count=2).config.finalists.count == 2
 
 
