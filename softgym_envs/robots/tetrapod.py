@@ -38,6 +38,9 @@ HANGING = -0.150
 """Published height of the centre at rest [m], from which the search for the equilibrium starts."""
 UP = np.array([0.0, 0.0, 1.0])
 
+WIDEST = 3.0
+"""Largest angle of a servo to either side [rad]: at pi, both directions of turning are the same position."""
+
 MESHES = {"published": 6, "accurate": 12, "reference": 24}
 """Number of beam elements of a leg, by name of the mesh."""
 
@@ -53,6 +56,8 @@ class Tetrapod(Robot):
         payload: mass at the centre [kg].
         mesh: ``"published"``, ``"accurate"`` or ``"reference"``: how many elements (`MESHES`).
         elements: quadratic beam elements per leg, instead of that of the mesh.
+        servo_range: largest angle of a servo to either side [rad], up to `WIDEST`. The published servos turn by 180
+            degrees. Beyond 90 the centre gets farther; choose the accurate mesh, because legs fold on the published one.
         gravity: acceleration [m/s2].
         **options: options of `Robot`.
     """
@@ -62,6 +67,7 @@ class Tetrapod(Robot):
     size = 0.2
     rest_mode = "displacement"
     made_of_beams = True
+    non_mechanical_options = (*Robot.non_mechanical_options, "servo_range")
 
     def __init__(
         self,
@@ -69,6 +75,7 @@ class Tetrapod(Robot):
         payload: float = 0.0,
         mesh: str = "published",
         elements: int | None = None,
+        servo_range: float = 0.5 * math.pi,
         gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
         **options: Any,
     ) -> None:
@@ -78,6 +85,8 @@ class Tetrapod(Robot):
             raise ValueError(f"payload = {payload} kg must be finite and not negative")
         if not isinstance(elements, int) or elements < 2:
             raise ValueError(f"elements = {elements!r} is out of bounds; allowed: integers from 2")
+        if not 0.0 < servo_range <= WIDEST:
+            raise ValueError(f"servo_range = {servo_range} rad is out of bounds; allowed: up to {WIDEST} rad")
         self.payload = float(payload)
         self.elements = elements
         bend = [
@@ -97,8 +106,8 @@ class Tetrapod(Robot):
         self.actuators = tuple(
             Actuator(
                 f"servo_{k + 1}",
-                -0.5 * math.pi,
-                0.5 * math.pi,
+                -servo_range,
+                servo_range,
                 math.pi / 20,
                 unit="rad",
                 unilateral=False,

@@ -84,6 +84,22 @@ def test_a_leg_that_folds_is_not_trusted():
     np.testing.assert_allclose(ends["accurate"], ends["reference"], atol=4e-4)
 
 
+def test_servos_that_turn_farther_reach_farther_on_every_fine_mesh():
+    """As the published ones do: beyond 100 mm to the right, where no leg folds and meshes agree."""
+    ends = []
+    for mesh in ("accurate", "reference"):
+        robot = make_robot("tetrapod", mesh=mesh, servo_range=2.8)
+        backend = FEMBackend(robot, dynamics=True)
+        command = np.zeros(4)
+        for _ in range(40):
+            command = np.clip(command + robot.rates * np.array([1.0, 1.0, -1.0, 1.0]), robot.lower, robot.upper)
+            state = backend.step(command)
+            assert state.trusted
+        ends.append(state.effector.ravel())
+    assert ends[0][0] > 0.105
+    np.testing.assert_allclose(*ends, atol=2e-4)
+
+
 def test_a_quarter_turn_of_the_commands_turns_the_motion(robot):
     """Servo k + 1 stands 90 degrees after servo k; a reflection swaps the two on either side of its plane."""
     command = np.array([0.5, -0.3, 0.2, 0.4])
@@ -258,6 +274,8 @@ def test_longer_legs_hang_lower_and_wider_ones_are_stiffer():
         ({"payload": np.inf}, "payload = inf kg must be finite"),
         ({"elements": 1}, "elements = 1 is out of bounds; allowed: integers from 2"),
         ({"elements": 6.0}, "elements = 6.0 must be an integer"),
+        ({"servo_range": np.pi}, "servo_range = 3.14.* rad is out of bounds; allowed: up to 3.0 rad"),
+        ({"servo_range": 0.0}, "servo_range = 0.0 rad is out of bounds"),
         ({"gravity": (0.0, 0.0)}, r"gravity = \(0.0, 0.0\) must be 3 numbers"),
         ({"gravity": (0.0, 0.0, np.nan)}, "gravity must be three finite numbers"),
         ({"legs": 5}, "legs"),
