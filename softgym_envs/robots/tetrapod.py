@@ -57,7 +57,7 @@ class Tetrapod(Robot):
         mesh: ``"published"``, ``"accurate"`` or ``"reference"``: how many elements (`MESHES`).
         elements: quadratic beam elements per leg, instead of that of the mesh.
         servo_range: largest angle of a servo to either side [rad], up to `WIDEST`. The published servos turn by 180
-            degrees. Beyond 90 the centre gets farther; choose the accurate mesh, because legs fold on the published one.
+            degrees. Beyond 90 the centre gets farther; choose the accurate mesh, since legs fold on the published one.
         gravity: acceleration [m/s2].
         **options: options of `Robot`.
     """
