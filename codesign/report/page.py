@@ -23,6 +23,7 @@ from softgym_envs.codesign.report.tables import BACKENDS, SHOWN_ALWAYS, percent
 from softgym_envs.codesign.report.units import present
 from softgym_envs.codesign.snapshot import StudySnapshot, load_study
 from softgym_envs.errors import SoftGymError
+from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 
 CONTROLLERS = {
@@ -330,42 +331,38 @@ def _pictures(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
     bodies = {"baseline": snapshot.config.baseline}
     if results.winner is not None:
         bodies["winner"] = results.winner.design
-    poses = [pose for pose, _ in _poses(snapshot)]
-    context: dict[str, Any] = {"poses": poses, "pictures": [], "overlay": None, "no_pictures": ""}
+    poses = _poses(snapshot)
+    context: dict[str, Any] = {"poses": [name for name, _ in poses], "pictures": [], "overlay": None, "no_pictures": ""}
     try:
-        context["pictures"] = _photographs(snapshot, bodies)
-        context["overlay"] = plots.overlay(_shapes(snapshot, bodies))
+        context["pictures"], shapes = _photographs(snapshot.config.robot, bodies, poses)
+        context["overlay"] = plots.overlay(shapes)
     except Exception as error:  # pictures need a working OpenGL, a report does not
         context["no_pictures"] = f"No pictures: {type(error).__name__}: {error}"
     return context
 
 
-def _photographs(snapshot: StudySnapshot, bodies: Mapping[str, dict[str, float]]) -> list[tuple[str, list[str]]]:
+def _photographs(
+    robot: Robot, bodies: Mapping[str, dict[str, float]], poses: Sequence[tuple[str, np.ndarray | None]]
+) -> tuple[list[tuple[str, list[str]]], list[tuple[str, dict[str, Any]]]]:
+    """Return the pictures of each body, and what `plots.overlay` draws: all bodies in the first two poses."""
     from softgym_envs.viewer.image import ImageRenderer
+    from softgym_envs.viewer.surface import BodySurface
 
-    renderer = ImageRenderer(snapshot.config.robot, IMAGE_SIZE)
+    renderer = ImageRenderer(robot, IMAGE_SIZE)
+    pictures: list[tuple[str, list[str]]] = []
+    shapes: list[tuple[str, dict[str, Any]]] = [(caption, {}) for caption, _ in poses[:2]]
     try:
-        return [
-            (role, [plots.picture(renderer.render_body(body, command)) for _, command in _poses(snapshot)])
-            for role, body in bodies.items()
-        ]
+        for role, body in bodies.items():
+            pictures.append((role, []))
+            surface = BodySurface(renderer.shapes.load(body))
+            for index, (_, command) in enumerate(poses):
+                pictures[-1][1].append(plots.picture(renderer.render_body(body, command)))
+                if index < len(shapes):  # the renderer has just found this shape: asking for it again costs nothing
+                    points = surface.points(renderer.shapes.at(body, command))
+                    shapes[index][1][role] = (points, surface.triangles, renderer.shapes.state.effector)
     finally:
         renderer.close()
-
-
-def _shapes(snapshot: StudySnapshot, bodies: Mapping[str, dict[str, float]]) -> list[tuple[str, dict[str, Any]]]:
-    """Return what `plots.overlay` draws: the bodies at rest and with all actuators at 50 %."""
-    from softgym_envs.viewer.surface import BodySurface, ShapeFinder
-
-    finder = ShapeFinder(snapshot.config.robot)
-    poses = _poses(snapshot)[:2]
-    shapes: list[tuple[str, dict[str, Any]]] = [(caption, {}) for caption, _ in poses]
-    for role, body in bodies.items():
-        model = finder.load(body)
-        surface = BodySurface(model)
-        for (_, command), (_, drawn) in zip(poses, shapes, strict=True):
-            drawn[role] = (surface.points(finder.at(body, command)), surface.triangles, finder.state.effector)
-    return shapes
+    return pictures, shapes
 
 
 def _interval_note(snapshot: StudySnapshot, results: StudyResults) -> str:

@@ -39,6 +39,8 @@ def codesign(
     folder = Path("results") / study.name if folder is None else folder
     with options.resumable():
         run_study(study, folder, workers=workers, progress=not quiet)
+        if not quiet:
+            click.echo("report: finite elements compute what baseline and winner do, to be drawn")
         report = write_report(folder)
     click.echo(f"report: {report}")
 

@@ -31,6 +31,9 @@ class ImageRenderer:
         window: show the images in a window too.
         source: finite elements of the robot whose states are rendered: their model is used instead of a new one.
 
+    Attributes:
+        shapes: finds the shapes that are drawn.
+
     Raises:
         ValueError: for a size that is not two positive integers, or a window without a display.
     """
@@ -51,7 +54,7 @@ class ImageRenderer:
         self.robot = robot
         self.size = (width, height)
         self._window = window
-        self._shapes = ShapeFinder(robot, source)
+        self.shapes = ShapeFinder(robot, source)
         self._scene: Scene | None = None
 
     def render(
@@ -75,8 +78,8 @@ class ImageRenderer:
             text: caption; default the Euclidean distance to the goal.
         """
         scene = self._open()
-        model = self._shapes.load(design)
-        x = self._shapes.nodes(design, state)
+        model = self.shapes.load(design)
+        x = self.shapes.nodes(design, state)
         scene.set_body(model, x)
         scene.set_ghost(None)
         scene.set_state(x, state)
@@ -107,10 +110,10 @@ class ImageRenderer:
         if ghost is None:
             scene.set_ghost(None)
         else:
-            scene.set_ghost(self._shapes.load(ghost), self._shapes.at(ghost, command))
-        model, x = self._shapes.load(design), self._shapes.at(design, command)
+            scene.set_ghost(self.shapes.load(ghost), self.shapes.at(ghost, command))
+        model, x = self.shapes.load(design), self.shapes.at(design, command)
         scene.set_body(model, x)
-        scene.set_state(x, self._shapes.state)
+        scene.set_state(x, self.shapes.state)
         scene.set_goal(None, None)
         scene.set_text(text)
         return scene.image()
@@ -124,7 +127,7 @@ class ImageRenderer:
     def _open(self) -> Scene:
         if self._scene is None:
             baseline = self.robot.design_space.baseline
-            model, rest = self._shapes.load(baseline), self._shapes.rest(baseline)
+            model, rest = self.shapes.load(baseline), self.shapes.rest(baseline)
             x = rest.nodes
             assert x is not None
             lines = cable_lines(model, x, rest, stub=STUB * self.robot.size)
