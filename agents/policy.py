@@ -16,6 +16,9 @@ from softgym_envs.registry import class_path
 from softgym_envs.storage import atomic_write, read_json, write_json
 
 FORMAT = 1
+
+POLICY_FILE = "a policy file (.safetensors)"
+"""What may be given instead of the name of a shipped policy, for messages."""
 _SHIPPED = Path(__file__).parent / "weights"
 
 
@@ -31,7 +34,7 @@ def policy_path(policy: str | Path) -> Path:
             raise WeightsError(f"policy '{path}' does not exist; train one with 'softgym train'")
         return path
     if str(policy) not in shipped_policies():
-        raise WeightsError(f"{unknown_name('policy', str(policy), shipped_policies())}, or a .safetensors file")
+        raise WeightsError(unknown_name("policy", str(policy), shipped_policies(), other=POLICY_FILE))
     return _SHIPPED / str(policy) / "policy.safetensors"
 
 

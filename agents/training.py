@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 
 EVALUATION_SEED = 1_000_003
 
+POLICY = "policy.safetensors"
+LATEST = "latest.safetensors"
+"""Files of a folder: the policy that is kept, and the one that an evaluation reads."""
+
 
 class CurvePoint(TypedDict):
     """A point of a learning curve: an evaluation during the training.
@@ -90,91 +94,150 @@ def train(
     if initial is not None:
         config = config.model_copy(update={"initial": str(initial)})
     folder = Path(folder)
-    result = folder / "policy.safetensors"
-    resolved = folder / "config.yaml"
-    begun = resolved.exists()
-    if begun:
-        other = difference(load_config(resolved, TrainConfig), config)
-        if other is not None:
-            raise DataError(f"'{folder}' holds a training with another configuration: {other}; choose a new folder")
-        if result.exists():
-            return result
-
-    began = time.process_time()
-    checkpoint = folder / "checkpoint.safetensors"
-    curve: list[CurvePoint] = []
-    best: Tensors = {}
-    outcome: Evaluation | None = None
-    learner = make_learner(config)
-    if checkpoint.exists():
-        curve, best, outcome, spent = _restore(learner, checkpoint)
-        began -= spent
-    elif config.initial is not None:
-        start_from = Policy(config.initial)
-        start_from.check_environment(config.environment, any_task=True)
-        learner.load_weights(read_tensors(start_from.path), start_from.path)
-    if proposer is not None:
-        proposer.attach(_model(learner), config, folder)
-    designs, goals = evaluation_set(config.environment, config.evaluation_episodes, EVALUATION_SEED)
+    begun = _begun(config, folder)
+    if begun and (folder / POLICY).exists():
+        return folder / POLICY
+    run = _Run(config, folder, proposer)
     if not begun:  # after all checks, so that invalid values do not leave a folder behind
         save_resolved(folder, config)
-    learner.log_to(folder)
+    run.learner.log_to(folder)
 
-    start = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
-    learning = curve[-1]["learning_seconds"] if curve else 0.0
-    bar = tqdm(total=config.steps, initial=learner.step, unit="step", desc=folder.name, disable=not progress)
-    stopped = outcome is not None and report is not None and bool(report(learner.step, outcome))
-    with bar:
-        while learner.step < config.steps and not stopped:
-            if proposer is not None:
-                proposer.begin(_model(learner))
-            target = min(config.steps, (learner.step // config.report_every + 1) * config.report_every)
-            cpu = time.process_time()
-            learner.learn(target, bar.update)
-            learning += time.process_time() - cpu
-            scratch = folder / "latest.safetensors"
-            save_policy(scratch, learner.weights(), {"config": config.model_dump(mode="json")})
-            outcome = evaluate(scratch, config.environment, goals, design=designs)
-            curve.append(
-                {
-                    "step": learner.step,
-                    "seconds": round(time.perf_counter() - start, 2),
-                    "learning_seconds": round(learning, 3),
-                    "success_rate": outcome.success_rate,
-                    "mean_distance": outcome.mean_distance,
-                    "worst_distance": outcome.worst_distance,
-                    "mean_return": outcome.mean_return,
-                }
-            )
-            # A proposer concentrates on bodies other than those of the evaluation, so the last policy is kept.
-            if proposer is not None or curve[-1]["mean_return"] >= max(row["mean_return"] for row in curve):
-                best = learner.weights()
-            scale = config.environment.task_class.distance_scale
-            distance = f"{scale.name} {scale.text(outcome.mean_distance, 2)}"
-            bar.set_postfix_str(f"success {outcome.success_rate:.0%}, {distance}")
-            shown = ("success_rate", "mean_distance", "mean_return")
-            learner.record({f"evaluation/{name}": getattr(outcome, name) for name in shown})
-            _write_curve(folder / "curve.csv", curve)
-            if proposer is not None:
-                proposer.save(learner.step)
-            _save_checkpoint(learner, checkpoint, curve, best, outcome, time.process_time() - began)
-            stopped = report is not None and bool(report(learner.step, outcome))
-    card = {
-        "config": config.model_dump(mode="json"),
-        "steps": learner.step,
-        "best_step": _best_step(curve) if proposer is None else learner.step,
-        "stopped_early": stopped,
-        "cpu_seconds": round(time.process_time() - began, 2),
-        "curve": curve,
-        "provenance": provenance(),
-    }
-    if proposer is not None:
-        proposer.finish(_model(learner))
-    save_policy(result, best, card)
-    for leftover in (folder / "latest.safetensors", folder / "latest.json", checkpoint):
-        leftover.unlink(missing_ok=True)
-    learner.close()
-    return result
+    def stop() -> bool:
+        return run.outcome is not None and report is not None and bool(report(run.learner.step, run.outcome))
+
+    with tqdm(total=config.steps, initial=run.learner.step, unit="step", desc=folder.name, disable=not progress) as bar:
+        stopped = stop()
+        while run.learner.step < config.steps and not stopped:
+            run.learn(bar.update)
+            bar.set_postfix_str(run.evaluate())
+            run.save()
+            stopped = stop()
+    return run.finish(stopped)
+
+
+def _begun(config: TrainConfig, folder: Path) -> bool:
+    """Return whether a folder holds this training, finished or not.
+
+    Raises:
+        ConfigError: if the folder's configuration cannot be read.
+        DataError: if it is that of another training.
+    """
+    resolved = folder / "config.yaml"
+    if not resolved.exists():
+        return False
+    other = difference(load_config(resolved, TrainConfig), config)
+    if other is not None:
+        raise DataError(f"'{folder}' holds a training with another configuration: {other}; choose a new folder")
+    return True
+
+
+class _Run:
+    """A training in its folder: the learner, and what its evaluations have found so far.
+
+    A new run continues from the checkpoint of the folder, if there is one.
+
+    Args:
+        config: of the training.
+        folder: of the results.
+        proposer: draws the sampled bodies and learns along with the policy, if any.
+
+    Attributes:
+        learner: the learner.
+        outcome: of the last evaluation; None before the first.
+
+    Raises:
+        ValueError: if the environment cannot be made.
+        ConfigError: if the initial policy was trained for another environment.
+        WeightsError: if it or the checkpoint is damaged or does not fit the configuration.
+    """
+
+    def __init__(self, config: TrainConfig, folder: Path, proposer: DesignProposer | None) -> None:
+        self._began = time.process_time()
+        self._config, self._folder, self._proposer = config, folder, proposer
+        self._checkpoint = folder / "checkpoint.safetensors"
+        self._curve: list[CurvePoint] = []
+        self._best: Tensors = {}
+        self.outcome: Evaluation | None = None
+        self.learner = make_learner(config)
+        if self._checkpoint.exists():
+            self._curve, self._best, self.outcome, spent = _restore(self.learner, self._checkpoint)
+            self._began -= spent
+        elif config.initial is not None:
+            start = Policy(config.initial)
+            start.check_environment(config.environment, any_task=True)
+            self.learner.load_weights(read_tensors(start.path), start.path)
+        if proposer is not None:
+            proposer.attach(_model(self.learner), config, folder)
+        self._designs, self._goals = evaluation_set(config.environment, config.evaluation_episodes, EVALUATION_SEED)
+        self._start = time.perf_counter() - (self._curve[-1]["seconds"] if self._curve else 0.0)
+        self._learning_seconds = self._curve[-1]["learning_seconds"] if self._curve else 0.0
+
+    @property
+    def _cpu_seconds(self) -> float:
+        return time.process_time() - self._began
+
+    def learn(self, tick: Callable[[int], object]) -> None:
+        """Learn until the next evaluation is due."""
+        config, learner = self._config, self.learner
+        if self._proposer is not None:
+            self._proposer.begin(_model(learner))
+        target = min(config.steps, (learner.step // config.report_every + 1) * config.report_every)
+        cpu = time.process_time()
+        learner.learn(target, tick)
+        self._learning_seconds += time.process_time() - cpu
+
+    def evaluate(self) -> str:
+        """Evaluate the present policy, keep the best one, and return the outcome as text."""
+        config, learner = self._config, self.learner
+        scratch = self._folder / LATEST
+        save_policy(scratch, learner.weights(), {"config": config.model_dump(mode="json")})
+        outcome = self.outcome = evaluate(scratch, config.environment, self._goals, design=self._designs)
+        self._curve.append(
+            {
+                "step": learner.step,
+                "seconds": round(time.perf_counter() - self._start, 2),
+                "learning_seconds": round(self._learning_seconds, 3),
+                "success_rate": outcome.success_rate,
+                "mean_distance": outcome.mean_distance,
+                "worst_distance": outcome.worst_distance,
+                "mean_return": outcome.mean_return,
+            }
+        )
+        # A proposer concentrates on bodies other than those of the evaluation, so the last policy is kept.
+        if self._proposer is not None or outcome.mean_return >= max(row["mean_return"] for row in self._curve):
+            self._best = learner.weights()
+        shown = ("success_rate", "mean_distance", "mean_return")
+        learner.record({f"evaluation/{name}": getattr(outcome, name) for name in shown})
+        scale = config.environment.task_class.distance_scale
+        return f"success {outcome.success_rate:.0%}, {scale.name} {scale.text(outcome.mean_distance, 2)}"
+
+    def save(self) -> None:
+        """Write the learning curve and the checkpoint, from which the training can continue."""
+        assert self.outcome is not None
+        _write_curve(self._folder / "curve.csv", self._curve)
+        if self._proposer is not None:
+            self._proposer.save(self.learner.step)
+        _save_checkpoint(self.learner, self._checkpoint, self._curve, self._best, self.outcome, self._cpu_seconds)
+
+    def finish(self, stopped: bool) -> Path:
+        """Write the policy with its card, remove the checkpoint and return the path of the policy."""
+        card = {
+            "config": self._config.model_dump(mode="json"),
+            "steps": self.learner.step,
+            "best_step": _best_step(self._curve) if self._proposer is None else self.learner.step,
+            "stopped_early": stopped,
+            "cpu_seconds": round(self._cpu_seconds, 2),
+            "curve": self._curve,
+            "provenance": provenance(),
+        }
+        if self._proposer is not None:
+            self._proposer.finish(_model(self.learner))
+        save_policy(self._folder / POLICY, self._best, card)
+        latest = self._folder / LATEST
+        for leftover in (latest, latest.with_suffix(".json"), self._checkpoint):
+            leftover.unlink(missing_ok=True)
+        self.learner.close()
+        return self._folder / POLICY
 
 
 def cpu_before(policy: Path, began: float) -> float:

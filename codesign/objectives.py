@@ -183,7 +183,7 @@ def find_objective(name: str, robot: Robot, task: type[Task]) -> Objective:
     if ":" in name:
         return _import_objective(name)
     if name not in OBJECTIVES:
-        raise ValueError(f"{unknown_name('objective', name, OBJECTIVES)}, or one of your own as 'module:attribute'")
+        raise ValueError(unknown_name("objective", name, OBJECTIVES, other="one of your own as 'module:attribute'"))
     objective = OBJECTIVES[name]
     if name == "mean_effort":
         units = {EFFORT_UNITS.get(actuator.unit, (f"J/{actuator.unit}", 1.0)) for actuator in robot.actuators}

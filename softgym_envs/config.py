@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from softgym_envs.errors import ConfigError, unknown_name
@@ -26,6 +26,18 @@ class Config(BaseModel):
     """Base class of all configurations: immutable, without unknown keys, finite numbers only."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=False, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_unknown_keys(cls, data: Any) -> Any:
+        """Say which keys are allowed where one is unknown, as pydantic does not, unless required ones are missing."""
+        if not isinstance(data, dict):
+            return data
+        missing = any(field.is_required() and name not in data for name, field in cls.model_fields.items())
+        unknown = next((name for name in data if name not in cls.model_fields), None)
+        if unknown is not None and not missing:
+            raise ValueError(unknown_name("key", str(unknown), cls.model_fields))
+        return data
 
 
 @dataclass(frozen=True)
@@ -148,7 +160,7 @@ def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> Model
             plural = "s" if len(missing) > 1 else ""
             message, count = f"missing required key{plural} {', '.join(missing)}", len(missing)
         else:
-            message, count = _describe(problems[0], model), 1
+            message, count = _describe(problems[0]), 1
         others = len(problems) - count
         more = f" (and {others} more problem{'s' if others > 1 else ''})" if others else ""
         raise ConfigError(f"{where}: {message}{more}") from None
@@ -158,13 +170,8 @@ def _dotted(problem: ErrorDetails) -> str:
     return ".".join(map(str, problem["loc"]))
 
 
-def _describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
+def _describe(problem: ErrorDetails) -> str:
     key = _dotted(problem)
-    if problem["type"] == "extra_forbidden":
-        *parents, last = problem["loc"]
-        allowed = _allowed(model, [part for part in parents if isinstance(part, str)])
-        known = unknown_name("key", str(last), allowed) if allowed else f"unknown key '{last}'"
-        return f"{'.'.join(map(str, parents))}: {known}" if parents else known
     message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("\n", " ")
     shown = _PASSWORD.sub(r":***@", repr(problem["input"]))
     if not isinstance(problem["input"], dict) and shown not in message:
@@ -214,17 +221,6 @@ def check_compatible(
     if other is not None:
         allowed = f", or change only: {', '.join(may_change)}" if may_change else ""
         raise ConfigError(f"{found} with {other}; use another {use}{allowed}")
-
-
-def _allowed(model: type[BaseModel], path: list[str]) -> list[str]:
-    """Return the keys allowed in the group at ``path``; none if the group is not a configuration."""
-    for name in path:
-        field = model.model_fields.get(name)
-        inner = None if field is None else field.annotation
-        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
-            return []
-        model = inner
-    return list(model.model_fields)
 
 
 def commit_of(root: Path) -> str | None:

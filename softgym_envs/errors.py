@@ -58,7 +58,7 @@ MAX_NAMES = 16
 """Largest number of allowed names that a message lists besides the nearest one."""
 
 
-def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> str:
+def unknown_name(kind: str, name: str, allowed: Iterable[str], *, other: str = "") -> str:
     """Return the message for a name that does not exist: the nearest name, if there is one, and the allowed names.
 
     A long list of allowed names is omitted if there is a near one.
@@ -67,6 +67,7 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> str:
         kind: what the name should be: ``"robot"``, ``"option"``, ...
         name: the name given.
         allowed: the names that exist.
+        other: what may be given instead of a name: ``"a policy file"``.
     """
     allowed = list(allowed)
     # Ignore a prefix or suffix that all names share, as in environment IDs.
@@ -80,8 +81,9 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> str:
     near = get_close_matches(core(str(name)), cores, n=1)
     hint = f"did you mean '{cores[near[0]]}'? " if near else ""
     if near and len(allowed) > MAX_NAMES:
-        return f"unknown {kind} '{name}'; {hint}".rstrip()
-    return f"unknown {kind} '{name}'; {hint}allowed: {', '.join(allowed) or 'none'}"
+        return f"unknown {kind} '{name}'; {hint}{f'allowed too: {other}' if other else ''}".rstrip()
+    names = [*allowed, f"or {other}"] if other else allowed
+    return f"unknown {kind} '{name}'; {hint}allowed: {', '.join(names) or 'none'}"
 
 
 def no_equilibrium(

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from softgym_envs.agents import EnvironmentConfig, TrainConfig
 from softgym_envs.config import Config, check_compatible, commit_of, difference
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.storage import JsonLines, drop_torn_line, read_json
@@ -107,3 +108,10 @@ def test_a_damaged_line_is_named(line, tmp_path):
     path.write_bytes(b'{"number": 0}\n' + line + b"\n")
     with pytest.raises(DataError, match=r"records\.jsonl', line 2 is damaged"):
         JsonLines(path).read()
+
+
+def test_a_configuration_made_in_python_says_which_keys_are_allowed():
+    with pytest.raises(ValueError, match="unknown key 'stepz'; did you mean 'steps'"):
+        TrainConfig(environment=EnvironmentConfig(id="SoftGym/FingerReach-v0"), stepz=3)
+    with pytest.raises(ValueError, match="unknown key 'gama'; did you mean 'gamma'"):
+        TrainConfig(environment={"id": "SoftGym/FingerReach-v0"}, sac={"gama": 0.9})

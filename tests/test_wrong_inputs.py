@@ -14,11 +14,13 @@ import yaml
 import softgym_envs  # noqa: F401 - registers the environments
 from softgym_envs import make_robot
 from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.policy import Policy
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.tools.config import CalibrationConfig, OptimiseConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import SoftGymError
 from softgym_envs.mechanics import MechanicalModel
+from softgym_envs.robots import Actuator
 from softgym_envs.surrogate.training import FitConfig
 from softgym_envs.testing import box_mesh
 
@@ -163,7 +165,27 @@ MISTAKES = {
         lambda f: config(f, CalibrationConfig, TRAIN),
         "config '*': missing required keys *fit, data (and * more problems)",
     ),
+    "shipped policy": (
+        lambda _: Policy("finger_rech"),
+        "unknown policy 'finger_rech'; did you mean 'finger_reach'? allowed too: a policy file (.safetensors)",
+    ),
+    "name without a list": (
+        lambda _: gymnasium.make(REACH, sample_design="length"),
+        "design variables = 'length' must be True, False or a list of names, such as ['length']",
+    ),
+    "option that only the environment takes": (
+        lambda _: gymnasium.make(REACH, bakend="fem"),
+        "unknown environment option 'bakend'; did you mean 'backend'? allowed: robot, task, backend, render_mode, *",
+    ),
     # Values
+    "range of an actuator": (
+        lambda _: Actuator("cable", low=0.02, high=0.0, rate=0.001),
+        "actuator 'cable': low 0.02 must be below high 0, both finite",
+    ),
+    "rate of an actuator": (
+        lambda _: Actuator("cable", low=0.0, high=0.02, rate=0.0),
+        "actuator 'cable': rate = 0 must be positive",
+    ),
     "empty configuration": (
         lambda f: config(f, FitConfig, {}),
         "config '*': missing required keys robot, data",

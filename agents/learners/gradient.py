@@ -43,8 +43,8 @@ class GradientLearner(NetworkLearner):
         if (self.needs_batch and not environment.batched) or environment.residual_scale:
             raise ValueError(
                 f"learner '{config.learner}' needs environment.backend = surrogate, or fem for robots of beams, and no "
-                f"residual_scale, got {environment.backend} and {environment.residual_scale:g}; allowed: learner 'sac' "
-                "or 'ppo'"
+                f"residual_scale, got backend {environment.backend} and residual_scale {environment.residual_scale:g}; "
+                "allowed here: learner 'sac', 'ppo' or 'evolution'"
             )
         super().__init__(config)
         if environment.batched:

@@ -48,14 +48,16 @@ def list_(as_json: bool) -> None:
 
     tables = {"robots": ROBOTS, "backends": BACKENDS, "tasks": TASKS}
     if as_json:
-        columns = ("robot", "task", "max_episode_steps")
+        columns = ("robot", "task", "max_episode_steps", "backend")
         rows = {name: {key: getattr(row, key) for key in columns} for name, row in ENVIRONMENTS.items()}
         click.echo(json.dumps({"environments": rows, **{title: list(table) for title, table in tables.items()}}))
         return
     click.echo("environments:")
     width = max(map(len, ENVIRONMENTS))
     for identifier, row in ENVIRONMENTS.items():
-        click.echo(f"  {identifier:{width}s}  robot {row.robot}, task {row.task}, {row.max_episode_steps} steps")
+        backend = f", backend {row.backend}" if row.backend else ""
+        steps = f"{row.max_episode_steps} steps"
+        click.echo(f"  {identifier:{width}s}  robot {row.robot}, task {row.task}, {steps}{backend}")
     for title, table in tables.items():
         click.echo(f"{title}: {', '.join(table)}")
 

@@ -122,12 +122,11 @@ def check_agent(name: str) -> None:
         ConfigError: with the nearest name, and the allowed ones.
     """
     from softgym_envs.agents.baselines import BASELINES
-    from softgym_envs.agents.policy import shipped_policies
+    from softgym_envs.agents.policy import POLICY_FILE, shipped_policies
 
     names = [*BASELINES, *shipped_policies()]
     if name not in names and not name.endswith(".safetensors"):
-        text = unknown_name("agent", name, names)
-        raise ConfigError(f"{text}{' A' if text.endswith('?') else '; a'} policy file ends with .safetensors")
+        raise ConfigError(unknown_name("agent", name, names, other=POLICY_FILE))
 
 
 def complete_environment(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:

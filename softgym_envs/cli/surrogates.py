@@ -154,6 +154,8 @@ def deploy(
         raise ConfigError("nothing to write: name FILES that end with .h or .onnx, or --controller FOLDER")
     if controller is None and not (max_effort is effort_rate is gains is None):
         raise ConfigError("--max-effort, --effort-rate and --gains need --controller FOLDER")
+    if effort_rate is not None and max_effort is None:
+        raise ConfigError("--effort-rate needs --max-effort: without it the controller commands displacements")
     for file in files:
         if file.suffix not in FORMATS:
             raise ConfigError(f"'{file}' must end with {' or '.join(FORMATS)}")
@@ -169,33 +171,32 @@ def deploy(
         else:
             export_onnx(model, file, members=members)
         click.echo(f"wrote {file}")
-    if controller is not None:
-        from softgym_envs.control.embedded import PICorrection
-        from softgym_envs.control.export.c import COMPILE, export_controller_c
-        from softgym_envs.control.inverse_qp import InverseQP
+    if controller is None:
+        return
+    from softgym_envs.control.embedded import PICorrection
+    from softgym_envs.control.export.c import COMPILE, export_controller_c
+    from softgym_envs.control.inverse_qp import InverseQP
 
-        if effort_rate is not None and max_effort is None:
-            raise ConfigError("--effort-rate needs --max-effort: without it the controller commands displacements")
-        qp = InverseQP.for_robot(body)
-        if max_effort is not None:
-            qp = InverseQP.by_efforts(body, max_effort, effort_rate or max_effort / 40.0)
-        correction = None if gains is None else PICorrection(*gains)
-        paths = [
-            *export_controller_c(
-                model, chosen, controller, controller=qp, correction=correction, members=members, name=name, robot=body
-            )
-        ]
-        commands = [COMPILE]
-        if learned is not body and max_effort is None:
-            from softgym_envs.estimation import finger_grid
-            from softgym_envs.estimation.export.c import COMPILE_LOOP, export_estimator_c
-            from softgym_envs.estimation.learned import LearnedEstimator
-            from softgym_envs.surrogate.export.common import exportable
+    qp = InverseQP.for_robot(body)
+    if max_effort is not None:
+        qp = InverseQP.by_efforts(body, max_effort, effort_rate or max_effort / 40.0)
+    correction = None if gains is None else PICorrection(*gains)
+    paths = [
+        *export_controller_c(
+            model, chosen, controller, controller=qp, correction=correction, members=members, name=name, robot=body
+        )
+    ]
+    commands = [COMPILE]
+    if learned is not body and max_effort is None:
+        from softgym_envs.estimation import finger_grid
+        from softgym_envs.estimation.export.c import COMPILE_LOOP, export_estimator_c
+        from softgym_envs.estimation.learned import LearnedEstimator
+        from softgym_envs.surrogate.export.common import exportable
 
-            estimator = LearnedEstimator(body, design=chosen, model=exportable(model, members))
-            paths += export_estimator_c(estimator, finger_grid(), controller, name=name)
-            commands += [COMPILE_LOOP]
-        for path in paths:
-            click.echo(f"wrote {path}")
-        for command in commands:
-            click.echo(f"compile with: cd {controller} && {command}")
+        estimator = LearnedEstimator(body, design=chosen, model=exportable(model, members))
+        paths += export_estimator_c(estimator, finger_grid(), controller, name=name)
+        commands += [COMPILE_LOOP]
+    for path in paths:
+        click.echo(f"wrote {path}")
+    for command in commands:
+        click.echo(f"compile with: cd {controller} && {command}")

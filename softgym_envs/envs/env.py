@@ -102,7 +102,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             check_display()
         self.render_mode = render_mode
         self.render_size = render_size
-        setup = set_up(robot, task, backend, EnvironmentOptions.check(options))
+        checked = EnvironmentOptions.check(options, own=("render_mode", "render_size"))
+        setup = set_up(robot, task, backend, checked)
         self.robot, self.task = setup.robot, setup.task
         self.design_space = self.robot.design_space
         self._fixed_design, self._sampled = setup.design, setup.sampled

@@ -15,7 +15,7 @@ from softgym_envs.envs.plant import Plants
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.envs.tasks.registry import make_task
-from softgym_envs.errors import unknown_name
+from softgym_envs.errors import DesignError, unknown_name
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 
@@ -52,8 +52,12 @@ class EnvironmentOptions:
     defaults: Mapping[str, Any] | None = None
 
     @classmethod
-    def check(cls, options: Mapping[str, Any]) -> EnvironmentOptions:
+    def check(cls, options: Mapping[str, Any], *, own: Sequence[str] = ()) -> EnvironmentOptions:
         """Return the options in a mapping.
+
+        Args:
+            options: name to value.
+            own: further options that a user may give the environment, for the message.
 
         Raises:
             ValueError: for an unknown name.
@@ -61,7 +65,9 @@ class EnvironmentOptions:
         names = [field.name for field in fields(cls)]
         for name in options:
             if name not in names:
-                raise ValueError(unknown_name("environment option", name, names))
+                # `defaults` is not the user's: the ID of the environment fills it in.
+                allowed = ["robot", "task", "backend", *own, *(each for each in names if each != "defaults")]
+                raise ValueError(unknown_name("environment option", name, allowed))
         return cls(**options)
 
 
@@ -163,10 +169,12 @@ def design_names(space: DesignSpace, choice: bool | Sequence[str]) -> tuple[str,
     """Return the variables in an option that is False, True (all variables) or a list of names.
 
     Raises:
-        DesignError: for an unknown name.
+        DesignError: for an unknown name, or a name that is not in a list.
     """
     if isinstance(choice, bool):
         return space.names if choice else ()
+    if isinstance(choice, str):
+        raise DesignError(f"design variables = {choice!r} must be True, False or a list of names, such as [{choice!r}]")
     return tuple(space[name].name for name in choice)
 
 

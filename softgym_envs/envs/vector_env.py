@@ -82,7 +82,8 @@ class SoftRobotVectorEnv(VectorEnv):
         check_counts(num_envs, max_episode_steps)
         self.autoreset_mode = check_autoreset(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        setup = set_up(robot, task, backend, EnvironmentOptions.check(options))
+        checked = EnvironmentOptions.check(options, own=("max_episode_steps", "autoreset_mode"))
+        setup = set_up(robot, task, backend, checked)
         self.robot, self.task = setup.robot, setup.task
         if not batches(setup.backend, self.robot, setup.backend_options):
             raise ValueError(

@@ -6,7 +6,7 @@ import functools
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import PurePath
 from typing import Any, TypeVar
 
@@ -19,6 +19,7 @@ from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.contact.obstacles import Obstacle, obstacle_from
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.robots.actuator import Actuator as Actuator
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature, Morpher
 from softgym_envs.robots.geometry.symmetry import Symmetry
@@ -51,29 +52,6 @@ TOUCH_RADIUS = 2.5e-3
 """Radius of the part of a body on which a touch acts [m]. At a single point, the compliance depends on the mesh."""
 
 _REQUIRED = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
-
-
-@dataclass(frozen=True)
-class Actuator:
-    """One actuator of a robot.
-
-    Args:
-        name: identifier.
-        low: smallest commanded displacement [unit].
-        high: largest commanded displacement [unit].
-        rate: largest change of the command per control step [unit].
-        unit: unit of displacement.
-        unilateral: whether it cannot push.
-        max_effort: largest effort either way; beyond it a commanded displacement is not reached.
-    """
-
-    name: str
-    low: float
-    high: float
-    rate: float
-    unit: str = "m"
-    unilateral: bool = True
-    max_effort: float = np.inf
 
 
 def _recording_options(init: F) -> F:

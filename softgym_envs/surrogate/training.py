@@ -8,7 +8,7 @@ import json
 import operator
 import shutil
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 
 from softgym_envs.config import BesideConfig, Config, save_resolved
 from softgym_envs.extras import require
+from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.correction import fit_correction
@@ -31,6 +32,9 @@ from softgym_envs.surrogate.trainer import Trainer
 from softgym_envs.surrogate.weight_files import card_of, load_model, save_model
 
 SPLITS = ("train", "validation", "test")
+
+Datasets = dict[str, dict[str, np.ndarray]]
+"""By name of the dataset, the columns of its states by name; the first axis runs over states."""
 
 BUCKLING = 0.01
 """If more than this share of the training states is unstable, the model must detect them; below, that is not worth its
@@ -294,9 +298,7 @@ def domain_of(
     return domain
 
 
-def generate_datasets(
-    config: FitConfig, data_folder: str | Path, *, progress: bool = True
-) -> dict[str, dict[str, np.ndarray]]:
+def generate_datasets(config: FitConfig, data_folder: str | Path, *, progress: bool = True) -> Datasets:
     """Return the datasets of a surrogate; whatever is missing is generated.
 
     Returns:
@@ -353,45 +355,18 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     folder, data_folder = Path(folder), Path(data_folder)
     robot = make_robot(config.robot, **config.robot_options)
     data = generate_datasets(config, data_folder, progress=progress)
-    digest = hashlib.sha256()
-    for split in data.values():
-        for column in split.values():
-            digest.update(np.ascontiguousarray(column).tobytes())
-    inputs: dict[str, Any] = {
-        "config": config.model_dump(mode="json", exclude={"workers", "executor"}),
-        "data_sha256": digest.hexdigest(),
-    }
-    card_path = folder / "model.json"
-    if card_path.exists():
-        model = load_model(folder, robot)
-        same = all(model.card["config"].get(k) == v for k, v in inputs["config"].items())
-        if same and model.card["data_sha256"] == inputs["data_sha256"]:
-            return model.card["test"]
+    inputs = _inputs(config, data)
+    known = _known_errors(folder, robot, inputs)
+    if known is not None:
+        return known
     torch.set_num_threads(1)
     features = Features(robot)
-    learned = {
-        name: with_images(robot, columns) if name.endswith("train") else columns for name, columns in data.items()
-    }
-    if more := learned.pop("more/train", None):
-        learned["train"] = {name: np.concatenate([column, more[name]]) for name, column in learned["train"].items()}
+    learned = _learned(robot, data)
     states = {name: training_states(robot, columns, features) for name, columns in learned.items()}
-    key = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:12]
-    trainer = Trainer(config.network, config.seed, folder / "parts", key, progress, config.workers)
-    start = time.perf_counter()
-    module = network_module(config.network.kind)
-    first: dict[str, Any] = {}
-    if config.pretraining is not None:
-        options = config.network.model_copy(update={"steps": config.pretraining.steps})
-        trained = Trainer(options, config.seed, folder / "parts" / "pretraining", key, progress, config.workers)
-        first["start"], _ = module.train(robot, states["pretraining/train"], states["pretraining/validation"], trained)
-    tensors, histories = module.train(robot, states["train"], states["validation"], trainer, **first)
-    seconds = time.perf_counter() - start
-    model = module.Model(robot, tensors, {})
+    trained = _train(config, robot, states, folder / "parts", inputs, progress)
+    Model = network_module(config.network.kind).Model
+    model = Model(robot, trained.tensors, {})
     errors = measure_errors(model, data["test"])
-    correction = None
-    if config.correction is not None:
-        levels = [data[f"correction/{level}"] for level in ("coarser", "own", "finer")]
-        correction = asdict(fit_correction(levels, config.correction.sizes, features.design(levels[1]["design"])))
     # Cheap states are learned, too, and few expensive ones hardly reach the bounds of the boxes.
     parts = [learned[name] for name in ("train", "pretraining/train") if name in learned]
     every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -403,14 +378,14 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         "states": {split: len(rows) for split, rows in states.items()},
         "unstable_states_left_out": {split: len(learned[split]["rest"]) - len(rows) for split, rows in states.items()},
         "data_sha256": inputs["data_sha256"],
-        "training_seconds": round(seconds, 1),
-        "best_validation": {part: min(row["validation"] for row in rows) for part, rows in histories.items()},
+        "training_seconds": round(trained.seconds, 1),
+        "best_validation": {part: min(row["validation"] for row in rows) for part, rows in trained.histories.items()},
         "test": errors,
         **({"errors": row_errors(model, data["validation"]).to_card()} if model.sensors else {}),
-        "correction": correction,
+        "correction": _correction(config, data, features),
     }
-    save_model(module.Model(robot, tensors, card), folder)
-    history = {f"{p}_{k}": np.array([row[k] for row in rows]) for p, rows in histories.items() for k in rows[0]}
+    save_model(Model(robot, trained.tensors, card), folder)
+    history = {f"{p}_{k}": np.array([row[k] for row in rows]) for p, rows in trained.histories.items() for k in rows[0]}
     with atomic_write(folder / "history.npz") as stream:
         np.savez_compressed(stream, allow_pickle=False, **history)
     save_resolved(folder, config)
@@ -421,3 +396,74 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         calibrate(folder, robot, **config.trust.model_dump(), state_folder=data_folder / "judged")
     shutil.rmtree(folder / "parts", ignore_errors=True)
     return errors
+
+
+def _inputs(config: FitConfig, data: Datasets) -> dict[str, Any]:
+    """Return what the weights follow from: the configuration and a hash of the data."""
+    digest = hashlib.sha256()
+    for split in data.values():
+        for column in split.values():
+            digest.update(np.ascontiguousarray(column).tobytes())
+    return {
+        "config": config.model_dump(mode="json", exclude={"workers", "executor"}),
+        "data_sha256": digest.hexdigest(),
+    }
+
+
+def _known_errors(folder: Path, robot: Robot, inputs: dict[str, Any]) -> dict[str, float] | None:
+    """Return the errors on the test set of weights in a folder; None if there are none of the same inputs."""
+    if not (folder / "model.json").exists():
+        return None
+    card = load_model(folder, robot).card
+    same = all(card["config"].get(name) == value for name, value in inputs["config"].items())
+    return card["test"] if same and card["data_sha256"] == inputs["data_sha256"] else None
+
+
+def _learned(robot: Robot, data: Datasets) -> Datasets:
+    """Return the datasets with what a training adds: mirror images, and further training states beside the others."""
+    learned = {
+        name: with_images(robot, columns) if name.endswith("train") else columns for name, columns in data.items()
+    }
+    if more := learned.pop("more/train", None):
+        learned["train"] = {name: np.concatenate([column, more[name]]) for name, column in learned["train"].items()}
+    return learned
+
+
+@dataclass(frozen=True)
+class _Trained:
+    """Result of a training.
+
+    Attributes:
+        tensors: weights of all networks.
+        histories: for each network the rows of its training.
+        seconds: wall time.
+    """
+
+    tensors: dict[str, np.ndarray]
+    histories: dict[str, list[dict[str, float]]]
+    seconds: float
+
+
+def _train(
+    config: FitConfig, robot: Robot, states: dict[str, Any], parts: Path, inputs: dict[str, Any], progress: bool
+) -> _Trained:
+    """Train the networks on states; finished ones are kept in the folder ``parts``, in case of an interruption."""
+    key = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:12]
+    trainer = Trainer(config.network, config.seed, parts, key, progress, config.workers)
+    start = time.perf_counter()
+    module = network_module(config.network.kind)
+    first: dict[str, Any] = {}
+    if config.pretraining is not None:
+        options = config.network.model_copy(update={"steps": config.pretraining.steps})
+        before = Trainer(options, config.seed, parts / "pretraining", key, progress, config.workers)
+        first["start"], _ = module.train(robot, states["pretraining/train"], states["pretraining/validation"], before)
+    tensors, histories = module.train(robot, states["train"], states["validation"], trainer, **first)
+    return _Trained(tensors, histories, time.perf_counter() - start)
+
+
+def _correction(config: FitConfig, data: Datasets, features: Features) -> dict[str, Any] | None:
+    """Return the factor to the converged efforts, as in the card; None without states on other meshes."""
+    if config.correction is None:
+        return None
+    levels = [data[f"correction/{level}"] for level in ("coarser", "own", "finer")]
+    return asdict(fit_correction(levels, config.correction.sizes, features.design(levels[1]["design"])))

@@ -1,0 +1,41 @@
+"""One actuator of a robot, as a user declares it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """One actuator of a robot.
+
+    Args:
+        name: identifier.
+        low: smallest commanded displacement [unit].
+        high: largest commanded displacement [unit].
+        rate: largest change of the command per control step [unit].
+        unit: unit of displacement.
+        unilateral: whether it cannot push.
+        max_effort: largest effort either way; beyond it a commanded displacement is not reached.
+
+    Raises:
+        ValueError: for an empty or infinite range, or a rate or largest effort that is not positive.
+    """
+
+    name: str
+    low: float
+    high: float
+    rate: float
+    unit: str = "m"
+    unilateral: bool = True
+    max_effort: float = np.inf
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
+            raise ValueError(f"actuator '{self.name}': low {self.low:g} must be below high {self.high:g}, both finite")
+        for label, value in (("rate", self.rate), ("max_effort", self.max_effort)):
+            if not value > 0.0:
+                raise ValueError(f"actuator '{self.name}': {label} = {value:g} must be positive")
