@@ -345,8 +345,8 @@ def _evaluate(
     finally:
         env.close()
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    columns[3] = columns[3].astype(bool)
-    return Evaluation(*columns[:6], steps=steps, untrusted=columns[6])
+    distances, means, returns, successes, efforts, ends, untrusted = columns
+    return Evaluation(distances, means, returns, successes.astype(bool), efforts, ends, steps, untrusted)
 
 
 def _inverse_qp(env: gymnasium.vector.VectorEnv) -> Callable[[np.ndarray], np.ndarray]:
