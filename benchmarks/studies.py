@@ -33,6 +33,7 @@ TITLES = {
     "finger_press": "Press finger",
     "gripper_manipulate": "Three-finger hand",
     "tetrapod_carry": "Tetrapod with 1 kg",
+    "tetrapod_carry_wide": "Tetrapod with 1 kg, servos that turn by 160°",
 }
 """Studies of the tables in their order, and the readable names of their robots."""
 
