@@ -36,6 +36,8 @@ class Evaluation:
         ends: first effector at the end of each episode [m], shape (n, 3); in an average of several evaluations, the
             mean of their ends.
         steps: environment steps.
+        untrusted: share of the steps of each episode that ended in a state which is not to be trusted (``trusted`` of
+            ``info``), shape (n,); NaN if it is not known.
         seconds: wall-clock time [s].
         cpu_seconds: CPU time of this process [s].
     """
@@ -47,8 +49,13 @@ class Evaluation:
     efforts: np.ndarray
     ends: np.ndarray
     steps: int
+    untrusted: np.ndarray | None = None
     seconds: float = 0.0
     cpu_seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.untrusted is None:
+            object.__setattr__(self, "untrusted", np.full(len(self), np.nan))
 
     def __len__(self) -> int:
         """Number of goals."""
@@ -116,7 +123,8 @@ class Evaluation:
             DataError: if a field is missing or not an array of numbers with a row for each goal.
         """
         try:
-            columns = {name: _column(data[name]) for name in _PER_GOAL}
+            old = {"untrusted": np.full(np.size(data["distances"]), np.nan)}  # files from before it was recorded
+            columns = {name: _column(data[name] if name in data else old[name]) for name in _PER_GOAL}
             cost = int(data["steps"]), float(data["seconds"]), float(data["cpu_seconds"])
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"stored evaluation cannot be read: {type(error).__name__} {error}") from None
@@ -142,7 +150,7 @@ def _column(values: Any) -> np.ndarray:
     return found.astype(float) if found.dtype == object else found
 
 
-_PER_GOAL = ("distances", "mean_distances", "returns", "successes", "efforts", "ends")
+_PER_GOAL = ("distances", "mean_distances", "returns", "successes", "efforts", "ends", "untrusted")
 _SUMMARY = (
     "success_rate",
     "mean_distance",
@@ -312,13 +320,14 @@ def _evaluate(
             # Episodes have touches, plants and noise of their own, whichever process runs them.
             start = {"design": body, "goal": path}
             observation, info = env.reset(seed=seed + int(index), options=start)
-            total, effort, distance, count, ended = 0.0, 0.0, 0.0, 0, False
+            total, effort, distance, doubted, count, ended = 0.0, 0.0, 0.0, 0, 0, False
             while not ended:
                 action = act(observation, env.unwrapped)
                 observation, reward, terminated, truncated, info = env.step(action)
                 total += float(reward)
                 effort += float(np.abs(info["effort"]).mean())
                 distance += info["distance"]
+                doubted += not info["trusted"]
                 count += 1
                 ended = terminated or truncated
             steps += count
@@ -330,12 +339,14 @@ def _evaluate(
                     info["is_success"] and info["converged"],
                     effort / count,
                     info["effector"],
+                    doubted / count,
                 )
             )
     finally:
         env.close()
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return Evaluation(columns[0], columns[1], columns[2], columns[3].astype(bool), columns[4], columns[5], steps)
+    distances, means, returns, successes, efforts, ends, untrusted = columns
+    return Evaluation(distances, means, returns, successes.astype(bool), efforts, ends, steps, untrusted)
 
 
 def _inverse_qp(env: gymnasium.vector.VectorEnv) -> Callable[[np.ndarray], np.ndarray]:
@@ -355,7 +366,9 @@ def _evaluate_batch(
     count = len(goals)
     env = environment.make_vec(count, sample_design=False)
     act = _inverse_qp(env) if policy is None else policy.begin()
-    columns = {name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "length")}
+    columns = {
+        name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "doubted", "length")
+    }
     ends = np.zeros((count, 3))
     running = np.ones(count, dtype=bool)
     try:
@@ -369,6 +382,7 @@ def _evaluate_batch(
             columns["mean"] += running * last["distance"]
             columns["return"] += running * reward
             columns["effort"] += running * np.abs(last["effort"]).mean(axis=1)
+            columns["doubted"] += running & ~last["trusted"]
             columns["length"] += running
             running &= ~(terminated | truncated)
     finally:
@@ -382,4 +396,5 @@ def _evaluate_batch(
         columns["effort"] / length,
         ends,
         int(length.sum()),
+        columns["doubted"] / length,
     )

@@ -33,6 +33,7 @@ TITLES = {
     "finger_press": "Press finger",
     "gripper_manipulate": "Three-finger hand",
     "tetrapod_carry": "Tetrapod with 1 kg",
+    "tetrapod_carry_wide": "Tetrapod with 1 kg, servos that turn by 160°",
 }
 """Studies of the tables in their order, and the readable names of their robots."""
 
@@ -112,7 +113,7 @@ def _meshes(found: dict[str, Any], mesh: dict[str, Any], whole: bool) -> list[di
                 row[f"{who}, mean effort [N]"] = compared[who]["mean_effort"]
         row["change [mm]"] = 1e3 * compared["objective_change"]
         if compared["backend"] == "refined":  # on the other mesh, at the same goals
-            row["change before [mm]"] = row["change [mm]"] - 1e3 * mesh["left"] * (1.0 - mesh["ratio"])
+            row["change before [mm]"] = 1e3 * mesh["before"]
         row["interval [mm]"] = _interval(compared)
         if compared["objective_mesh"] and compared["objective_mesh"]["interval"]:
             row["with the mesh [mm]"] = [1e3 * end for end in compared["objective_mesh"]["interval"]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,44 @@ from softgym_envs.codesign.variables import is_option
 
 STREAM = 0x60A15
 """Separates the seeds of a study's goals from those of trainings, which draw goals from the same task."""
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """Goals of one kind, some of which stand for all of them.
+
+    Attributes:
+        share: of these goals among all.
+        numbers: which goals were chosen, from 0.
+    """
+
+    share: float
+    numbers: tuple[int, ...]
+
+
+def first_goals(total: int, count: int) -> list[Stratum]:
+    """Return the first ``count`` of ``total`` goals, which stand for all: goals are drawn in random order."""
+    return [Stratum(1.0, tuple(range(min(count, total))))]
+
+
+def missed_first(missed: np.ndarray, count: int) -> list[Stratum]:
+    """Choose half of ``count`` goals among those missed and half among the others, the first ones of each kind.
+
+    If one kind has too few, the other one has more. A mean over all goals is that of the kinds, weighted by their
+    shares, so it has no bias, however the kinds were told apart.
+
+    Args:
+        missed: whether each goal is missed, shape (k,).
+        count: number of goals to choose, from 2.
+    """
+    kinds = [np.flatnonzero(missed), np.flatnonzero(~np.asarray(missed))]
+    first = min(len(kinds[0]), max(count // 2, count - len(kinds[1])))
+    counts = [first, min(len(kinds[1]), count - first)]
+    return [
+        Stratum(len(kind) / len(missed), tuple(kind[:chosen].tolist()))
+        for kind, chosen in zip(kinds, counts, strict=True)
+        if len(kind)
+    ]
 
 
 def family_goals(config: StudyConfig, count: int) -> np.ndarray:

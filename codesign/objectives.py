@@ -160,12 +160,13 @@ OBJECTIVES: dict[str, Objective] = {
         Objective("mean_return", lambda o: o.evaluation.returns, "Mean return", maximize=True),
         Objective("mean_tracking_distance", lambda o: o.evaluation.mean_distances, "Mean tracking distance", "mm", 1e3),
         Objective("mean_effort", lambda o: o.evaluation.efforts, "Mean actuator effort", "N"),
+        Objective("untrusted_share", lambda o: o.evaluation.untrusted, "Share of untrusted states", "%", 100.0),
         Objective("material_volume", lambda o: o.model.volume, "Material volume", "cm3", 1e6, of_body=True),
     )
 }
 """Registry: name to objective."""
 
-PATH_OBJECTIVES = ("mean_return", "mean_tracking_distance", "mean_effort")
+PATH_OBJECTIVES = ("mean_return", "mean_tracking_distance", "mean_effort", "untrusted_share")
 """Objectives that are means or sums over the steps of an episode."""
 
 

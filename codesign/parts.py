@@ -52,6 +52,10 @@ without training in a trial, counts goals and compares each with the same goal o
 """
 
 
+LEAST_OF_KINDS = 4
+"""Fewest goals of a refinement that are half missed and half reached: two of a kind have a scatter."""
+
+
 class PrunerConfig(Config):
     """Algorithm that stops hopeless trials: a key of `PRUNERS`, and further arguments of its class."""
 
@@ -157,7 +161,12 @@ class RefinementConfig(Config):
     robot_options: dict[str, Any] = Field(
         min_length=1, description="options of the robot that make the mesh finer, such as {mesh_size: 0.0075} [m]"
     )
-    goals: int = Field(ge=1, description="how many goals: the first of the unseen ones")
+    goals: int = Field(ge=1, description="how many of the unseen goals")
+    choose: Literal["first", "missed"] = Field(
+        default="first",
+        description="which goals: the first ones, which are a random sample; or half of them among those that the "
+        "baseline misses on the mesh of the study, weighted by their share of all unseen goals",
+    )
     ratio: float | None = Field(
         default=None,
         gt=0.0,
@@ -165,6 +174,12 @@ class RefinementConfig(Config):
         description="size of its elements over that of the coarser mesh; default: the ratio of the numbers of unknowns "
         "for robots made of beams, its cube root for others",
     )
+
+    @model_validator(mode="after")
+    def _two_of_each_kind(self) -> RefinementConfig:
+        if self.choose == "missed" and self.goals < LEAST_OF_KINDS:
+            raise ValueError(f"choose = 'missed' needs two goals of each kind; allowed: goals from {LEAST_OF_KINDS}")
+        return self
 
 
 class FinalistsConfig(Config):

@@ -170,6 +170,7 @@ class FinalistTest(Record):
     error: str | None = None  # why the body cannot be simulated
     unknowns: int | None = None  # of its mesh, on finite elements
     last_motion: float | None = None  # of the effector in the last step [m], if only ends are tested; see `Ends`
+    numbers: list[int] | None = None  # of the goals among all unseen ones; None: the first ones
 
 
 @dataclass(eq=False)
@@ -206,6 +207,7 @@ class PlannedTest:
     backend: str
     goals: str
     seed: int
+    numbers: tuple[int, ...] | None = None  # of the goals to test; None: all
 
     @property
     def key(self) -> tuple[int, str, str, str, int]:
@@ -268,6 +270,12 @@ class TestGroup:
     def last_motion(self) -> float | None:
         """Largest last motion of any seed [m], if it is known."""
         return max((test.last_motion for test in self.tests if test.last_motion is not None), default=None)
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the goals among all of their set."""
+        numbers = self.tests[0].numbers
+        return list(range(len(self.mean))) if numbers is None else numbers
 
     @property
     def worst_distance(self) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY_RECORD, StudyFolder
+from softgym_envs.codesign.goals import Stratum, first_goals, missed_first
 from softgym_envs.codesign.objectives import Objective
 from softgym_envs.codesign.records import (
     REFINED,
@@ -195,8 +196,28 @@ class StudySnapshot:
         return [plan for body in (baseline, winner) for plan in self._refined(body)]
 
     def _refined(self, body: Finalist) -> list[PlannedTest]:
-        agent = body.agents[0]
-        return [PlannedTest(body, agent, REFINED, "unseen", seed) for seed in self.seeds(agent)]
+        agent, strata = body.agents[0], self.refined_goals
+        numbers = None if strata is None else tuple(number for stratum in strata for number in stratum.numbers)
+        return [PlannedTest(body, agent, REFINED, "unseen", seed, numbers) for seed in self.seeds(agent)]
+
+    @cached_property
+    def refined_goals(self) -> list[Stratum] | None:
+        """Unseen goals of the tests on the finer mesh; None without them, and before the baseline was tested.
+
+        What the baseline misses is what it misses with its own controller on the mesh of the study, in the test that
+        the finer mesh corrects. No result on the finer mesh, and none of the winner, takes part in the choice.
+        """
+        refinement, baseline, total = self.config.finalists.refinement, self.baseline, len(self.folder.goals["unseen"])
+        if refinement is None or baseline is None:
+            return None
+        if refinement.choose == "first":
+            return first_goals(total, refinement.goals)
+        agent = baseline.agents[0]
+        key = (baseline.trial, agent, "fem", "unseen", self.seeds(agent)[0])
+        for test in self.all_tests:
+            if (test.trial, test.agent, test.backend, test.goals, test.seed) == key and test.evaluation is not None:
+                return missed_first(~test.evaluation.successes.astype(bool), refinement.goals)
+        return None
 
     @cached_property
     def tests(self) -> list[TestGroup]:

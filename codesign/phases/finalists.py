@@ -110,11 +110,10 @@ def _test(folder: StudyFolder, plan: PlannedTest) -> FinalistTest:
     controller: str | Path = plan.agent
     if plan.agent == "policy" and finalist.policy:
         controller = _trained_policy(folder, finalist, plan.seed) if plan.seed else folder.path / finalist.policy
-    test = FinalistTest(finalist.trial, plan.agent, plan.backend, plan.goals, plan.seed)
+    numbers = None if plan.numbers is None else list(plan.numbers)
+    test = FinalistTest(finalist.trial, plan.agent, plan.backend, plan.goals, plan.seed, numbers=numbers)
     environment = finalist_environment(config, plan.backend, finalist.options)
-    goals, refinement = folder.goals[plan.goals], config.finalists.refinement
-    if refinement is not None and plan.backend == REFINED:
-        goals = goals[: refinement.goals]
+    goals = folder.goals[plan.goals] if numbers is None else folder.goals[plan.goals][numbers]
     try:
         if config.finalists.test == "ends" and plan.backend != "surrogate":
             start = finalist_environment(config, "surrogate", finalist.options)

@@ -10,6 +10,7 @@ import numpy as np
 
 from softgym_envs.agents.evaluation import known
 from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.goals import Stratum
 from softgym_envs.codesign.objectives import Objective
 from softgym_envs.codesign.records import REFINED, Finalist, TestGroup
 from softgym_envs.codesign.report.results import (
@@ -110,7 +111,8 @@ def _comparisons(snapshot: StudySnapshot) -> list[Comparison]:
                     rows.append(_compare(before, after, snapshot.objective))
     if finer is not None:
         dimension = 1 if snapshot.config.robot.made_of_beams else 3
-        rows = [_with_mesh(row, found, (baseline.trial, winner.trial), finer.ratio, dimension) for row in rows]
+        trials, strata = (baseline.trial, winner.trial), snapshot.refined_goals or []
+        rows = [_with_mesh(row, found, trials, strata, finer.ratio, dimension) for row in rows]
     return rows
 
 
@@ -118,6 +120,7 @@ def _with_mesh(
     row: Comparison,
     found: Mapping[tuple[int, str, str], TestGroup],
     trials: tuple[int, int],
+    strata: Sequence[Stratum],
     ratio: float | None,
     dimension: int,
 ) -> Comparison:
@@ -127,6 +130,7 @@ def _with_mesh(
         row: the comparison.
         found: tests on unseen goals.
         trials: of baseline and winner.
+        strata: the goals of the finer mesh.
         ratio: of the sizes of elements, or None for what follows from the unknowns.
         dimension: of the elements: with half their size there are about 2 ** dimension times as many.
     """
@@ -143,8 +147,8 @@ def _with_mesh(
 
     def part(tables: Sequence[Sequence[np.ndarray]], interval: Interval) -> MeshPart:
         (before, after), (before_fine, after_fine) = ([table.mean(axis=0) for table in pair] for pair in tables)
-        fine = after_fine - before_fine
-        return mesh_part((after - before)[: len(fine)], fine, ratio, interval)
+        numbers = both[1][0].numbers
+        return mesh_part((after - before)[numbers], after_fine - before_fine, ratio, interval, strata)
 
     distances = [[group.table("distances") for group in groups] for groups in both]
     own = [[table for group in groups if (table := group.objective_table) is not None] for groups in both]

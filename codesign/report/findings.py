@@ -80,11 +80,11 @@ def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     coarse, fine = (rows.get((backend, agent)) for backend in ("fem", REFINED))
     if coarse is None or fine is None or coarse.distance_mesh is None:
         return None
-    measure, mesh = snapshot.config.distance, coarse.distance_mesh
-    before = fine.distance_change - mesh.left * (1.0 - mesh.ratio)  # on the other mesh, at the same goals
+    measure, mesh, own = snapshot.config.distance, coarse.distance_mesh, "the mesh of the study"
+    kinds = f", half of them missed by the baseline on {own}," if finer.choose == "missed" else ""
     text = (
-        f"At {fine.goals} goals the change is {measure.text(fine.distance_change, '+')} there, and "
-        f"{measure.text(before, '+')} on the mesh of the study. "
+        f"At {fine.goals} goals{kinds} the change is {measure.text(fine.distance_change, '+')} there, and "
+        f"{measure.text(mesh.before, '+')} on {own}. "
     )
     if mesh.interval is None:
         return Finding("A finer mesh was tested", f"{text}With fewer than {MIN_GOALS} goals there is no interval.")

@@ -290,10 +290,16 @@ def _mesh_note(snapshot: StudySnapshot, results: StudyResults) -> str:
         return ""
     mesh, measure = row.distance_mesh, snapshot.config.distance
     low, high = (measure.number(end, "+") for end in mesh.left_interval)
+    finer = snapshot.config.finalists.refinement
+    kinds = (
+        ", about half of them missed by the baseline, weighted by their share of all,"
+        if (finer is not None and finer.choose == "missed")
+        else ""
+    )
     note = (
-        f"“With the mesh” adds what is left of the mesh's error: the change on {mesh.goals} goals on both meshes, "
-        f"extrapolated linearly to elements of size zero (those of the finer mesh are {mesh.ratio:.2f} times as "
-        f"large), would be {measure.text(mesh.left, '+')} more ({low} to {high})."
+        f"“With the mesh” adds what is left of the mesh's error: the change on {mesh.goals} goals{kinds} on both "
+        "meshes, extrapolated linearly to elements of size zero (those of the finer mesh are "
+        f"{mesh.ratio:.2f} times as large), would be {measure.text(mesh.left, '+')} more ({low} to {high})."
     )
     motions = [test.last_motion for test in results.tests if test.last_motion is not None]
     if motions:

@@ -66,7 +66,7 @@ class BodyStatistics(Record):
 class Comparison(Record):
     """Winner against baseline on the same test goals, with one controller on one backend [SI]; intervals of 95 %.
 
-    The backend ``"refined"`` is FEM with a finer mesh, on the first of the test goals.
+    The backend ``"refined"`` is FEM with a finer mesh, on some of the test goals.
     """
 
     backend: str

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.codesign.goals import Stratum, first_goals
 from softgym_envs.codesign.records import Record
 
 CONFIDENCE = 0.95
@@ -55,36 +56,48 @@ class MeshPart(Record):
     Attributes:
         goals: number of goals on the finer mesh.
         ratio: size of its elements over that of the coarser mesh.
-        left: mean of what is left.
+        before: mean change at these goals on the coarser mesh.
+        left: mean of what is left, over all goals.
         left_interval: interval of this mean over goals; with few goals it reaches from the smallest to the largest.
         interval: interval of the change on the coarser mesh, widened by `left_interval`.
     """
 
     goals: int
     ratio: float
+    before: float
     left: float
     left_interval: tuple[float, float]
     interval: Interval
 
 
-def mesh_part(coarse: np.ndarray, fine: np.ndarray, ratio: float, interval: Interval) -> MeshPart:
+def mesh_part(
+    coarse: np.ndarray, fine: np.ndarray, ratio: float, interval: Interval, strata: Sequence[Stratum] = ()
+) -> MeshPart:
     """Return what is left of a mesh's error in a change, from the same change on a finer mesh.
 
     The error is taken as linear in the size of the elements, as sharp edges make it: at each goal
-    ``(fine - coarse) / (1 - ratio)`` is left. The scatter of its mean over goals comes from bootstrapping them.
+    ``(fine - coarse) / (1 - ratio)`` is left. The scatter of its mean over goals comes from bootstrapping them. Goals
+    of several kinds are bootstrapped kind by kind, and the mean over all goals is that of the kinds, weighted by their
+    shares.
 
     Args:
         coarse: the change at the goals of the finer mesh, on the coarser one, shape (k,).
         fine: the same on the finer mesh.
         ratio: size of the finer mesh's elements over that of the coarser mesh's, below 1.
         interval: of the change at all goals, on the coarser mesh.
+        strata: kinds of goals, in the order of the changes; default: one.
     """
     left = (np.asarray(fine) - np.asarray(coarse)) / (1.0 - ratio)
-    drawn = np.random.default_rng(0).integers(len(left), size=(RESAMPLES, len(left)))
+    rng, start, mean, means = np.random.default_rng(0), 0, 0.0, np.zeros(RESAMPLES)
+    for stratum in strata or first_goals(len(left), len(left)):
+        part = left[start : start + len(stratum.numbers)]
+        start += len(part)
+        mean += stratum.share * float(part.mean())
+        means += stratum.share * part[rng.integers(len(part), size=(RESAMPLES, len(part)))].mean(axis=1)
     tails = 0.5 * (1.0 - CONFIDENCE)
-    low, high = (float(end) for end in np.quantile(left[drawn].mean(axis=1), (tails, 1.0 - tails)))
+    low, high = (float(end) for end in np.quantile(means, (tails, 1.0 - tails)))
     whole = None if interval is None else (interval[0] + min(low, 0.0), interval[1] + max(high, 0.0))
-    return MeshPart(len(left), ratio, float(left.mean()), (low, high), whole)
+    return MeshPart(len(left), ratio, float(np.mean(coarse)), mean, (low, high), whole)
 
 
 def rate_interval(successes: np.ndarray) -> Interval:

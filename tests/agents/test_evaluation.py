@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softgym_envs.agents.config import EnvironmentConfig
-from softgym_envs.agents.evaluation import Evaluation, evaluate, sample_goals
+from softgym_envs.agents.evaluation import Evaluation, evaluate, make_agent, sample_goals
 from softgym_envs.agents.vec_env import SB3VecEnv
 from softgym_envs.errors import DataError
 
@@ -48,6 +48,29 @@ def test_files_hold_everything(evaluation):
     again = Evaluation.from_json(data)
     assert again.to_json() == evaluation.to_json()
     assert again.successes.dtype == evaluation.successes.dtype
+
+
+def test_files_from_before_trust_was_recorded_can_be_read():
+    data = some(3, 0).to_json()
+    assert data.pop("untrusted") == [None, None, None]
+    assert np.isnan(Evaluation.from_json(data).untrusted).all()
+
+
+def test_untrusted_states_are_counted():
+    """A policy that folds legs on the published mesh, in a batch; random actions alone."""
+    environment = EnvironmentConfig(id="SoftGym/TetrapodCarry-v0")
+    goals = sample_goals(environment, 1, seed=0)
+    folding = evaluate("tetrapod_carry_empty", environment, goals)
+    assert 0.2 < folding.untrusted[0] < 1.0
+    env = environment.make()
+    act = make_agent("tetrapod_carry_empty")
+    observation, _ = env.reset(seed=0)
+    doubted = []
+    for _ in range(100):
+        observation, _, _, _, info = env.step(act(observation, env.unwrapped))
+        doubted.append(not info["trusted"])
+    assert folding.untrusted[0] == pytest.approx(np.mean(doubted), abs=0.02)
+    assert 0.0 <= evaluate("random", environment, goals).untrusted[0] <= 1.0
 
 
 def test_a_damaged_file_is_named():

@@ -12,6 +12,7 @@ from softgym_envs.agents.evaluation import Evaluation, evaluate
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
+from softgym_envs.codesign.goals import Stratum, missed_first
 from softgym_envs.codesign.phases import ends
 from softgym_envs.codesign.records import FinalistTest, TrialResult
 from softgym_envs.codesign.report.collect import collect
@@ -155,6 +156,44 @@ def test_intervals_against_values_by_hand():
     assert mesh_part(np.zeros(2), np.zeros(2), 0.5, None).interval is None
 
 
+def test_missed_goals_are_half_of_those_on_the_finer_mesh():
+    missed = np.zeros(20, dtype=bool)
+    missed[[3, 8, 9, 15, 19]] = True
+    assert missed_first(missed, 6) == [Stratum(0.25, (3, 8, 9)), Stratum(0.75, (0, 1, 2))]
+    assert missed_first(missed, 14) == [
+        Stratum(0.25, (3, 8, 9, 15, 19)),
+        Stratum(0.75, (*range(3), *range(4, 8), 10, 11)),
+    ]
+    assert missed_first(missed[:4], 8) == [Stratum(0.25, (3,)), Stratum(0.75, (0, 1, 2))]
+    assert missed_first(~missed[:3], 2) == [Stratum(1.0, (0, 1))] == missed_first(missed[:3], 2)
+
+
+def test_goals_chosen_by_the_baseline_do_not_favour_the_winner():
+    """Goals where the coarse mesh makes the baseline miss by chance shrink on the finer one: the mean has no bias."""
+    rng, true, found, naive = np.random.default_rng(1), -0.5, [], []
+    for _ in range(400):
+        baseline, winner = rng.normal(2.0, 1.0, 40), rng.normal(1.5, 1.0, 40)  # without errors of the mesh
+        coarse = baseline + rng.normal(0.0, 1.0, 40)
+        strata = missed_first(coarse > 3.0, 12)
+        numbers = [number for stratum in strata for number in stratum.numbers]
+        before, after = (winner - coarse)[numbers], (winner - baseline)[numbers]
+        part = mesh_part(before, after, 0.5, None, strata)
+        found.append((winner - coarse).mean() + 0.5 * part.left)  # the change at all goals on the finer mesh
+        naive.append(after.mean())
+    assert np.mean(found) == pytest.approx(true, abs=4.0 * np.std(found) / 20.0)
+    assert np.mean(naive) < true - 0.1  # the mean over the chosen goals is biased
+
+
+def test_kinds_of_goals_count_by_their_shares():
+    strata = [Stratum(0.25, (1, 2)), Stratum(0.75, (0, 3))]
+    part = mesh_part(
+        np.array([-4e-3, -4e-3, 0.0, 0.0]), np.array([-3e-3, -1e-3, 0.0, 0.0]), 0.5, (-2e-3, -1e-3), strata
+    )
+    assert part.left == pytest.approx(1e-3) and part.before == pytest.approx(-2e-3)
+    assert part.left_interval == pytest.approx((0.5e-3, 1.5e-3))  # of the kind that scatters
+    assert part.interval == pytest.approx((-2e-3, 0.5e-3))
+
+
 def evaluation(distances):
     distances = np.asarray(distances, dtype=float)
     ones = np.ones(len(distances))
@@ -165,8 +204,8 @@ def evaluation(distances):
 def written(tmp_path, tiny):
     """Function ``written(refined, ratio, error) -> snapshot``: tests written by hand, distances in metres."""
 
-    def make(refined, ratio=None, error=None):
-        finer = {"robot_options": {"mesh_size": 0.005}, "goals": 2, "ratio": ratio}
+    def make(refined, ratio=None, error=None, **options):
+        finer = {"robot_options": {"mesh_size": 0.005}, "goals": 2, "ratio": ratio, **options}
         data = tiny(
             finalists={"count": 1, "test": "ends", "refinement": finer},
             goals={"count": 3, "unseen_count": 6, "training_count": 1},
@@ -229,6 +268,37 @@ def test_elements_of_beams_are_lines(written, monkeypatch):
     snapshot = written(REFINED)
     monkeypatch.setattr(type(snapshot.config.robot), "made_of_beams", True)
     assert collect(snapshot).comparison[0].distance_mesh.ratio == pytest.approx(1000 / 8000)
+
+
+def test_the_baseline_alone_chooses_goals_of_the_finer_mesh(written):
+    folder = written(None, goals=4, choose="missed").folder
+    file = folder.path / "finalists" / "trial0000-qp-fem-unseen.json"
+    test = FinalistTest.read(file)
+    test.evaluation = evaluation([1e-3, 5e-3, 1e-3, 1e-3, 5e-3, 1e-3])
+    test.write(file)
+    snapshot = load_study(folder)
+    assert snapshot.refined_goals == [Stratum(1 / 3, (1, 4)), Stratum(2 / 3, (0, 2))]
+    assert [plan.numbers for plan in snapshot.refinements] == 2 * [(1, 4, 0, 2)]
+    for plan, distances in zip(snapshot.refinements, ([4e-3, 2e-3, 1e-3, 1e-3], 4 * [1e-3]), strict=True):
+        found = evaluation(distances)
+        FinalistTest(
+            plan.finalist.trial,
+            "qp",
+            "refined",
+            "unseen",
+            0,
+            found,
+            {"mean_distance": 0.0},
+            distances,
+            unknowns=8000,
+            numbers=list(plan.numbers),
+        ).write(folder.path / plan.file)
+    snapshot = load_study(folder)
+    part = collect(snapshot).comparison[0].objective_mesh
+    # Written by hand: changes of -4 mm at all goals of the coarse mesh, and -3, -1, 0, 0 mm on the fine one.
+    assert part.before == pytest.approx(-4e-3) and part.goals == 4 and part.ratio == pytest.approx(0.5)
+    assert part.left == pytest.approx(2.0 * (2e-3 / 3 + 4e-3 * 2 / 3))
+    assert "half of them missed by the baseline" in findings(snapshot, collect(snapshot))[1].text
 
 
 def test_refinements_wait_for_the_winner(written):
