@@ -276,13 +276,13 @@ def fit(
             axis=1,
         )
         ridge = np.concatenate([np.zeros(model.stiffness.size), np.full(model.corrections.size, RIDGE)])
-        weightsof = np.concatenate([model.stiffness.ravel(), model.corrections.ravel()])
+        numbers = np.concatenate([model.stiffness.ravel(), model.corrections.ravel()])
         normal = jacobian.T @ jacobian + np.diag(ridge)
-        slope = jacobian.T @ residual.ravel() + ridge * weightsof
+        slope = jacobian.T @ residual.ravel() + ridge * numbers
         improved = False
         for _ in range(8):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -slope)
-            new = weightsof + step
+            new = numbers + step
             trial = replace(
                 model,
                 stiffness=new[: model.stiffness.size].reshape(model.stiffness.shape),
