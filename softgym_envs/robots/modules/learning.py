@@ -102,7 +102,6 @@ RECIPES = {
         rays=2,
         degrees=(3, 1),
         order=5,
-        corners=True,
     ),
     "crossed_leaves": Recipe(
         {"leaf_length": (0.012, 0.020), "width": (0.012, 0.018), "thickness": (0.001, 0.0018)},
