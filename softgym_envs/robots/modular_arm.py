@@ -77,7 +77,6 @@ WIRES = {"wire_x": (1.0, 0.0), "wire_y": (0.0, 1.0)}
 class _Cell(NamedTuple):
     """A cell of one body: its module, the module's design, its axes, and the height at which it begins [m]."""
 
-    kind: str
     module: Module
     design: Mapping[str, float]
     axes: np.ndarray
@@ -201,7 +200,7 @@ class ModularArm(Robot):
             name, axes = CELLS[cell]
             own = self._size(design, name, number)
             own["young_modulus"] = design["young_modulus"]
-            part = _Cell(name, MODULES[name](), own, axes, height)
+            part = _Cell(MODULES[name](), own, axes, height)
             yield part
             height += part.length
 
@@ -236,7 +235,7 @@ class ModularArm(Robot):
                 ports.append(placed.far)
                 cavities += [] if placed.cavity is None else [placed.cavity]
                 continue
-            learned = learned_module(part.kind)
+            learned = learned_module(part.module.name)
             far = builder.add_frame(origin + [0.0, 0.0, part.length])
             builder.add_superelement(
                 ports[-1],
@@ -266,7 +265,7 @@ class ModularArm(Robot):
             half = design["wire_radius"]
             model.skins += [box_skin(port, (half, half, 0.001), model.nodes) for port in ports]
             for part, near, far in zip(self._modules(design), ports[:-1], ports[1:], strict=True):
-                section = SHAPES[part.kind].section(part.design)
+                section = SHAPES[part.module.name].section(part.design)
                 model.skins.append(bridge_skin(near, far, section, part.axes, model.nodes))
         return model
 

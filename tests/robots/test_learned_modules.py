@@ -9,7 +9,7 @@ import pytest
 from softgym_envs.errors import DesignError, WeightsError
 from softgym_envs.robots.modules import MODULES, learned_module, learning
 from softgym_envs.robots.modules.energy import MIRRORED, ModuleEnergy, reflections, terms
-from softgym_envs.robots.modules.learned import load_module
+from softgym_envs.robots.modules.learned import load_module, polynomials
 from softgym_envs.robots.modules.learning import RECIPES, Recipe, calibrated, errors, fit
 from softgym_envs.robots.modules.states import ModuleStates, solve_states
 
@@ -101,6 +101,32 @@ def test_a_fit_finds_the_energy_that_made_the_states(name, order):
     assert error < 0.02 < 0.2 * linear
 
 
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("name", ["solid_block", "crossed_leaves"])
+def test_the_slopes_of_a_fit_are_the_derivatives_of_its_residuals(name, order):
+    """By numbers that are drawn at random, at an energy that is not yet fitted."""
+    recipe, states = Recipe({"length": (0.01, 0.03)}, 0.5, order=order), made_states(name, order, 12, 1)
+    model, rng = fit(recipe, name, states, {}, steps=0), np.random.default_rng(2)
+    P, Q = (polynomials(model.unit(states.designs), degree) for degree in recipe.degrees)
+    products, weights = learning._products(states.strain, model.terms), learning._weights(states, recipe.rotation)
+    start = np.concatenate([model.stiffness.ravel(), rng.normal(size=model.corrections.size)])
+
+    def at(numbers):
+        k, c = np.split(numbers, [model.stiffness.size])
+        return replace(model, stiffness=k.reshape(-1, 6), corrections=c.reshape(model.corrections.shape))
+
+    def residuals(numbers):
+        found = learning._corrected(at(numbers), states, products)
+        return learning._residuals(found.gradient(), found.hessian(), weights).ravel()
+
+    slopes = learning._slopes(at(start), learning._corrected(at(start), states, products), products, weights, P, Q)
+    step = 1e-5
+    for column in rng.choice(len(start), 40, replace=False):
+        move = step * np.eye(len(start))[column]
+        expected = (residuals(start + move) - residuals(start - move)) / (2.0 * step)
+        np.testing.assert_allclose(slopes[:, column], expected, atol=1e-6 * max(abs(expected).max(), 1e-3))
+
+
 def test_bounds_cover_states_that_were_neither_learned_nor_used_to_calibrate():
     """With noisy forces, whose size bounds must find; the numbers are those of fixed seeds."""
     learned, others = (made_states("solid_block", 3, count, seed) for count, seed in ((200, 2), (600, 3)))
@@ -145,7 +171,8 @@ def test_bodies_are_drawn_from_the_box_in_any_order_of_its_dimensions(monkeypatc
 
     monkeypatch.setattr(learning, "solve_states", record)
     with pytest.raises(InterruptedError):
-        learning.learn_module("accordion", Recipe({"width": (0.008, 0.014), "amplitude": (0.003, 0.0079)}, 0.3, 16))
+        box = {"width": (0.008, 0.014), "amplitude": (0.003, 0.0079)}
+        learning.learn_module("accordion", Recipe(box, 0.3, bodies=16))
     for name, low, high in (("width", 0.008, 0.014), ("amplitude", 0.003, 0.0079)):
         assert 0.9 * low < drawn[0][name].min() < 1.1 * low < 0.9 * high < drawn[0][name].max() < 1.1 * high
 

@@ -11,6 +11,7 @@ from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.geometry.export import write_drawing
 from softgym_envs.robots.modules import MODULES, Link, Structure
+from softgym_envs.robots.modules.base import DENSITY
 
 E = 1.0e7
 NO_POISSON = {"young_modulus": E, "poisson_ratio": 0.0}  # then clamped ends do not stiffen a beam
@@ -152,6 +153,16 @@ def test_an_accordion_stretches_by_bending_its_folds():
     lean = 4.0 * amplitude / pitch
     merged = 0.5 * thickness * math.hypot(1.0, lean)
     assert whole * (1.0 - merged / amplitude) ** 3 < found[Z, Z] < whole
+
+
+def test_the_mesh_of_an_accordion_fills_its_drawing():
+    """The wall is as wide along x at every height; two plates close it."""
+    folds, pitch, amplitude, width, thickness, plate = 2, 0.008, 0.005, 0.006, 0.001, 0.003
+    module = MODULES["accordion"]()
+    design = {"folds": folds, "pitch": pitch, "amplitude": amplitude, "width": width, "thickness": thickness}
+    wall = thickness * math.hypot(1.0, 4.0 * amplitude / pitch) * folds * pitch
+    plates = 2.0 * plate * 2.0 * (amplitude + 2.0 * thickness)
+    assert module.mass(design) == pytest.approx(DENSITY * width * (wall + plates), rel=1e-9)
 
 
 def monolith(parts, tip):

@@ -8,37 +8,30 @@ from collections.abc import Mapping
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.robots.base import Drawing
 from softgym_envs.robots.modules.base import MATERIAL, Module
-from softgym_envs.robots.modules.plates import PLATE, add_plates, add_prism
+from softgym_envs.robots.modules.plates import PLATE, add_layers
 
 
 def draw_folds(
     *, depth: float, width: float, thickness: float, amplitude: float, pitch: float, folds: float, plate: float
 ) -> None:
     """Draw two plates and a zigzag wall between them, in mm. The wall begins and ends on the z axis."""
-    import gmsh
-
-    occ = gmsh.model.occ
     count = round(folds)
-    length = count * pitch + 2.0 * plate
-    # The wall goes on into the plates in its own direction, so that they overlap.
-    inside = 0.3 * plate
-    lean = amplitude / (0.25 * pitch)
-    middle = [(-lean * inside, plate - inside)]
+    length, edge = count * pitch + 2.0 * plate, depth / 2
+    half = 0.5 * thickness * math.hypot(1.0, amplitude / (0.25 * pitch))  # along x, of a wall that leans
+    right = [(edge, 0.0), (edge, plate), (half, plate)]
     for k in range(count):
         start = plate + k * pitch
-        middle += [(amplitude, start + 0.25 * pitch), (-amplitude, start + 0.75 * pitch)]
-    middle.append((lean * inside, length - plate + inside))
-    half = 0.5 * thickness * math.hypot(1.0, lean)  # along x, of a wall that leans
-    outline = [(x + half, z) for x, z in middle] + [(x - half, z) for x, z in reversed(middle)]
-    wall = add_prism(outline, -width / 2, width / 2)
-    first, last = add_plates(depth, width, length, plate)
-    occ.fuse([first], [wall, last])
+        right += [(half + amplitude, start + 0.25 * pitch), (half - amplitude, start + 0.75 * pitch)]
+    right += [(half, length - plate), (edge, length - plate), (edge, length)]
+    # Half a turn about y maps the body onto itself.
+    add_layers(right + [(-x, length - z) for x, z in right], width)
 
 
 class Accordion(Module):
     """A wall in zigzag between two plates; it stretches along z and bends about y."""
 
     name = "accordion"
+    helpers = (add_layers,)
     symmetry = ("y", "xz")
     design_space = DesignSpace(
         DesignVariable("folds", 1, 5, 3, "1", "number of folds; rounded"),

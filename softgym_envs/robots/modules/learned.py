@@ -72,10 +72,15 @@ class LearnedModule:
     order: int = 3
 
     @property
-    def terms(self) -> np.ndarray:
-        """The corrections that the symmetry of the module allows, shape (m, 4); see `energy.terms`."""
+    def symmetry(self) -> tuple[str, ...]:
+        """That of the module; see `Module`."""
         module: type[Module] = MODULES[self.module]
-        return terms(module.symmetry, self.order)
+        return module.symmetry
+
+    @property
+    def terms(self) -> np.ndarray:
+        """The corrections that the symmetry of the module allows, shape (m, order + 1); see `energy.terms`."""
+        return terms(self.symmetry, self.order)
 
     def unit(self, designs: np.ndarray) -> np.ndarray:
         """Map dimensions (n, v) to [-1, 1] on a logarithmic scale."""
@@ -95,7 +100,7 @@ class LearnedModule:
             length,
             modulus * np.exp(P @ self.stiffness),
             Q @ self.corrections,
-            MODULES[self.module].symmetry,  # type: ignore[attr-defined]
+            self.symmetry,
             self.order,
             self.rotation,
             self.largest_strains,
@@ -127,8 +132,7 @@ class LearnedModule:
         length, modulus, unit = self._body(design)
         P = polynomials(unit, self.degrees[0])[0]
         bulge = length**3 / modulus * float(np.exp(P @ self.bulge))
-        symmetry = MODULES[self.module].symmetry  # type: ignore[attr-defined]
-        return CavityVolume(length, length**3 * (P @ self.swelling), bulge, symmetry)
+        return CavityVolume(length, length**3 * (P @ self.swelling), bulge, self.symmetry)
 
     def _body(self, design: Mapping[str, float] | None) -> tuple[float, float, np.ndarray]:
         """Return the length [m] and Young's modulus [Pa] of a body, and its dimensions in [-1, 1], shape (1, v)."""

@@ -10,7 +10,7 @@ derivatives of the residuals are exact, and Levenberg and Marquardt's method fin
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -55,6 +55,7 @@ class Recipe:
 
     box: Mapping[str, tuple[float, float]]
     rotation: float
+    _: KW_ONLY
     bodies: int = 20
     unloaded: int = 32
     rays: int = 3
@@ -76,20 +77,39 @@ RECIPES = {
     ),
     "solid_block": Recipe({"length": (0.010, 0.030), "width": (0.008, 0.020), "depth": (0.008, 0.020)}, 0.3),
     "notch_hinge": Recipe(
-        {"radius": (0.003, 0.006), "width": (0.008, 0.014), "neck": (0.0018, 0.0035)}, 0.3, 16, 32, 2
+        {"radius": (0.003, 0.006), "width": (0.008, 0.014), "neck": (0.0018, 0.0035)}, 0.3, bodies=16, rays=2
     ),
     "torsion_tube": Recipe(
-        {"length": (0.015, 0.040), "radius": (0.006, 0.010), "wall": (0.0015, 0.003)}, 0.3, 30, 40, 2
+        {"length": (0.015, 0.040), "radius": (0.006, 0.010), "wall": (0.0015, 0.003)},
+        0.3,
+        bodies=30,
+        unloaded=40,
+        rays=2,
     ),
     "bellows": Recipe(
-        {"pitch": (0.007, 0.010), "radius": (0.007, 0.010), "amplitude": (0.0012, 0.0024)}, 0.3, 28, 24, 2, (2, 1)
+        {"pitch": (0.007, 0.010), "radius": (0.007, 0.010), "amplitude": (0.0012, 0.0024)},
+        0.3,
+        bodies=28,
+        unloaded=24,
+        rays=2,
+        degrees=(2, 1),
     ),
     # Stiffer rotations carry several times the load that turns the softest one.
     "accordion": Recipe(
-        {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)}, 0.9, 16, 32, 2, (2, 1), 5
+        {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)},
+        0.9,
+        bodies=16,
+        rays=2,
+        degrees=(3, 1),
+        order=5,
     ),
     "crossed_leaves": Recipe(
-        {"leaf_length": (0.012, 0.020), "width": (0.012, 0.018), "thickness": (0.001, 0.0018)}, 0.3, 16, 16, 2, (2, 1)
+        {"leaf_length": (0.012, 0.020), "width": (0.012, 0.018), "thickness": (0.001, 0.0018)},
+        0.3,
+        bodies=16,
+        unloaded=16,
+        rays=2,
+        degrees=(2, 1),
     ),
 }
 """What is learned, by the name of the module."""
@@ -209,6 +229,34 @@ def _guess_at_rest(model: LearnedModule, states: ModuleStates, P: np.ndarray, Q:
     return replace(model, stiffness=stiffness, corrections=corrections)
 
 
+def _slopes(
+    model: LearnedModule, state: _Corrected, products: _Products, weights: _Weights, P: np.ndarray, Q: np.ndarray
+) -> np.ndarray:
+    """Return the derivatives of all residuals by the numbers of a model: stiffness, then corrections.
+
+    ``P`` and ``Q`` are the polynomials of stiffness and corrections at the states.
+    """
+    target = model.terms[:, 0]
+    k, g, G = state.k, state.value, state.first
+    kt, gt, Gt, St = k[:, target], g[:, target], G[:, target], state.second[:, target]
+    by_c = kt[:, :, None] * (products.value[:, :, None] * Gt + gt[:, :, None] * products.first)
+    cross = np.einsum("ntp,ntq->ntpq", products.first, Gt)
+    curved = products.value[:, :, None, None] * St + gt[:, :, None, None] * products.second
+    by_c2 = kt[:, :, None, None] * (cross + np.swapaxes(cross, 2, 3) + curved)
+    by_k = (k * g)[:, :, None] * G
+    by_k2 = k[:, :, None, None] * (np.einsum("nip,niq->nipq", G, G) + g[:, :, None, None] * state.second)
+    slopes_k = np.swapaxes(_residuals(by_k, by_k2, weights), 1, 2)
+    slopes_c = np.swapaxes(_residuals(by_c, by_c2, weights), 1, 2)
+    rows = slopes_k.shape[0] * slopes_k.shape[1]
+    return np.concatenate(
+        [
+            np.einsum("nri,np->nrpi", slopes_k, P).reshape(rows, -1),
+            np.einsum("nrt,nq->nrqt", slopes_c, Q).reshape(rows, -1),
+        ],
+        axis=1,
+    )
+
+
 def fit(
     recipe: Recipe,
     module: str,
@@ -254,35 +302,18 @@ def fit(
     for _ in range(5):
         trials.append(replace(trials[0], corrections=_guess(trials[-1], states, products, Q)))
     model = min(trials, key=lambda trial: cost_of(trial, errors_of(trial)[1]))
-    target = model.terms[:, 0]
     state, residual = errors_of(model)
     cost, damping = cost_of(model, residual), 1e-3
     for _ in range(steps):
-        k, g, G = state.k, state.value, state.first
-        kt, gt, Gt, St = k[:, target], g[:, target], G[:, target], state.second[:, target]
-        by_c = kt[:, :, None] * (products.value[:, :, None] * Gt + gt[:, :, None] * products.first)
-        cross = np.einsum("ntp,ntq->ntpq", products.first, Gt)
-        curved = products.value[:, :, None, None] * St + gt[:, :, None, None] * products.second
-        by_c2 = kt[:, :, None, None] * (cross + np.swapaxes(cross, 2, 3) + curved)
-        by_k = (k * g)[:, :, None] * G
-        by_k2 = k[:, :, None, None] * (np.einsum("nip,niq->nipq", G, G) + g[:, :, None, None] * state.second)
-        slopes_k = np.swapaxes(_residuals(by_k, by_k2, weights), 1, 2)
-        slopes_c = np.swapaxes(_residuals(by_c, by_c2, weights), 1, 2)
-        jacobian = np.concatenate(
-            [
-                np.einsum("nri,np->nrpi", slopes_k, P).reshape(residual.size, -1),
-                np.einsum("nrt,nq->nrqt", slopes_c, Q).reshape(residual.size, -1),
-            ],
-            axis=1,
-        )
+        jacobian = _slopes(model, state, products, weights, P, Q)
         ridge = np.concatenate([np.zeros(model.stiffness.size), np.full(model.corrections.size, RIDGE)])
-        weightsof = np.concatenate([model.stiffness.ravel(), model.corrections.ravel()])
+        numbers = np.concatenate([model.stiffness.ravel(), model.corrections.ravel()])
         normal = jacobian.T @ jacobian + np.diag(ridge)
-        slope = jacobian.T @ residual.ravel() + ridge * weightsof
+        slope = jacobian.T @ residual.ravel() + ridge * numbers
         improved = False
         for _ in range(8):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -slope)
-            new = weightsof + step
+            new = numbers + step
             trial = replace(
                 model,
                 stiffness=new[: model.stiffness.size].reshape(model.stiffness.shape),
@@ -369,7 +400,7 @@ def with_cavity(model: LearnedModule, states: ModuleStates) -> LearnedModule:
     module: type[Module] = MODULES[model.module]
     if not module.closed:
         return model
-    slopes = _products(states.strain, np.insert(volume_terms(module.symmetry), 0, 0, axis=1)).first
+    slopes = _products(states.strain, np.insert(volume_terms(model.symmetry), 0, 0, axis=1)).first
     columns = np.einsum("nti,np->nipt", slopes, P)
     shape = columns.shape
     columns = columns.reshape(shape[0] * shape[1], -1)
