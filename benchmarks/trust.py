@@ -16,8 +16,8 @@ from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_mode
 #: The calibration uses seed 11.
 SEED = 12
 
-BODIES, ATTACKS = 32, 2000
-"""Most bodies of a stratum, and states of the search."""
+BODIES, ATTACKS = 16, 2000
+"""Most bodies of a stratum, and states of the search. Rows of commits before this one have 32 bodies."""
 
 
 def trust(variant: str, folder: str | Path = "results/trust") -> dict[str, object]:
