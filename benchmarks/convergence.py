@@ -87,14 +87,20 @@ STUDIES = {
         bodies=3,
     ),  # fmt: skip
     "two_finger_gripper": Study("two_finger_gripper", *scaled(10 * MM), (6 * MM, 4 * MM, 4 * MM, 2 * MM), {}, bodies=1),
+    "two_finger_gripper_taut": Study(
+        "two_finger_gripper", *scaled(10 * MM), (10 * MM, 8 * MM, 8 * MM, 10 * MM), {}, bodies=1
+    ),
     "three_finger_gripper": Study(
         "three_finger_gripper", *scaled(10 * MM), (4 * MM, 2 * MM, 4 * MM, 2 * MM, 3 * MM, 3 * MM), {}, bodies=0
+    ),
+    "three_finger_gripper_taut": Study(
+        "three_finger_gripper", *scaled(10 * MM), (8 * MM, 8 * MM, 6 * MM, 6 * MM, 6 * MM, 6 * MM), {}, bodies=0
     ),
     "contact_aided_finger": Study("contact_aided_finger", *scaled(8 * MM), (math.radians(10.0),), {}),
     "trunk": Study("trunk", *beams((5, 10, 20)), (20e-9, 0.0, 0.0, 10e-9, 0.0, 0.0), {}),
     "tetrapod": Study("tetrapod", *beams((6, 12, 24)), (0.5, 0.0, 0.0, 0.0), {}),
 }
-"""Studies by name."""
+"""Studies by name. The commands of grippers leave cables slack, but for those of the studies ``taut``."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +115,7 @@ class Level:
         effort: of the first actuator.
         compliance: ``W_aa`` of the first actuator at rest.
         seconds: CPU time of the last increment.
+        slack: number of cables that the command leaves slack.
         failure: why there is no value.
     """
 
@@ -119,6 +126,7 @@ class Level:
     effort: float
     compliance: float
     seconds: float
+    slack: int = 0
     failure: str = ""
 
 
@@ -150,10 +158,11 @@ def measure(robot: Robot, design: Mapping[str, float], body: str, mesh: str, stu
             state = statics.solve((k + 1) / study.steps * np.array(study.command))
             seconds = time.process_time() - start
     except (ConvergenceError, InfeasibleDesign) as error:
-        return Level(body, mesh, unknowns, (nan,) * 3, nan, nan, nan, str(error))
+        return Level(body, mesh, unknowns, (nan,) * 3, nan, nan, nan, failure=str(error))
     tip = 1e3 * (state.condensed.delta.e[:3] - rest.condensed.delta.e[:3])
     compliance = float(rest.condensed.W.aa[0, 0])
-    return Level(body, mesh, unknowns, tuple(map(float, tip)), float(state.effort[0]), compliance, seconds)
+    slack = int((robot.unilateral & (state.condensed.delta.a > np.array(study.command) + 1e-9)).sum())
+    return Level(body, mesh, unknowns, tuple(map(float, tip)), float(state.effort[0]), compliance, seconds, slack)
 
 
 def converge(name: str) -> dict[str, object]:

@@ -17,7 +17,9 @@ TITLES = {
     "diamond": "Diamond",
     "cable_trunk": "cable trunk",
     "two_finger_gripper": "gripper, two fingers",
+    "two_finger_gripper_taut": "gripper, two fingers, taut cables",
     "three_finger_gripper": "gripper, three fingers",
+    "three_finger_gripper_taut": "gripper, three fingers, taut cables",
     "contact_aided_finger": "contact-aided finger",
     "trunk": "Stiff-Flop trunk",
     "tetrapod": "Tetrapod",
@@ -70,9 +72,11 @@ def convergence_limits() -> str:
             continue
         tip = ", ".join(f"{x:.2f}" for x in body["tip [mm]"])
         orders = [f"{body[f'{quantity}, order']:.1f}" for quantity in ("tip", "effort")]
-        rows.append([TITLES[name], f"({tip})", orders[0], f"{body['effort']:.4g}", orders[1], str(len(failed))])
-    head = ["robot", "tip, converged [mm]", "order", "effort, converged", "order", "failures"]
-    return markdown(head, rows, "llrrrr")
+        # Older records do not count slack cables.
+        slack = ", ".join(str(row["slack"]) for row in found["rows"] if row["body"] == "baseline" and "slack" in row)
+        rows.append([TITLES[name], f"({tip})", orders[0], f"{body['effort']:.4g}", orders[1], slack, str(len(failed))])
+    head = ["robot", "tip, converged [mm]", "order", "effort, converged", "order", "slack cables", "failures"]
+    return markdown(head, rows, "llrrrlr")
 
 
 def convergence_corrections() -> str:

@@ -131,8 +131,8 @@ class Domain:
     Attributes:
         low: smallest displacements, shape (n_a,); a margin of 1 % of the range is included.
         high: largest displacements, shape (n_a,), likewise.
-        design_low: smallest values of all design variables in the order of the space, shape (d,), likewise; -inf for
-            variables without bounds.
+        design_low: smallest values of all design variables in the order of the space, shape (d,), likewise (see
+            `_with_margin`); -inf for variables without bounds.
         design_high: largest values, shape (d,), likewise.
         inflation: factor of the uncertainty.
         limit: largest trusted uncertainty of the effector [m].
@@ -195,8 +195,8 @@ class Domain:
         design_low, design_high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
         bounded = sorted(((names.index(name), *ends) for name, ends in designs.items() if ends[1] > ends[0]))
         for name, (low, high) in designs.items():
-            slack = 0.01 * (high - low) + 1e-9 * abs(high)
-            design_low[names.index(name)], design_high[names.index(name)] = low - slack, high + slack
+            k = names.index(name)
+            design_low[k], design_high[k] = _with_margin(name, low, high)
         return cls(
             box[:, 0] - margin,
             box[:, 1] + margin,
@@ -213,3 +213,19 @@ class Domain:
             np.array([0.5 * (low + high) for _, low, high in bounded]),
             np.array([0.5 * (high - low) for _, low, high in bounded]),
         )
+
+
+def _with_margin(name: str, low: float, high: float) -> tuple[float, float]:
+    """Return the bounds of a design variable's trusted values: those of the training bodies, and 1 % of their range.
+
+    Near 0.5 everything depends on ``1 - 2 nu``, over orders of magnitude, so for Poisson's ratio the 1 % hold for the
+    logarithm of that as well, which networks are given: from 0.498 to 0.499 it halves, and the bulk modulus doubles.
+    """
+    margin = 0.01 * (high - low)
+    lowest, highest = low - margin, high + margin
+    if name == "poisson_ratio" and high < 0.5:
+        factor = ((1.0 - 2.0 * low) / (1.0 - 2.0 * high)) ** 0.01
+        lowest = max(lowest, 0.5 - (0.5 - low) * factor)
+        highest = min(highest, 0.5 - (0.5 - high) / factor)
+    rounding = 1e-9 * abs(high)
+    return lowest - rounding, highest + rounding

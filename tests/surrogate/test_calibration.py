@@ -29,7 +29,7 @@ from softgym_envs.surrogate.calibration import (
 )
 from softgym_envs.surrogate.data import strata
 from softgym_envs.surrogate.data.strata import JudgedStates, draw_commands, strata_of
-from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, doubt_text
+from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, Domain, doubt_text
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
 from softgym_envs.surrogate.weight_files import load_model
 from softgym_envs.testing import random_states
@@ -96,6 +96,24 @@ def test_factors_are_interpolated_between_strata():
     np.testing.assert_allclose(found.body_factors(np.array([0.0, 1.0]), 1)[0], [2.0, 4.0])
     plain = Calibration()
     assert plain.body_factors(np.array([0.0, 0.5, 1.0]), 3)[0].tolist() == [1.0, 1.0, 1.0]
+
+
+def test_poisson_ratios_are_trusted_up_to_those_of_the_training():
+    """The margin is 1 % of the training's range of ``log(1 - 2 nu)``: a linear one would end beyond 0.499."""
+    model = pretrained_model(make_robot("cable_trunk"))
+    space, domain = model.robot.design_space, model.domain
+    low, high = model.card["domain"]["design"]["poisson_ratio"]
+    k = space.names.index("poisson_ratio")
+    learned = np.log((1.0 - 2.0 * low) / (1.0 - 2.0 * high))
+    assert np.log((1.0 - 2.0 * high) / (1.0 - 2.0 * domain.design_high[k])) == pytest.approx(0.01 * learned, rel=1e-4)
+    assert domain.design_low[k] == pytest.approx(low - 0.01 * (high - low), rel=1e-8)  # here the linear one is narrower
+    designs = np.array([space.complete({"poisson_ratio": nu}).array for nu in (high, 0.4988, 0.499)])
+    context, still = model.context(designs), np.zeros((3, model.count))
+    assert (model.doubt(context, still, np.zeros(3), still)[1] & OUTSIDE).tolist() == [0, OUTSIDE, OUTSIDE]
+    # A ratio that was not learned stays trusted, in spite of round-off.
+    card = {"domain": {"design": {"poisson_ratio": [0.3, 0.3]}}}
+    fixed = Domain.of_card(card, model.robot)
+    assert fixed.design_low[k] < 0.3 < fixed.design_high[k]
 
 
 def test_malformed_calibrations():
