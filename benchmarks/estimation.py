@@ -14,6 +14,7 @@ import argparse
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
@@ -24,11 +25,146 @@ from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.registry import make_robot
 
 LENGTH, LARGEST_PULL, FORCE = 0.120, 0.010, 2.0
+TOUCHES, SEED = 300, 1
+"""Of the comparison of open with sealed cavities."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What ten or so readings of one touch told.
+
+    Attributes:
+        below: distance of the touch to the flange [m].
+        force: of the touch [N].
+        found_force: estimated [N].
+        spread: its standard deviation [N].
+        tip_error: distance of the estimated to the true tip [m].
+        tip_distance: squared, in standard deviations, and its directions that have an uncertainty.
+        slack: whether the cable hung slack.
+        misfits: of each reading.
+        equilibria: computed for all readings.
+        seconds: CPU time of all readings.
+        alone: CPU times of readings that need no new equilibrium [s].
+    """
+
+    below: float
+    force: float
+    found_force: float
+    spread: float
+    tip_error: float
+    tip_distance: tuple[float, int]
+    slack: bool
+    misfits: tuple[float, ...]
+    equilibria: int
+    seconds: float
+    alone: tuple[float, ...]
+
+    @property
+    def relative(self) -> float:
+        """Size of the error of the force, as a part of the force."""
+        return abs(self.found_force - self.force) / self.force
+
+    @property
+    def told(self) -> bool:
+        """Whether the estimate claims to know the force to 10 %."""
+        return self.spread <= 0.1 * self.found_force
+
+    @property
+    def tip_inside(self) -> bool:
+        """Whether the true tip lies within the region of 95 %."""
+        return self.tip_distance[0] <= float(chi2.ppf(0.95, self.tip_distance[1]))
+
+    @property
+    def force_inside(self) -> bool:
+        """Whether the true force lies within the interval of 95 %."""
+        return abs(self.found_force - self.force) <= 1.96 * self.spread
+
+
+def sensor_noise(cavities: int, share: float, sealed: bool = False) -> Noise:
+    """Return noise that is a share of the mean change of the baseline's volumes or pressures under the full pull."""
+    robot = make_robot("sensorized_finger", cavities=cavities, sealed=sealed)
+    change = Statics(robot.build()).solve([LARGEST_PULL]).condensed.delta.s
+    level = share * float(np.abs(change).mean())
+    return Noise(displacement=1e-4, volume=level, pressure=level)
+
+
+def distance_in_deviations(error: np.ndarray, covariance: np.ndarray) -> tuple[float, int]:
+    """Return the squared distance in standard deviations along the directions with an uncertainty, and their number.
+
+    Of three coordinates of the tip, only those that the parameters move have an uncertainty.
+    """
+    values, axes = np.linalg.eigh(covariance)
+    known = values > 1e-6 * values[-1]
+    return float(((axes.T @ error)[known] ** 2 / values[known]).sum()), int(known.sum())
+
+
+def touches(
+    cavities: int,
+    count: int,
+    readings: int,
+    pitch: float,
+    noise: Noise,
+    seed: int,
+    design: Mapping[str, float],
+    sealed: bool = False,
+) -> list[Found]:
+    """Return what the estimator finds under random touches of a body, whose missing variables take their baseline.
+
+    Touches under which the finger buckles are left out: there is no reading to explain.
+    """
+    rng = np.random.default_rng(seed)
+    robot = make_robot("sensorized_finger", cavities=cavities, sealed=sealed)
+    grid, result = finger_grid(pitch), []
+    for _ in range(count):
+        cell = (int(rng.integers(grid.cells[0])), int(rng.integers(grid.cells[1])))
+        corners = grid.corners(cell)
+        point = corners[0] + rng.random() * (corners[1] - corners[0]) + rng.random() * (corners[2] - corners[0])
+        command = np.array([rng.uniform(0.001, LARGEST_PULL)])
+        pull = command + noise.displacement * rng.standard_normal(1)
+        force = 0.0
+        while force < 0.2:
+            force = abs(FORCE * float(rng.standard_normal()))
+        estimator = Estimator(robot, design=design, load=Touch(grid, cell, FORCE), noise=noise)
+        body = robot.build(design)
+        body.add_contact("touch", point, radius=estimator.radius)
+        try:
+            state = Statics(body).solve(pull, contact=force * np.array(grid.normal))
+        except ConvergenceError:
+            continue
+        level, equilibria, misfits = noise.pressure if sealed else noise.volume, 0, []
+        begin = time.process_time()
+        for _ in range(readings):
+            measured = state.condensed.delta.s + level * rng.standard_normal(cavities)
+            found = estimator.update(estimator.reading(command, measured))
+            misfits.append(found.misfit)
+            equilibria += found.equilibria
+        seconds, alone = time.process_time() - begin, []
+        for _ in range(20):
+            begin = time.process_time()
+            if not estimator.update(estimator.reading(command, measured)).equilibria:
+                alone.append(time.process_time() - begin)
+        error = found.effector - state.condensed.delta.e
+        result.append(
+            Found(
+                below=-float(point[2]),
+                force=force,
+                found_force=float(found.load[0]),
+                spread=float(np.sqrt(found.load_covariance[0, 0])),
+                tip_error=float(np.linalg.norm(error)),
+                tip_distance=distance_in_deviations(error, found.effector_covariance),
+                slack=bool(state.slack.any()),
+                misfits=tuple(misfits),
+                equilibria=equilibria,
+                seconds=seconds,
+                alone=tuple(alone),
+            )
+        )
+    return result
 
 
 def measure(
     cavities: int,
-    touches: int,
+    count: int,
     readings: int,
     pitch: float,
     noise_share: float,
@@ -36,81 +172,37 @@ def measure(
     design: Mapping[str, float],
     sealed: bool = False,
 ) -> dict[str, float | None]:
-    """Return errors, coverage and speed of a body whose missing variables take their baseline.
+    """Return errors, coverage and speed of the estimator, see `touches`.
 
     The noise of volumes or pressures is a share of their change under the full pull in the baseline, one for all.
     """
-    rng = np.random.default_rng(seed)
-    robot = make_robot("sensorized_finger", cavities=cavities, sealed=sealed)
-    change = Statics(robot.build()).solve([LARGEST_PULL]).condensed.delta.s
-    level = noise_share * float(np.abs(change).mean())
-    noise = Noise(displacement=1e-4, volume=level, pressure=level)
-    grid = finger_grid(pitch)
-    tip, force, inside, forces_inside, misfits, certain = [], [], [], [], [], []
-    cpu, alone, steps, solved, buckled = 0.0, [], 0, 0, 0
-    for _ in range(touches):
-        cell = (int(rng.integers(grid.cells[0])), int(rng.integers(grid.cells[1])))
-        corners = grid.corners(cell)
-        point = corners[0] + rng.random() * (corners[1] - corners[0]) + rng.random() * (corners[2] - corners[0])
-        command = np.array([rng.uniform(0.001, LARGEST_PULL)])
-        pull = command + noise.displacement * rng.standard_normal(1)
-        true_force = 0.0
-        while true_force < 0.2:
-            true_force = abs(FORCE * rng.standard_normal())
-        estimator = Estimator(robot, design=design, load=Touch(grid, cell, FORCE), noise=noise)
-        body = robot.build(design)
-        body.add_contact("touch", point, radius=estimator.radius)
-        try:
-            state = Statics(body).solve(pull, contact=true_force * np.array(grid.normal))
-        except ConvergenceError:  # the finger has buckled: there is no reading to explain
-            buckled += 1
-            continue
-        begin, found_equilibria = time.process_time(), 0
-        for _ in range(readings):
-            measured = state.condensed.delta.s + level * rng.standard_normal(cavities)
-            found = estimator.update(estimator.reading(command, measured))
-            misfits.append(found.misfit)
-            found_equilibria += found.equilibria
-        cpu += time.process_time() - begin
-        steps += readings
-        solved += found_equilibria
-        for _ in range(20):
-            begin = time.process_time()
-            if not estimator.update(estimator.reading(command, measured)).equilibria:
-                alone.append(time.process_time() - begin)
-        error = found.effector - state.condensed.delta.e
-        tip.append(float(np.linalg.norm(error)))
-        force.append(float(found.load[0] - true_force) / true_force)
-        # Three coordinates of the tip, of which only those that the parameters move have an uncertainty.
-        values, axes = np.linalg.eigh(found.effector_covariance)
-        known = values > 1e-6 * values[-1]
-        inside.append(float(((axes.T @ error)[known] ** 2 / values[known]).sum()) <= chi2.ppf(0.95, known.sum()))
-        spread = float(np.sqrt(found.load_covariance[0, 0]))
-        certain.append(spread <= 0.1 * found.load[0])
-        forces_inside.append(abs(found.load[0] - true_force) <= 1.96 * spread)
-    size = np.abs(force)
+    noise = sensor_noise(cavities, noise_share, sealed)
+    found = touches(cavities, count, readings, pitch, noise, seed, design, sealed)
+    tip, size = np.array([touch.tip_error for touch in found]), np.array([touch.relative for touch in found])
+    certain = np.array([touch.told for touch in found])
+    steps = readings * len(found)
     return {
         "cavities": cavities,
-        "touches": len(tip),
-        "touches without equilibrium": buckled,
+        "touches": len(found),
+        "touches without equilibrium": count - len(found),
         "readings": readings,
-        "noise of pressure [Pa]" if sealed else "volume noise [mm3]": level if sealed else level * 1e9,
-        "tip error mean [% of length]": 100 * float(np.mean(tip)) / LENGTH,
+        "noise of pressure [Pa]" if sealed else "volume noise [mm3]": noise.pressure if sealed else noise.volume * 1e9,
+        "tip error mean [% of length]": 100 * float(tip.mean()) / LENGTH,
         "tip error 95th [% of length]": 100 * float(np.percentile(tip, 95)) / LENGTH,
-        "tip error worst [% of length]": 100 * float(np.max(tip)) / LENGTH,
+        "tip error worst [% of length]": 100 * float(tip.max()) / LENGTH,
         "force error median [%]": 100 * float(np.median(size)),
         "force error mean [%]": 100 * float(size.mean()),
         "force error 95th [%]": 100 * float(np.percentile(size, 95)),
         "force within 10 % [%]": 100 * float((size <= 0.1).mean()),
-        "force told to 10 % [% of touches]": 100 * float(np.mean(certain)),
-        "force error of those, median [%]": 100 * float(np.median(size[certain])) if any(certain) else None,
-        "force error of those, mean [%]": 100 * float(np.mean(size[certain])) if any(certain) else None,
-        "coverage tip [%]": 100 * float(np.mean(inside)),
-        "coverage force [%]": 100 * float(np.mean(forces_inside)),
-        "misfit mean": float(np.mean(misfits)),
-        "updates on finite elements per CPU s": steps / cpu,
-        "equilibria per update": solved / steps,
-        "updates per CPU s without a new equilibrium": 1.0 / float(np.mean(alone)),
+        "force told to 10 % [% of touches]": 100 * float(certain.mean()),
+        "force error of those, median [%]": 100 * float(np.median(size[certain])) if certain.any() else None,
+        "force error of those, mean [%]": 100 * float(size[certain].mean()) if certain.any() else None,
+        "coverage tip [%]": 100 * float(np.mean([touch.tip_inside for touch in found])),
+        "coverage force [%]": 100 * float(np.mean([touch.force_inside for touch in found])),
+        "misfit mean": float(np.mean([touch.misfits for touch in found])),
+        "updates on finite elements per CPU s": steps / sum(touch.seconds for touch in found),
+        "equilibria per update": sum(touch.equilibria for touch in found) / steps,
+        "updates per CPU s without a new equilibrium": 1.0 / float(np.mean([t for f in found for t in f.alone])),
     }
 
 
@@ -134,7 +226,7 @@ def sealed_finger() -> dict[str, object]:
         }
     for cavities in (2, 4):
         for sealed in (False, True):
-            found = measure(cavities, 60, 10, 5e-3, 0.01, 0, {}, sealed)
+            found = measure(cavities, TOUCHES, 10, 5e-3, 0.01, SEED, {}, sealed)
             result[f"estimate, {cavities} cavities, {'sealed' if sealed else 'open'}"] = found
     return result
 

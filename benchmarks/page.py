@@ -25,6 +25,7 @@ from benchmarks.accurate_meshes import TABLES as ACCURATE_TABLES
 from benchmarks.contact_sets import TABLES as SET_TABLES
 from benchmarks.convergence_tables import CONVERGENCE_TABLES
 from benchmarks.deployed_estimator import TABLES as ESTIMATOR_TABLES
+from benchmarks.force_limits import TABLES as FORCE_TABLES
 from benchmarks.grasp_codesign import TABLES as GRASP_TABLES
 from benchmarks.grown_shapes import TABLES as GROWN_TABLES
 from benchmarks.learned_sensors import TABLES as SENSOR_TABLES
@@ -51,6 +52,7 @@ TABLES = (
     | MOTION_TABLES
     | SENSOR_TABLES
     | ESTIMATOR_TABLES
+    | FORCE_TABLES
     | ROBUSTNESS_TABLES
     | PRINTED_TABLES
     | STRUCTURE_TABLES
