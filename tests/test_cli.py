@@ -230,8 +230,8 @@ def test_a_full_disk_is_one_line_that_names_the_file(arguments, softgym, monkeyp
 def test_a_file_in_the_way_of_a_folder_is_named(softgym, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     Path("taken").write_text("")
-    status, _, err = softgym("configs", "--copy", "taken")
-    assert status == 2 and err == "softgym: error: 'taken' cannot be a folder: a file is in its way\n"
+    status, _, err = softgym("deploy", "finger", "taken/model.h")
+    assert status == 2 and re.fullmatch(r"softgym: error: 'taken.*' cannot be a folder: a file is in its way\n", err)
 
 
 def test_a_worker_reports_a_full_disk_in_one_line(monkeypatch, capsys, tmp_path):
