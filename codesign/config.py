@@ -201,7 +201,10 @@ class StudyConfig(StudyProblem):
 
     def _check_strategy(self) -> None:
         plan, strategy = self.plan, f"strategy '{self.strategy}'"
-        refuse(plan.policy and not self.policy, f"{strategy} needs 'policy': a trained design-conditioned policy")
+        refuse(
+            plan.policy and not self.policy,
+            f"{strategy} needs 'policy': a shared policy, trained with design_in_observation",
+        )
         refuse(not plan.policy and bool(self.policy), f"{strategy} does not use policy = '{self.policy}'; remove it")
         for name in filter(is_option, self.variables):
             refuse(

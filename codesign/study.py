@@ -200,7 +200,8 @@ def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
 
         if queue.left():
             finished = len(study.result_files())
-            text = f"{config.trials} bodies of study '{config.name}', {finished} of them finished before"
+            bodies = "1 body" if config.trials == 1 else f"{config.trials} bodies"
+            text = f"{bodies} of study '{config.name}', {finished} of them finished before"
             output.begin("trials", text, config.trials, finished)
         while queue.left():
             if queue.claimable():

@@ -68,6 +68,12 @@ def read_value(text: str) -> Any:
 _PASSWORD = re.compile(r"(?<=[^/]):[^/@:\s]*@")
 """The password in a database address, which must not appear in a message or log."""
 
+_IN_YAML = (
+    (re.compile(r"must be a valid (tuple|list)"), "must be a list"),
+    (re.compile(r"must be a valid dictionary( or instance of \w+)?"), "must be a mapping of keys to values"),
+)
+"""What pydantic says in Python's terms, and the same in those of a configuration file."""
+
 ModelT = TypeVar("ModelT", bound=Config)
 
 
@@ -173,6 +179,8 @@ def _dotted(problem: ErrorDetails) -> str:
 def _describe(problem: ErrorDetails) -> str:
     key = _dotted(problem)
     message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("\n", " ")
+    for pattern, plain in _IN_YAML:
+        message = pattern.sub(plain, message)
     shown = _PASSWORD.sub(r":***@", repr(problem["input"]))
     if not isinstance(problem["input"], dict) and shown not in message:
         message += f", got {shown}"

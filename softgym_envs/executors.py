@@ -12,14 +12,16 @@ from typing import Any
 
 from softgym_envs.errors import ConfigError
 
-EXECUTORS = ("loky", "ray")
-"""``"loky"``: processes on this machine; ``"ray"``: a Ray cluster (the extra ``ray``)."""
+EXECUTORS = ("processes", "ray")
+"""``"processes"`` of this machine; ``"ray"``: a Ray cluster (the extra ``ray``)."""
 
 PARENT_CHECK_INTERVAL = 0.2
 """Interval at which a worker process checks that its parent is still alive [s]."""
 
 
-def parallel_map(function: Callable, arguments: Sequence[tuple], workers: int, executor: str = "loky") -> Iterator[Any]:
+def parallel_map(
+    function: Callable, arguments: Sequence[tuple], workers: int, executor: str = "processes"
+) -> Iterator[Any]:
     """Yield ``function(*row)`` for each row of ``arguments``.
 
     Local processes yield results in the order in which they finish, and end when this process ends, even if it is

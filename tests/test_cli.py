@@ -227,6 +227,13 @@ def test_a_full_disk_is_one_line_that_names_the_file(arguments, softgym, monkeyp
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
+def test_a_file_in_the_way_of_a_folder_is_named(softgym, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    Path("taken").write_text("")
+    status, _, err = softgym("deploy", "finger", "taken/model.h")
+    assert status == 2 and re.fullmatch(r"softgym: error: 'taken.*' cannot be a folder: a file is in its way\n", err)
+
+
 def test_a_worker_reports_a_full_disk_in_one_line(monkeypatch, capsys, tmp_path):
     def full(_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "trials/0000/result.json")

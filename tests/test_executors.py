@@ -17,7 +17,7 @@ SQUARES = [(k, k) for k in range(20)]
 
 
 def test_unknown_executor():
-    with pytest.raises(ValueError, match=r"'threads' is unknown; allowed: 'loky', 'ray'"):
+    with pytest.raises(ValueError, match=r"'threads' is unknown; allowed: 'processes', 'ray'"):
         list(parallel_map(operator.mul, SQUARES, 2, "threads"))
 
 

@@ -153,6 +153,14 @@ MISTAKES = {
         lambda f: config(f, StudyConfig, FINGER, "objective=mean_distanse"),
         "config '*': *unknown objective 'mean_distanse'*mean_distance*",
     ),
+    "name in place of a list": (
+        lambda f: config(f, StudyConfig, FINGER, "variables=length"),
+        "config '*': variables: must be a list, got 'length'",
+    ),
+    "number in place of a group": (
+        lambda f: config(f, StudyConfig, FINGER, "goals=3"),
+        "config '*': goals: must be a mapping of keys to values, got 3",
+    ),
     "sampler": (
         lambda f: config(f, StudyConfig, FINGER, "sampler.name=tpee"),
         "config '*': sampler.name: must be 'tpe', 'cmaes', 'gp', 'nsgaii', 'qmc' or 'random', got 'tpee'",

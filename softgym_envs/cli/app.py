@@ -98,7 +98,11 @@ def _described(error: Exception) -> str:
     """Return the message of an error; of one of the file system, the file and the reason."""
     if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
-    return f"'{error.filename}': {error.strerror}" if error.filename is not None else error.strerror
+    if error.filename is None:
+        return error.strerror
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        return f"'{error.filename}' cannot be a folder: a file is in its way"
+    return f"'{error.filename}': {error.strerror}"
 
 
 def _fail(message: str) -> NoReturn:

@@ -19,7 +19,10 @@ from softgym_envs.extras import require
 if TYPE_CHECKING:
     from softgym_envs.agents.config import EnvironmentConfig
 
-AGENT_HELP = "qp, qp_static, qp_model, qp_pi, force, close, random, or a policy (a file, or the name of a shipped one)."
+AGENT_HELP = (
+    "qp, qp_static, qp_model, qp_pi, qp_estimated, force, close, random, or a policy (a file, or the name of a shipped "
+    "one)."
+)
 
 
 def _environment(id: str, agent: str, backend: str | None, verb: str) -> EnvironmentConfig:

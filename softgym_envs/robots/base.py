@@ -247,7 +247,9 @@ class Robot(ABC):
         Raises:
             ValueError: if the robot has none.
         """
-        raise ValueError(f"robot '{self.name}' has no reference path: pass your own")
+        raise ValueError(
+            f"robot '{self.name}' has no reference path: define reference_path, or pass task_options={{'path': points}}"
+        )
 
     def displacements(self, fractions: np.ndarray) -> np.ndarray:
         """Return the commands, shape (N, n_a), at which states are sampled, for points of the unit cube (N, n_a).
@@ -265,11 +267,13 @@ class Robot(ABC):
             DesignError: for a malformed design.
             InfeasibleDesign: if the geometry cannot exist, or the body at rest crosses an obstacle or itself.
 
-        Any other exception is an error in the robot's code; a note is added that names the robot and the design.
+        Any other exception is an error in the robot's code, such as a ValueError for a model without the actuators and
+        effectors that the class declares; a note is added that names the robot and the design.
         """
         complete = self.design_space.complete(design)
         try:
             model = self.assemble(complete)
+            self._check_rows(model)
             self._add_contact(model, complete)
             return model
         except SoftGymError:
@@ -277,6 +281,19 @@ class Robot(ABC):
         except Exception as error:
             error.add_note(f"while assembling robot '{self.name}' for {complete}")
             raise
+
+    def _check_rows(self, model: MechanicalModel) -> None:
+        """Raise ValueError for a model without the actuators and effectors that the class declares, in their order."""
+        if not isinstance(model, MechanicalModel):
+            raise ValueError(f"robot '{self.name}': assemble must return a MechanicalModel, got {model!r}")
+        declared = {"a": tuple(actuator.name for actuator in self.actuators), "e": tuple(self.effectors)}
+        for role, kind in (("a", "actuators"), ("e", "effectors")):
+            added = tuple(constraint.name for constraint in model.constraints[role])
+            if added != declared[role]:
+                raise ValueError(
+                    f"robot '{self.name}': assemble must add the {kind} {', '.join(declared[role])} in this order, "
+                    f"got {', '.join(added) or 'none'}"
+                )
 
     def printable(self) -> Robot:
         """Return the robot whose solid parts are this one's body; it takes the same designs."""
@@ -389,7 +406,7 @@ class Robot(ABC):
             if value.shape != (count,):
                 raise ValueError(f"robot '{self.name}': {name} must have shape ({count},), got {value.shape}")
             setattr(self, name, value)
-        lengths = {"size": self.size}
+        lengths = {"size": self.size, "effector_rest": float(np.abs(self.effector_rest).max())}
         bounded = [(a.name, a.high, a.unit) for a in self.actuators]
         bounded += [(v.name, v.high, v.unit) for v in self.design_space]
         lengths |= {f"high of '{name}'": high for name, high, unit in bounded if unit == "m"}

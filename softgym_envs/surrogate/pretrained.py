@@ -61,7 +61,10 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
     folder = Path(weights) if weights is not None else pretrained_folder(robot)
     if weights is None and not folder.is_dir():
         shipped = sorted(p.name for p in _ROOT.iterdir()) if _ROOT.is_dir() else []
-        raise WeightsError(f"no weights ship for '{folder.name}'; shipped: {', '.join(shipped) or 'none'}")
+        raise WeightsError(
+            f"no weights ship for '{folder.name}': use backend='fem', or fit weights with 'softgym fit' and pass "
+            f"backend_options={{'weights': folder}}; shipped: {', '.join(shipped) or 'none'}"
+        )
     return load_model(folder, robot, members)
 
 

@@ -181,7 +181,7 @@ class FitConfig(Config):
         correction: states on other meshes, by which the efforts are corrected.
         network: kind of the network and its hyper-parameters.
         workers: number of processes that solve FEM states.
-        executor: ``"loky"`` for processes of this machine, or ``"ray"`` for tasks of a cluster.
+        executor: ``"processes"`` of this machine, or ``"ray"`` for tasks of a cluster.
         seed: seed of the training.
         trust: calibrate the uncertainty under commands, by stratum; None leaves it calibrated on the validation states.
     """
@@ -193,7 +193,7 @@ class FitConfig(Config):
     correction: CorrectionConfig | None = None
     network: NetworkOptions = Field(default_factory=network_module("potential").Options)
     workers: int = Field(default=2, gt=0)
-    executor: Literal["loky", "ray"] = "loky"
+    executor: Literal["processes", "ray"] = "processes"
     seed: int = 0
     trust: TrustConfig | None = None
 

@@ -251,6 +251,9 @@ def test_track_needs_a_path_or_a_reference_path(monkeypatch):
     with pytest.raises(ValueError, match="robot 'finger' has no reference path"):
         make_task("track", robot)
     assert make_task("track", robot, path=np.zeros((2, 3))).path.shape == (2, 3)
+    monkeypatch.setattr(type(robot), "reference_path", lambda self, count=20: np.zeros((count, 2)))
+    with pytest.raises(ValueError, match="reference_path of robot 'finger' must have shape"):
+        make_task("track", robot)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

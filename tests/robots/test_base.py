@@ -170,6 +170,7 @@ def test_attributes_may_be_set_after_the_base_constructor():
         ({"effectors": "tip"}, TypeError, "effectors must be a tuple of names, got 'tip'"),
         ({"effort_scale": [1.0, 2.0]}, ValueError, r"effort_scale must have shape \(1,\), got \(2,\)"),
         ({"effector_rest": [0.0, 1.0]}, ValueError, r"effector_rest must have shape \(3,\), got \(2,\)"),
+        ({"effector_rest": [0.0, 0.0, 50.0]}, ValueError, "effector_rest = 50 m; did you mean 0.05 m?"),
         ({"size": 50.0}, ValueError, "robot 'odd': size = 50 m; did you mean 0.05 m?"),
         (
             {"actuators": (Actuator("cable", 0.0, 20.0, 1.0),)},
@@ -182,11 +183,50 @@ def test_attributes_may_be_set_after_the_base_constructor():
             "high of 'length' = 70 m; did you mean 0.07 m",
         ),
     ],
-    ids=["effectors", "effort_scale", "effector_rest", "size", "stroke", "variable"],
+    ids=["effectors", "effort_scale", "effector_rest", "rest in millimetres", "size", "stroke", "variable"],
 )
 def test_malformed_attributes(attributes, error, message):
     with pytest.raises(error, match=message):
         type("Odd", (Spike,), {"name": "odd", **attributes})()
+
+
+class Pair(Spike):
+    """A robot with two cables, to be added in their order."""
+
+    name = "pair"
+    effort_scale = [1.0, 1.0]
+    actuators = (Actuator("cable", 0.0, 0.005, 0.001), Actuator("other", 0.0, 0.005, 0.001))
+
+
+class Swapped(Pair):
+    """The same cables, added in another order."""
+
+    def assemble(self, design):
+        model = super().assemble(design)
+        model.add_cable("other", model.nodes[3:], pull_point=np.array([0.0, 0.02, 0.0]))
+        model.constraints["a"].reverse()
+        return model
+
+
+@pytest.mark.parametrize(
+    ("robot", "message"),
+    [
+        (Pair, "robot 'pair': assemble must add the actuators cable, other in this order, got cable"),
+        (Swapped, "robot 'pair': assemble must add the actuators cable, other in this order, got other, cable"),
+        (
+            type("Other", (Spike,), {"name": "other", "effectors": ("top",)}),
+            "robot 'other': assemble must add the effectors top in this order, got tip",
+        ),
+        (
+            type("Nothing", (Spike,), {"name": "nothing", "assemble": lambda self, design: None}),
+            "robot 'nothing': assemble must return a MechanicalModel, got None",
+        ),
+    ],
+    ids=["missing cable", "order of cables", "effector", "no model"],
+)
+def test_a_model_has_the_rows_that_its_robot_declares(robot, message):
+    with pytest.raises(ValueError, match=f"^{message}\nwhile assembling"):
+        robot().build()
 
 
 # -- infeasible designs and bugs ------------------------------------------------------------------------------------

@@ -30,7 +30,8 @@ class Track(Task):
         self, robot: Robot, *, path: np.ndarray | None = None, jitter: float = 0.0, lookahead: int = 1
     ) -> None:
         super().__init__(robot)
-        self.path: Array = robot.reference_path() if path is None else check_goals(path, "path", robot)
+        name = "path" if path is not None else f"reference_path of robot '{robot.name}'"
+        self.path: Array = check_goals(robot.reference_path() if path is None else path, name, robot)
         self.jitter = check_length(jitter, "jitter", robot)
         if lookahead < 0:
             raise ValueError(f"lookahead = {lookahead} control steps must be 0 or more")

@@ -93,7 +93,7 @@ def generate_dataset(
     robot_options: dict | None = None,
     groups_per_shard: int = 25,
     workers: int = 1,
-    executor: str = "loky",
+    executor: str = "processes",
     progress: bool = True,
 ) -> dict[str, np.ndarray]:
     """Generate a dataset, or finish an interrupted one, and return it.
@@ -109,7 +109,7 @@ def generate_dataset(
         robot_options: options of the robot.
         groups_per_shard: designs per shard.
         workers: number of processes, each with one thread.
-        executor: ``"loky"``: processes on this machine; ``"ray"``: a Ray cluster (the one of ``RAY_ADDRESS``, or one
+        executor: ``"processes"`` of this machine; ``"ray"``: a Ray cluster (the one of ``RAY_ADDRESS``, or one
             that is started here), whose machines share the folder. It needs the extra ``ray``.
         progress: show a progress bar.
 
