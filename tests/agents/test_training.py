@@ -337,6 +337,7 @@ def test_goals_repeat_and_belong_to_the_body():
         "tetrapod_carry_evolution",
         "tetrapod_carry_empty",
         "tetrapod_carry_wide",
+        "tetrapod_carry_kilogram",
         "tetrapod_reach_analytic",
     ],
 )
