@@ -75,6 +75,7 @@ TRUNK_LEVELS = {
 
 STUDIES = {
     "finger": Study("finger", *scaled(10 * MM), (10 * MM, 10 * MM), {"self_contact": False}),
+    "finger_sideways": Study("finger", *scaled(10 * MM), (10 * MM, 8 * MM), {"self_contact": False}, bodies=0),
     "finger_1cable": Study("finger", *scaled(10 * MM), (10 * MM,), {"cables": 1, "self_contact": False}),
     "diamond": Study("diamond", scaled(17 * MM)[0], None, (15 * MM, 0.0, 0.0, 0.0), {}, steps=4),
     "cable_trunk": Study(
@@ -88,19 +89,16 @@ STUDIES = {
     ),  # fmt: skip
     "two_finger_gripper": Study("two_finger_gripper", *scaled(10 * MM), (6 * MM, 4 * MM, 4 * MM, 2 * MM), {}, bodies=1),
     "two_finger_gripper_taut": Study(
-        "two_finger_gripper", *scaled(10 * MM), (10 * MM, 8 * MM, 8 * MM, 10 * MM), {}, bodies=1
+        "two_finger_gripper", *scaled(10 * MM), (10 * MM, 8 * MM, 8 * MM, 10 * MM), {}, bodies=0
     ),
     "three_finger_gripper": Study(
         "three_finger_gripper", *scaled(10 * MM), (4 * MM, 2 * MM, 4 * MM, 2 * MM, 3 * MM, 3 * MM), {}, bodies=0
-    ),
-    "three_finger_gripper_taut": Study(
-        "three_finger_gripper", *scaled(10 * MM), (8 * MM, 8 * MM, 6 * MM, 6 * MM, 6 * MM, 6 * MM), {}, bodies=0
     ),
     "contact_aided_finger": Study("contact_aided_finger", *scaled(8 * MM), (math.radians(10.0),), {}),
     "trunk": Study("trunk", *beams((5, 10, 20)), (20e-9, 0.0, 0.0, 10e-9, 0.0, 0.0), {}),
     "tetrapod": Study("tetrapod", *beams((6, 12, 24)), (0.5, 0.0, 0.0, 0.0), {}),
 }
-"""Studies by name. The commands of grippers leave cables slack, but for those of the studies ``taut``."""
+"""Studies by name. ``finger_sideways`` and ``two_finger_gripper_taut`` show where the errors of grippers come from."""
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ from softgym_envs.surrogate.features import Features
 
 TITLES = {
     "finger": "Soft Finger, 2 cables",
+    "finger_sideways": "Soft Finger, unequal cables",
     "finger_1cable": "Soft Finger, 1 cable",
     "diamond": "Diamond",
     "cable_trunk": "cable trunk",
     "two_finger_gripper": "gripper, two fingers",
     "two_finger_gripper_taut": "gripper, two fingers, taut cables",
     "three_finger_gripper": "gripper, three fingers",
-    "three_finger_gripper_taut": "gripper, three fingers, taut cables",
     "contact_aided_finger": "contact-aided finger",
     "trunk": "Stiff-Flop trunk",
     "tetrapod": "Tetrapod",

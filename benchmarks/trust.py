@@ -17,7 +17,7 @@ from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_mode
 SEED = 12
 
 BODIES, ATTACKS = 16, 2000
-"""Most bodies of a stratum, and states of the search. Rows of commits before this one have 32 bodies."""
+"""Most bodies of a stratum, and states of the search. Rows recorded earlier have up to 32 bodies."""
 
 
 def trust(variant: str, folder: str | Path = "results/trust") -> dict[str, object]:

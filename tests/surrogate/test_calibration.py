@@ -284,7 +284,8 @@ def test_commands_without_an_equilibrium_are_told_by_their_softness(trunk, monke
     rows = report(trunk, states)
     assert (rows["inside"].lost, rows["faces"].lost) == (0, 10)
     assert (rows["inside"].states, rows["faces"].states) == (100, 90)
-    assert rows["faces"].unsolved <= 10 and rows["faces"].worst < 1e-9
+    # Networks compute in single precision, where round-off depends on the number of rows.
+    assert rows["faces"].unsolved <= 10 and rows["faces"].worst < 1e-7
 
 
 def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
