@@ -25,7 +25,7 @@ from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.registry import make_robot
 
 LENGTH, LARGEST_PULL, FORCE = 0.120, 0.010, 2.0
-TOUCHES, SEED = 300, 1
+TOUCHES, SEED = 60, 0
 """Of the comparison of open with sealed cavities."""
 
 

@@ -30,7 +30,7 @@ from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 
-TOUCHES, READINGS, SEED = 100, 10, 11
+TOUCHES, READINGS, SEED = 60, 10, 11
 FORCE, WEAKEST, STRONGEST = 1.0, 0.2, 2.0
 """Forces are drawn with a standard deviation of the first between the others [N], which the learned model knows."""
 HALF_NORMAL = 1.0 - 2.0 / np.pi

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.recorded import figure, records, results
 from benchmarks.tables import markdown
 
-GOALS, SENSED_GOALS, SEED = 30, 20, 7
+GOALS, SENSED_GOALS, SEED = 30, 10, 7
 
 PLANTS: dict[str, dict[str, Any]] = {
     "nominal": {},
