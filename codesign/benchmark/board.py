@@ -14,19 +14,20 @@ from softgym_envs.codesign.benchmark.regret import MethodRow, Stored, contests, 
 from softgym_envs.codesign.benchmark.runs import stored_runs
 from softgym_envs.codesign.benchmark.scoring import DATA, normalised, reference
 from softgym_envs.codesign.benchmark.submission import Submission
-from softgym_envs.codesign.benchmark.table import TABLE_JUDGES, Table, shipped_tables
+from softgym_envs.codesign.benchmark.table import (
+    BEST_SHARE,
+    FEWEST_RANKED,
+    TABLE_JUDGES,
+    Agreement,
+    Table,
+    shipped_tables,
+)
 from softgym_envs.codesign.benchmark.winners import rank_correlation, stored_winners
 from softgym_envs.codesign.objectives import Objective
 from softgym_envs.errors import DataError
 
 SUBMISSIONS = DATA / "submissions"
 """Accepted submissions, one JSON file each."""
-
-BEST = 0.1
-"""Share of the bodies of a table among which judges are compared once more."""
-
-FEWEST_RANKED = 10
-"""Bodies below which no rank correlation among the best is shown."""
 
 
 def problem_table() -> str:
@@ -272,18 +273,26 @@ def bodies_table() -> str:
         for judge in (key for key in TABLE_JUDGES if key in table.values):
             scored = int(np.isfinite(table.values[judge][:, 0]).sum())
             cells = [f"`{name}`", f"`{judge}`", TABLE_JUDGES[judge].about, f"{scored:,}"]
-            if judge == "rest":
+            judged = "rest_few" if judge.endswith("_few") else "rest"
+            if judge == judged:
                 rows.append([*cells, "-", "-", "-"])
                 continue
-            _, tau, bias = table.agreement("rest", judge)
-            ranked = "-" if np.isnan(tau) else f"{tau:.3f}"  # of two bodies
-            count, tau, _ = table.agreement("rest", judge, best=BEST)
-            among = f"{tau:.3f}" if count >= FEWEST_RANKED else "-"
-            rows.append([*cells, ranked, among, f"{unit.scale * bias:+.4f}"])
+            every, best = table.agreement(judged, judge), table.agreement(judged, judge, best=BEST_SHARE)
+            among = _tau(best) if best.bodies >= FEWEST_RANKED else "-"
+            rows.append([*cells, _tau(every), among, f"{unit.scale * every.bias:+.4f}"])
     if not rows:
         return "No tables are shipped."
     ranks = ["Kendall's tau with `rest`", "among the best tenth"]
     return _table(["problem", "judge", "about", "bodies", *ranks, "mean difference [mm]"], rows)
+
+
+def _tau(found: Agreement) -> str:
+    """Return Kendall's tau with its interval, and the number of bodies where it is that of a sample."""
+    if np.isnan(found.tau):
+        return "-"  # fewer than three bodies
+    if np.isnan(found.interval[0]):
+        return f"{found.tau:.3f}"
+    return f"{found.tau:.2f} ({found.interval[0]:.2f} to {found.interval[1]:.2f}; {found.bodies} bodies)"
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -36,9 +36,37 @@ if TYPE_CHECKING:
 CHUNK = 64
 """Bodies whose episodes run at once."""
 
+FEW = 2
+"""How many goals, from the first on, judges with ``_few`` in their names score. They are for accurate finite elements,
+which take 45 to 60 CPU s a body on the 12 goals of the finger, and they are compared with ``rest_few``."""
+
+FEWEST_RANKED, MOST_RESAMPLED = 10, 256
+"""Smallest number of bodies whose ranking by two judges is compared, and largest whose tau has an interval."""
+
+BEST_SHARE = 0.1
+"""Share of the bodies that counts as the best ones when judges are compared: there searches go."""
+
 COLUMNS = ("mean_distance", "mean_effort", "success_rate")
 """What a table holds of each body and judge: means over the search goals. The effort is that of the end for judges at
 rest, and the mean over the episode for the others."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How two judges agree on bodies.
+
+    Attributes:
+        bodies: how many both have scored.
+        tau: Kendall's tau of their mean distances; NaN for fewer than three bodies.
+        interval: 95 % interval of tau by a bootstrap over the bodies; NaN for fewer than `FEWEST_RANKED` bodies, and
+            for more than `MOST_RESAMPLED`, where it is narrower than +-0.1.
+        bias: mean of the distances [m] of the second judge minus those of the first.
+    """
+
+    bodies: int
+    tau: float = np.nan
+    interval: tuple[float, float] = (np.nan, np.nan)
+    bias: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -51,6 +79,7 @@ class Table:
         values: by judge, `COLUMNS` of each body [SI], shape (bodies, 3); NaN where a judge has not scored a body.
         longest: largest step towards rest, relative to the range of a command, of the judges at rest.
         first: by judge, how many bodies from the beginning it has scored; others were chosen, see `tabulate`.
+        samples: by judge and share of the best bodies of `rest` ("1", "0.1"), the places of a sample over their ranks.
     """
 
     problem: FrozenProblem
@@ -58,6 +87,7 @@ class Table:
     values: Mapping[str, np.ndarray]
     longest: float = LONGEST
     first: Mapping[str, int] = field(default_factory=dict)
+    samples: Mapping[str, Mapping[str, list[int]]] = field(default_factory=dict)
 
     @classmethod
     def read(cls, name: str, path: Path | None = None) -> Table:
@@ -86,7 +116,7 @@ class Table:
             first = json.loads(meta["first"])
         else:  # a table from before bodies were chosen
             first = {judge: _scored(rows) for judge, rows in values.items()}
-        return cls(problem, points, values, float(meta["longest"]), first)
+        return cls(problem, points, values, float(meta["longest"]), first, json.loads(meta.get("samples", "{}")))
 
     def __len__(self) -> int:
         """Number of bodies."""
@@ -113,20 +143,33 @@ class Table:
         """Return `COLUMNS` [SI] of the nearest listed bodies, shape (k, 3), for points (k, n) of the unit box."""
         return self.values[judge][self.nearest(points, judge)]
 
-    def agreement(self, first: str, second: str, best: float = 1.0) -> tuple[int, float, float]:
-        """Return on how many bodies two judges can be compared, Kendall's tau of their mean distances, and the bias.
+    def agreement(self, first: str, second: str, best: float = 1.0) -> Agreement:
+        """Compare the mean distances of two judges on the bodies that both have scored.
 
-        The bias is the mean of the distances [m] of the second judge minus those of the first. With a share ``best``
-        only that share of the bodies counts, those that the first judge finds best: there searches go.
+        With a share ``best`` only that share of the bodies counts, those that the first judge finds best: there
+        searches go. Of a judge with a sample over these ranks, see `tabulate`, only the sample counts.
         """
-        from scipy.stats import kendalltau
+        from scipy.stats import bootstrap, kendalltau
 
         a, b = self.values[first][:, 0], self.values[second][:, 0]
         both = np.isfinite(a) & np.isfinite(b)
-        if best < 1.0 and both.any():
+        sample = self.samples.get(second, {}).get(f"{best:g}")
+        if sample is not None:
+            both &= np.isin(np.arange(len(a)), sample)
+        elif best < 1.0 and both.any():
             both &= a <= np.quantile(a[both], best)
-        tau = float(kendalltau(a[both], b[both]).statistic) if both.sum() > 2 else np.nan
-        return int(both.sum()), tau, float(np.mean(b[both] - a[both])) if both.any() else np.nan
+        count, pair = int(both.sum()), (a[both], b[both])
+        if count < 3:
+            return Agreement(count, bias=float(np.mean(pair[1] - pair[0])) if count else np.nan)
+
+        def tau(x: np.ndarray, y: np.ndarray) -> float:
+            return float(kendalltau(x, y).statistic)
+
+        interval = (np.nan, np.nan)
+        if FEWEST_RANKED <= count <= MOST_RESAMPLED:
+            drawn = bootstrap(pair, tau, paired=True, vectorized=False, n_resamples=2000, method="percentile", rng=0)
+            interval = float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
+        return Agreement(count, tau(*pair), interval, float(np.mean(pair[1] - pair[0])))
 
 
 def shipped_tables() -> list[str]:
@@ -175,6 +218,7 @@ class Tabulation:
         problem: a problem with the objective ``mean_distance``, on a batched surrogate.
         longest: largest step towards rest, see `softgym_envs.codesign.benchmark.rest`.
         goal_set: name of the goals.
+        goal_count: how many of them count, from the first on; default all.
 
     Raises:
         ValueError: for a problem that has no such table.
@@ -183,6 +227,8 @@ class Tabulation:
     problem: FrozenProblem
     longest: float = LONGEST
     goal_set: str = "search"
+    goal_count: int | None = None
+    _solvers: dict[str | None, SoftRobotEnv] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         definition = self.problem.definition
@@ -196,7 +242,12 @@ class Tabulation:
     @property
     def goals(self) -> np.ndarray:
         """The goals [m], shape (g, p, 3)."""
-        return self.problem.goals[self.goal_set]
+        return self.problem.goals[self.goal_set][: self.goal_count]
+
+    @cached_property
+    def few(self) -> Tabulation:
+        """The same on the first `FEW` goals."""
+        return replace(self, goal_count=FEW)
 
     def designs(self, points: np.ndarray) -> list[dict[str, float]]:
         """Return the complete designs [SI] of points (k, n) of the unit box."""
@@ -253,15 +304,13 @@ class Tabulation:
         environment = self.environment(mesh)
         robot = self.problem.definition.model_copy(update={"environment": environment}).robot
         _, commands = self._at_rest(mesh if ships_weights(robot) else None, points)
-        made = environment.on("fem").make(sample_design=False)
-        env = cast("SoftRobotEnv", made.unwrapped)
-        try:
-            rows = [
-                settle_on_fem(env, design, self.goals[:, 0], command, self.longest).mean(axis=0)
-                for design, command in zip(self.designs(points), commands, strict=True)
-            ]
-        finally:
-            made.close()
+        if mesh not in self._solvers:
+            self._solvers[mesh] = cast("SoftRobotEnv", environment.on("fem").make(sample_design=False).unwrapped)
+        env = self._solvers[mesh]
+        rows = [
+            settle_on_fem(env, design, self.goals[:, 0], command, self.longest).mean(axis=0)
+            for design, command in zip(self.designs(points), commands, strict=True)
+        ]
         return np.array(rows)
 
 
@@ -292,6 +341,13 @@ TABLE_JUDGES: dict[str, TableJudge] = {
     "fem_accurate": TableJudge(
         "inverse QP, at rest on the accurate mesh", 1, lambda t, points: t.fem("accurate", points)
     ),
+    "rest_few": TableJudge(f"as `rest`, on the first {FEW} goals", 1, lambda t, points: t.few.at_rest(None, points)),
+    "rest_accurate_few": TableJudge(
+        f"as `rest_accurate`, on the first {FEW} goals", 1, lambda t, points: t.few.at_rest("accurate", points)
+    ),
+    "fem_accurate_few": TableJudge(
+        f"as `fem_accurate`, on the first {FEW} goals", 1, lambda t, points: t.few.fem("accurate", points)
+    ),
 }
 """Judges of tables by name. Bodies are chunked so that an interrupted computation resumes after each chunk."""
 
@@ -303,6 +359,7 @@ def tabulate(
     output: Path | None = None,
     longest: float = LONGEST,
     best: Mapping[str, int] | None = None,
+    ranked: Mapping[str, int] | None = None,
 ) -> Path:
     """Score bodies of a problem and write the table; an interrupted call continues where it stopped.
 
@@ -316,22 +373,27 @@ def tabulate(
         longest: largest step towards rest, relative to the range of a command.
         best: by judge, how many of the best bodies of each judge at rest on a learned model it scores besides: there
             searches go, and few bodies are enough for a judge that takes minutes for each.
+        ranked: by judge, how many bodies it scores besides of a sample over the ranks of ``rest``, and as many of a
+            sample over the best `BEST_SHARE` of these ranks: what a judge that is slow says about the ranking. A
+            longer sample begins with the shorter one.
 
     Raises:
-        ValueError: for a problem that has no such table, or an unknown judge.
+        ValueError: for a problem that has no such table, an unknown judge, or ``ranked`` without bodies of ``rest``.
     """
     require("benchmark")
     problem = load_problem(name)
     tabulation = Tabulation(problem, longest)
-    best = best or {}
-    for judge in (*counts, *best):
+    best, ranked = best or {}, ranked or {}
+    for judge in (*counts, *best, *ranked):
         if judge not in TABLE_JUDGES or (judge == "shared" and problem.definition.policy is None):
             raise ValueError(f"problem '{name}': {unknown_name('judge of tables', judge, TABLE_JUDGES)}")
     path = output or DATA / "tables" / f"{name}.parquet"
-    known, first = _extendable(name, path, longest)
+    known, first, samples = _extendable(name, path, longest)
     bodies = max([*counts.values(), *(len(table) for table in known.values())])
     points = _points(len(problem.variables), bodies)
-    values = {judge: np.full((bodies, len(COLUMNS)), np.nan) for judge in dict.fromkeys([*known, *counts, *best])}
+    values = {
+        judge: np.full((bodies, len(COLUMNS)), np.nan) for judge in dict.fromkeys([*known, *counts, *best, *ranked])
+    }
     for judge, table in known.items():
         values[judge][: len(table)] = table
     for judge, count in counts.items():
@@ -341,11 +403,33 @@ def tabulate(
             rows = slice(start, min(start + chunk, count))
             if rows.stop > done:
                 values[judge][rows] = tabulated(tabulation, judge, points[rows], folder, start)
-    for judge, count in best.items():
-        for index in _leading(values, count):
-            if np.isnan(values[judge][index, 0]):
-                values[judge][index] = tabulated(tabulation, judge, points[index : index + 1], folder, index)[0]
-    return _write(Table(problem, points, values, longest, first), path)
+    chosen = [(judge, place) for judge, count in best.items() for place in _leading(values, count)]
+    for judge, count in ranked.items():
+        samples[judge] = _samples(values, first, count)
+        chosen += [(judge, place) for places in zip(*samples[judge].values(), strict=True) for place in places]
+    for judge, place in chosen:
+        if np.isnan(values[judge][place, 0]):
+            values[judge][place] = tabulated(tabulation, judge, points[place : place + 1], folder, place)[0]
+    return _write(Table(problem, points, values, longest, first, samples), path)
+
+
+def _samples(values: Mapping[str, np.ndarray], first: Mapping[str, int], count: int) -> dict[str, list[int]]:
+    """Return places of a random sample over the ranks of ``rest``, and of one over its best bodies.
+
+    Ranks are those among the bodies that all judges at rest on a learned model have scored. They follow a scrambled
+    Sobol sequence, so that they are spread evenly, and a longer sample begins with the shorter one.
+
+    Raises:
+        ValueError: if ``rest`` has not scored so many bodies.
+    """
+    from scipy.stats import qmc
+
+    scored = min((first[judge] for judge in ("rest", "rest_accurate") if judge in first), default=0)
+    if "rest" not in first or BEST_SHARE * scored < count:
+        raise ValueError(f"a sample of {count} of the best bodies needs {round(count / BEST_SHARE)} bodies of 'rest'")
+    order = np.argsort(values["rest"][:scored, 0])
+    drawn = qmc.Sobol(1, rng=np.random.default_rng(0)).random(1 << (count - 1).bit_length())[:count, 0]
+    return {f"{share:g}": [int(order[int(part * share * scored)]) for part in drawn] for share in (1.0, BEST_SHARE)}
 
 
 def _leading(values: Mapping[str, np.ndarray], count: int) -> list[int]:
@@ -354,16 +438,21 @@ def _leading(values: Mapping[str, np.ndarray], count: int) -> list[int]:
     return sorted({int(place) for judge in judges for place in np.argsort(values[judge][:, 0])[:count]})
 
 
-def _extendable(name: str, path: Path, longest: float) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Return values and `Table.first` of a table that is there; none if it is for another version or another step."""
+def _extendable(
+    name: str, path: Path, longest: float
+) -> tuple[dict[str, np.ndarray], dict[str, int], dict[str, Mapping[str, list[int]]]]:
+    """Return values, `Table.first` and `Table.samples` of a table that is there.
+
+    All are empty if it is for another version or another step.
+    """
     if not path.is_file():
-        return {}, {}
+        return {}, {}, {}
     try:
         found = Table.read(name, path)
     except DataError:
-        return {}, {}
+        return {}, {}, {}
     same = found.longest == longest and np.allclose(found.points, _points(found.points.shape[1], len(found)), atol=1e-6)
-    return (dict(found.values), dict(found.first)) if same else ({}, {})
+    return (dict(found.values), dict(found.first), dict(found.samples)) if same else ({}, {}, {})
 
 
 def _scored(values: np.ndarray) -> int:
@@ -418,6 +507,7 @@ def _write(found: Table, path: Path) -> Path:
         "columns": json.dumps(list(columns)),
         "longest": f"{found.longest:g}",
         "first": json.dumps(dict(found.first)),
+        "samples": json.dumps(dict(found.samples)),
         "commit": str(provenance()["commit"]),
     }
     with atomic_write(path) as stream:

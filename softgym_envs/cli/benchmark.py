@@ -250,14 +250,21 @@ def freeze(names: tuple[str, ...], keep: bool) -> None:
     metavar="JUDGE=N",
     default=("rest=100000", "qp=1000"),
     show_default=True,
-    help="Judge and how many bodies it scores: rest, rest_accurate, qp, shared, trained, fem or fem_accurate; several "
-    "with several.",
+    help="Judge and how many bodies it scores: rest, rest_accurate, qp, shared, trained, fem or fem_accurate, "
+    "or one of these with _few, on few goals; several with several.",
 )
 @click.option(
     "--best",
     multiple=True,
     metavar="JUDGE=N",
     help="Judge that also scores the N best bodies of each judge at rest on a learned model; several with several.",
+)
+@click.option(
+    "--ranked",
+    multiple=True,
+    metavar="JUDGE=N",
+    help="Judge that also scores N bodies drawn over all ranks of rest, and N over its best tenth; several with "
+    "several.",
 )
 @click.option(
     "--longest",
@@ -269,7 +276,13 @@ def freeze(names: tuple[str, ...], keep: bool) -> None:
 @click.option("--output", type=options.PATH, help="Parquet file (default: the shipped table of the problem).")
 @results
 def tabulate(
-    name: str, judges: tuple[str, ...], best: tuple[str, ...], longest: float, output: Path | None, folder: Path
+    name: str,
+    judges: tuple[str, ...],
+    best: tuple[str, ...],
+    ranked: tuple[str, ...],
+    longest: float,
+    output: Path | None,
+    folder: Path,
 ) -> None:
     """Score many bodies of a problem by several judges and write them as a table.
 
@@ -278,8 +291,9 @@ def tabulate(
     """
     from softgym_envs.codesign.benchmark.table import tabulate as run
 
+    chosen = _counts("--best", best), _counts("--ranked", ranked)
     with options.resumable():
-        click.echo(f"wrote {run(name, _counts('--judge', judges), folder, output, longest, _counts('--best', best))}")
+        click.echo(f"wrote {run(name, _counts('--judge', judges), folder, output, longest, *chosen)}")
 
 
 def _counts(option: str, values: Sequence[str]) -> dict[str, int]:

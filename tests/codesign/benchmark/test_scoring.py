@@ -1,9 +1,12 @@
 """Scores, hypervolumes, statistics and tables."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from softgym_envs.codesign.benchmark import board, regret, runs
+from softgym_envs.codesign.benchmark import table as table_module
 from softgym_envs.codesign.benchmark.frozen import load_problem
 from softgym_envs.codesign.benchmark.problem import Score
 from softgym_envs.codesign.benchmark.scoring import Reference, front, hypervolume, improvement, normalised
@@ -128,6 +131,39 @@ def test_the_best_bodies_of_the_learned_models_are_scored_besides(tiny, tmp_path
     assert np.isfinite(Table.read("tiny-v1", output).values["qp"][:, 0]).nonzero()[0].tolist() == sorted({0, 1} | best)
 
 
+def test_a_slow_judge_scores_a_sample_over_the_ranks(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(table_module, "FEW", 1)
+    output = tmp_path / "tiny.parquet"
+    tabulate("tiny-v1", {"rest": 40}, tmp_path, output, longest=0.5, ranked={"rest_few": 2})
+    short = Table.read("tiny-v1", output)
+    tabulate("tiny-v1", {"rest": 40}, tmp_path, output, longest=0.5, ranked={"rest_few": 4})
+    table = Table.read("tiny-v1", output)
+    every, best = (table.samples["rest_few"][share] for share in ("1", "0.1"))
+    assert every[:2] == short.samples["rest_few"]["1"] and best[:2] == short.samples["rest_few"]["0.1"]
+    ranks = np.argsort(np.argsort(table.values["rest"][:, 0]))
+    assert sorted(ranks[every] // 10) == [0, 1, 2, 3] and sorted(ranks[best]) == [0, 1, 2, 3]  # one from each part
+    assert set(np.flatnonzero(np.isfinite(table.values["rest_few"][:, 0]))) == {*every, *best}
+    first_goal = replace(tiny.evaluator("search"), goals=tiny.goals["search"][:1])
+    exact = first_goal(tiny.design(table.points[best[0]]), "qp").values["mean_distance"]
+    assert table.values["rest_few"][best[0], 0] == pytest.approx(exact, rel=1e-4)
+    solved = table_module.Tabulation(tiny, 0.5).few.fem(None, table.points[best[:2]])
+    assert np.allclose(solved[:, 0], table.values["rest_few"][best[:2], 0], atol=1e-4)
+    assert table.agreement("rest", "rest_few").bodies == table.agreement("rest", "rest_few", 0.1).bodies == 4
+    with pytest.raises(ValueError, match="a sample of 5 of the best bodies needs 50 bodies of 'rest'"):
+        tabulate("tiny-v1", {"rest": 40}, tmp_path, output, longest=0.5, ranked={"rest_few": 5})
+
+
+def test_kendalls_tau_of_a_sample_has_an_interval(tiny):
+    rng = np.random.default_rng(0)
+    first = rng.random((60, 3))
+    table = Table(tiny, rng.random((60, 3)), {"rest": first, "qp": first + 0.3 * rng.random((60, 3))})
+    found = table.agreement("rest", "qp")
+    assert found.bodies == 60 and 0.4 < found.interval[0] < found.tau < found.interval[1] < 0.9
+    assert found.interval[1] - found.interval[0] < 0.3
+    same = Table(tiny, table.points, {"rest": first, "qp": first}).agreement("rest", "qp")
+    assert [same.tau, *same.interval] == pytest.approx([1.0, 1.0, 1.0])
+
+
 def test_tables(tiny, tmp_path):
     output = tmp_path / "tiny.parquet"
     counts = {"shared": 70, "qp": 2, "rest": 3, "trained": 1, "fem": 2}
@@ -151,11 +187,12 @@ def test_tables(tiny, tmp_path):
     assert table.lookup(table.points[1:2], "fem")[0, 0] == pytest.approx(exact, abs=1e-7)
     with pytest.raises(ValueError, match=r"unknown judge of tables 'rst'; did you mean 'rest'"):
         tabulate("tiny-v1", {"rst": 1}, tmp_path, output)
-    count, tau, bias = table.agreement("rest", "fem")
-    assert count == 2 and np.isnan(tau) and abs(bias) < 1e-4
+    found = table.agreement("rest", "fem")
+    assert found.bodies == 2 and np.isnan(found.tau) and abs(found.bias) < 1e-4
     distances = {"rest": np.array([[1.0], [2.0], [3.0], [np.nan]]), "qp": np.array([[2.0], [4.0], [3.0], [1.0]])}
-    assert Table(tiny, table.points[:4], distances).agreement("rest", "qp") == (3, pytest.approx(1 / 3), 1.0)
-    assert Table(tiny, table.points[:4], distances).agreement("rest", "qp", best=0.5)[::2] == (2, 1.5)
+    found, best = (Table(tiny, table.points[:4], distances).agreement("rest", "qp", share) for share in (1.0, 0.5))
+    assert (found.bodies, found.tau, found.bias) == (3, pytest.approx(1 / 3), 1.0) and np.isnan(found.interval).all()
+    assert (best.bodies, best.bias) == (2, 1.5)
     search = TableSearch.on(table, "small", "shared")
     solve(search, make_optimiser("tpe", tiny, 0))
     assert len(search.ledger) == 7 and search.best is not None
