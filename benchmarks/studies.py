@@ -37,7 +37,10 @@ TITLES = {
 }
 """Studies of the tables in their order, and the readable names of their robots."""
 
-COMMANDS = {"finger_reach": "make demo"}
+COMMANDS = {
+    "finger_reach": "make demo",
+    "tetrapod_carry_wide": "softgym codesign --config tetrapod_carry_wide trials=10",
+}
 """Commands that run a study, where it is not ``softgym codesign --config NAME``."""
 
 JUDGES = {"fem": "finite elements", "refined": "finite elements, finer mesh", "surrogate": "surrogate"}

@@ -28,6 +28,7 @@ from softgym_envs.testing import wait_until
 
 POLICY = "diamond_reach_designs"
 FINER = {"robot_options": {"mesh_size": 0.0065}, "goals": 2}
+HALF_MISSED = {**FINER, "goals": 4, "choose": "missed"}
 
 
 @pytest.fixture(scope="module")
@@ -331,7 +332,7 @@ def killed_and_continued(tmp_path_factory, tiny, start_study):
     data = tiny(
         trials=3,
         goals={"count": 4, "unseen_count": 5, "training_count": 1},
-        finalists={"count": 1, "test": "ends", "choose": "fem", "refinement": FINER},
+        finalists={"count": 1, "test": "ends", "choose": "fem", "refinement": HALF_MISSED},
     )
     process = start_study(folder, data)
 
@@ -367,7 +368,13 @@ def test_its_report_shows_every_mesh(killed_and_continued):
         for t in sorted(snapshot.tests, key=lambda t: t.unknowns or 0)
         if t.trial == 0 and t.goals == "unseen" and t.backend != "surrogate"
     )
-    assert coarse.unknowns < fine.unknowns and len(fine.mean) == 2 and len(coarse.mean) == 5
+    assert coarse.unknowns < fine.unknowns and len(fine.mean) == 4 and len(coarse.mean) == 5
+    missed = [number for number in range(5) if not coarse.mean.successes[number]]
+    half = missed[: max(2, 4 - (5 - len(missed)))]
+    assert fine.numbers[: len(half)] == half and len(set(fine.numbers)) == 4
+    # The meshes differ by more than a millimetre, but the same goal is the worst.
+    assert fine.mean.distances.argmax() == coarse.mean.distances[fine.numbers].argmax() == 0
+    assert "4 goals, about half of them missed by the baseline" in text
     json.loads((folder.path / "results.json").read_text(), parse_constant=pytest.fail)
 
 
