@@ -72,11 +72,9 @@ def convergence_limits() -> str:
             continue
         tip = ", ".join(f"{x:.2f}" for x in body["tip [mm]"])
         orders = [f"{body[f'{quantity}, order']:.1f}" for quantity in ("tip", "effort")]
-        # Older records do not count slack cables.
-        slack = ", ".join(str(row["slack"]) for row in found["rows"] if row["body"] == "baseline" and "slack" in row)
-        rows.append([TITLES[name], f"({tip})", orders[0], f"{body['effort']:.4g}", orders[1], slack, str(len(failed))])
-    head = ["robot", "tip, converged [mm]", "order", "effort, converged", "order", "slack cables", "failures"]
-    return markdown(head, rows, "llrrrlr")
+        rows.append([TITLES[name], f"({tip})", orders[0], f"{body['effort']:.4g}", orders[1], str(len(failed))])
+    head = ["robot", "tip, converged [mm]", "order", "effort, converged", "order", "failures"]
+    return markdown(head, rows, "llrrrr")
 
 
 def convergence_corrections() -> str:
