@@ -147,7 +147,8 @@ def deployed_estimator() -> dict[str, object]:
     noise, grid = Noise(displacement=1e-4, volume=5.7e-10), finger_grid()
     robot = make_robot("sensorized_finger")
     estimator = LearnedEstimator(robot, noise=noise)
-    rng, result = np.random.default_rng(4), {}
+    result: dict[str, object] = {}
+    rng = np.random.default_rng(4)
     times: dict[str, list[float]] = {f"{who}, {when}": [] for who in ("Python", *REALS) for when in ("first", "later")}
     differences: dict[str, list[float]] = {real: [] for real in REALS}
     stacks = dict.fromkeys(REALS, 0)
@@ -188,8 +189,9 @@ def deployed_estimator() -> dict[str, object]:
         result[f"{who}: {when} readings of a touch [1/CPU s]"] = 1.0 / float(np.mean(values))
     for real, machine in machines.items():
         result[f"C, {real}: largest difference from Python [standard deviations]"] = max(differences[real])
-        share = float(np.percentile(differences[real], 99))
-        result[f"C, {real}: 99 % of the differences are below [standard deviations]"] = share
+        result[f"C, {real}: 99 % of the differences are below [standard deviations]"] = float(
+            np.percentile(differences[real], 99)
+        )
         result[f"C, {real}: state [bytes]"] = machine.state
         result[f"C, {real}: stack [bytes]"] = stacks[real]
     result["constants [kB]"] = int(constants[1]) / 1e3
