@@ -65,15 +65,14 @@ def study(folder: Path) -> tuple[str, dict[str, Any]]:
         raise DataError(f"{file}: commit is {commit!r}; results are recorded from clean commits only")
     config = load_config(folder / "config.yaml", StudyConfig)
     seconds = found["cost"]["cpu_seconds"]
-    measured, change = "objective", "objective_change_interval"
-    if config.objective == "mean_return":  # tables hold lengths
-        measured, change = "mean_distance", "distance_change_interval"
+    lengths = config.objective == "mean_return"  # tables hold lengths
+    measured, kind = ("mean_distance", "distance") if lengths else ("objective", "objective")
     rows = [
         {
             "controller": _controller(config, found, compared["agent"]),
             "baseline [mm]": 1e3 * compared["baseline"][measured],
             "winner [mm]": 1e3 * compared["winner"][measured],
-            "change, 95% interval [mm]": _interval(compared, change),
+            "change, 95% interval [mm]": _interval(compared, f"{kind}_change_interval"),
             "goals reached by the baseline [%]": 100.0 * compared["baseline"]["success_rate"],
             "goals reached by the winner [%]": 100.0 * compared["winner"]["success_rate"],
             "test goals": compared["goals"],
@@ -83,7 +82,7 @@ def study(folder: Path) -> tuple[str, dict[str, Any]]:
     ]
     if not rows:
         raise DataError(f"{file}: neither baseline nor winner was tested by finite elements")
-    mesh = next((row["objective_mesh"] for row in found["comparison"] if row.get("objective_mesh")), None)
+    mesh = next((row[f"{kind}_mesh"] for row in found["comparison"] if row.get(f"{kind}_mesh")), None)
     if mesh is not None and mesh["interval"] is not None:  # a single path has none
         rows[0]["change with the mesh, 95% interval [mm]"] = [1e3 * end for end in mesh["interval"]]
     rows[0]["CPU with FEM check [min]"] = sum(seconds.values()) / 60.0
@@ -92,34 +91,35 @@ def study(folder: Path) -> tuple[str, dict[str, Any]]:
     title = TITLES.get(found["name"], found["title"])
     entry = {"title": title, "command": command, "commit": commit, "trials": found["trials"]["complete"], "rows": rows}
     if mesh is not None:
-        entry["meshes"] = _meshes(found, mesh, config.finalists.test == "episodes")
+        entry["meshes"] = _meshes(found, mesh, (measured, kind), config.finalists.test == "episodes")
     return found["name"], entry
 
 
-def _meshes(found: dict[str, Any], mesh: dict[str, Any], whole: bool) -> list[dict[str, Any]]:
+def _meshes(found: dict[str, Any], mesh: dict[str, Any], names: tuple[str, str], whole: bool) -> list[dict[str, Any]]:
     """What each physics says of baseline and winner with their own controller, a finer mesh included.
 
     Args:
         found: results of the study.
         mesh: what is left of the mesh's error in the change.
+        names: of the value of a body in the tables, and of its change.
         whole: whether finite elements ran whole episodes, so that mean efforts of all physics mean the same.
     """
-    agent = found["comparison"][0]["agent"]
+    (measured, kind), agent = names, found["comparison"][0]["agent"]
     unknowns = {test["backend"]: test.get("unknowns") for test in found["tests"] if "error" not in test}
     rows = []
     for compared in (row for row in found["comparison"] if row["agent"] == agent):
         row = {"judge": JUDGES[compared["backend"]], "goals": compared["goals"]}
         row["unknowns"] = unknowns.get(compared["backend"])
         for who in ("baseline", "winner"):
-            row[f"{who} [mm]"] = 1e3 * compared[who]["objective"]
+            row[f"{who} [mm]"] = 1e3 * compared[who][measured]
             if whole or compared["backend"] != "surrogate":
                 row[f"{who}, mean effort [N]"] = compared[who]["mean_effort"]
-        row["change [mm]"] = 1e3 * compared["objective_change"]
+        row["change [mm]"] = 1e3 * compared[f"{kind}_change"]
         if compared["backend"] == "refined":  # on the other mesh, at the same goals
             row["change before [mm]"] = 1e3 * mesh["before"]
-        row["interval [mm]"] = _interval(compared)
-        if compared["objective_mesh"] and compared["objective_mesh"]["interval"]:
-            row["with the mesh [mm]"] = [1e3 * end for end in compared["objective_mesh"]["interval"]]
+        row["interval [mm]"] = _interval(compared, f"{kind}_change_interval")
+        if (part := compared.get(f"{kind}_mesh")) and part["interval"]:
+            row["with the mesh [mm]"] = [1e3 * end for end in part["interval"]]
         rows.append(row)
     return rows
 
@@ -132,7 +132,7 @@ def _controller(config: StudyConfig, found: dict[str, Any], agent: str) -> str:
     return f"{LEARNERS[config.training.learner]}, a policy for each body{trainings}"
 
 
-def _interval(compared: dict[str, Any], name: str = "objective_change_interval") -> list[float] | None:
+def _interval(compared: dict[str, Any], name: str) -> list[float] | None:
     """Interval of a change [mm]; None for a single goal, which has none."""
     interval = compared[name]
     return [1e3 * end for end in interval] if interval and compared["goals"] > 1 else None

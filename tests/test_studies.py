@@ -63,14 +63,21 @@ def test_studies_of_the_return_are_recorded_by_their_distances(tmp_path):
     assert "objective: mean_return" in config
     (tmp_path / "config.yaml").write_text(config)
     ends = [{"objective": 1e3 * d, "mean_distance": d, "success_rate": 0.0} for d in (0.05, 0.03)]
+    ends = [body | {"mean_effort": 0.2} for body in ends]
     compared = {"backend": "fem", "agent": "qp", "goals": 1, "baseline": ends[0], "winner": ends[1]}
-    changes = {"objective_change_interval": None, "distance_change_interval": None}
-    found = copy.deepcopy(FOUND) | {"name": "tetrapod_carry", "comparison": [compared | changes]}
+    changes = {"objective_change_interval": None, "distance_change_interval": None, "distance_change": -0.02}
+    part = {"ratio": 0.5, "before": -0.02, "left": 0.01, "interval": None}
+    finer = compared | changes | {"backend": "refined", "distance_change": -0.015}
+    found = copy.deepcopy(FOUND) | {"name": "tetrapod_carry", "tests": []}
+    found["comparison"] = [compared | changes | {"distance_mesh": part}, finer]
     (tmp_path / "results.json").write_text(json.dumps(found))
     name, entry = study(tmp_path)
     assert name == "tetrapod_carry" and entry["title"] == "Tetrapod with 1 kg"
     assert entry["rows"][0]["baseline [mm]"] == pytest.approx(50.0)
     assert entry["rows"][0]["winner [mm]"] == pytest.approx(30.0)
+    own, refined = entry["meshes"]
+    assert own["winner [mm]"] == pytest.approx(30.0) and own["change [mm]"] == pytest.approx(-20.0)
+    assert refined["change [mm]"] == pytest.approx(-15.0) and refined["change before [mm]"] == pytest.approx(-20.0)
 
 
 def test_a_baseline_that_wins_is_said_to(tmp_path):
