@@ -115,16 +115,19 @@ def test_policy_of_ppo_is_its_mean_action_and_weights_return(tmp_path):
     learner.close()
 
 
-def test_evolution_finds_a_linear_policy_that_reaches_goals():
-    config = QUICK["evolution"].model_copy(update={"steps": 16_000, "num_envs": 16, "evolution": EvolutionConfig()})
-    learner = EvolutionLearner(config)
-    first = learner._episode(learner._unpacked(np.zeros((16, 32), dtype=np.float32)), lambda steps: None)
-    assert np.ptp(first[0]) == 0.0 and first[1] == 50  # every candidate has the same goal
-    learner.learn(config.steps, lambda steps: None)
-    assert learner.weights()["actor.mu.weight"].shape == (2, 15)
-    last = learner._episode({name: np.stack([value] * 16) for name, value in learner.weights().items()}, print)
-    assert last[0].mean() > 2.0 * first[0].mean()
-    learner.close()
+def test_evolution_finds_linear_policies_that_reach_goals():
+    gains = []
+    for seed in range(4):  # a single search may get stuck, and rounding, which depends on the processor, decides which
+        updates = {"steps": 16_000, "num_envs": 16, "seed": seed, "evolution": EvolutionConfig()}
+        learner = EvolutionLearner(QUICK["evolution"].model_copy(update=updates))
+        first = learner._episode(learner._unpacked(np.zeros((16, 32), dtype=np.float32)), lambda steps: None)
+        assert np.ptp(first[0]) == 0.0 and first[1] == 50  # every candidate has the same goal
+        learner.learn(learner.config.steps, lambda steps: None)
+        assert learner.weights()["actor.mu.weight"].shape == (2, 15)
+        last = learner._episode({name: np.stack([value] * 16) for name, value in learner.weights().items()}, print)
+        gains.append(last[0].mean() / first[0].mean())
+        learner.close()
+    assert np.median(gains) > 2.0
 
 
 def test_evolution_acts_as_its_policy_and_needs_a_generation(tmp_path):
