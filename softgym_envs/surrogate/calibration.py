@@ -62,6 +62,10 @@ USUAL = 0.98
 SEARCHES = 6
 """Most searches of a calibration."""
 
+ROUNDING = 1e-4
+"""Relative change of a limit that may be rounding: networks in single precision give batches of other sizes slightly
+other values."""
+
 ROUNDS = 4
 POOL = 8
 """Bodies and commands from which an adversary chooses each of its own."""
@@ -336,7 +340,7 @@ def calibrate(
     unlimited, everything = _calibrated(model, calibration), known
     limits: list[float] = []  # below which searches were made
     limit = safe_limit(predict(unlimited, known), robot.goal_tolerance)
-    while attacks and len(limits) < SEARCHES and (not limits or limit < limits[-1]):
+    while attacks and len(limits) < SEARCHES and (not limits or limit < (1.0 - ROUNDING) * limits[-1]):
         limits.append(limit)
         found_states = attack(_calibrated(model, calibration, limit), attacks, states, seed, state_folder, len(limits))
         everything = JudgedStates.join([everything, found_states])

@@ -51,6 +51,11 @@ def green(image):
     return middle - np.maximum(red, blue) > 40
 
 
+def alike(image, other):
+    """Whether at most one pixel in a thousand differs visibly: rounding moves the edges of shapes a little."""
+    return (np.abs(image.astype(int) - other).max(axis=-1) > 8).mean() <= 1e-3
+
+
 class TestImage:
     def test_shape_and_content(self, renderer, states):
         image = draw(renderer, states["rest"])
@@ -85,13 +90,13 @@ class TestImage:
     @pytest.mark.parametrize("name", ["rest", "bent", "slack"])
     def test_state_without_nodes(self, renderer, states, name):
         bare = dataclasses.replace(states[name], nodes=None)
-        expected = draw(renderer, states[name]).astype(int)
-        assert np.abs(draw(renderer, bare).astype(int) - expected).max() <= 8
+        assert alike(draw(renderer, bare), draw(renderer, states[name]))
+        assert not alike(draw(renderer, bare), draw(renderer, states["slack" if name == "bent" else "bent"]))
 
     def test_effort_driven_state_without_nodes(self, backend, renderer):
         state = backend.step(np.array([4.0, 6.0]), "effort")
         bare = dataclasses.replace(state, nodes=None)
-        assert np.abs(draw(renderer, bare).astype(int) - draw(renderer, state)).max() <= 8
+        assert alike(draw(renderer, bare), draw(renderer, state))
 
     def test_design_changes_the_picture(self, backend, renderer, states):
         short = {"length": 0.038}
