@@ -123,8 +123,8 @@ class Evaluation:
             DataError: if a field is missing or not an array of numbers with a row for each goal.
         """
         try:
-            old = {"untrusted": np.full(np.size(data["distances"]), np.nan)}  # files from before it was recorded
-            columns = {name: _column(data[name] if name in data else old[name]) for name in _PER_GOAL}
+            data = {"untrusted": np.full(np.size(data["distances"]), np.nan), **data}  # older files do not have it
+            columns = {name: _column(data[name]) for name in _PER_GOAL}
             cost = int(data["steps"]), float(data["seconds"]), float(data["cpu_seconds"])
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"stored evaluation cannot be read: {type(error).__name__} {error}") from None

@@ -273,17 +273,19 @@ def bodies_table() -> str:
         for judge in (key for key in TABLE_JUDGES if key in table.values):
             scored = int(np.isfinite(table.values[judge][:, 0]).sum())
             cells = [f"`{name}`", f"`{judge}`", TABLE_JUDGES[judge].about, f"{scored:,}"]
-            judged = "rest_few" if judge.endswith("_few") else "rest"
-            if judge == judged:
-                rows.append([*cells, "-", "-", "-"])
-                continue
-            every, best = table.agreement(judged, judge), table.agreement(judged, judge, best=BEST_SHARE)
-            among = _tau(best) if best.bodies >= FEWEST_RANKED else "-"
-            rows.append([*cells, _tau(every), among, f"{unit.scale * every.bias:+.4f}"])
+            goals = "_few" if judge.endswith("_few") else ""
+            own = [f"rest_accurate{goals}"] if judge.startswith("fem_accurate") else []
+            others = [other for other in (f"rest{goals}", *own) if other != judge and other in table.values]
+            for other in others:
+                every, best = table.agreement(other, judge), table.agreement(other, judge, best=BEST_SHARE)
+                among = _tau(best) if best.bodies >= FEWEST_RANKED else "-"
+                rows.append([*cells, f"`{other}`", _tau(every), among, f"{unit.scale * every.bias:+.4f}"])
+            if not others:
+                rows.append([*cells, *"----"])
     if not rows:
         return "No tables are shipped."
-    ranks = ["Kendall's tau with `rest`", "among the best tenth"]
-    return _table(["problem", "judge", "about", "bodies", *ranks, "mean difference [mm]"], rows)
+    compared = ["compared with", "Kendall's tau", "among the best tenth", "mean difference [mm]"]
+    return _table(["problem", "judge", "about", "bodies", *compared], rows)
 
 
 def _tau(found: Agreement) -> str:

@@ -38,7 +38,7 @@ CHUNK = 64
 
 FEW = 2
 """How many goals, from the first on, judges with ``_few`` in their names score. They are for accurate finite elements,
-which take 45 to 60 CPU s a body on the 12 goals of the finger, and they are compared with ``rest_few``."""
+which take 35 to 60 CPU s a body on the 12 goals of the finger, and they are compared with ``rest_few``."""
 
 FEWEST_RANKED, MOST_RESAMPLED = 10, 256
 """Smallest number of bodies whose ranking by two judges is compared, and largest whose tau has an interval."""

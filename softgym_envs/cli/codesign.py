@@ -40,7 +40,7 @@ def codesign(
     with options.resumable():
         run_study(study, folder, workers=workers, progress=not quiet)
         if not quiet:
-            click.echo("report: finite elements compute what baseline and winner do, to be drawn")
+            click.echo("drawing the report: finite elements compute what baseline and winner do at one goal")
         report = write_report(folder)
     click.echo(f"report: {report}")
 
