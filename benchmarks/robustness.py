@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from benchmarks.recorded import figure, records, results
 from benchmarks.tables import markdown
+from softgym_envs.config import load_config
 
-GOALS, SENSED_GOALS, SEED = 30, 10, 7
+if TYPE_CHECKING:
+    from softgym_envs.agents.config import EnvironmentConfig
+
+CONFIGS = Path(__file__).parent.parent / "configs" / "agents"
+GOALS, SEED = 30, 7
 
 PLANTS: dict[str, dict[str, Any]] = {
     "nominal": {},
@@ -62,33 +69,30 @@ def _benchmark(robot: str) -> Callable[[], dict[str, object]]:
     return run
 
 
-SENSED = {
-    "robustness_sensors": {
-        "inverse QP, open loop": "qp_model",
-        "inverse QP with estimator": "qp_estimated",
-        "policy with memory": "sensorized_finger_reach_recurrent",
-    },
-    "robustness_sensors_sac": {
-        "SAC": "sensorized_finger_reach_sac",
-        "SAC, randomised": "sensorized_finger_reach_randomised",
-    },
+SENSED = {"inverse QP, open loop": "qp_model", "inverse QP with estimator": "qp_estimated"}
+"""Controllers of SensorizedFingerReach, which hides the tip, that need no training."""
+
+TRAINED = {
+    "policy with memory": "sensorized_finger_reach_recurrent",
+    "SAC": "sensorized_finger_reach_sac",
+    "SAC, randomised": "sensorized_finger_reach_randomised",
 }
-"""Controllers of SensorizedFingerReach, which hides the tip, by the benchmark that measures them; policies were trained
-with noise, the last one on plants that differ from the model. SAC sees the last four readings."""
+"""Configurations of its policies, trained with noise on the learned model, the last on plants that differ from it."""
+
+TRAINED_SEEDS = (0, 1, 2)
 
 
-def _sensed(group: str) -> dict[str, object]:
-    from softgym_envs.agents.config import EnvironmentConfig
+def _sensed(names: Mapping[str, str | Path], environment: EnvironmentConfig) -> dict[str, object]:
+    """Evaluate agents by the name of their results, on every plant."""
     from softgym_envs.agents.evaluation import evaluate, sample_goals
 
-    task_options = {"history": 4} if group == "robustness_sensors_sac" else {}
-    nominal = EnvironmentConfig(id="SoftGym/SensorizedFingerReach-v0", backend="fem", task_options=task_options)
-    goals = sample_goals(nominal, SENSED_GOALS, SEED)
+    environment = environment.on("fem")
+    goals = sample_goals(environment, GOALS, SEED)
     result: dict[str, object] = {}
     for plant, option in PLANTS.items():
-        environment = nominal.model_copy(update={"plant": option})
-        for name, agent in SENSED[group].items():
-            found = evaluate(agent, environment, goals, seed=SEED)
+        changed = environment.model_copy(update={"plant": option})
+        for name, agent in names.items():
+            found = evaluate(agent, changed, goals, seed=SEED)
             result[f"{name}, {plant}: goals reached [%]"] = 100.0 * float(np.mean(found.successes))
             result[f"{name}, {plant}: mean distance [mm]"] = 1e3 * found.mean_distance
     return result
@@ -96,17 +100,31 @@ def _sensed(group: str) -> dict[str, object]:
 
 def sensed() -> dict[str, object]:
     """Success of controllers that see sensors in place of the tip, on FEM, on plants unlike their model."""
-    return _sensed("robustness_sensors")
+    from softgym_envs.agents.config import EnvironmentConfig
+
+    return _sensed(SENSED, EnvironmentConfig(id="SoftGym/SensorizedFingerReach-v0"))
 
 
-def sensed_sac() -> dict[str, object]:
-    """Success of SAC, which sees sensors in place of the tip, on FEM, on plants unlike its model."""
-    return _sensed("robustness_sensors_sac")
+def sensed_policies() -> dict[str, object]:
+    """Success of policies that see sensors in place of the tip, trained here, on FEM, on plants unlike their model."""
+    from softgym_envs.agents.config import TrainConfig
+    from softgym_envs.agents.training import train
+
+    result: dict[str, object] = {}
+    with TemporaryDirectory() as folder:
+        for name, file in TRAINED.items():
+            config = load_config(CONFIGS / f"{file}.yaml", TrainConfig)
+            seeds = {
+                f"{name}, seed {seed}": train(config.model_copy(update={"seed": seed}), Path(folder) / f"{file}_{seed}")
+                for seed in TRAINED_SEEDS
+            }
+            result |= _sensed(seeds, config.environment)
+    return result
 
 
 BENCHMARKS = {f"robustness_{robot}": _benchmark(robot) for robot in POLICIES} | {
     "robustness_sensors": sensed,
-    "robustness_sensors_sac": sensed_sac,
+    "robustness_sensors_policies": sensed_policies,
 }
 """Benchmarks by name."""
 
@@ -124,10 +142,20 @@ def robustness_table() -> str:
 
 
 def sensed_table() -> str:
-    """Controllers that see sensors in place of the tip, on plants unlike their model."""
-    groups = [_on_plants(group, controllers) for group, controllers in SENSED.items()]
-    rows = [[parts[0][0], *(cell for part in parts for cell in part[1:])] for parts in zip(*groups, strict=True)]
-    names = [name for controllers in SENSED.values() for name in controllers]
+    """Controllers that see sensors in place of the tip, on plants unlike their model; policies by their three seeds."""
+    rows = _on_plants("robustness_sensors", SENSED)
+    for row in rows:
+        for name in TRAINED:
+            reached, distance = (
+                [
+                    figure("robustness_sensors_policies", f"{name}, seed {seed}, {row[0]}: {what}")
+                    for seed in TRAINED_SEEDS
+                ]
+                for what in ("goals reached [%]", "mean distance [mm]")
+            )
+            shares = ", ".join(f"{float(value):.0f}" for value in reached)
+            row.append(f"{shares} %, {np.mean([float(value) for value in distance]):.2f} mm")
+    names = [*SENSED, *TRAINED]
     return markdown(["plant", *names], rows, "l" + "r" * len(names))
 
 
