@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 CONFIGS = Path(__file__).parent.parent / "configs" / "agents"
 GOALS, SEED = 30, 7
 
+PULL_STEP = 2.0
+"""Largest step of a pull [mm]."""
+
 PLANTS: dict[str, dict[str, Any]] = {
     "nominal": {},
     "20 % stiffer": {"stiffness": 1.2},
@@ -67,6 +70,47 @@ def _benchmark(robot: str) -> Callable[[], dict[str, object]]:
     run = partial(robustness, robot)
     run.__doc__ = f"Success of controllers of the {robot} on FEM, on plants unlike their model."
     return run
+
+
+def reachable() -> dict[str, object]:
+    """Goals of the finger that any pull of its cables holds on FEM, with and without friction.
+
+    Commands are fitted to each goal by least squares; cables are pulled from rest in proportion, without going back.
+    """
+    import gymnasium
+    from scipy.optimize import least_squares
+
+    import softgym_envs  # noqa: F401
+    from softgym_envs.agents.evaluation import sample_goals
+    from softgym_envs.agents.policy import Policy
+
+    nominal = Policy(POLICIES["finger"]).environment.model_copy(update={"sample_design": False})
+    goals = sample_goals(nominal, GOALS, SEED)
+    result: dict[str, object] = {}
+    for friction in (0.0, PLANTS["cable friction 0.85"]["cable_friction"]):
+        env: Any = gymnasium.make(nominal.id, backend="fem", plant={"cable_friction": friction}).unwrapped
+        env.reset(seed=SEED)
+        backend, actuators = env.backend, env.robot.actuators
+        bounds = 1e3 * np.array([[each.low for each in actuators], [each.high for each in actuators]])
+
+        def missed(pull: np.ndarray, goal: np.ndarray, backend: Any = backend) -> np.ndarray:
+            backend.reset()
+            for share in np.linspace(0.0, 1.0, int(np.ceil(pull.max() / PULL_STEP)) + 1)[1:]:
+                state = backend.step(1e-3 * share * pull)
+            return 1e3 * (state.effector.ravel() - goal)
+
+        fits = [
+            least_squares(missed, bounds.mean(axis=0), bounds=bounds, diff_step=1e-3, xtol=1e-4, args=(goal.ravel(),))
+            for goal in goals
+        ]
+        distances = np.linalg.norm([fit.fun for fit in fits], axis=1)
+        label = f"friction {friction:g}"
+        result[f"{label}: goals in reach [%]"] = 100.0 * float(np.mean(distances <= 1e3 * env.task.success_distance))
+        result[f"{label}: mean closest distance [mm]"] = float(distances.mean())
+        result[f"{label}: farthest goal [mm]"] = float(distances.max())
+        result[f"{label}: largest pull [mm]"] = float(max(fit.x.max() for fit in fits))
+        env.close()
+    return result
 
 
 SENSED = {"inverse QP, open loop": "qp_model", "inverse QP with estimator": "qp_estimated"}
@@ -123,6 +167,7 @@ def sensed_policies() -> dict[str, object]:
 
 
 BENCHMARKS = {f"robustness_{robot}": _benchmark(robot) for robot in POLICIES} | {
+    "robustness_reachable": reachable,
     "robustness_sensors": sensed,
     "robustness_sensors_policies": sensed_policies,
 }
