@@ -71,12 +71,16 @@ def surrogates() -> str:
         card = json.loads((pretrained_folder(body) / "model.json").read_text())
         strata = card.get("calibration", {}).get("strata", {})
         inside, corners = strata.get("inside"), strata.get("corners")
-        cells = [SHIPPED[name], *(short(1e3 * card["test"][f"effector_{k}"]) for k in ("mean", "worst"))]
-        cells += [short(1e3 * inside[k]) for k in ("mean", "worst")] if inside else ["", ""]
-        cells += [f"{100 * row['trusted']:.0f}" if row else "" for row in (inside, corners)]
-        rows.append([*cells, f"{1e3 * body.goal_tolerance:.3g}"])
-    head = ["weights", "same displacements: mean", "worst", "same commands: mean", "worst"]
-    return markdown([*head, "trusted inside [%]", "at corners [%]", "goal tolerance"], rows, "lrrrrrrr")
+        cells = [_pair(card["test"]["effector_mean"], card["test"]["effector_worst"])]
+        cells += [_pair(inside["mean"], inside["worst"]) if inside else ""]
+        cells += [f"{100 * inside['trusted']:.0f}, {100 * corners['trusted']:.0f}" if inside and corners else ""]
+        rows.append([SHIPPED[name], *cells, f"{1e3 * body.goal_tolerance:.3g}"])
+    head = ["weights", "same displacements: mean, worst", "same commands: mean, worst"]
+    return markdown([*head, "trusted inside, at corners [%]", "goal tolerance"], rows, "lrrrr")
+
+
+def _pair(mean: float, worst: float) -> str:
+    return f"{short(1e3 * mean)}, {short(1e3 * worst)}"
 
 
 CALIBRATED = WEIGHTS | {f"{name}_accurate": f"{title}, accurate mesh" for name, title in WEIGHTS.items()}
