@@ -160,7 +160,7 @@ def _study(name: str, repeat: int) -> Any:
 
 
 def _truth(path: Path, values: tuple[float, ...], folder: Path) -> Path:
-    """Score of one body of the grid: train from the design-conditioned policy, and evaluate."""
+    """Score of one body of the grid: train from the shared policy, and evaluate."""
     import torch
 
     from softgym_envs.agents.evaluation import evaluate

@@ -1,4 +1,4 @@
-"""One policy for all structures of the modular arm: unseen structures, finite elements, and its order of bodies.
+"""A shared policy for all structures of the modular arm: unseen structures, finite elements, and its order of bodies.
 
     softgym codesign --config configs/codesign/modular_reach_policy.yaml --folder F
 

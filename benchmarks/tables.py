@@ -112,20 +112,47 @@ def codesign_bodies() -> str:
     )
 
 
+STRATEGIES = (
+    "warm start, analytic gradient, Gaussian process, 12 goals (default)",
+    "shared policy, Gaussian process, 12 goals",
+    "inverse QP, Gaussian process, 12 goals",
+    "critic",
+    "distribution",
+    "plain nesting, Hyperband",
+)
+"""Runs of the short table: the best of each strategy."""
+
+
 def strategies() -> str:
     """Regret and cost of the co-design strategies."""
+    columns = {
+        "regret at the end [%]": "regret at the end [%]",
+        "environment steps": "environment steps",
+        "steps behind the policy it is given": "steps of the given policy",
+        "environment steps to 10% regret": "steps until regret stays below 10%",
+        "environment steps to 1% regret": "below 1%",
+        "CPU seconds to 1% regret": "CPU seconds until then",
+        "CPU minutes": "CPU [min]",
+    }
+    end = ": regret at the end [%]"
+    return _regrets([name.removesuffix(end) for name in results("strategies") if name.endswith(end)], columns)
+
+
+def strategies_short() -> str:
+    """Regret and cost of one run of each strategy."""
+    columns = {
+        "regret at the end [%]": "regret at the end [%]",
+        "CPU seconds to 1% regret": "CPU seconds until regret stays below 1%",
+        "environment steps to 1% regret": "environment steps until then",
+        "steps behind the policy it is given": "steps of the given policy",
+    }
+    return _regrets(STRATEGIES, columns)
+
+
+def _regrets(names: Sequence[str], columns: Mapping[str, str]) -> str:
     found = results("strategies")
-    head = ["strategy", "regret at the end [%]", "environment steps", "steps of the given policy"]
-    head += ["steps until regret stays below 10%", "below 1%", "CPU seconds until then", "CPU [min]"]
-    columns = ["regret at the end [%]", "environment steps", "steps behind the policy it is given"]
-    columns += [
-        "environment steps to 10% regret",
-        "environment steps to 1% regret",
-        "CPU seconds to 1% regret",
-        "CPU minutes",
-    ]
-    names = [key.removesuffix(f": {columns[0]}") for key in found if key.endswith(f": {columns[0]}")]
-    return markdown(head, [[n, *(_spread(found[f"{n}: {c}"]) for c in columns)] for n in names], "lrrrrrrr")
+    rows = [[name, *(_spread(found[f"{name}: {column}"]) for column in columns)] for name in names]
+    return markdown(["strategy", *columns.values()], rows, "l" + "r" * len(columns))
 
 
 def _spread(value: object) -> str:
@@ -518,7 +545,8 @@ def provenance() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     function.__name__: function
     for function in (
-        headlines, codesign, codesign_goals, codesign_bodies, learners, strategies, kills, profile, agents, carry,
+        headlines, codesign, codesign_goals, codesign_bodies, learners, strategies, strategies_short, kills,
+        profile, agents, carry,
         test_set, buckling, predicted_tracking, trajectories, design_gradients, networks,
         design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, sealed_stiffness,

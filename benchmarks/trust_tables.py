@@ -1,4 +1,4 @@
-"""Tables of the page on surrogates: what calibrated weights say about their errors, and what they were trained on."""
+"""Tables of the pages on surrogates: what calibrated weights say about their errors, and what they were trained on."""
 
 from __future__ import annotations
 
@@ -63,8 +63,32 @@ def fidelities() -> str:
     return markdown(head, rows, "llrrrr")
 
 
+def surrogates() -> str:
+    """Errors of all shipped weights: at equal displacements, and for calibrated ones under commands inside the box."""
+    rows = []
+    for name, (robot, options) in shipped_robots().items():
+        body = make_robot(robot, **options)
+        card = json.loads((pretrained_folder(body) / "model.json").read_text())
+        strata = card.get("calibration", {}).get("strata", {})
+        inside, corners = strata.get("inside"), strata.get("corners")
+        cells = [_pair(card["test"]["effector_mean"], card["test"]["effector_worst"])]
+        cells += [_pair(inside["mean"], inside["worst"]) if inside else ""]
+        cells += [f"{100 * inside['trusted']:.0f}, {100 * corners['trusted']:.0f}" if inside and corners else ""]
+        rows.append([SHIPPED[name], *cells, f"{1e3 * body.goal_tolerance:.3g}"])
+    head = ["weights", "same displacements: mean, worst", "same commands: mean, worst"]
+    return markdown([*head, "trusted inside, at corners [%]", "goal tolerance"], rows, "lrrrr")
+
+
+def _pair(mean: float, worst: float) -> str:
+    return f"{short(1e3 * mean)}, {short(1e3 * worst)}"
+
+
 CALIBRATED = WEIGHTS | {f"{name}_accurate": f"{title}, accurate mesh" for name, title in WEIGHTS.items()}
 FIDELITIES = CALIBRATED | {"cable_trunk_coarse": "cable trunk, quadratic elements"}
+SHIPPED = FIDELITIES | {
+    "sensorized_finger_2cavities_touched": "sensorized finger, 2 cavities",
+    "sensorized_finger_4cavities_touched": "sensorized finger, 4 cavities",
+}
 FACTORS = {"mean": 1e3, "worst": 1e3, "worst_trusted": 1e3, "coverage": 100.0, "trusted": 100.0}
 """From metres and shares to millimetres and percent."""
 TRUST_HEAD = [
@@ -87,5 +111,7 @@ def _trust_rows(title: str, strata: Mapping[str, Mapping[str, Any]], tolerance: 
     return rows
 
 
-TABLES: dict[str, Callable[[], str]] = {"trust": trust, "calibrated": calibrated, "fidelities": fidelities}
+TABLES: dict[str, Callable[[], str]] = {
+    function.__name__: function for function in (trust, calibrated, fidelities, surrogates)
+}
 """Tables by name."""

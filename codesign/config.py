@@ -48,11 +48,11 @@ class StudyConfig(StudyProblem):
         secondary_objectives: further objectives; the study then looks for the Pareto front of all of them.
         constraints: largest allowed values of objectives that are minimised, smallest of those that are maximised [SI];
             a body that violates one cannot win.
-        strategy: how bodies are scored. ``"policy"``: by one design-conditioned policy. ``"warm_start"``: each trial
+        strategy: how bodies are scored. ``"policy"``: by one shared policy. ``"warm_start"``: each trial
             fine-tunes that policy. ``"scratch"``: each trial trains a policy (plain nesting). ``"critic"`` and
             ``"distribution"``: bodies and a policy are trained together, then that policy scores every body. ``"qp"``:
             by the inverse QP, without training.
-        policy: design-conditioned policy, for ``"policy"`` and ``"warm_start"``: a file or the name of a shipped one.
+        policy: shared policy, for ``"policy"`` and ``"warm_start"``: a file or the name of a shipped one.
         joint: training of bodies and policy together, for ``"critic"`` and ``"distribution"``.
         trials: number of bodies, the baseline and those of the screen included.
         workers: number of workers with one thread each.
@@ -203,7 +203,7 @@ class StudyConfig(StudyProblem):
         plan, strategy = self.plan, f"strategy '{self.strategy}'"
         refuse(
             plan.policy and not self.policy,
-            f"{strategy} needs 'policy': a shared policy, trained with design_in_observation",
+            f"{strategy} needs 'policy': a shared policy, which is trained with design_in_observation",
         )
         refuse(not plan.policy and bool(self.policy), f"{strategy} does not use policy = '{self.policy}'; remove it")
         for name in filter(is_option, self.variables):
@@ -219,7 +219,7 @@ class StudyConfig(StudyProblem):
         shown = self.environment.design_in_observation
         refuse(
             plan.shares_policy and shown is not True and not set(self.variables) <= set(shown or ()),
-            f"{strategy} needs a policy that observes the body: add {', '.join(self.variables)} to "
+            f"{strategy} needs a policy that reads the design: add {', '.join(self.variables)} to "
             "environment.design_in_observation",
         )
         if plan.proposer:

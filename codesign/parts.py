@@ -17,14 +17,14 @@ class Strategy:
     """How a body gets its score."""
 
     trains: bool = False  # each trial trains a policy of its own
-    policy: bool = False  # the study needs a given policy: as the start of trainings, else as shared policy
+    policy: bool = False  # the study needs a given shared policy, to start trainings or to score bodies
     proposer: str | None = (
         None  # name in `softgym_envs.agents.joint.PROPOSERS` if bodies and a shared policy are trained together
     )
 
     @property
     def shares_policy(self) -> bool:
-        """Whether one policy scores all bodies: the given one, or that of the joint training."""
+        """Whether a shared policy scores all bodies: the given one, or that of the joint training."""
         return not self.trains and (self.policy or bool(self.proposer))
 
 

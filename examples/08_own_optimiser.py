@@ -5,7 +5,7 @@ import numpy as np
 from softgym_envs.codesign.benchmark import Search, load_problem, submit
 
 problem = load_problem("finger-zone-v1")
-search = Search(problem, level="small", judge="shared")  # one policy for all bodies: milliseconds a body
+search = Search(problem, level="small", judge="shared")  # a shared policy: milliseconds a body
 rng = np.random.default_rng(0)
 best, point, step = -np.inf, np.zeros(len(problem.variables)), 0.6
 while search.open:

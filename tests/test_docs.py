@@ -169,6 +169,14 @@ def test_configurations_on_pages_are_valid(page, config):
         check_config(config, yaml.safe_load(text), page)
 
 
+def test_parts_of_a_study_on_the_page_of_strategies_are_valid():
+    """The first block is a whole study; each of the others replaces some of its keys."""
+    study, *parts = (yaml.safe_load(text) for _, text, _ in code_blocks(DOCS / "strategies.md", "yaml"))
+    assert len(parts) == 4
+    for part in ({}, *parts):
+        check_config(StudyConfig, study | part, "strategies")
+
+
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs the extra 'docs'")
 def test_the_site_builds_without_a_warning(tmp_path):
     done = subprocess.run(

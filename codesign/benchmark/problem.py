@@ -25,7 +25,7 @@ from softgym_envs.config import BesideConfig, Config
 from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign, unknown_name
 
 Judge = Literal["qp", "shared", "trained"]
-"""Who controls a body while it is scored: the inverse QP, one policy for all bodies, or a policy trained for it."""
+"""Who controls a body while it is scored: the inverse QP, a shared policy, or a policy trained for it."""
 
 JUDGES: tuple[Judge, ...] = ("qp", "shared", "trained")
 GOAL_SETS = ("training", "search", "validation", "test")
@@ -64,7 +64,7 @@ class BenchmarkProblem(StudyProblem):
         name: ID with its version: ``finger-zone-v1``. Any change of the problem needs a new version.
         track: key of `TRACKS`.
         judge: who controls the bodies in the search, unless the optimiser chooses another judge, and in the final test.
-        policy: policy for all bodies: the judge ``"shared"``, and the start of the trainings of ``"trained"``.
+        policy: shared policy: the judge ``"shared"``, and the start of the trainings of ``"trained"``.
         training: training for one body, for the judge ``"trained"``.
         goals: sets of goals by name, `GOAL_SETS`, each with a seed of its own.
         budgets: by name, `LEVELS`.

@@ -33,14 +33,14 @@ def refreeze(name: str, bodies: int = 5, data: Path = DATA) -> list[Path]:
         The files in which the hash was renamed.
 
     Raises:
-        DataError: if no winner is stored, a score differs, or the policy for all bodies is another one; then nothing is
+        DataError: if no winner is stored, a score differs, or the shared policy is another one; then nothing is
             changed.
     """
     definition = load_definition(name)  # an unknown name is an error of its own
     problem = load_problem(name, check=False)
     if frozen_parts(definition, problem.goals).get("policy") != problem.parts.get("policy"):
         # It decides what the judges shared and trained say of every body, whichever judge the stored searches had.
-        raise DataError(f"problem '{name}': the policy for all bodies is another one; this needs a new version")
+        raise DataError(f"problem '{name}': the shared policy is another one; this needs a new version")
     winners = [
         (run, design, scores)
         for run, _ in stored_runs(data)

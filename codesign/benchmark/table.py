@@ -332,7 +332,7 @@ TABLE_JUDGES: dict[str, TableJudge] = {
     ),
     "qp": TableJudge("inverse QP, whole episodes", CHUNK, lambda t, points: t.episodes("qp", points)),
     "shared": TableJudge(
-        "one policy for all bodies, whole episodes",
+        "shared policy, whole episodes",
         CHUNK,
         lambda t, points: t.episodes(str(t.problem.definition.policy), points),
     ),

@@ -131,7 +131,7 @@ class _Runner:
         else:
             self._keep_qp(self._assess("qp", self.goals))
             if config.plan.trains:
-                if config.policy:  # how well one policy for all bodies would have judged this one
+                if config.policy:  # how well the shared policy would have judged this one
                     judged = self._assess(config.policy, self.goals)
                     result.judge, result.judge_value = judged.evaluation, judged.values[config.objective]
                 policy = self._train()

@@ -27,11 +27,11 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 
 CONTROLLERS = {
-    "warm_start": "a policy fine-tuned in each trial from one design-conditioned policy",
+    "warm_start": "a policy fine-tuned in each trial from a shared policy",
     "scratch": "a policy trained from scratch in each trial",
-    "policy": "one design-conditioned policy shared by all bodies",
-    "critic": "one policy trained together with bodies that its critic proposes, then shared by all bodies",
-    "distribution": "one policy trained together with a distribution of bodies, then shared by all bodies",
+    "policy": "a shared policy: one for all bodies, which also reads the design",
+    "critic": "a shared policy, trained together with bodies that its critic proposes",
+    "distribution": "a shared policy, trained together with a distribution of bodies",
     "qp": "inverse QP on the condensed model, no training",
 }
 IMAGE_SIZE = (420, 420)

@@ -18,9 +18,9 @@ from softgym_envs.errors import ConfigError
 @click.command()
 @options.run_options("agents")
 @options.folder
-@click.option("--initial", type=options.PATH, help="Policy to start from.")
+@click.option("--initial", type=options.PATH, help="Policy file to start from.")
 def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
-    """Train a policy by any learner.
+    """Train a policy with the learner that the configuration names.
 
     An interrupted run continues from its last checkpoint.
     """
@@ -38,11 +38,15 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
 @click.option(
     "--agent", "agents", multiple=True, default=("qp", "random"), show_default=True, help=AGENT_HELP + " Repeatable."
 )
-@click.option("--backend", "backends", multiple=True, help="surrogate or fem (default: the environment's). Repeatable.")
+@click.option(
+    "--backend", "backends", multiple=True, help="surrogate, hybrid or fem (default: the environment's). Repeatable."
+)
 @options.design
 @click.option("--goals", default=200, show_default=True, help="Number of unseen goals.")
 @click.option("--seed", default=2_000_003, show_default=True, help="Seed of the goals.")
-@click.option("--workers", default=1, show_default=True, help="Number of processes, where goals run one by one.")
+@click.option(
+    "--workers", default=1, show_default=True, help="Number of processes for goals that run one by one, as on FEM."
+)
 @click.option("--output", type=options.PATH, help="Write all results as JSON to this file.")
 @options.as_json
 @options.overrides
@@ -60,7 +64,7 @@ def evaluate(
 ) -> None:
     """Evaluate agents on the same unseen goals.
 
-    CONFIG is the configuration file that they were trained with.
+    --config is the one that the policies were trained with.
     """
     from softgym_envs.agents.baselines import BASELINES
     from softgym_envs.agents.config import TrainConfig

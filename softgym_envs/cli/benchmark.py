@@ -22,7 +22,7 @@ results = click.option(
 def benchmark() -> None:
     """Compare optimisers of bodies and controllers on frozen problems.
 
-    Scores of submissions are those on finite elements.
+    Submissions are scored on finite elements.
     """
 
 
@@ -114,10 +114,13 @@ def run(
 
 @benchmark.command()
 @click.argument("name")
-@click.option("--bodies", type=click.IntRange(min=3), default=16, show_default=True)
+@click.option("--bodies", type=click.IntRange(min=3), default=16, show_default=True, help="Number of bodies.")
 @results
 def judges(name: str, bodies: int, folder: Path) -> None:
-    """Compare the judges of a problem with specialists on finite elements."""
+    """Compare the judges of a problem with trained policies on finite elements.
+
+    These policies are trained for each body.
+    """
     from softgym_envs.codesign.benchmark import runs
 
     with options.resumable():
@@ -128,17 +131,16 @@ def judges(name: str, bodies: int, folder: Path) -> None:
 
 @benchmark.command()
 @click.argument("names", nargs=-1, required=True)
-@click.option(
-    "--every", multiple=True, help="Check the winners of all seeds of this method; several with several options."
-)
+@click.option("--every", multiple=True, help="Check the winners of all seeds of this method; repeat for several.")
 @click.option("--rest", is_flag=True, help="Compare states at rest in place of whole episodes (a tenth of the time).")
 @click.option("--store", is_flag=True, help="Add the winners to the stored ones (source checkout).")
 @results
 def winners(names: tuple[str, ...], every: tuple[str, ...], rest: bool, store: bool, folder: Path) -> None:
     """Check the winners of the stored searches of problems NAMES on finite elements.
 
-    They are those of each method's median seed under the inverse QP, on the search goals, with the budget `small`.
-    Exploitation is the score on the learned model minus that on finite elements. An interrupted call continues.
+    By default: the winner of each method's median seed, under the inverse QP, on the search goals, with the budget
+    `small`. Exploitation is the score on the learned model minus that on finite elements. An interrupted call continues
+    where it stopped.
     """
     from softgym_envs.codesign.benchmark import winners as module
 
@@ -161,11 +163,10 @@ def winners(names: tuple[str, ...], every: tuple[str, ...], rest: bool, store: b
 @click.option("--accurate", is_flag=True, help="Score the baseline and the best body on the accurate mesh too.")
 @results
 def reference_(names: tuple[str, ...], accurate: bool, folder: Path) -> None:
-    """Find the 0 and the 1 of the scores of problems NAMES (source checkout, seconds to minutes each).
+    """Find which bodies score 0 and 1 on problems NAMES (source checkout, seconds to minutes each).
 
-    They are the baseline body and the most promising winner of the stored searches, tested on finite elements on the
-    test goals. Most promising is the winner that is best on the validation goals. A better body that is already known
-    stays.
+    0 is the baseline body. 1 is the winner of the stored searches that is best on the validation goals, unless a better
+    body is already known. Both are tested on finite elements, on the test goals.
     """
     from softgym_envs.codesign.benchmark import references
     from softgym_envs.codesign.benchmark.frozen import load_problem
@@ -218,7 +219,7 @@ def table_(folder: Path, store: bool) -> None:
 @benchmark.command(name="board")
 @click.argument("paths", nargs=-1, type=options.PATH)
 def board_(paths: tuple[Path, ...]) -> None:
-    """Show the leaderboard of the stored submissions, and where those of the files PATHS would stand."""
+    """Show the leaderboard, and where the submissions in the files PATHS would stand."""
     from softgym_envs.codesign.benchmark import board
 
     click.echo(board.leaderboard(more=paths))
@@ -228,10 +229,10 @@ def board_(paths: tuple[Path, ...]) -> None:
 @click.argument("names", nargs=-1, required=True)
 @click.option("--keep", is_flag=True, help="Keep stored results, if stored winners still have the same scores.")
 def freeze(names: tuple[str, ...], keep: bool) -> None:
-    """Freeze problems NAMES: draw their goals, and store these with the hashes (source checkout).
+    """Freeze problems NAMES: draw their goals, and store them with the hashes (source checkout).
 
-    A change that cannot change scores, such as another calibration of the uncertainty of weights, changes the hash too.
-    With --keep some stored winners are scored again; if nothing differs, the stored results get the new hash.
+    Some changes alter the hash but no score, such as another calibration of the weights' uncertainty. With --keep, some
+    stored winners are scored again; if no score differs, the stored results get the new hash.
     """
     from softgym_envs.codesign.benchmark import frozen
     from softgym_envs.codesign.benchmark.refreeze import refreeze
@@ -251,27 +252,26 @@ def freeze(names: tuple[str, ...], keep: bool) -> None:
     default=("rest=100000", "qp=1000"),
     show_default=True,
     help="Judge and how many bodies it scores: rest, rest_accurate, qp, shared, trained, fem or fem_accurate, "
-    "or one of these with _few, on few goals; several with several.",
+    "or one of these with _few, on few goals; repeat for several.",
 )
 @click.option(
     "--best",
     multiple=True,
     metavar="JUDGE=N",
-    help="Judge that also scores the N best bodies of each judge at rest on a learned model; several with several.",
+    help="Judge that also scores the N best bodies of each judge at rest on a learned model; repeat for several.",
 )
 @click.option(
     "--ranked",
     multiple=True,
     metavar="JUDGE=N",
-    help="Judge that also scores N bodies drawn over all ranks of rest, and N over its best tenth; several with "
-    "several.",
+    help="Judge that also scores N bodies over all ranks of rest, and N over its best tenth; repeat for several.",
 )
 @click.option(
     "--longest",
     type=click.FloatRange(min=0.0, max=1.0, min_open=True),
     default=0.1,
     show_default=True,
-    help="Largest step towards rest, relative to the range of a command.",
+    help="Largest step towards rest, as a part of the range of a command.",
 )
 @click.option("--output", type=options.PATH, help="Parquet file (default: the shipped table of the problem).")
 @results

@@ -27,7 +27,7 @@ def codesign(
 ) -> None:
     """Optimise body and controller together and write a report.
 
-    An interrupted study continues where it stopped.
+    The report is FOLDER/report.html. An interrupted study continues where it stopped.
     """
     require("codesign")
     from softgym_envs.codesign.config import StudyConfig
@@ -51,7 +51,8 @@ def codesign(
 def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
     """Rank design variables by their effect.
 
-    The method is one at a time, Morris or Sobol. An interrupted run continues where it stopped.
+    The configuration names the method: one variable at a time, Morris or Sobol. An interrupted run continues where it
+    stopped.
     """
     require("codesign")
     from softgym_envs.codesign.tools.config import SensitivityConfig
@@ -77,7 +78,8 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
 def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
     """Search for the best bodies without a controller.
 
-    The solver is an Optuna sampler, whose interrupted runs continue where they stopped, or gradient descent.
+    The configuration names the solver: an Optuna sampler or gradient descent. An interrupted run of a sampler continues
+    where it stopped.
     """
     require("codesign")
     from softgym_envs.codesign.tools import gradient

@@ -12,7 +12,7 @@ from softgym_envs.storage import atomic_write
 
 
 @click.command()
-@click.option("--copy", type=options.PATH, metavar="FOLDER", help="Copy all of them to a new folder, to edit them.")
+@click.option("--copy", type=options.PATH, metavar="FOLDER", help="Copy them all to this new folder, to edit them.")
 def configs(copy: Path | None) -> None:
     """List the shipped configurations, or copy them.
 

@@ -1,4 +1,4 @@
-"""Verbs for environments: list, rollout, view."""
+"""Verbs for environments: list, rollout, record, view."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def list_(as_json: bool) -> None:
 @click.command()
 @click.argument("environment", shell_complete=options.complete_environment)
 @click.option("--agent", default="qp", show_default=True, help=AGENT_HELP)
-@click.option("--backend", help="surrogate or fem (default: the environment's).")
+@click.option("--backend", help="surrogate, hybrid or fem (default: the environment's).")
 @options.design
 @click.option("--seed", default=0, show_default=True, help="Seed of the episode.")
 @click.option("--record", type=options.PATH, help="Write a rerun recording (.rrd) to this file.")
@@ -131,10 +131,10 @@ def rollout(
 @click.argument("environment")
 @click.argument("name")
 @click.option("--agent", default="qp", show_default=True, help=AGENT_HELP)
-@click.option("--backend", help="surrogate or fem (default: the environment's).")
+@click.option("--backend", help="surrogate, hybrid or fem (default: the environment's).")
 @options.design
 @click.option("--episodes", default=100, show_default=True, help="Number of episodes.")
-@click.option("--seed", default=0, show_default=True, help="Seed of the first episode; the others count on.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the first episode; the next ones add 1 each.")
 def record(
     environment: str,
     name: str,
@@ -146,7 +146,7 @@ def record(
 ) -> None:
     """Record episodes as a Minari dataset, for offline learning.
 
-    NAME is that of the dataset, such as softgym/finger-reach/qp-v0.
+    NAME is the name of the dataset, such as softgym/finger-reach/qp-v0.
     """
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.agents.offline import record_episodes
@@ -165,7 +165,7 @@ def record(
 def view(recording: Path) -> None:
     """Open a recording in the rerun viewer.
 
-    'softgym rollout ENVIRONMENT --record FILE' makes one.
+    'softgym rollout ENVIRONMENT --record FILE' makes a recording.
     """
     import subprocess
 

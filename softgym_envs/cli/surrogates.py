@@ -15,9 +15,9 @@ from softgym_envs.errors import ConfigError
 @options.run_options("surrogate")
 @options.folder
 def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...]) -> None:
-    """Generate the datasets of a surrogate.
+    """Generate the datasets of a surrogate: train, validation and test.
 
-    The datasets are train, validation and test. An interrupted run continues where it stopped.
+    An interrupted run continues where it stopped.
     """
     from softgym_envs.config import load_config
     from softgym_envs.surrogate.training import FitConfig, generate_datasets
@@ -35,7 +35,8 @@ def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...])
 def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
     """Generate data, train a surrogate and test it.
 
-    An interrupted run continues where it stopped.
+    The weights are written to FOLDER; their errors on the test set are printed. An interrupted run continues where it
+    stopped.
     """
     from softgym_envs.config import load_config
     from softgym_envs.surrogate.training import FitConfig
@@ -50,10 +51,14 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
 @click.argument("robot")
 @options.robot_option
 @click.option("--weights", type=options.PATH, help="Folder of the weights (default: the shipped weights).")
-@click.option("--folder", type=options.PATH, help="Folder of the FEM states; an interrupted run continues.")
-@click.option("--bodies", type=click.IntRange(1), default=64, show_default=True, help="Bodies of each stratum.")
-@click.option("--states", type=click.IntRange(1), default=5, show_default=True, help="Commands of each body.")
-@click.option("--attacks", type=click.IntRange(0), default=500, show_default=True, help="States of the search.")
+@click.option("--folder", type=options.PATH, help="Keep the FEM states in this folder; an interrupted run continues.")
+@click.option(
+    "--bodies", type=click.IntRange(1), default=64, show_default=True, help="Number of bodies in each stratum."
+)
+@click.option("--states", type=click.IntRange(1), default=5, show_default=True, help="Number of commands per body.")
+@click.option(
+    "--attacks", type=click.IntRange(0), default=500, show_default=True, help="Number of states of each search."
+)
 @click.option("--seed", type=click.IntRange(0), default=11, show_default=True, help="Seed of all states.")
 @click.option("--kept-only", is_flag=True, help="Calibrate on what FOLDER holds of an interrupted run.")
 def calibrate_trust(
@@ -69,8 +74,9 @@ def calibrate_trust(
 ) -> None:
     """Calibrate the uncertainty of a surrogate on FEM.
 
-    The uncertainty bounds 95 % of the errors in every stratum of states under given commands, and no trusted state that
-    a search finds is off by more than the goal tolerance. The result is written to the card of the weights.
+    Bodies are drawn in strata, such as inside the design box and at its corners. The uncertainty is scaled until it
+    covers 95 % of the errors under commands in each stratum. Then the limit of trust is lowered until a search finds
+    no trusted state that is off by more than the goal tolerance. The result is written to the card of the weights.
     """
     from dataclasses import asdict
 
@@ -90,15 +96,16 @@ def calibrate_trust(
 @options.robot_option
 @click.option("--weights", type=options.PATH, help="Folder of the weights (default: the shipped weights).")
 @click.option("--bodies", type=click.IntRange(8), default=128, show_default=True, help="Number of bodies.")
-@click.option("--states", type=click.IntRange(1), default=4, show_default=True, help="Commands of each body.")
+@click.option("--states", type=click.IntRange(1), default=4, show_default=True, help="Number of commands per body.")
 @click.option("--degree", type=click.IntRange(1), default=3, show_default=True, help="Degree of the polynomials.")
-@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Number of processes.")
 def fit_inertia(
     robot: str, options_: tuple[str, ...], weights: Path | None, bodies: int, states: int, degree: int, workers: int
 ) -> None:
     """Learn the inertia of a robot, for motion on its surrogate.
 
-    Bodies are drawn and reduced about equilibria on FEM. The result is written beside the weights.
+    Draws bodies, solves equilibria on FEM and reduces the mass of each body about them. The result is written beside
+    the weights.
     """
     from softgym_envs.surrogate.inertia import write_inertia
     from softgym_envs.surrogate.inertia_training import fit_inertia as run
@@ -123,7 +130,11 @@ def fit_inertia(
 @click.option(
     "--max-effort", type=float, help="Controller: command efforts up to this [N, Pa, ...] instead of displacements."
 )
-@click.option("--effort-rate", type=float, help="Controller: largest change of an effort per step (default: 1/40).")
+@click.option(
+    "--effort-rate",
+    type=float,
+    help="Controller: largest change of an effort per step (default: 1/40 of --max-effort).",
+)
 @click.option("--gains", type=float, nargs=2, help="Controller: proportional and integral gain per step.")
 def deploy(
     robot: str,
@@ -140,10 +151,11 @@ def deploy(
 ) -> None:
     """Write a surrogate as a C header or an ONNX graph, or a whole controller in C.
 
-    FILES end with .h (a C header of one body) or .onnx (a graph that takes the design as an input). --controller writes
-    one header with the model, the inverse QP and its PI correction, and a program that steps it. For a robot whose
-    touch is learned and that is commanded in displacement, it also writes estimator.h, which finds the effector from
-    the volumes of cavities and the touched cell, and loop.c, the closed loop of both.
+    FILES end with .h (a C header of one body) or .onnx (a graph that takes the design as an input).
+
+    --controller FOLDER writes controller.h, with the model, the inverse QP and its PI correction, and main.c, a program
+    that steps it. For the sensorized finger, unless it is commanded by efforts, the folder also gets estimator.h, which
+    finds the tip from the volumes of the cavities and the touched cell, and loop.c, the closed loop of both.
     """
     from softgym_envs.surrogate.export.c import export_c
     from softgym_envs.surrogate.export.common import FORMATS

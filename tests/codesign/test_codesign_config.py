@@ -313,7 +313,7 @@ SHARED = {"strategy": "policy", "policy": "finger_reach_designs"}
         ),
         (
             {**SHARED, "environment": {"id": SHOWN["id"]}},
-            "strategy 'policy' needs a policy that observes the body: add h",
+            "strategy 'policy' needs a policy that reads the design: add h",
         ),
         (
             {**SHARED, "environment": {**SHOWN, "design_in_observation": True}, "variables": ["young_modulus"]},

@@ -56,7 +56,7 @@ def test_another_policy_for_all_bodies_needs_a_new_version(tiny, problems, tmp_p
     path.write_text(path.read_text().replace(tiny.parts["policy"], "0" * 32))
     stale = frozen.load_problem("tiny-v1", check=False).hash
     stored.write_text(stored.read_text().replace(tiny.hash, stale))
-    with pytest.raises(DataError, match="the policy for all bodies is another one"):
+    with pytest.raises(DataError, match="the shared policy is another one"):
         refreeze.refreeze("tiny-v1", data=tmp_path)
     assert stale in stored.read_text()
 
