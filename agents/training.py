@@ -1,4 +1,4 @@
-"""Training of a policy by one of the learning methods, with evaluations, checkpoints and resumption."""
+"""Training of a policy by one of the learning methods, with evaluations, checkpoints, resumption and extension."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from softgym_envs.agents.evaluation import Evaluation, evaluate, evaluation_set
 from softgym_envs.agents.learners import make_learner
 from softgym_envs.agents.learners.base import Learner, Tensors
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
-from softgym_envs.config import difference, load_config, provenance, save_resolved
+from softgym_envs.config import difference, load_config, provenance, save_config, save_resolved
 from softgym_envs.errors import DataError
 from softgym_envs.extras import require
-from softgym_envs.storage import atomic_write, read_json
+from softgym_envs.storage import atomic_write, read_json, write_json
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
@@ -31,7 +31,8 @@ EVALUATION_SEED = 1_000_003
 
 POLICY = "policy.safetensors"
 LATEST = "latest.safetensors"
-"""Files of a folder: the policy that is kept, and the one that an evaluation reads."""
+CHECKPOINT = "checkpoint.safetensors"
+"""Files of a folder: the policy that is kept, the one that an evaluation reads, and the state of the training."""
 
 
 class CurvePoint(TypedDict):
@@ -57,14 +58,19 @@ def train(
     report: Callable[[int, Evaluation], bool] | None = None,
     proposer: DesignProposer | None = None,
     progress: bool = True,
+    keep_checkpoint: bool = False,
 ) -> Path:
-    """Train a policy, or resume an interrupted training in ``folder``.
+    """Train a policy, resume an interrupted training in ``folder``, or extend one there to more steps.
 
     Writes ``policy.safetensors`` (for SAC, actor and critics) with its card and ``curve.csv``; SAC also writes
     TensorBoard logs if TensorBoard is installed. Until the end, ``checkpoint.safetensors`` holds weights, optimiser
     moments, replay buffer and random states, so that a resumed training gives the same policy as an uninterrupted one
     (all episodes restart after each evaluation). The saved policy is the one with the largest mean return in an
     evaluation; the card gives its step, and the CPU time of all processes that took part in the training.
+
+    A folder with a checkpoint is extended by the same configuration with more ``steps``. What a learner plans over all
+    steps, such as its learning rate, is from then on that of a training of the new number of steps. Until the extended
+    training ends, the folder keeps the previous policy. ``provenance.json`` and the card list each extension.
 
     Args:
         config: configuration of the training.
@@ -76,6 +82,7 @@ def train(
         proposer: draws the sampled bodies and learns along with the policy, for the learner ``"sac"``; default a
             uniform draw from the box.
         progress: show a progress bar.
+        keep_checkpoint: keep the checkpoint at the end, so that the training can be extended.
 
     Returns:
         The path of ``policy.safetensors``.
@@ -83,7 +90,7 @@ def train(
     Raises:
         ValueError: if the environment cannot be made; a new folder is then not created.
         ConfigError: if ``initial`` was trained for another environment, or the folder's configuration cannot be read.
-        DataError: if the folder holds the training of another configuration.
+        DataError: if the folder holds the training of another configuration, or one that cannot be extended.
         WeightsError: if ``initial`` or a checkpoint is damaged or does not fit the configuration.
     """
     require("train")
@@ -94,12 +101,15 @@ def train(
     if initial is not None:
         config = config.model_copy(update={"initial": str(initial)})
     folder = Path(folder)
-    begun = _begun(config, folder)
-    if begun and (folder / POLICY).exists():
+    earlier = _earlier_steps(config, folder)
+    if earlier is not None and is_finished(folder, config.steps):
         return folder / POLICY
     run = _Run(config, folder, proposer)
-    if not begun:  # after all checks, so that invalid values do not leave a folder behind
+    # Files are written after all checks, so that invalid values neither leave a folder behind nor change one.
+    if earlier is None:
         save_resolved(folder, config)
+    elif earlier < config.steps:
+        _save_extension(folder, config, earlier, run.learner.step)
     run.learner.log_to(folder)
 
     def stop() -> bool:
@@ -112,23 +122,53 @@ def train(
             bar.set_postfix_str(run.evaluate())
             run.save()
             stopped = stop()
-    return run.finish(stopped)
+    return run.finish(stopped, keep_checkpoint)
 
 
-def _begun(config: TrainConfig, folder: Path) -> bool:
-    """Return whether a folder holds this training, finished or not.
+def is_finished(folder: str | Path, steps: int) -> bool:
+    """Return whether a folder holds the policy of a finished training of at least so many steps."""
+    card = (Path(folder) / POLICY).with_suffix(".json")  # written after the policy
+    return card.exists() and read_json(card)["config"]["steps"] >= steps
+
+
+def _earlier_steps(config: TrainConfig, folder: Path) -> int | None:
+    """Return the steps of the training that a folder holds, finished or not; None if it holds none.
 
     Raises:
         ConfigError: if the folder's configuration cannot be read.
-        DataError: if it is that of another training.
+        DataError: if it is that of another training, or of one that cannot be extended to the steps of ``config``.
     """
     resolved = folder / "config.yaml"
     if not resolved.exists():
-        return False
-    other = difference(load_config(resolved, TrainConfig), config)
+        return None
+    stored = load_config(resolved, TrainConfig)
+    other = difference(stored, config, ignore=["steps"])
     if other is not None:
-        raise DataError(f"'{folder}' holds a training with another configuration: {other}; choose a new folder")
-    return True
+        raise DataError(
+            f"'{folder}' holds a training with another configuration: {other}; choose a new folder, or change only: "
+            "steps (to train on)"
+        )
+    if config.steps < stored.steps:
+        raise DataError(
+            f"'{folder}' holds a training of {stored.steps} steps, got steps = {config.steps}; choose a new folder, or "
+            f"steps = {stored.steps} or more"
+        )
+    if stored.steps < config.steps and is_finished(folder, stored.steps) and not (folder / CHECKPOINT).exists():
+        raise DataError(
+            f"'{folder}' holds a finished training of {stored.steps} steps without '{CHECKPOINT}', so it cannot be "
+            f"extended to {config.steps}; choose a new folder, and start from this policy with --initial "
+            f"{folder / POLICY}"
+        )
+    return stored.steps
+
+
+def _save_extension(folder: Path, config: TrainConfig, earlier: int, step: int) -> None:
+    """Record that a training of ``earlier`` steps, which has reached ``step``, goes on to those of a configuration."""
+    path = folder / "provenance.json"
+    origin = read_json(path)
+    extension = {"from_steps": earlier, "to_steps": config.steps, "at_step": step, "provenance": provenance()}
+    write_json(path, {**origin, "extensions": [*origin.get("extensions", []), extension]})
+    save_config(folder, config)
 
 
 class _Run:
@@ -154,7 +194,7 @@ class _Run:
     def __init__(self, config: TrainConfig, folder: Path, proposer: DesignProposer | None) -> None:
         self._began = time.process_time()
         self._config, self._folder, self._proposer = config, folder, proposer
-        self._checkpoint = folder / "checkpoint.safetensors"
+        self._checkpoint = folder / CHECKPOINT
         self._curve: list[CurvePoint] = []
         self._best: Tensors = {}
         self.outcome: Evaluation | None = None
@@ -219,8 +259,8 @@ class _Run:
             self._proposer.save(self.learner.step)
         _save_checkpoint(self.learner, self._checkpoint, self._curve, self._best, self.outcome, self._cpu_seconds)
 
-    def finish(self, stopped: bool) -> Path:
-        """Write the policy with its card, remove the checkpoint and return the path of the policy."""
+    def finish(self, stopped: bool, keep_checkpoint: bool) -> Path:
+        """Write the policy with its card, remove what is no longer needed and return the path of the policy."""
         card = {
             "config": self._config.model_dump(mode="json"),
             "steps": self.learner.step,
@@ -230,11 +270,13 @@ class _Run:
             "curve": self._curve,
             "provenance": provenance(),
         }
+        if extensions := read_json(self._folder / "provenance.json").get("extensions"):
+            card["extensions"] = extensions
         if self._proposer is not None:
             self._proposer.finish(_model(self.learner))
         save_policy(self._folder / POLICY, self._best, card)
         latest = self._folder / LATEST
-        for leftover in (latest, latest.with_suffix(".json"), self._checkpoint):
+        for leftover in (latest, latest.with_suffix(".json"), *([] if keep_checkpoint else [self._checkpoint])):
             leftover.unlink(missing_ok=True)
         self.learner.close()
         return self._folder / POLICY

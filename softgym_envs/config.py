@@ -274,7 +274,11 @@ def provenance() -> dict[str, Any]:
 
 def save_resolved(folder: str | Path, config: Config) -> None:
     """Write a configuration and its provenance to a results folder."""
-    folder = Path(folder)
-    with atomic_write(folder / "config.yaml", "w") as stream:
+    save_config(folder, config)
+    write_json(Path(folder) / "provenance.json", provenance())
+
+
+def save_config(folder: str | Path, config: Config) -> None:
+    """Write a configuration to a results folder."""
+    with atomic_write(Path(folder) / "config.yaml", "w") as stream:
         yaml.safe_dump(config.model_dump(mode="json"), stream, sort_keys=False)
-    write_json(folder / "provenance.json", provenance())

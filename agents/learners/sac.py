@@ -82,6 +82,9 @@ class SACLearner(SB3Learner):
                 stored = tensors[f"buffer/{name}"]
                 getattr(buffer, name)[: len(stored)] = stored
         buffer.pos, buffer.full = meta["position"], meta["full"]
+        filled = len(tensors["buffer/rewards"])
+        if buffer.full and filled < buffer.buffer_size:  # a shorter training had just filled its smaller buffer
+            buffer.pos, buffer.full = filled, False
 
 
 def make_model(config: TrainConfig) -> SAC:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.objectives import Objective
@@ -20,30 +20,111 @@ SHOWN_ALWAYS = ("mean_distance", "success_rate")
 """Objectives that every comparison shows, whatever the objective of the study."""
 
 
+@dataclass(frozen=True)
+class DesignRow:
+    """A variable of baseline and winner; places are in percent of the range."""
+
+    name: str
+    optimised: bool
+    description: str
+    baseline: str
+    winner: str
+    at_limit: str
+    change: str
+    low: str
+    high: str
+    baseline_place: float
+    winner_place: float | None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A value with its interval, that with the error of the mesh, and whether it is a certain improvement."""
+
+    value: str
+    interval: str = ""
+    mesh: str = ""
+    good: bool = False
+
+
+@dataclass(frozen=True)
+class ComparisonRow:
+    """Baseline and winner with one controller on one backend."""
+
+    backend: str
+    agent: str
+    goals: int
+    cells: list[Cell]
+    closer: int
+    farther: int
+
+
+@dataclass(frozen=True)
+class TransferRow:
+    """The difference of an objective between surrogate and FEM."""
+
+    agent: str
+    measure: str
+    bodies: int
+    mean: str
+    worst: str
+    spearman: str
+
+
+@dataclass(frozen=True)
+class FinalistRow:
+    """A finalist; each cell has a value and a smaller text below it."""
+
+    trial: int
+    role: str
+    cells: list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class TrialRow:
+    """A trial of the search."""
+
+    number: int
+    state: str
+    reason: str
+    origin: str
+    cells: list[str]
+
+
+@dataclass(frozen=True)
+class CostRow:
+    """Environment steps and times of a part of the study."""
+
+    part: str
+    steps: str
+    cpu: str
+    wall: str
+
+
 def percent(value: float) -> str:
     """Return a share in percent."""
     return f"{100 * value:.1f} %"
 
 
-def design_row(variable: VariableResult) -> dict[str, Any]:
+def design_row(variable: VariableResult) -> DesignRow:
     """Return a variable of baseline and winner."""
     unit, baseline, winner = variable.unit, variable.baseline, variable.winner
     name, factor, decimals = shown_unit(unit)
     changed = winner is not None and winner != baseline
     change = f"{(winner - baseline) * factor:+.{decimals}f}{' ' + name if name else ''}" if changed and winner else "-"
-    return {
-        "name": variable.name.replace("_", " "),
-        "optimised": variable.optimised,
-        "description": variable.description,
-        "baseline": present(baseline, unit),
-        "winner": "-" if winner is None else present(winner, unit),
-        "at_limit": f"at its {variable.at_limit} limit" if variable.at_limit else "",
-        "change": change,
-        "low": present(variable.low, unit),
-        "high": present(variable.high, unit),
-        "baseline_place": round(100 * variable.place(baseline), 1),
-        "winner_place": None if winner is None else round(100 * variable.place(winner), 1),
-    }
+    return DesignRow(
+        name=variable.name.replace("_", " "),
+        optimised=variable.optimised,
+        description=variable.description,
+        baseline=present(baseline, unit),
+        winner="-" if winner is None else present(winner, unit),
+        at_limit=f"at its {variable.at_limit} limit" if variable.at_limit else "",
+        change=change,
+        low=present(variable.low, unit),
+        high=present(variable.high, unit),
+        baseline_place=round(100 * variable.place(baseline), 1),
+        winner_place=None if winner is None else round(100 * variable.place(winner), 1),
+    )
 
 
 def _cell(
@@ -52,18 +133,18 @@ def _cell(
     show: Callable[[float], str],
     better: int = 0,
     mesh: MeshPart | None = None,
-) -> dict[str, Any]:
+) -> Cell:
     """Return a cell; ``better`` is the sign of an improvement, 0 for a value that is not a change."""
     if interval is None:
-        return {"value": value, "interval": "", "mesh": "", "good": False}
+        return Cell(value)
     whole = mesh.interval if mesh is not None and mesh.interval is not None else None
     low, high = (show(end) for end in interval)
-    return {
-        "value": value,
-        "interval": f"{low} to {high}",
-        "mesh": "" if whole is None else f"with the mesh {show(whole[0])} to {show(whole[1])}",
-        "good": min(better * end for end in whole or interval) > 0.0,
-    }
+    return Cell(
+        value=value,
+        interval=f"{low} to {high}",
+        mesh="" if whole is None else f"with the mesh {show(whole[0])} to {show(whole[1])}",
+        good=min(better * end for end in whole or interval) > 0.0,
+    )
 
 
 def comparison_columns(config: StudyConfig) -> list[str]:
@@ -76,10 +157,10 @@ def comparison_columns(config: StudyConfig) -> list[str]:
     ]
 
 
-def comparison_row(row: Comparison, config: StudyConfig) -> dict[str, Any]:
+def comparison_row(row: Comparison, config: StudyConfig) -> ComparisonRow:
     """Return the comparison for one controller and backend."""
     measures = config.shown_objectives
-    cells: list[dict[str, Any]] = []
+    cells: list[Cell] = []
     # Measure, its mean, and the prefix of its other fields in the comparison.
     shown = [(config.primary, "objective", "objective")] if config.objective not in SHOWN_ALWAYS else []
     shown += [(measures["success_rate"], "success_rate", "success")]
@@ -92,29 +173,29 @@ def comparison_row(row: Comparison, config: StudyConfig) -> dict[str, Any]:
         mesh = getattr(row, f"{prefix}_mesh", None)
         show = partial(measure.number, sign="+")
         cells.append(_cell(measure.text(change, "+"), interval, show, measure.sign, mesh))
-    return {
-        "backend": BACKENDS[row.backend],
-        "agent": AGENTS[row.agent],
-        "goals": row.goals,
-        "cells": cells,
-        "closer": row.goals_closer,
-        "farther": row.goals_farther,
-    }
+    return ComparisonRow(
+        backend=BACKENDS[row.backend],
+        agent=AGENTS[row.agent],
+        goals=row.goals,
+        cells=cells,
+        closer=row.goals_closer,
+        farther=row.goals_farther,
+    )
 
 
-def transfer_row(row: Transfer, objective: Objective) -> dict[str, Any]:
+def transfer_row(row: Transfer, objective: Objective) -> TransferRow:
     """Return how an objective differs between surrogate and FEM."""
-    return {
-        "agent": AGENTS[row.agent],
-        "measure": objective.label,
-        "bodies": len(row.trials),
-        "mean": objective.text(row.mean_gap, "+"),
-        "worst": objective.text(row.worst_gap, "-"),
-        "spearman": "-" if row.spearman is None else f"{row.spearman:.2f}",
-    }
+    return TransferRow(
+        agent=AGENTS[row.agent],
+        measure=objective.label,
+        bodies=len(row.trials),
+        mean=objective.text(row.mean_gap, "+"),
+        worst=objective.text(row.worst_gap, "-"),
+        spearman="-" if row.spearman is None else f"{row.spearman:.2f}",
+    )
 
 
-def finalist_table(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
+def finalist_table(snapshot: StudySnapshot, results: StudyResults) -> tuple[list[str], list[FinalistRow]]:
     """Return columns and rows of the table of all finalists."""
     objective, config = snapshot.objective, snapshot.config
     optimised = [variable for variable in results.variables if variable.optimised]
@@ -141,19 +222,18 @@ def finalist_table(snapshot: StudySnapshot, results: StudyResults) -> dict[str, 
                 below = f"{objective.text(group.value(objective.name))}; {below}"
             broken = config.violations_text({name: group.value(name) for name in limits}, limits)
             cells.append((percent(group.mean.success_rate), f"{below}; {broken}" if broken else below))
-        role = results.roles.get(body.trial, "")
-        rows.append({"trial": body.trial, "role": role, "winner": role == "winner", "cells": cells})
+        rows.append(FinalistRow(body.trial, results.roles.get(body.trial, ""), cells))
     columns = [variable.name.replace("_", " ") for variable in optimised] + [f"{objective.label} in search"]
     columns += ["constraints in search"] if config.constraints else []
     columns += [f"{AGENTS[agent]}, {BACKENDS[backend]}" for agent, backend in kinds]
-    return {"finalist_columns": columns, "finalists": rows}
+    return columns, rows
 
 
 def _broken(snapshot: StudySnapshot, trial: TrialResult) -> str:
     return snapshot.config.violations_text(trial.values, snapshot.config.constraints)
 
 
-def trial_table(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any]:
+def trial_table(snapshot: StudySnapshot, results: StudyResults) -> tuple[list[str], list[TrialRow]]:
     """Return columns and rows of the table of all trials."""
     optimised = [variable for variable in results.variables if variable.optimised]
     config, objective = snapshot.config, snapshot.objective
@@ -169,22 +249,16 @@ def trial_table(snapshot: StudySnapshot, results: StudyResults) -> dict[str, Any
         return [*found, objective.text(trial.qp_value), f"{trial.training_steps:,}", f"{trial.seconds:.1f} s"]
 
     rows = [
-        {
-            "number": trial.number,
-            "state": trial.state,
-            "reason": trial.reason or _broken(snapshot, trial),
-            "origin": trial.origin,
-            "cells": cells(trial),
-        }
+        TrialRow(trial.number, trial.state, trial.reason or _broken(snapshot, trial), trial.origin, cells(trial))
         for trial in snapshot.trials
     ]
     columns = [variable.name.replace("_", " ") for variable in optimised]
     columns += [objective.label, *(config.objectives[name].label for name in others)]
     columns += ["constraints"] if config.constraints else []
-    return {"trial_columns": [*columns, "by inverse QP", "training steps", "time"], "trials": rows}
+    return [*columns, "by inverse QP", "training steps", "time"], rows
 
 
-def cost_rows(cost: Cost) -> list[dict[str, str]]:
+def cost_rows(cost: Cost) -> list[CostRow]:
     """Return environment steps and time of each phase."""
     retraining = (
         f"{cost.retraining_steps:,} of training, {cost.retraining_report_steps:,} of its reports, "
@@ -212,19 +286,9 @@ def cost_rows(cost: Cost) -> list[dict[str, str]]:
         return "-" if seconds is None else f"{seconds / 60:.1f} min"
 
     rows = [
-        {
-            "part": title,
-            "steps": steps,
-            "cpu": minutes(cost.cpu_seconds[part]),
-            "wall": minutes(cost.wall_seconds.get(part)),
-        }
+        CostRow(title, steps, minutes(cost.cpu_seconds[part]), minutes(cost.wall_seconds.get(part)))
         for part, (title, steps) in parts.items()
         if part not in ("screen", "shared_policy") or cost.cpu_seconds[part]
     ]
-    total = {
-        "part": "Total",
-        "steps": "",
-        "cpu": minutes(sum(cost.cpu_seconds.values())),
-        "wall": minutes(sum(cost.wall_seconds.values())),
-    }
+    total = CostRow("Total", "", minutes(sum(cost.cpu_seconds.values())), minutes(sum(cost.wall_seconds.values())))
     return [*rows, total]

@@ -22,15 +22,22 @@ from softgym_envs.errors import ConfigError
 def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
     """Train a policy with the learner that the configuration names.
 
-    An interrupted run continues from its last checkpoint.
+    An interrupted run continues from its last checkpoint. In the same folder, more steps (steps=80000) extend a
+    finished run.
     """
     from softgym_envs.agents.config import TrainConfig
+    from softgym_envs.agents.training import is_finished
     from softgym_envs.agents.training import train as run
     from softgym_envs.config import load_config
 
+    wanted = load_config(config, TrainConfig, overrides)
+    finished = is_finished(folder, wanted.steps)
     with options.resumable():
-        path = run(load_config(config, TrainConfig, overrides), folder, initial=initial, progress=not quiet)
-    click.echo(f"wrote {path}")
+        path = run(wanted, folder, initial=initial, progress=not quiet, keep_checkpoint=True)
+    if finished:
+        click.echo(f"{path} is finished after {wanted.steps} steps; a larger steps=... trains on")
+    else:
+        click.echo(f"wrote {path}")
 
 
 @click.command()

@@ -6,8 +6,6 @@ from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from softgym_envs.estimation.estimator import Estimator as Estimator
-    from softgym_envs.estimation.estimator import Noise as Noise
-    from softgym_envs.estimation.estimator import Readings as Readings
     from softgym_envs.estimation.learned import LearnedEstimator as LearnedEstimator
     from softgym_envs.estimation.loads import Payload as Payload
     from softgym_envs.estimation.loads import Touch as Touch
@@ -15,13 +13,16 @@ if TYPE_CHECKING:
     from softgym_envs.estimation.loads import finger_grid as finger_grid
     from softgym_envs.estimation.model_errors import RowErrors as RowErrors
     from softgym_envs.estimation.model_errors import measured_errors as measured_errors
+    from softgym_envs.estimation.readings import Noise as Noise
+    from softgym_envs.estimation.readings import Readings as Readings
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
-        "estimator": ["Estimator", "Noise", "Readings"],
+        "estimator": ["Estimator"],
         "learned": ["LearnedEstimator"],
         "loads": ["Payload", "Touch", "TouchGrid", "finger_grid"],
         "model_errors": ["RowErrors", "measured_errors"],
+        "readings": ["Noise", "Readings"],
     },
 )

@@ -19,11 +19,20 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.estimation.loads import Load
 from softgym_envs.estimation.places import Bend, Mixture, Moments, joint_moments
 from softgym_envs.estimation.posterior import Gaussian, Posterior, most_probable
+from softgym_envs.estimation.readings import (
+    Noise,
+    Readings,
+    checked_pressures,
+    checked_readings,
+    checked_volumes,
+    explains,
+)
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.domain import UNEXPLAINED
 
 IMPROBABLE = 0.999
 """Probability of a smaller misfit from which on an estimate is also sought with slack cables."""
@@ -36,42 +45,6 @@ ACCURATE = 0.1
 
 SMALLEST = 1e-6
 """Smallest variance of effectors that is not zero, as a part of the largest."""
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviations of sensors, and of changes from one reading to the next.
-
-    Attributes:
-        displacement: of the true displacement of an actuator around its command [m].
-        volume: of the measured volume of a cavity [m3].
-        pressure: of the measured pressure of the air in a sealed cavity [Pa].
-        effort: of the measured effort of an actuator [N]; None if it is not measured.
-        drift: of each parameter of the load from one reading to the next, as a part of its spread before any reading.
-    """
-
-    displacement: float = 1e-4
-    volume: float = 1e-9
-    pressure: float = 10.0
-    effort: float | None = None
-    drift: float = 0.0
-
-
-@dataclass(frozen=True)
-class Readings:
-    """One reading of all sensors.
-
-    Attributes:
-        command: commanded displacements of the actuators, shape (n_a,).
-        volumes: of the open cavities [m3], shape (open,).
-        efforts: of the actuators, shape (n_a,), if they are measured.
-        pressures: gauge pressures of the air in the sealed cavities [Pa], shape (sealed,).
-    """
-
-    command: np.ndarray
-    volumes: np.ndarray | None = None
-    efforts: np.ndarray | None = None
-    pressures: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +66,7 @@ class Estimate:
         converged: whether Gauss-Newton converged, within the accuracy of its last equilibrium.
         equilibria: how many were computed for this reading.
         near: the equilibrium near which the estimate lies, with its condensed model.
+        doubt: why the estimate is not trusted, 0 if it is: a number in `softgym_envs.surrogate.domain.DOUBTS`.
     """
 
     displacement: np.ndarray
@@ -105,6 +79,12 @@ class Estimate:
     converged: bool
     equilibria: int
     near: Linearised
+    doubt: int
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the model explains the readings."""
+        return self.doubt == 0
 
     @property
     def condensed(self) -> CondensedModel:
@@ -165,14 +145,34 @@ class Linearised:
 
 @dataclass(frozen=True)
 class _Evidence:
-    """Readings under one command: their mean, its standard deviations, their number, and what was known before them."""
+    """Readings under one command, and what was known before them.
+
+    Attributes:
+        command: the command (n_a,).
+        last: the last reading (k,).
+        measured: mean of the readings (k,).
+        noise: standard deviations of one reading (k,).
+        count: number of readings.
+        prior: distribution of the parameters before the readings.
+        mixture: the same at each place of the load, if it is a sum over places.
+    """
 
     command: np.ndarray
+    last: np.ndarray
     measured: np.ndarray
-    spread: np.ndarray
+    noise: np.ndarray
     count: int
     prior: Gaussian
     mixture: Mixture | None
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Standard deviations of the mean (k,)."""
+        return self.noise / np.sqrt(self.count)
+
+    def own_residuals(self, residuals: np.ndarray) -> np.ndarray:
+        """Return the residuals of the last reading (k,) for those of the mean, each in its own deviations."""
+        return (self.last - self.measured) / self.noise + residuals / np.sqrt(self.count)
 
 
 @dataclass(frozen=True)
@@ -235,6 +235,8 @@ class Estimator:
     one after the other, each near another equilibrium, they would seem to tell force and place of a touch apart where
     their product alone is known.
 
+    Readings that nothing explains give an estimate that is not trusted, and do not change what the estimator knows.
+
     Args:
         robot: the body; its cavities are sensors: of volume if they are open, of pressure if they are sealed.
         design: missing variables take their baseline.
@@ -285,6 +287,7 @@ class Estimator:
         self._sealed = np.array([isinstance(c, SealedAir) for c in sensors], dtype=bool)
         self._rest = np.zeros(len(sensors))  # readings of the undeformed body; pressures are relative to ambient
         self._rest[~self._sealed] = self.rest_volumes
+        self._ambient = np.array([c.ambient for c in sensors if isinstance(c, SealedAir)])
         unlimited = np.full(n_a, np.inf)
         actuators = Gaussian(np.zeros(n_a), self.noise.displacement**2 * np.eye(n_a), -unlimited, unlimited)
         if self.belief is not None:
@@ -345,19 +348,18 @@ class Estimator:
         command = checked_readings("command", readings.command, n_a)
         sealed = self._sealed
         cavities = np.zeros(len(sealed))
-        cavities[~sealed] = checked_readings("volumes", readings.volumes, int((~sealed).sum()))
-        cavities[sealed] = checked_readings("pressures", readings.pressures, int(sealed.sum()))
+        cavities[~sealed] = checked_volumes(readings.volumes, self._rest[~sealed])
+        cavities[sealed] = checked_pressures(readings.pressures, self._ambient)
         parts, noise = [cavities], [np.where(sealed, self.noise.pressure, self.noise.volume)]
         if self.noise.effort is not None:
             parts.append(checked_readings("efforts", readings.efforts, n_a))
             noise.append(np.full(n_a, self.noise.effort))
-        measured, spread, before = np.concatenate(parts), np.concatenate(noise), self._evidence
+        last, before = np.concatenate(parts), self._evidence
         if before is None or self._drift.any() or (command != before.command).any():
             prior = replace(self.belief, covariance=self.belief.covariance + np.diag(self._drift**2))
-            return _Evidence(command, measured, spread, 1, prior, self._mixture)
+            return _Evidence(command, last, last, np.concatenate(noise), 1, prior, self._mixture)
         count = before.count + 1
-        mean = before.measured + (measured - before.measured) / count
-        return replace(before, measured=mean, spread=spread / np.sqrt(count), count=count)
+        return replace(before, last=last, measured=before.measured + (last - before.measured) / count, count=count)
 
     def _explain(self, near: Linearised, evidence: _Evidence, start: np.ndarray | None) -> Posterior:
         n_a = self._counts[0]
@@ -372,8 +374,10 @@ class Estimator:
     def update(self, readings: Readings) -> Estimate:
         """Return the estimate after one more reading.
 
+        After an error the estimator knows what it knew before.
+
         Raises:
-            ValueError: if readings have a wrong shape or are not finite, as with a lost sensor.
+            ValueError: if readings have a wrong shape, are not finite (a lost sensor) or are impossible (a wrong unit).
             ConvergenceError: if the body has no equilibrium under the command, at the most probable load before it.
         """
         n_a, self._solved = self._counts[0], 0
@@ -395,42 +399,53 @@ class Estimator:
                 found = slack
             else:
                 found = replace(found, solved=slack.solved)
-        self._near, self._evidence, self.belief = found.near, evidence, found.posterior.parameters
+        parameters, converged = found.posterior.parameters, found.posterior.converged and found.close
         displacement, load = command + found.posterior.mode[:n_a], found.posterior.mode[n_a:]
         effectors = found.near.state.condensed.slices["e"]
-        covariance = self.belief.covariance
+        covariance = parameters.covariance
         slope = (found.near.response[0] @ self._parameters_to_rows(load))[effectors]
+        unexplained = not explains(evidence.own_residuals(found.posterior.residuals))
         estimate = Estimate(
             displacement=displacement,
             load=load,
             load_covariance=covariance[n_a:, n_a:],
             effector=found.near.rows(displacement, self.forces(load))[0][effectors],
             effector_covariance=slope @ covariance @ slope.T,
-            parameters=self.belief,
+            parameters=parameters,
             misfit=found.posterior.misfit,
-            converged=found.posterior.converged and found.close,
+            converged=converged,
             equilibria=self._solved,
             near=found.near,
+            doubt=UNEXPLAINED if unexplained else 0,
         )
-        return estimate if evidence.mixture is None else self._mean(estimate, evidence.mixture, evidence)
+        mixture = evidence.mixture
+        if mixture is not None:
+            estimate, mixture = self._mean(estimate, mixture, evidence)
+        # A search that has not ended goes on from here with the next reading.
+        if not (unexplained and converged):
+            self._near, self._evidence, self.belief, self._mixture = found.near, evidence, parameters, mixture
+        return estimate
 
-    def _mean(self, estimate: Estimate, before: Mixture, evidence: _Evidence) -> Estimate:
+    def _mean(self, estimate: Estimate, before: Mixture, evidence: _Evidence) -> tuple[Estimate, Mixture]:
         """Replace the most probable values of an estimate by means over all that explains the readings.
 
         These are all sizes and places of the load and, where it is not certain which cables are slack, both cases.
+
+        Returns:
+            The estimate, and the distribution after the readings.
         """
         branch = self._branch(estimate.near, before, evidence)
         branches, unsure = [branch], branch.unsure
         if unsure.any() and (other := self._turned(estimate, evidence, unsure)) is not None:
             branches = [each.consistent(unsure) for each in (branch, self._branch(other, before, evidence))]
-        self._mixture = branches[0].mixture
+        mixture = branches[0].mixture
         for each in branches[1:]:
-            self._mixture = self._mixture.beside(each.mixture)
+            mixture = mixture.beside(each.mixture)
         parts = [(each.mixture, each.base, each.slopes) for each in branches]
         moments = joint_moments(parts)
         if (bend := self._bend(estimate, moments)) is not None:
             moments = joint_moments(parts, bend)
-        return replace(
+        mean = replace(
             estimate,
             displacement=evidence.command + moments.displacement,
             load=moments.load,
@@ -439,6 +454,7 @@ class Estimator:
             effector_covariance=moments.output_covariance,
             equilibria=self._solved,
         )
+        return mean, mixture
 
     def _branch(self, near: Linearised, before: Mixture, evidence: _Evidence) -> _Branch:
         """Return what readings tell if the body stays near an equilibrium, with the same cables slack."""
@@ -565,11 +581,3 @@ class Estimator:
         allowed = self.accuracy * np.linalg.norm(spread, axis=1)
         moved = np.concatenate([displacement - near.displacement, self.forces(load) - near.forces])
         return bool((np.abs(moved) <= allowed + 1e-9).all())
-
-
-def checked_readings(name: str, values: np.ndarray | None, count: int) -> np.ndarray:
-    """Return values of one kind of reading as an array (count,), or a ValueError."""
-    array = np.asarray([] if values is None else values, dtype=float)
-    if array.shape != (count,) or not np.isfinite(array).all():
-        raise ValueError(f"readings '{name}' must be {count} finite values, got {array.tolist()}")
-    return array

@@ -10,7 +10,7 @@ model under held actuators, after which ``W`` puts slack ones back to no effort.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import log_ndtr
@@ -18,14 +18,16 @@ from scipy.stats import chi2
 
 from softgym_envs.backends.surrogate import TOLERANCE
 from softgym_envs.errors import ConvergenceError, WeightsError
-from softgym_envs.estimation.estimator import IMPROBABLE, Noise, Readings, checked_readings
+from softgym_envs.estimation.estimator import IMPROBABLE
 from softgym_envs.estimation.loads import Touch, cell_nodes
 from softgym_envs.estimation.places import Mixture, Moments, Places
 from softgym_envs.estimation.posterior import Gaussian
+from softgym_envs.estimation.readings import Noise, Readings, checked_readings, checked_volumes, explains
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.model import SurrogateModel
+from softgym_envs.surrogate.domain import OUTSIDE, UNEXPLAINED
+from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_model
 from softgym_envs.surrogate.row_errors import RowErrors
 
@@ -49,6 +51,7 @@ class LearnedEstimate:
         misfit: sum of the squared residuals at the most probable place, in standard deviations of the readings.
         condensed: model of actuators, effectors and sensors at the most probable place.
         slack: which actuators hang slack there, shape (n_a,).
+        doubt: why the estimate is not trusted, 0 if it is: a sum of numbers in `softgym_envs.surrogate.domain.DOUBTS`.
     """
 
     displacement: np.ndarray
@@ -59,12 +62,19 @@ class LearnedEstimate:
     misfit: float
     condensed: CondensedModel
     slack: np.ndarray
+    doubt: int
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the model may be trusted here and explains the readings."""
+        return self.doubt == 0
 
 
 @dataclass(frozen=True)
 class _Responses:
     """States of q bodies: sensors (q, k) and effectors (q, n_e), their derivatives by actuators and force."""
 
+    context: Context
     sensors: np.ndarray
     sensor_slopes: np.ndarray
     effectors: np.ndarray
@@ -75,6 +85,29 @@ class _Responses:
     slack: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Known:
+    """What the readings of a touch have told so far.
+
+    Attributes:
+        before: distribution before the readings under the present command.
+        after: distribution after them; None before the first reading of the touch.
+        command: the present command (n_a,); None before the first reading.
+        count: number of readings under it.
+        mean: of their volumes, relative to those at rest, shape (n_s,).
+        at: errors and forces at all places from which the next search starts, shape (q, n_a + 1).
+        tried: whether a search from the largest force has been tried under this command.
+    """
+
+    before: Mixture
+    after: Mixture | None = None
+    command: np.ndarray | None = None
+    count: int = 0
+    mean: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    at: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    tried: bool = False
+
+
 class LearnedEstimator:
     """Finds the shape of a body and a touch on it from a stream of readings, on its learned model.
 
@@ -82,6 +115,9 @@ class LearnedEstimator:
     actuators stays known when the command or the touch changes. The errors of learned volumes and effectors depend on
     the command. Their means are subtracted; their deviations do not become smaller with the number of readings, so they
     are added to the noise of the mean.
+
+    An estimate says whether it may be trusted, as states of the surrogate do. Readings under a command outside the
+    learned box, and readings that nothing explains, do not change what the estimator knows.
 
     Args:
         robot: the body, whose touch is learned; its cavities are sensors.
@@ -152,14 +188,13 @@ class LearnedEstimator:
         self.errors = errors
         n_a = self.model.count
         self._actuators = np.zeros(n_a), self.noise.displacement**2 * np.eye(n_a)
-        self._before: Mixture | None = None
-        self._mixture: Mixture | None = None
+        self._known: _Known | None = None
         self.touch(load)
 
     def touch(self, load: Touch | None) -> None:
         """Replace the touch; the errors of actuators stay known."""
-        if self._mixture is not None:
-            self._actuators = _actuators_of(self._mixture)
+        if self._known is not None and self._known.after is not None:
+            self._actuators = _actuators_of(self._known.after)
         self.load = load
         mean, covariance = self._actuators
         unlimited = np.full(len(mean), np.inf)
@@ -173,9 +208,7 @@ class LearnedEstimator:
             points, normal = load.grid.inside(load.cell, coordinates), np.array(load.grid.normal)
             touches = [self.robot.touch_design(self.design, point, normal) for point in points]
             self._touches = np.array([[touch[name] for name in self._loads] for touch in touches])
-        self._before = Mixture.before_readings(self._places, known, size)
-        self._mixture = None
-        self._command: np.ndarray | None = None
+        self._known = _Known(Mixture.before_readings(self._places, known, size))
 
     def reading(self, command: np.ndarray, change: np.ndarray) -> Readings:
         """Return the readings for values of the sensor rows of the condensed model, ``delta.s`` (n_s,)."""
@@ -184,38 +217,60 @@ class LearnedEstimator:
     def update(self, readings: Readings) -> LearnedEstimate:
         """Return the estimate after one more reading.
 
+        After an error the estimator knows what it knew before.
+
         Raises:
-            ValueError: if readings have a wrong shape or are not finite, as with a lost sensor.
+            ValueError: if readings have a wrong shape, are not finite (a lost sensor) or are impossible (a wrong unit).
             ConvergenceError: if the model finds no equilibrium.
         """
         command = checked_readings("command", readings.command, self.model.count)
-        volumes = checked_readings("volumes", readings.volumes, len(self.rest_volumes)) - self.rest_volumes
-        if self._command is None or (command != self._command).any():
-            if self._mixture is not None:
-                self._before = self._mixture
-            self._command, self._count, self._mean = command, 0, np.zeros_like(volumes)
-            assert self._before is not None
-            self._at, self._tried = self._limited(self._before.means), False
-        self._count += 1
-        self._mean = self._mean + (volumes - self._mean) / self._count
+        volumes = checked_volumes(readings.volumes, self.rest_volumes) - self.rest_volumes
+        known = self._known
+        assert known is not None
+        if known.command is None or (command != known.command).any():
+            before = known.before if known.after is None else known.after
+            known = _Known(before, None, command, 0, np.zeros_like(volumes), self._limited(before.means))
+        count, steps = known.count + 1, self.steps if known.count == 0 else 1
+        mean = known.mean + (volumes - known.mean) / count
         bias, deviation = self.errors.at(self._share(command))
-        spread = np.hypot(self.noise.volume / np.sqrt(self._count), deviation[self._own :])
-        self._measured = self._mean + bias[self._own :]
-        steps = self.steps if self._count == 1 else 1
-        found, response, at = self._search(command, spread, self._at, steps)
-        misfit, best = self._misfit(found, response, at, spread)
-        if not self._tried and self.load is not None and misfit > chi2.ppf(IMPROBABLE, len(spread)):
+        spread = np.hypot(self.noise.volume / np.sqrt(count), deviation[self._own :])
+        measured, tried = mean + bias[self._own :], known.tried
+        found, response, at = self._search(known.before, measured, spread, command, known.at, steps)
+        expected, best = _expected(found, response, at)
+        misfit = float((((measured - expected) / spread) ** 2).sum())
+        if not tried and self.load is not None and misfit > chi2.ppf(IMPROBABLE, len(spread)):
             # Beyond a slack cable there may be a better explanation, which steps from small forces do not reach.
-            self._tried, strong = True, at.copy()
+            tried, strong = True, at.copy()
             strong[:, -1] = self.largest_force
-            other = self._search(command, spread, strong, self.steps)
+            other = self._search(known.before, measured, spread, command, strong, self.steps)
             if np.logaddexp.reduce(_logarithms(other[0])) > np.logaddexp.reduce(_logarithms(found)):
                 found, response, at = other
-                misfit, best = self._misfit(found, response, at, spread)
-        self._mixture, self._at = found, self._limited(found.means)
+                expected, best = _expected(found, response, at)
+                misfit = float((((measured - expected) / spread) ** 2).sum())
+        doubt = self._doubt(command, found, response, best)
+        one = np.hypot(self.noise.volume, deviation[self._own :])
+        if not explains((volumes + bias[self._own :] - expected) / one):
+            doubt |= UNEXPLAINED
+        elif self._has_learned(command):
+            after = replace(known, after=found, count=count, mean=mean, at=self._limited(found.means), tried=tried)
+            self._known = after
         tips = response.effectors - bias[: self._own] - np.einsum("qon,qn->qo", response.effector_slopes, at)
         moments = found.moments(tips, response.effector_slopes)
-        return self._estimate(command, moments, misfit, response, best, deviation[: self._own])
+        return self._estimate(command, moments, misfit, response, best, deviation[: self._own], doubt)
+
+    def _has_learned(self, command: np.ndarray) -> bool:
+        """Return whether a command (n_a,) lies in the box of the training states."""
+        return bool(((self.model.domain.low <= command) & (command <= self.model.domain.high)).all())
+
+    def _doubt(self, command: np.ndarray, found: Mixture, response: _Responses, best: int) -> int:
+        """Return why the model is not trusted at the most probable place, 0 if it is."""
+        row = slice(best, best + 1)
+        context, displacement = response.context.rows(np.array([best])), response.displacement[row]
+        spread = self.model.effector(context, displacement)[1]
+        doubt = int(self.model.doubt(context, displacement, spread, command[None])[1][0])
+        force = found.means[best, -1] if self.load is not None else 0.0
+        inside = self._has_learned(command) and force <= self.largest_force
+        return doubt if inside else doubt | OUTSIDE
 
     def _share(self, command: np.ndarray) -> float:
         """Return how far the actuators are commanded, as a mean share of their ranges."""
@@ -223,28 +278,27 @@ class LearnedEstimator:
         return float(np.mean((command - robot.lower) / (robot.upper - robot.lower)))
 
     def _search(
-        self, command: np.ndarray, spread: np.ndarray, start: np.ndarray, steps: int
+        self,
+        before: Mixture,
+        measured: np.ndarray,
+        spread: np.ndarray,
+        command: np.ndarray,
+        start: np.ndarray,
+        steps: int,
     ) -> tuple[Mixture, _Responses, np.ndarray]:
         """Return the distribution after Gauss-Newton steps at all places, the last responses, and where they were."""
-        before, now = self._before, start
-        assert before is not None and steps > 0
+        now = start
+        assert steps > 0
         for _ in range(steps):
             at, response = now, self.respond(command, now)
             base = response.sensors - np.einsum("qkn,qn->qk", response.sensor_slopes, at)
-            found = before.after(self._measured, spread, base, response.sensor_slopes)
+            found = before.after(measured, spread, base, response.sensor_slopes)
             now = self._limited(found.means)
             deviation = np.sqrt(np.einsum("qnn->qn", found.covariances))
             likely = _logarithms(found) > _logarithms(found).max() - 8.0
             if (np.abs(now - at) <= self.accuracy * deviation)[likely].all():
                 break
         return found, response, at
-
-    def _misfit(self, found: Mixture, response: _Responses, at: np.ndarray, spread: np.ndarray) -> tuple[float, int]:
-        """Return the sum of the squared residuals at the most probable place, and the number of that place."""
-        best = int(np.argmax(_logarithms(found)))
-        expected = response.sensors[best] + response.sensor_slopes[best] @ (found.means[best] - at[best])
-        residual = (self._measured - expected) / spread
-        return float(residual @ residual), best
 
     def _estimate(
         self,
@@ -254,6 +308,7 @@ class LearnedEstimator:
         response: _Responses,
         best: int,
         deviation: np.ndarray,
+        doubt: int,
     ) -> LearnedEstimate:
         loaded = slice(0, None if self.load is not None else 0)
         every, size = response.condensed, self.model.size
@@ -271,6 +326,7 @@ class LearnedEstimator:
             misfit=misfit,
             condensed=CondensedModel(W, delta - W @ effort, effort, roles, tuple(every.rows[k] for k in kept)),
             slack=response.slack[best],
+            doubt=doubt,
         )
 
     def _limited(self, parameters: np.ndarray) -> np.ndarray:
@@ -278,6 +334,11 @@ class LearnedEstimator:
         found = parameters.copy()
         found[:, -1] = np.clip(found[:, -1], 0.0, self.largest_force)
         return found
+
+    @property
+    def knows_body(self) -> bool:
+        """Whether the body lies in the box of those that the model has learned."""
+        return bool(self.model.context(self._body[None]).arrays["known"][0])
 
     @property
     def largest_force(self) -> float:
@@ -326,6 +387,7 @@ class LearnedEstimator:
         slopes = np.concatenate([np.matmul(W[:, :, :n], K), by_force[:, :, None] / step], axis=2)
         own, sensors = slice(n, n + 3 * len(self.robot.effectors)), slice(n + model.effectors, None)
         return _Responses(
+            context=here,
             sensors=delta[:, sensors],
             sensor_slopes=slopes[:, sensors],
             effectors=delta[:, own],
@@ -335,6 +397,12 @@ class LearnedEstimator:
             effort=effort,
             slack=slack,
         )
+
+
+def _expected(found: Mixture, response: _Responses, at: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the changes of volumes (n_s,) that are expected at the most probable place, and its number."""
+    best = int(np.argmax(_logarithms(found)))
+    return response.sensors[best] + response.sensor_slopes[best] @ (found.means[best] - at[best]), best
 
 
 def _logarithms(mixture: Mixture) -> np.ndarray:

@@ -12,13 +12,20 @@ from softgym_envs.mechanics.compilation import njit
 from softgym_envs.robots.base import Robot
 
 #: Why a state is not trusted. Batched states hold the sum of these numbers, 0 for a trusted state.
-OUTSIDE, SPREAD, SOFT, LOADED, FOLDED = 1, 2, 4, 8, 16
+OUTSIDE, SPREAD, SOFT, LOADED, FOLDED, UNEXPLAINED = 1, 2, 4, 8, 16, 32
 
-DOUBTS = {OUTSIDE: "outside box", SPREAD: "spread", SOFT: "softening", LOADED: "loads", FOLDED: "folded beam"}
+DOUBTS = {
+    OUTSIDE: "outside box",
+    SPREAD: "spread",
+    SOFT: "softening",
+    LOADED: "loads",
+    FOLDED: "folded beam",
+    UNEXPLAINED: "unexplained readings",
+}
 """The reasons in words: body or displacements lie outside the box of the training states; the uncertainty is above the
 limit; the actuators are so soft that the body may be about to buckle, or a body of superelements has; a learned
 superelement carries larger loads than those that it was learned under; an element of a beam bends farther than it can
-resist, which it would not do on a finer mesh."""
+resist, which it would not do on a finer mesh; an estimate explains the readings of the sensors badly."""
 
 SLACK = 1e-3
 """Actuators that end farther beyond their commands than this are slack [half their range]."""

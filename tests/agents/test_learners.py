@@ -17,7 +17,7 @@ from softgym_envs.agents.learners.ppo import PPOLearner
 from softgym_envs.agents.learners.recurrent import RecurrentLearner
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.agents.residual import BatchQP
-from softgym_envs.agents.training import train
+from softgym_envs.agents.training import CHECKPOINT, _restore, train
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.robots.modular_arm import KINDS
 
@@ -99,6 +99,47 @@ def test_same_seed_same_policy_and_interruptions_change_nothing(name, tmp_path, 
     assert train(config, tmp_path / "resumed", progress=False).read_bytes() == first
     with pytest.raises(DataError, match="learner"):
         train(config.model_copy(update={"learner": "sac"}), tmp_path / "resumed", progress=False)
+
+
+def _without_plans(config):
+    """Return a configuration whose learning does not depend on the number of steps."""
+    learner = config.learner
+    if learner == "evolution":
+        return config
+    options = getattr(config, learner)
+    changes = {"final_learning_rate": options.learning_rate}
+    if hasattr(options, "lead"):
+        changes["lead"] = 1e-9
+    return config.model_copy(update={learner: options.model_copy(update=changes)})
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_an_extended_training_goes_on_from_its_last_state(name, tmp_path):
+    long = _without_plans(QUICK[name])
+    short = long.model_copy(update={"steps": 512})
+    uninterrupted = train(long, tmp_path / "uninterrupted", progress=False)
+    train(short, tmp_path / "extended", progress=False, keep_checkpoint=True)
+    torch.manual_seed(5)  # a new process would have other random states
+    extended = train(long, tmp_path / "extended", progress=False)
+    assert extended.read_bytes() == uninterrupted.read_bytes()
+    curves = [
+        [(point["step"], point["mean_return"]) for point in Policy(path).card["curve"]]
+        for path in (extended, uninterrupted)
+    ]
+    assert curves[0] == curves[1] and len(curves[0]) == 2
+
+
+def test_rates_of_an_extended_training_are_those_of_the_new_number_of_steps(tmp_path):
+    train(SHORT, tmp_path, progress=False, keep_checkpoint=True)
+    longer = SHORT.model_copy(update={"steps": 2048})
+    train(longer, tmp_path, progress=False, report=lambda step, outcome: step > 1024, keep_checkpoint=True)
+    learner = AnalyticLearner(longer)
+    _restore(learner, tmp_path / CHECKPOINT)
+    learner._slow_down()
+    first, last = SHORT.analytic.learning_rate, SHORT.analytic.final_learning_rate
+    expected = first + (last - first) * learner.step / 2048
+    assert learner.step == 1536 and learner._optimiser.param_groups[0]["lr"] == pytest.approx(expected, rel=1e-9)
+    learner.close()
 
 
 def test_policy_of_ppo_is_its_mean_action_and_weights_return(tmp_path):

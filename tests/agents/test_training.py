@@ -158,11 +158,62 @@ def test_damaged_checkpoint_is_named(tmp_path, monkeypatch):
 
 
 def test_a_folder_of_another_configuration_is_refused(trained):
-    with pytest.raises(DataError, match="another configuration: steps = 400, got 800"):
-        train(CONFIG.model_copy(update={"steps": 800}), trained.parent, progress=False)
     shown = CONFIG.environment.model_copy(update={"robot_options": {"cables": 1}})
-    with pytest.raises(DataError, match=r"environment\.robot_options = \{\}, got \{'cables': 1\}"):
+    with pytest.raises(DataError, match=r"environment\.robot_options = \{\}, got \{'cables': 1\}.*change only: steps"):
         train(CONFIG.model_copy(update={"environment": shown}), trained.parent, progress=False)
+
+
+def test_a_training_that_cannot_be_extended_is_refused_and_left_as_it_is(trained):
+    before = {path.name: path.read_bytes() for path in trained.parent.iterdir() if path.is_file()}
+    with pytest.raises(DataError, match=r"of 400 steps, got steps = 300.*steps = 400 or more"):
+        train(CONFIG.model_copy(update={"steps": 300}), trained.parent, progress=False)
+    with pytest.raises(DataError, match=r"of 400 steps without 'checkpoint\.safetensors'.*to 800.*--initial"):
+        train(CONFIG.model_copy(update={"steps": 800}), trained.parent, progress=False)
+    assert before == {path.name: path.read_bytes() for path in trained.parent.iterdir() if path.is_file()}
+
+
+LONG = CONFIG.model_copy(
+    update={"steps": 600, "sac": CONFIG.sac.model_copy(update={"final_learning_rate": 1e-3, "hindsight": 0.8})}
+)
+"""Its learning rate does not depend on the number of steps."""
+
+
+@pytest.mark.parametrize("first", [200, 204])
+def test_an_extended_training_goes_on_with_its_replay_buffer(first, tmp_path):
+    """204 steps end after 208, which fill the buffer of the first training to the last row."""
+    short = LONG.model_copy(update={"steps": first, "report_every": 208 if first == 204 else 200})
+    long = short.model_copy(update={"steps": 624 if first == 204 else 600})
+    uninterrupted = train(long, tmp_path / "uninterrupted", progress=False)
+    folder = tmp_path / "extended"
+    train(short, folder, progress=False, keep_checkpoint=True)
+    assert train(long, folder, progress=False).read_bytes() == uninterrupted.read_bytes()
+
+
+def test_an_interrupted_extension_keeps_the_policy_and_ends_as_an_uninterrupted_one(tmp_path, monkeypatch):
+    short = LONG.model_copy(update={"steps": 200})
+    uninterrupted = train(LONG, tmp_path / "uninterrupted", progress=False).read_bytes()
+    folder = tmp_path / "extended"
+    policy = train(short, folder, progress=False, keep_checkpoint=True)
+    before = policy.read_bytes()
+    original = SACLearner.learn
+
+    def learn(learner, target, progress):
+        if learner.step >= 400:
+            raise KeyboardInterrupt
+        original(learner, target, progress)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SACLearner, "learn", learn)
+        with pytest.raises(KeyboardInterrupt):
+            train(LONG, folder, progress=False, keep_checkpoint=True)
+    assert policy.read_bytes() == before and Policy(policy).card["steps"] == 200
+    assert train(LONG, folder, progress=False).read_bytes() == uninterrupted
+    assert load_config(folder / "config.yaml", TrainConfig) == LONG
+    (extension,) = Policy(policy).card["extensions"]
+    assert extension == json.loads((folder / "provenance.json").read_text())["extensions"][0]
+    assert [extension[key] for key in ("from_steps", "to_steps", "at_step")] == [200, 600, 200]
+    with open(folder / "curve.csv") as stream:
+        assert [int(row["step"]) for row in csv.DictReader(stream)] == [200, 400, 600]
 
 
 def test_a_damaged_configuration_of_a_folder_is_named(tmp_path):

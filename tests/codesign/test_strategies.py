@@ -199,7 +199,7 @@ def test_report_opens_in_a_browser(run, tmp_path, require_program):
 
 def test_every_strategy_is_described():
     from softgym_envs.codesign.parts import STRATEGIES
-    from softgym_envs.codesign.report.page import CONTROLLERS
+    from softgym_envs.codesign.report.sentences import CONTROLLERS
 
     assert set(CONTROLLERS) == set(STRATEGIES)
 

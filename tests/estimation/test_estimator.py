@@ -11,6 +11,7 @@ from softgym_envs import make_robot
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.estimation import Estimator, Noise, Payload, Readings, Touch, finger_grid
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.surrogate.domain import UNEXPLAINED
 
 GRID = finger_grid()
 TOUCH = np.array([1.3, 0.4, -0.6])  # N, and the place in the cell
@@ -142,6 +143,41 @@ def test_touches_outside_the_grid_are_told():
 def test_lost_sensors_are_told(volumes):
     with pytest.raises(ValueError, match="readings 'volumes' must be 2 finite values"):
         finger_estimator(2).update(Readings(np.array([0.0]), np.array(volumes)))
+
+
+@pytest.mark.parametrize(
+    ("sealed", "message"),
+    [
+        (False, r"readings 'volumes' number 0 = -50 m3 is impossible; allowed: above 0, up to .* m3"),
+        (True, r"readings 'pressures' number 1 = -101325 Pa is impossible; allowed: above -101325, up to 911925 Pa"),
+    ],
+)
+def test_impossible_readings_are_refused_and_forgotten(sealed, message):
+    estimators = [finger_estimator(2, sealed=sealed) for _ in range(2)]
+    change = np.full(2, 5e3 if sealed else -5e-8)
+    reading = estimators[0].reading(np.array([0.006]), change)
+    wrong = {"pressures": np.array([5e3, -101325.0])} if sealed else {"volumes": np.full(2, -50.0)}
+    for each in estimators:
+        each.update(reading)
+    with pytest.raises(ValueError, match=message):
+        estimators[0].update(replace(reading, **wrong))
+    found, expected = (each.update(reading) for each in estimators)
+    assert found.misfit == expected.misfit and (found.load_covariance == expected.load_covariance).all()
+
+
+def test_unexplained_readings_are_not_trusted_and_not_remembered():
+    def estimator():
+        return Estimator(make_robot("sensorized_finger"), load=Touch(GRID, (0, 14)), noise=Noise(volume=6e-10))
+
+    command = np.array([0.006])
+    first, other = estimator(), estimator()
+    right = first.reading(command, first.linearise(command, TOUCH).state.condensed.delta.s)
+    assert first.update(right).trusted and other.update(right).trusted
+    found = first.update(replace(right, volumes=0.9 * right.volumes))
+    assert found.converged and found.doubt == UNEXPLAINED and not found.trusted
+    after, expected = first.update(right), other.update(right)
+    np.testing.assert_allclose(after.load, expected.load, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(after.load_covariance, expected.load_covariance, rtol=1e-6, atol=1e-12)
 
 
 def test_axes_of_a_grid_are_perpendicular():

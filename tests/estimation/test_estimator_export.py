@@ -16,6 +16,7 @@ from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.estimation import Noise, Readings, Touch, TouchGrid, finger_grid
 from softgym_envs.estimation.export.c import export_estimator_c
 from softgym_envs.estimation.learned import LearnedEstimator
+from softgym_envs.surrogate.domain import OUTSIDE, SPREAD, UNEXPLAINED
 
 CC = shutil.which("cc") or shutil.which("gcc")
 pytestmark = pytest.mark.skipif(CC is None, reason="no C compiler")
@@ -44,6 +45,7 @@ class Result(ctypes.Structure):
         ("effector_covariance", ctypes.c_double * 9),
         ("misfit", ctypes.c_double),
         ("slack", ctypes.c_int * 1),
+        ("doubt", ctypes.c_int),
     ]
 
     def array(self, name):
@@ -140,6 +142,7 @@ def test_estimates_are_those_of_python(exported, real):
         expected = reference.update(Readings(command, volumes))
         status, found = machine.update(command, volumes)
         assert status == 0 and bool(found.slack[0]) == bool(expected.slack[0])
+        assert found.doubt == expected.doubt & ~SPREAD  # the header has no ensemble
         scale = np.linalg.norm(deviations(expected.effector_covariance))
         row = [
             np.abs(found.array("effector") - expected.effector).max() / scale,
@@ -167,17 +170,24 @@ def test_estimates_are_those_of_python(exported, real):
 def test_wrong_readings_change_nothing(exported):
     estimator, folder = exported
     machine = Compiled(folder)
-    volumes = estimator.rest_volumes - 10e-9
+    volumes = (
+        estimator.rest_volumes + SurrogateBackend(estimator.robot, estimator.design).step([0.005]).condensed.delta.s
+    )
     assert machine.touch((1, 15)) == 0 and machine.update([0.005], volumes)[0] == 0
     before = machine.struct.raw
     assert machine.touch((1, GRID.cells[1])) == machine.touch((-1, 0)) == 1
     for command, measured, status in (
         ([np.nan], volumes, 1),
         ([0.005], volumes * np.inf, 1),
+        ([0.005], 1e9 * volumes, 1),  # mm3 in place of m3
+        ([0.005], estimator.rest_volumes - 10.0, 1),
         ([1e30], volumes, 2),
     ):
         found, result = machine.update(command, measured)
         assert found == status and not result.array("effector_covariance").any()
+    for command, measured, doubt in (([0.0152], volumes, OUTSIDE), ([0.005], 0.9 * volumes, UNEXPLAINED)):
+        status, result = machine.update(command, measured)
+        assert status == 0 and result.doubt & doubt and result.array("effector_covariance").any()
     assert machine.struct.raw == before
     assert machine.update([0.005], volumes)[0] == 0 and machine.struct.raw != before
 

@@ -13,7 +13,9 @@ from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.estimation import Noise, Readings, Touch, finger_grid
 from softgym_envs.estimation.learned import LearnedEstimator
 from softgym_envs.estimation.model_errors import measured_errors
+from softgym_envs.estimation.readings import LARGEST_RESIDUAL
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.surrogate.domain import OUTSIDE, UNEXPLAINED
 from softgym_envs.surrogate.row_errors import KNOTS, RowErrors
 
 GRID = finger_grid()
@@ -146,6 +148,67 @@ def test_larger_errors_of_the_model_leave_the_force_less_certain(robot):
         estimator = LearnedEstimator(robot, load=load, noise=NOISE, errors=RowErrors(0.0 * rows, rows))
         spreads.append(estimator.update(Readings(COMMAND, estimator.rest_volumes - 2e-8)).load_covariance[0, 0])
     assert spreads[1] > 1.5 * spreads[0]
+
+
+def plant_reading(estimator, force=0.8, command=COMMAND):
+    """Return the readings of the learned model itself under a touch."""
+    plant = SurrogateBackend(estimator.robot, estimator.design)
+    plant.touch(PointForce(POINT, np.array([0.0, force, 0.0])))
+    return Readings(command, estimator.rest_volumes + plant.step(command).condensed.delta.s)
+
+
+def same(found, expected):
+    return found.misfit == expected.misfit and (found.effector_covariance == expected.effector_covariance).all()
+
+
+def test_a_likely_reading_is_trusted(robot):
+    estimator = touched(robot)
+    found = estimator.update(plant_reading(estimator))
+    assert found.trusted and found.doubt == 0
+
+
+@pytest.mark.parametrize(
+    "wrong", [lambda v: 1e9 * v, lambda v: v - 50.0, lambda v: 0.0 * v], ids=["mm3", "change", "0"]
+)
+def test_impossible_volumes_are_refused_and_forgotten(robot, wrong):
+    estimator, other = touched(robot), touched(robot)
+    reading = plant_reading(estimator)
+    for each in (estimator, other):
+        each.update(reading)
+    with pytest.raises(ValueError, match=r"readings 'volumes' number 0 = .* m3 is impossible; allowed: above 0, up to"):
+        estimator.update(replace(reading, volumes=wrong(reading.volumes)))
+    assert same(estimator.update(reading), other.update(reading))
+
+
+@pytest.mark.parametrize("case", ["command", "readings"])
+def test_what_the_model_does_not_know_is_not_trusted_and_not_remembered(robot, case):
+    estimator, other = touched(robot), touched(robot)
+    reading = plant_reading(estimator)
+    for each in (estimator, other):
+        each.update(reading)
+    if case == "command":
+        found, doubt = estimator.update(plant_reading(estimator, command=np.array([0.0155]))), OUTSIDE
+    else:
+        found, doubt = estimator.update(replace(reading, volumes=0.9 * reading.volumes)), UNEXPLAINED
+    assert not found.trusted and found.doubt & doubt
+    assert same(estimator.update(reading), other.update(reading))
+
+
+def test_forces_and_bodies_beyond_the_training_are_not_trusted(robot):
+    estimator = touched(robot)
+    found = estimator.update(plant_reading(estimator, force=1.15 * estimator.largest_force))
+    assert found.load[0] > estimator.largest_force and found.doubt == OUTSIDE
+    other = LearnedEstimator(robot, design={"poisson_ratio": 0.4}, noise=NOISE, exact=True)
+    assert touched(robot).knows_body and not other.knows_body
+    assert other.update(Readings(COMMAND, other.rest_volumes - 5e-8)).doubt & OUTSIDE
+
+
+def test_a_small_steady_error_does_not_become_unexplained_with_the_number_of_readings(robot):
+    estimator = LearnedEstimator(robot, noise=NOISE, exact=True)
+    reading = plant_reading(estimator, force=0.0)
+    shifted = replace(reading, volumes=reading.volumes + np.array([5.0, -5.0]) * NOISE.volume)
+    found = [estimator.update(shifted) for _ in range(40)]
+    assert all(each.trusted for each in found) and found[-1].misfit > 2 * LARGEST_RESIDUAL**2
 
 
 def test_wrong_inputs_are_named(robot):

@@ -12,6 +12,7 @@ from softgym_envs.backends.surrogate import TOLERANCE
 from softgym_envs.estimation.estimator import IMPROBABLE
 from softgym_envs.estimation.learned import PLACES, STEP, LearnedEstimator
 from softgym_envs.estimation.loads import TouchGrid, cell_nodes
+from softgym_envs.estimation.readings import LARGEST_RESIDUAL, MOST_GROWTH
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.export.c_loads import loaded_text
 from softgym_envs.surrogate.export.c_text import check_identifier, comment, functions, names_of
@@ -123,6 +124,7 @@ def _header(estimator: LearnedEstimator, grid: TouchGrid, expected_force: float,
         f"range[{n}]": robot.upper - robot.lower,
         f"bias[{KNOTS}][{own + k}]": estimator.errors.mean,
         f"deviation[{KNOTS}][{own + k}]": estimator.errors.deviation,
+        f"learned[{n}][2]": np.column_stack([model.domain.low, model.domain.high]),
         "largest_force": np.array(estimator.largest_force),
     }
     bytes_ += 8 * sum(array.size for array in constants.values())
@@ -134,6 +136,8 @@ def _header(estimator: LearnedEstimator, grid: TouchGrid, expected_force: float,
         "displacement_noise": noise.displacement,
         "expected_force": expected_force,
         "improbable": float(chi2.ppf(IMPROBABLE, k)),
+        "most_growth": MOST_GROWTH,
+        "unexplained": LARGEST_RESIDUAL**2 * k,
     }
     counts = {"most_steps": 26, "steps": estimator.steps, "knots": KNOTS}
     counts |= {"columns": grid.cells[0], "rows": grid.cells[1]}
@@ -162,8 +166,10 @@ def _header(estimator: LearnedEstimator, grid: TouchGrid, expected_force: float,
         f"                           {p}_result *result)",
         "    One reading: displacements that the actuators are commanded [m], volumes of the cavities [m3]. Readings",
         "    in a row under one command are explained together by their mean. The result holds means and covariances",
-        "    over all that explains the readings.",
-        "    Returns 0; or, with everything unchanged, 1 if an input is not finite, 2 if the model finds no state.",
+        "    over all that explains the readings. Under a command that the model has not learned, and for readings",
+        "    that nothing explains, result->doubt says so, and the reading is forgotten.",
+        "    Returns 0; or, with everything unchanged, 1 if an input is not finite or a volume is impossible, as in a",
+        "    wrong unit, 2 if the model finds no state.",
         "",
         "Nothing is allocated; the only state is in the struct. Do not compile with -ffast-math, which removes the",
         f"checks for values that are not finite. #define {upper}_REAL float before the header halves the state and",
@@ -180,6 +186,7 @@ def _header(estimator: LearnedEstimator, grid: TouchGrid, expected_force: float,
         *(f"static const double {p}_{key} = {_braces(array)};" for key, array in constants.items()),
         f"static const float {p}_untouched[2] = {_braces(untouched.astype(np.float32))};",
         f"static const float {p}_force_step = {STEP * estimator.stiffness!r}f;",
+        f"static const int {p}_known_body = {int(estimator.knows_body)};",
         f"static const int {p}_unilateral[{n}] = {_braces(robot.unilateral.astype(int))};\n",
         functions("qp", names),
         functions("evaluate", names),
