@@ -112,7 +112,7 @@ def test_values_that_no_search_writes(submission, tmp_path, data, change, messag
         ({"hash": 3}, r"the submission: hash: must be a valid string, got 3"),
         ({"claimd": []}, r"the submission: unknown field 'claimd'; did you mean 'claimed'"),
         ({"designs": [{"length": "long"}]}, r"designs.0.length: must be a valid number.*got 'long'"),
-        ({"ledger": [3]}, r"ledger.0: must be a valid dictionary, got 3"),
+        ({"ledger": [3]}, r"ledger.0: must be a mapping of keys to values, got 3"),
         ({"ledger": [{"design": {}, "judge": "qp", "fem_solves": "many"}]}, r"ledger.0: fem_solves: .*got 'many'"),
     ],
 )
@@ -130,7 +130,8 @@ def test_fields_of_another_type(submission, tmp_path, data, change, message):
 
 
 def test_costs_that_are_not_what_a_score_takes(submission, tmp_path, data):
-    submission.ledger[1]["environment_steps"] = 0
+    for row in submission.ledger:
+        row["environment_steps"] = 0
     refused(submission, tmp_path, r"counts 0 environment steps for the submitted body, but scoring it takes 100", data)
     submission.ledger[1]["environment_steps"] = -100
     refused(submission, tmp_path, r"ledger.1.environment_steps = -100; allowed: finite numbers from 0", data)
