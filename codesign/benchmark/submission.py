@@ -111,7 +111,7 @@ def _typed(kind: type[RecordT], data: Any, where: str) -> RecordT:
     if unknown := [name for name in data if name not in names]:
         raise DataError(f"{where}: {unknown_name('field', unknown[0], names)}")
     try:
-        return _adapter(kind).validate_python(data)
+        return _adapter(kind).validate_python(data)  # type: ignore[arg-type]  # records have no hash, classes do
     except ValidationError as error:
         raise DataError(f"{where}: {first_problem(error)}") from None
 
