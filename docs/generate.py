@@ -140,7 +140,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         return markdown.replace(HERE, lists[folder]()) if folder in lists else markdown
     if page.file.src_uri.removesuffix(".md") in PAGES:
         return f"{markdown}\n\n[This page as a notebook]({name}.ipynb){{ download }}\n"
-    if page.file.src_uri == "benchmark.md":
+    if page.file.src_uri in ("benchmark.md", "benchmark_findings.md"):
         return benchmark_page(markdown)
     if page.file.src_uri == "gallery.md":
         return markdown.replace(HERE, gallery())

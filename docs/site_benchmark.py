@@ -1,4 +1,4 @@
-"""Generated parts of the page of the benchmark: problems, leaderboard and tables of the baselines."""
+"""Generated parts of the pages of the benchmark: problems, leaderboard and tables of the baselines."""
 
 from __future__ import annotations
 
@@ -22,5 +22,5 @@ PARTS = {
 
 
 def benchmark_page(markdown: str) -> str:
-    """Return the page with its generated parts."""
+    """Return a page with its generated parts."""
     return re.sub(r"<!-- benchmark: (\w+) -->", lambda match: PARTS[match[1]](), markdown)

@@ -160,16 +160,21 @@ def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> Model
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        problems = error.errors(include_url=False)
-        missing = [_dotted(problem) for problem in problems if problem["type"] == "missing"]
-        if missing:
-            plural = "s" if len(missing) > 1 else ""
-            message, count = f"missing required key{plural} {', '.join(missing)}", len(missing)
-        else:
-            message, count = _describe(problems[0]), 1
-        others = len(problems) - count
-        more = f" (and {others} more problem{'s' if others > 1 else ''})" if others else ""
-        raise ConfigError(f"{where}: {message}{more}") from None
+        raise ConfigError(f"{where}: {first_problem(error)}") from None
+
+
+def first_problem(error: ValidationError) -> str:
+    """Return one line that names all missing keys, or else describes the first problem, and counts the others."""
+    problems = error.errors(include_url=False)
+    missing = [_dotted(problem) for problem in problems if problem["type"] == "missing"]
+    if missing:
+        plural = "s" if len(missing) > 1 else ""
+        message, count = f"missing required key{plural} {', '.join(missing)}", len(missing)
+    else:
+        message, count = _describe(problems[0]), 1
+    others = len(problems) - count
+    more = f" (and {others} more problem{'s' if others > 1 else ''})" if others else ""
+    return message + more
 
 
 def _dotted(problem: ErrorDetails) -> str:

@@ -69,6 +69,8 @@ def read_json(path: str | Path) -> Any:
     """
     try:
         return json.loads(Path(path).read_text())
+    except json.JSONDecodeError as error:
+        raise DataError(f"'{path}' cannot be read: it is truncated or not valid JSON ({error})") from None
     except (OSError, ValueError) as error:
         raise DataError(f"'{path}' cannot be read: {_reason(error)}") from None
 

@@ -9,15 +9,33 @@ import pytest
 
 from benchmarks import run
 from benchmarks.recorded import SOURCES
+from softgym_envs.codesign.benchmark.scoring import DATA
 from softgym_envs.errors import ConfigError
 
 ENTRIES = [(path.name, name, entry) for path in SOURCES for name, entry in json.loads(path.read_text()).items()]
+
+COMMIT = "[0-9a-f]{7,40}"
 
 
 @pytest.mark.parametrize(("file", "name", "entry"), ENTRIES, ids=["-".join(entry[:2]) for entry in ENTRIES])
 def test_recorded_results_come_from_a_commit(file, name, entry):
     commit = str(entry.get("commit"))
-    assert re.fullmatch("[0-9a-f]{7,40}", commit), f"'{name}' in {file} comes from {commit}: measure it again"
+    assert re.fullmatch(COMMIT, commit), f"'{name}' in {file} comes from {commit}: measure it again"
+
+
+def test_searches_of_the_benchmark_come_from_a_commit():
+    found = {
+        f"{run['problem']} {run['method']} {run['judge']} seed {run['seed']}": run["commit"]
+        for run in json.loads((DATA / "runs.json").read_text())
+    }
+    for folder, key in (("references", "found"), ("submissions", "provenance")):
+        for path in (DATA / folder).glob("*.json"):
+            origin = json.loads(path.read_text())[key]
+            if origin:  # no search has found a better body than the baseline
+                found[f"{folder}/{path.name}"] = origin["commit"]
+    assert len(found) > 900
+    wrong = {name: commit for name, commit in found.items() if not re.fullmatch(COMMIT, str(commit))}
+    assert not wrong, "run them again from a clean clone (softgym benchmark run, then table --store)"
 
 
 def test_results_of_uncommitted_code_are_not_recorded(monkeypatch):

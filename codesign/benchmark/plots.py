@@ -1,17 +1,22 @@
-"""Pictures of the benchmark's page, made from the stored runs: regret over compute, and winners beside baselines."""
+"""Pictures of the benchmark's page, made from stored results: regret over compute, and best bodies over baselines."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from softgym_envs.agents.statistics import interquartile_mean
-from softgym_envs.codesign.benchmark.frozen import load_problem
+from softgym_envs.codesign.benchmark.frozen import load_problem, problem_names
+from softgym_envs.codesign.benchmark.problem import BenchmarkProblem
 from softgym_envs.codesign.benchmark.regret import EQUAL, Contest, Stored, contests
 from softgym_envs.codesign.benchmark.runs import stored_runs
-from softgym_envs.codesign.report.plots import STYLE
+from softgym_envs.codesign.benchmark.scoring import DATA, reference
+from softgym_envs.codesign.report.plots import STYLE, draw_silhouette, silhouette
+from softgym_envs.codesign.report.units import present
 
 COLOURS = {
     "random": "#94a3b8",
@@ -32,6 +37,12 @@ COLOURS = {
     "inheritance": "#0369a1",
 }
 """Colour of each method in all figures."""
+
+BASELINE, BEST = "#ea580c", "#0f766e"
+"""Colours of the outlines of bodies."""
+
+SLENDER = 3.0
+"""Length over width from which a body is drawn lying."""
 
 
 def regret_at(contest: Contest, method: str, steps: np.ndarray) -> np.ndarray:
@@ -86,27 +97,114 @@ def draw_regret(runs: Sequence[Stored] | None = None, columns: int = 3) -> np.nd
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def draw_winners(
-    runs: Sequence[Stored] | None = None, columns: int = 4, size: tuple[int, int] = (300, 260)
-) -> np.ndarray:
-    """Draw the best body of each problem with one objective, at rest, in front of the pale baseline.
+def draw_winners(data: Path = DATA, columns: int = 3) -> np.ndarray:
+    """Draw the best known body of each problem with one objective over its baseline: outlines at rest, to scale.
+
+    Problems with the same two bodies share a panel, whose title says which variables differ.
 
     Returns:
         The picture, shape (height, width, 3), uint8.
     """
-    from softgym_envs.viewer.image import render_bodies
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
-    best: dict[str, tuple[float, dict[str, float]]] = {}
-    for run, _ in stored_runs() if runs is None else runs:
-        if run.curve and run.optimum is None and run.designs:
-            value = run.curve[-1][2]
-            if run.problem not in best or value > best[run.problem][0]:
-                best[run.problem] = value, run.designs[0]
-    images = []
-    for name, (_, design) in sorted(best.items()):
-        definition = load_problem(name, check=False).definition
-        body, options = definition.body(design)
-        robot = definition.environment_of(options).make_robot()
-        images.append(render_bodies(robot, [body], size=size, ghost=definition.baseline, texts=[name]))
-    images += [np.full_like(images[0], 255)] * (-len(images) % columns)
-    return np.concatenate([np.concatenate(images[i : i + columns], axis=1) for i in range(0, len(images), columns)])
+    panels = [_Panel.of(*known) for known in _best_known(data)]
+    panels.sort(key=lambda panel: panel.height > 1.0 / SLENDER)  # flat ones first, so that they share rows
+    rows = [panels[i : i + columns] for i in range(0, len(panels), columns)]
+    with matplotlib.rc_context(STYLE):
+        heights = [1.2 + 2.2 * max(panel.height for panel in row) for row in rows]
+        figure = Figure(figsize=(3.6 * columns, sum(heights) + 0.4), layout="constrained", dpi=110)
+        canvas = FigureCanvasAgg(figure)
+        grid = figure.add_gridspec(len(rows), columns, height_ratios=heights)
+        for place, panel in enumerate(panels):
+            axes = figure.add_subplot(grid[divmod(place, columns)])
+            for (points, triangles), colour, share in zip(panel.bodies, (BEST, BASELINE), (0.45, 0.12), strict=True):
+                draw_silhouette(axes, points[:, panel.plane], triangles, panel.extent, colour, share)
+            across, up = ("xyz"[axis] for axis in panel.plane)
+            axes.set(xlabel=f"{across} [mm]", ylabel=f"{up} [mm]", aspect="equal")
+            axes.set_title("\n".join(panel.title), fontsize=8.5, loc="left")
+        handles = [Patch(color=colour) for colour in (BASELINE, BEST)]
+        figure.legend(handles, ["baseline", "best known body"], loc="outside upper center", ncols=2)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """What one panel of `draw_winners` shows: two outlines, best known body first, in the axes of a view."""
+
+    title: list[str]
+    bodies: list[tuple[np.ndarray, np.ndarray]]
+    plane: list[int]
+
+    @classmethod
+    def of(cls, names: list[str], definition: BenchmarkProblem, best: dict[str, float]) -> _Panel:
+        bodies = [_outline(definition, body) for body in (best, definition.baseline_values)]
+        return cls([*names, *_changes(definition, best)], bodies, _plane(bodies))
+
+    @property
+    def extent(self) -> np.ndarray:
+        return _extent(self.bodies, self.plane)
+
+    @property
+    def height(self) -> float:
+        """Height over width, at most 1."""
+        across, up = np.ptp(self.extent, axis=0)
+        return min(float(up / across), 1.0)
+
+
+def _best_known(data: Path) -> list[tuple[list[str], BenchmarkProblem, dict[str, float]]]:
+    """Return problems with the same baseline and best known body, the definition of the first, and the body."""
+    found: dict[str, tuple[list[str], BenchmarkProblem, dict[str, float]]] = {}
+    for name in problem_names():
+        problem = load_problem(name, check=False)
+        definition, known = problem.definition, reference(problem, data)
+        if known is None or len(known.designs) != 1 or definition.score_count > 1:
+            continue
+        key = repr((definition.robot.name, definition.baseline_values, known.designs[0]))
+        found.setdefault(key, ([], definition, known.designs[0]))[0].append(name)
+    return sorted(found.values(), key=lambda each: (each[1].robot.name, each[0]))
+
+
+def _outline(definition: BenchmarkProblem, values: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points [m] (n, 3) of a body at rest and the triangles (t, 3) of its surface, without rigid objects."""
+    from softgym_envs.viewer.surface import BodySurface, ShapeFinder
+
+    design, options = definition.body(values)
+    shapes = ShapeFinder(definition.environment_of(options).make_robot())
+    surface = BodySurface(shapes.load(design))
+    return surface.points(shapes.at(design)), surface.triangles[~surface.rigid]
+
+
+def _plane(bodies: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[int]:
+    """Return the axes of the view, to the right and up, in which the outlines of two bodies differ most.
+
+    The view shows the longest side in full. A slender body lies, any other stands.
+    """
+    spans = np.ptp(np.concatenate([points[np.unique(triangles)] for points, triangles in bodies]), axis=0)
+    longest = int(spans.argmax())
+    found = {}
+    for other in set(range(3)) - {longest}:
+        plane = [longest, other] if spans[longest] > SLENDER * spans[other] else sorted((longest, other))
+        extent = _extent(bodies, plane)
+        first, second = (silhouette(points[:, plane], triangles, extent) for points, triangles in bodies)
+        found[float(np.mean(first != second) * np.prod(np.ptp(extent, axis=0)))] = plane
+    return found[max(found)]
+
+
+def _extent(bodies: Sequence[tuple[np.ndarray, np.ndarray]], plane: list[int]) -> np.ndarray:
+    """Return the lower and the upper corner [m] of a rectangle around bodies in a plane, shape (2, 2)."""
+    points = np.concatenate([points[np.unique(triangles)][:, plane] for points, triangles in bodies])
+    margin = 0.04 * np.ptp(points, axis=0).max()
+    return np.array([points.min(axis=0) - margin, points.max(axis=0) + margin])
+
+
+def _changes(definition: BenchmarkProblem, best: Mapping[str, float]) -> list[str]:
+    """Return lines such as ``"length 41.50 mm -> 38.00 mm"``, one for each variable."""
+    lines = []
+    for name, variable in definition.optimised.items():
+        before, after = (present(value, variable.unit) for value in (definition.baseline_values[name], best[name]))
+        lines.append(f"{name.replace('_', ' ')} {before.split()[0]} \N{RIGHTWARDS ARROW} {after}")
+    return lines

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import cache
+from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, TypeVar
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from softgym_envs.agents.policy import Policy, policy_path
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem, file_hash, load_problem
@@ -15,8 +18,16 @@ from softgym_envs.codesign.benchmark.problem import JUDGES, LEVELS, Budget, Scor
 from softgym_envs.codesign.benchmark.scoring import DATA, Reference, front, make_reference, normalised, write_reference
 from softgym_envs.codesign.benchmark.search import Search
 from softgym_envs.codesign.records import Record
-from softgym_envs.config import provenance
-from softgym_envs.errors import ConfigError, ConvergenceError, DataError, DesignError, InfeasibleDesign
+from softgym_envs.config import first_problem, provenance
+from softgym_envs.errors import (
+    ConfigError,
+    ConvergenceError,
+    DataError,
+    DesignError,
+    InfeasibleDesign,
+    WeightsError,
+    unknown_name,
+)
 from softgym_envs.storage import read_json
 
 TOLERANCE = {"qp": 1e-3, "shared": 1e-3, "trained": 5e-2, "policy": 1e-3}
@@ -69,6 +80,40 @@ class Submission(Record):
     optimiser_seconds: float = 0.0
     pretraining_steps: int = 0
     provenance: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Return the submission that `to_json` wrote.
+
+        Raises:
+            DataError: if a field is missing, unknown or of another type, also in a row of the ledger.
+        """
+        found = _typed(cls, data, "the submission")
+        for number, row in enumerate(found.ledger):
+            _typed(Score, row, f"ledger.{number}")
+        return found
+
+
+RecordT = TypeVar("RecordT", bound=Record)
+
+_adapter = cache(TypeAdapter)
+
+
+def _typed(kind: type[RecordT], data: Any, where: str) -> RecordT:
+    """Return a record whose fields have the declared types.
+
+    Raises:
+        DataError: one line with the field, its value and what is allowed.
+    """
+    if not isinstance(data, dict):
+        raise DataError(f"{where} must be an object with fields, got a {type(data).__name__}")
+    names = [item.name for item in fields(kind)]  # type: ignore[arg-type]
+    if unknown := [name for name in data if name not in names]:
+        raise DataError(f"{where}: {unknown_name('field', unknown[0], names)}")
+    try:
+        return _adapter(kind).validate_python(data)  # type: ignore[arg-type]  # records have no hash, classes do
+    except ValidationError as error:
+        raise DataError(f"{where}: {first_problem(error)}") from None
 
 
 @dataclass(frozen=True)
@@ -208,6 +253,11 @@ def _checked_problem(submission: Submission) -> FrozenProblem:
         )
     if submission.level not in LEVELS:
         raise SubmissionRefused(f"level '{submission.level}' does not exist; allowed: {', '.join(LEVELS)}")
+    if submission.judge not in problem.definition.judges:
+        raise SubmissionRefused(
+            f"problem '{problem.name}' has no judge '{submission.judge}'; allowed: "
+            f"{', '.join(problem.definition.judges)}"
+        )
     limit = 1 if problem.definition.score_count == 1 else 8
     if not 1 <= len(submission.designs) <= limit:
         raise SubmissionRefused(f"{len(submission.designs)} bodies are submitted; allowed: 1 to {limit}")
@@ -216,6 +266,11 @@ def _checked_problem(submission: Submission) -> FrozenProblem:
             problem.definition.checked(design)
         except DesignError as error:
             raise SubmissionRefused(f"the body is not in the box of '{problem.name}': {error}") from None
+    if len(submission.claimed) not in (0, len(submission.designs)):
+        raise SubmissionRefused(
+            f"scores of {len(submission.claimed)} bodies are claimed; allowed: those of the {len(submission.designs)} "
+            "submitted ones, or none"
+        )
     return problem
 
 
@@ -224,6 +279,9 @@ def _checked_ledger(problem: FrozenProblem, submission: Submission) -> list[Scor
     rows = [Score.from_json(row) for row in submission.ledger]
     limits = problem.definition.budgets[submission.level]  # type: ignore[index]
     for name in Budget.model_fields:
+        for number, row in enumerate(rows):
+            if not (isfinite(value := getattr(row, name)) and value >= 0):
+                raise SubmissionRefused(f"ledger.{number}.{name} = {value:g}; allowed: finite numbers from 0")
         before = sum(getattr(row, name) for row in rows[:-1])  # the score that crosses the limit counts
         if before >= max(getattr(limits, name), 1):
             raise SubmissionRefused(
@@ -232,7 +290,11 @@ def _checked_ledger(problem: FrozenProblem, submission: Submission) -> list[Scor
             )
     for design in submission.designs:
         if not any(_same(problem, row.design, design) and row.share == 1.0 for row in rows):
-            raise SubmissionRefused("a submitted body is not in the ledger of the search, with all goals and steps")
+            values = ", ".join(f"{name} = {value:.6g}" for name, value in design.items())
+            raise SubmissionRefused(
+                f"the submitted body ({values}) is not in the ledger, which has {len(rows)} rows; allowed: a body that "
+                "was scored on all goals, with all steps of its training (share = 1)"
+            )
     return rows
 
 
@@ -249,24 +311,39 @@ def _checked_policy(problem: FrozenProblem, submission: Submission, folder: Path
     given = submission.policy
     if submission.controller in JUDGES:
         if submission.controller not in problem.definition.judges:
-            raise SubmissionRefused(f"problem '{problem.name}' has no judge '{submission.controller}'")
+            raise SubmissionRefused(
+                f"problem '{problem.name}' has no judge '{submission.controller}' as controller; allowed: "
+                f"{', '.join(problem.definition.judges)}, or policy with a file"
+            )
         return None
     if submission.controller != "policy" or not given:
         raise SubmissionRefused(
             f"controller '{submission.controller}' does not exist; allowed: {', '.join(JUDGES)}, or policy with a file"
         )
-    path = folder / str(given.get("file"))
+    missing = [name for name in ("file", "sha256", "goals") if name not in given]
+    if missing:
+        raise SubmissionRefused(f"policy lacks {', '.join(missing)}; needed: file, sha256 and goals")
+    if not isinstance(given["goals"], list):
+        raise SubmissionRefused(f"policy.goals = {given['goals']!r} must be a list of hashes, which may be empty")
+    path = folder / str(given["file"])
     if not path.is_file():
-        raise SubmissionRefused(f"the policy '{given.get('file')}' does not lie beside the submission")
-    if file_hash(path) != given.get("sha256"):
-        raise SubmissionRefused(f"the policy '{path.name}' is not the one that was submitted: its SHA-256 differs")
-    policy = Policy(path)
-    named = set(given.get("goals", []))
+        raise SubmissionRefused(f"the policy '{given['file']}' does not lie beside the submission, in '{folder}'")
+    if (found := file_hash(path)) != given["sha256"]:
+        raise SubmissionRefused(
+            f"the policy '{path.name}' is not the one that was submitted: its SHA-256 begins with {found[:12]}, that "
+            f"of the submission with {str(given['sha256'])[:12]}"
+        )
+    try:
+        policy = Policy(path)
+    except WeightsError as error:
+        raise SubmissionRefused(str(error)) from None
+    named = set(map(str, given["goals"]))
     trained = policy.environment.task_options.get("goals") or []
     named |= {goal_key(np.asarray(goal, dtype=float)) for goal in trained}
-    if not problem.single_path and (leaked := named & problem.test_keys):
+    if not problem.single_path and (leaked := sorted(named & problem.test_keys)):
         raise SubmissionRefused(
-            f"the policy '{path.name}' was trained on {len(leaked)} of the test goals of '{problem.name}'"
+            f"the policy '{path.name}' was trained on {len(leaked)} of the {len(problem.test_keys)} test goals of "
+            f"'{problem.name}' ({', '.join(leaked[:3])}{', ...' if len(leaked) > 3 else ''}); allowed: any other goals"
         )
     return path
 
@@ -277,6 +354,11 @@ def _check_search_score(problem: FrozenProblem, submission: Submission, rows: li
         row = next(row for row in rows if _same(problem, row.design, design) and row.share == 1.0)
         found = problem.evaluate(design, judge=submission.judge, seed=submission.seed)  # type: ignore[arg-type]
         _compare(submission.judge, "score in the ledger", row.scores, found.scores)
+        if row.environment_steps < found.environment_steps:
+            raise SubmissionRefused(
+                f"the ledger counts {row.environment_steps} environment steps for the submitted body, but scoring it "
+                f"takes {found.environment_steps}"
+            )
 
 
 def _compare(controller: str, what: str, claimed: list[float], found: list[float]) -> None:
@@ -297,7 +379,7 @@ def _tested(problem: FrozenProblem, submission: Submission, policy: Path | None)
     for design in submission.designs:
         try:
             score = evaluator(design, judge, seed=submission.seed, policy=policy)
-        except (InfeasibleDesign, ConvergenceError) as error:
+        except (InfeasibleDesign, ConvergenceError, ConfigError) as error:  # or a policy of another environment
             raise SubmissionRefused(f"the body cannot be tested: {error}") from None
         if not score.feasible:
             raise SubmissionRefused(f"the body is infeasible on finite elements: {score.reason}")

@@ -160,7 +160,7 @@ def parallel(snapshot: StudySnapshot, results: StudyResults) -> str:
     return out[0]
 
 
-def _silhouette(points: np.ndarray, triangles: np.ndarray, extent: np.ndarray) -> np.ndarray:
+def silhouette(points: np.ndarray, triangles: np.ndarray, extent: np.ndarray) -> np.ndarray:
     """Return the shadow of a body on a plane, as an image (h, w) of 0 and 1.
 
     The body has points in the plane [m] (n, 2) and triangles (t, 3). ``extent`` holds two corners of the image [m],
@@ -174,6 +174,16 @@ def _silhouette(points: np.ndarray, triangles: np.ndarray, extent: np.ndarray) -
     for corners in (points[triangles] - extent[0]) * scale:
         draw.polygon([(float(a), float(b)) for a, b in corners], fill=1)
     return np.asarray(image)
+
+
+def draw_silhouette(
+    ax: Any, points: np.ndarray, triangles: np.ndarray, extent: np.ndarray, colour: str, opacity: float = 0.16
+) -> None:
+    """Draw the shadow of a body [mm] with its outline; points, triangles and extent are those of `silhouette`."""
+    image = silhouette(points, triangles, extent)
+    grid = [1e3 * np.linspace(extent[0, k], extent[1, k], n) for k, n in enumerate(reversed(image.shape))]
+    ax.contourf(*grid, image, levels=[0.5, 1.5], colors=[colour], alpha=opacity)
+    ax.contour(*grid, image, levels=[0.5], colors=[colour], linewidths=1.3)
 
 
 def overlay(shapes: Sequence[tuple[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]]]) -> str:
@@ -193,10 +203,7 @@ def overlay(shapes: Sequence[tuple[str, Mapping[str, tuple[np.ndarray, np.ndarra
             extent = np.array([points.min(axis=0) - margin, points.max(axis=0) + margin])
             for role, (shape, triangles, effectors) in bodies.items():
                 colour = WINNER if role == "winner" else BASELINE
-                image = _silhouette(shape[:, plane], triangles, extent)
-                grid = [1e3 * np.linspace(extent[0, k], extent[1, k], n) for k, n in enumerate(reversed(image.shape))]
-                ax.contourf(*grid, image, levels=[0.5, 1.5], colors=[colour], alpha=0.16)
-                ax.contour(*grid, image, levels=[0.5], colors=[colour], linewidths=1.3)
+                draw_silhouette(ax, shape[:, plane], triangles, extent, colour)
                 ax.scatter(*(1e3 * effectors[:, plane].T), 30, colour, zorder=4, label=f"{role}, effector")
             ax.set(xlabel=labels[0], ylabel=labels[1], aspect="equal")
             ax.set_title(caption, fontsize=10, color="#334155")

@@ -67,8 +67,14 @@ def show(name: str) -> None:
 
 @benchmark.command()
 @click.argument("names", nargs=-1, required=True)
-@click.option("--method", "methods", multiple=True, required=True, help="Optimiser; several with several options.")
-@click.option("--judge", help="Who controls the bodies in the search (default: the problem's).")
+@click.option(
+    "--method",
+    "methods",
+    multiple=True,
+    required=True,
+    help="Optimiser, such as gp or random; several with several options. An unknown one lists all.",
+)
+@click.option("--judge", help="Who controls the bodies in the search: qp, shared or trained (default: the problem's).")
 @click.option("--level", default="small", show_default=True, help="Budget: small, medium or large.")
 @click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Number of seeds.")
 @click.option("--bodies", type=click.IntRange(min=1), help="Largest number of bodies, besides the budget.")

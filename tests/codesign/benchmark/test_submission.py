@@ -12,6 +12,7 @@ from softgym_envs.codesign.benchmark.problem import goal_key
 from softgym_envs.codesign.benchmark.scoring import reference
 from softgym_envs.codesign.benchmark.submission import SubmissionRefused
 from softgym_envs.errors import DataError
+from softgym_envs.storage import read_json, write_json
 
 
 @pytest.fixture
@@ -66,7 +67,7 @@ def test_a_forged_ledger(submission, tmp_path, data):
 def test_a_body_that_the_search_has_not_scored(submission, tmp_path, data):
     name = next(iter(submission.designs[0]))
     submission.designs[0][name] *= 0.999
-    refused(submission, tmp_path, r"a submitted body is not in the ledger", data)
+    refused(submission, tmp_path, rf"the submitted body \({name} = .* is not in the ledger, which has 2 rows", data)
 
 
 def test_a_body_out_of_the_box(submission, tmp_path, data):
@@ -82,6 +83,61 @@ def test_a_wrong_version(submission, tmp_path, data):
 def test_an_unknown_problem(submission, tmp_path, data):
     submission.problem = "tiny-v2"
     refused(submission, tmp_path, r"unknown problem 'tiny-v2'; did you mean 'tiny-v1'", data)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"judge": "magic"}, r"problem 'tiny-v1' has no judge 'magic'; allowed: qp, shared, trained"),
+        ({"level": "huge"}, r"level 'huge' does not exist; allowed: small, medium, large"),
+        ({"designs": []}, r"0 bodies are submitted; allowed: 1 to 1"),
+        ({"claimed": [[-0.01], [-1e-9]]}, r"scores of 2 bodies are claimed; allowed: those of the 1 submitted ones"),
+        ({"controller": "policy"}, r"controller 'policy' does not exist; allowed: .*, or policy with a file"),
+        ({"controller": "policy", "policy": {"file": "x"}}, r"policy lacks sha256, goals; needed: file, sha256 and"),
+        (
+            {"controller": "policy", "policy": {"file": "x", "sha256": "0", "goals": "all"}},
+            r"policy.goals = 'all' must be a list of hashes",
+        ),
+    ],
+)
+def test_values_that_no_search_writes(submission, tmp_path, data, change, message):
+    for name, value in change.items():
+        setattr(submission, name, value)
+    refused(submission, tmp_path, message, data)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"hash": 3}, r"the submission: hash: must be a valid string, got 3"),
+        ({"claimd": []}, r"the submission: unknown field 'claimd'; did you mean 'claimed'"),
+        ({"designs": [{"length": "long"}]}, r"designs.0.length: must be a valid number.*got 'long'"),
+        ({"ledger": [3]}, r"ledger.0: must be a mapping of keys to values, got 3"),
+        ({"ledger": [{"design": {}, "judge": "qp", "fem_solves": "many"}]}, r"ledger.0: fem_solves: .*got 'many'"),
+    ],
+)
+def test_fields_of_another_type(submission, tmp_path, data, change, message):
+    path = tmp_path / "submission.json"
+    write_json(path, {**submission.to_json(), **change})
+    with pytest.raises(DataError, match=message):
+        verify(path, data=data)
+    write_json(path, {"problem": "tiny-v1"})
+    with pytest.raises(DataError, match=r"missing required keys hash, method, author, level"):
+        verify(path, data=data)
+    write_json(path, [submission.to_json()])
+    with pytest.raises(DataError, match=r"the submission must be an object with fields, got a list"):
+        verify(path, data=data)
+
+
+def test_costs_that_are_not_what_a_score_takes(submission, tmp_path, data):
+    for row in submission.ledger:
+        row["environment_steps"] = 0
+    refused(submission, tmp_path, r"counts 0 environment steps for the submitted body, but scoring it takes 100", data)
+    submission.ledger[1]["environment_steps"] = -100
+    refused(submission, tmp_path, r"ledger.1.environment_steps = -100; allowed: finite numbers from 0", data)
+    submission.ledger[1]["environment_steps"] = 100
+    submission.ledger[0]["cpu_seconds"] = float("nan")
+    refused(submission, tmp_path, r"ledger.0.cpu_seconds = nan; allowed: finite numbers from 0", data)
 
 
 def test_more_than_the_budget(submission, tmp_path, data):
@@ -101,10 +157,36 @@ def test_policies(submission, tiny, tmp_path, data):
     refused(submission, tmp_path, r"the policy 'mine.safetensors' does not lie beside the submission", data)
     shutil.copy(source, path)
     shutil.copy(source.with_suffix(".json"), path.with_suffix(".json"))
-    submission.policy["goals"] = [goal_key(tiny.goals["test"][0]), "0" * 16]
-    refused(submission, tmp_path, r"'mine.safetensors' was trained on 1 of the test goals of 'tiny-v1'", data)
+    key = goal_key(tiny.goals["test"][0])
+    trained_on = rf"'mine.safetensors' was trained on 1 of the 1 test goals of 'tiny-v1' \({key}\); allowed: any other"
+    submission.policy["goals"] = [key, "0" * 16]
+    refused(submission, tmp_path, trained_on, data)
     submission.policy = {**submission.policy, "goals": [], "sha256": "0" * 32}
-    refused(submission, tmp_path, r"is not the one that was submitted: its SHA-256 differs", data)
+    refused(submission, tmp_path, r"is not the one that was submitted: its SHA-256 begins with \w{12}, that of", data)
     submission.policy["sha256"] = file_hash(source)
+    card = read_json(path.with_suffix(".json"))
+    goals = {"goals": tiny.goals["test"][:, 0].tolist()}  # named by the training itself
+    environment = {**card["config"]["environment"], "task_options": goals}
+    write_json(path.with_suffix(".json"), {**card, "config": {**card["config"], "environment": environment}})
+    refused(submission, tmp_path, trained_on, data)
+    path.with_suffix(".json").unlink()
+    refused(submission, tmp_path, r"policy card .*mine.json' cannot be read: No such file or directory", data)
+    shutil.copy(source.with_suffix(".json"), path.with_suffix(".json"))
+    other = policy_path("diamond_reach_designs")
+    for suffix in (".safetensors", ".json"):
+        shutil.copy(other.with_suffix(suffix), tmp_path / f"other{suffix}")
+    submission.policy = {"file": "other.safetensors", "sha256": file_hash(other), "goals": []}
+    refused(submission, tmp_path, r"cannot be tested: environment.id = SoftGym/FingerReach-v0 .* does not fit", data)
+    submission.policy = {"file": "mine.safetensors", "sha256": file_hash(source), "goals": []}
     submission.write(tmp_path / "submission.json")
     assert len(verify(tmp_path / "submission.json", data=data).scores) == 1
+
+
+def test_files_that_cannot_be_read(submission, tmp_path, data):
+    path = tmp_path / "submission.json"
+    with pytest.raises(DataError, match=r"submission.json' cannot be read: No such file or directory"):
+        verify(path, data=data)
+    submission.write(path)
+    path.write_text(path.read_text()[:400])
+    with pytest.raises(DataError, match=r"submission.json' cannot be read: it is truncated or not valid JSON"):
+        verify(path, data=data)
