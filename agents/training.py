@@ -16,7 +16,7 @@ from softgym_envs.agents.evaluation import Evaluation, evaluate, evaluation_set
 from softgym_envs.agents.learners import make_learner
 from softgym_envs.agents.learners.base import Learner, Tensors
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
-from softgym_envs.config import difference, load_config, provenance, save_config, save_resolved
+from softgym_envs.config import difference, load_stored, provenance, save_config, save_resolved
 from softgym_envs.errors import DataError
 from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_json, write_json
@@ -138,10 +138,9 @@ def _earlier_steps(config: TrainConfig, folder: Path) -> int | None:
         ConfigError: if the folder's configuration cannot be read.
         DataError: if it is that of another training, or of one that cannot be extended to the steps of ``config``.
     """
-    resolved = folder / "config.yaml"
-    if not resolved.exists():
+    if not (folder / "config.yaml").exists():
         return None
-    stored = load_config(resolved, TrainConfig)
+    stored = load_stored(folder, TrainConfig, "a training")
     other = difference(stored, config, ignore=["steps"])
     if other is not None:
         raise DataError(

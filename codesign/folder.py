@@ -13,7 +13,7 @@ from softgym_envs.codesign.goals import draw_goals
 from softgym_envs.codesign.records import Account, TrialResult
 from softgym_envs.codesign.scheduling.connect import open_storage
 from softgym_envs.codesign.scheduling.storage import SharedStorage, StudyStorage, file_lock
-from softgym_envs.config import check_compatible, check_config, load_config, save_resolved
+from softgym_envs.config import check_compatible, check_config, load_stored, save_resolved
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.storage import atomic_write, read_json, write_json
 
@@ -137,7 +137,7 @@ class StudyFolder:
         """The resolved configuration."""
         if not (self.path / "config.yaml").exists():
             raise DataError(f"'{self.path}' is not the folder of a co-design study: it has no config.yaml")
-        return load_config(self.path / "config.yaml", StudyConfig)
+        return load_stored(self.path, StudyConfig, "a co-design study")
 
     @cached_property
     def goals(self) -> dict[str, np.ndarray]:

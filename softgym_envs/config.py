@@ -97,7 +97,9 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
         try:
             data = read_value(path.read_text())
         except OSError as error:
-            raise ConfigError(f"config '{path}' cannot be read: {error.strerror or error}") from None
+            inside = path / "config.yaml"
+            reason = f"it is a folder; its file is {inside}" if inside.exists() else error.strerror or error
+            raise ConfigError(f"config '{path}' cannot be read: {reason}") from None
         except (yaml.YAMLError, UnicodeDecodeError) as error:
             where = getattr(error, "problem_mark", None)
             place = f", line {where.line + 1}" if where is not None else ""
@@ -121,6 +123,23 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
         except yaml.YAMLError:
             raise ConfigError(f"override '{override}': the value is not valid YAML") from None
     return check_config(model, data, f"config '{path}'" if path is not None else "config")
+
+
+def load_stored(folder: str | Path, model: type[ModelT], kind: str) -> ModelT:
+    """Return the configuration that `save_config` wrote to a folder.
+
+    Args:
+        folder: the folder.
+        model: class of the configuration.
+        kind: what the folder should hold, for the message: ``"a training"``.
+
+    Raises:
+        ConfigError: if the folder holds something else, or its configuration cannot be read.
+    """
+    try:
+        return load_config(Path(folder) / "config.yaml", model)
+    except ConfigError as error:
+        raise ConfigError(f"folder '{folder}' does not hold {kind}: {error}; use another folder") from None
 
 
 def _find_files(model: type[BaseModel], data: dict[str, Any], folder: Path) -> None:

@@ -212,6 +212,24 @@ def test_bad_input_is_one_line_and_status_two(refused, arguments, words):
     assert line.count("did you mean") <= 1
 
 
+def test_a_finished_training_is_extended_and_its_folder_is_named(softgym, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    small = ["report_every=256", "evaluation_episodes=2"]
+    arguments = ["train", "--config", "finger_reach_analytic", "--folder", "run", "--quiet", *small]
+    assert softgym(*arguments, "steps=256")[:2] == (0, "wrote run/policy.safetensors\n")
+    status, out, _ = softgym(*arguments, "steps=256")
+    assert status == 0 and "is finished after 256 steps; a larger steps=... trains on" in out
+    assert softgym(*arguments, "steps=512")[:2] == (0, "wrote run/policy.safetensors\n")
+    lines = Path("run/curve.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in lines] == ["step", "256", "512"]
+    _, _, err = softgym("codesign", "--config", "finger_reach", "--folder", "run")
+    assert "run' does not hold a co-design study: config" in err and "missing required keys name" in err
+    _, _, err = softgym("evaluate", "--config", "finger_reach_analytic", "--agent", "run")
+    assert "agent 'run' is the folder of a training; its policy is run/policy.safetensors" in err
+    _, _, err = softgym("evaluate", "--config", "./run", "--agent", "qp")
+    assert "it is a folder; its file is run/config.yaml" in err
+
+
 @pytest.mark.parametrize(
     "arguments",
     [["deploy", "finger", "x.h"], ["show", "finger", "--picture", "x.png"], ["configs", "--copy", "copies"]],

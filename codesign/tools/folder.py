@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from softgym_envs.codesign.scheduling.storage import file_lock
-from softgym_envs.config import Config, check_compatible, load_config, save_resolved
+from softgym_envs.config import Config, check_compatible, load_stored, save_resolved
 from softgym_envs.errors import ConfigError
 
 RESULTS = ("journal.log", "evaluations.jsonl", "result.json")
@@ -57,11 +57,6 @@ def _check(folder: Path, config: Config, kind: str, may_change: Sequence[str]) -
         if results:
             raise ConfigError(f"folder '{folder}' holds {results[0]} but no config.yaml; use another folder")
         return
-    try:
-        old = load_config(path, type(config))
-    except ConfigError:
-        raise ConfigError(
-            f"folder '{folder}' does not hold {kind}: its config.yaml belongs to something else; use another folder"
-        ) from None
+    old = load_stored(folder, type(config), kind)
     if results:
         check_compatible(old, config, f"folder '{folder}' holds {kind}", may_change=may_change)

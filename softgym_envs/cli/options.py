@@ -125,6 +125,9 @@ def check_agent(name: str) -> None:
     from softgym_envs.agents.policy import POLICY_FILE, shipped_policies
 
     names = [*BASELINES, *shipped_policies()]
+    policy = Path(name) / "policy.safetensors"
+    if name not in names and policy.exists():
+        raise ConfigError(f"agent '{name}' is the folder of a training; its policy is {policy}")
     if name not in names and not name.endswith(".safetensors"):
         raise ConfigError(unknown_name("agent", name, names, other=POLICY_FILE))
 
