@@ -144,7 +144,7 @@ def _header(estimator: LearnedEstimator, grid: TouchGrid, expected_force: float,
     names = names_of(p, many=True) | {key: repr(float(value)) for key, value in numbers.items()}
     names |= {key: str(value) for key, value in counts.items()}
     about = [
-        f"Estimator of a touched soft robot, written by softgym-envs {__version__} (C99, estimator header format 1):",
+        f"Estimator of a touched soft robot, written by softgym-envs {__version__} (C99, estimator header format 2):",
         "thesis, sec. 3.3.6, on a learned model: shape, force and place of a touch from volumes of cavities.",
         "",
         f"Robot      {robot.name} ({model.robot.weights_name})",
