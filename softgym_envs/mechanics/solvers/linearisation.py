@@ -202,21 +202,27 @@ class Linearisation:
         count = self.H.shape[1]
         B = np.column_stack([assembled.gradients, assembled.residual])
         X = np.zeros_like(B)
-        known = self._tangent.solver.expand(self._half) if self._columns is None else self._columns
-        X[:, :count] = known[:, :count]
+        motions = self._tangent.solver.expand(self._half) if self._columns is None else self._columns
+        X[:, :count] = motions[:, :count]
         R = B - self._tangent.multiply(values, extra, X)
-        allowed, todo, rate = SMALL_REST * np.append(np.diag(self.W), 0.0), np.arange(count + 1), 1.0
+        size = np.maximum(np.diag(self.W), np.finfo(float).tiny)  # zero for a row that cannot move
+        allowed, rates, todo = np.append(SMALL_REST * size, 0.0), np.ones(count + 1), np.arange(count + 1)
+        before = 0.0  # of the residual
         for sweep in range(MAX_SWEEPS):
             Y = self._tangent.solver.solve(R[:, todo])
             rest = (R[:, todo] * Y).sum(axis=0)
             if sweep == 0:
                 allowed[count] = SMALL_STEP_REST * rest[count]
-                rate = SMALL_REST * float((rest[:count] / allowed[:count]).max(initial=0.0))
-                if not rate <= LARGEST_REST:
-                    return False
+                rates[:count] = (rest[:count] / size).max(initial=0.0)
+            elif todo[-1] == count:
+                rates[count] = rest[-1] / before
+            known = rates[:count] if sweep == 0 else rates
+            if not (known <= LARGEST_REST).all():
+                return False
+            before = rest[-1]
             X[:, todo] += Y
             R[:, todo] -= self._tangent.multiply(values, extra, Y)
-            todo = todo[rate * rest > allowed[todo]]
+            todo = todo[rates[todo] * rest > allowed[todo]]
             if not len(todo):
                 break
         else:
