@@ -10,14 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from softgym_envs.robots.registry import make_robot
-from softgym_envs.surrogate.calibration import (
-    ROUNDS,
-    attack,
-    calibration_states,
-    cross_validated,
-    judged_states,
-    report,
-)
+from softgym_envs.surrogate.calibration import attack, calibration_states, cross_validated, judged_states, report
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
 
 #: The calibration uses seed 11.
@@ -26,18 +19,14 @@ SEED = 12
 BODIES, ATTACKS = 16, 2000
 """Most bodies of a stratum, and states of the search. Rows recorded earlier have up to 32 bodies."""
 
-FIRST_ROUNDS = {"diamond": 2}
-"""Weights whose search ends after so many of its `ROUNDS` rounds, because their states take long."""
-
 
 def trust(variant: str, folder: str | Path = "results/trust") -> dict[str, object]:
     """Errors, coverage and trust of weights by stratum, on FEM states that their calibration has not seen.
 
     As many states as the calibration used, but at most those of `BODIES` bodies, and `ATTACKS` of a new search for
-    trusted states with large errors (``adversarial``), or those of its first rounds (`FIRST_ROUNDS`), with the limit
-    of trust as it is. States of an accurate mesh take many seconds, so there the states of the calibration serve again,
-    if the folder has them: those of each body are judged by factors and a limit of trust from all others, and
-    ``adversarial`` is the search of the calibration.
+    trusted states with large errors (``adversarial``), with the limit of trust as it is. States of an accurate mesh
+    take many seconds, so there the states of the calibration serve again, if the folder has them: those of each body
+    are judged by factors and a limit of trust from all others, and ``adversarial`` is the search of the calibration.
 
     Args:
         variant: name of shipped weights that have been calibrated.
@@ -50,8 +39,7 @@ def trust(variant: str, folder: str | Path = "results/trust") -> dict[str, objec
     if expensive := "mesh" in robot.mechanics_key:
         rows = cross_validated(model, calibration_states(model, kept))
     else:
-        rounds = FIRST_ROUNDS.get(variant, ROUNDS)
-        attacked = attack(model, ATTACKS * rounds // ROUNDS, sizes["states"], SEED, kept, rounds=rounds)
+        attacked = attack(model, ATTACKS, sizes["states"], SEED, kept)
         states = judged_states(model, min(sizes["bodies"], BODIES), sizes["states"], SEED, kept)
         rows = report(model, states) | {"adversarial": report(model, attacked)["adversarial"]}
     result: dict[str, object] = {

@@ -409,19 +409,13 @@ def calibration_states(model: SurrogateModel, folder: str | Path) -> JudgedState
 
 
 def attack(
-    model: SurrogateModel,
-    count: int,
-    states: int,
-    seed: int,
-    folder: str | Path | None = None,
-    number: int = 0,
-    rounds: int = ROUNDS,
+    model: SurrogateModel, count: int, states: int, seed: int, folder: str | Path | None = None, number: int = 0
 ) -> JudgedStates:
     """Search for trusted states with large errors; return all that were judged, in the stratum ``adversarial``.
 
-    In each round, gradients of the spread move bodies and commands from anywhere in their boxes to where the spread is
-    largest, and each body keeps the trusted commands with the largest uncertainty. From the second round on, half of
-    the bodies start near those with the largest errors on FEM so far.
+    In each of `ROUNDS` rounds, gradients of the spread move bodies and commands from anywhere in their boxes to where
+    the spread is largest, and each body keeps the trusted commands with the largest uncertainty. From the second round
+    on, half of the bodies start near those with the largest errors on FEM so far.
 
     Args:
         model: a calibrated model.
@@ -430,16 +424,14 @@ def attack(
         seed: of the random numbers.
         folder: where the states of each body are kept; an interrupted search continues with the next body.
         number: of the search: each has random numbers of its own.
-        rounds: number of rounds. The first rounds of a longer search are those of a shorter one with as many states in
-            each.
     """
     rng = np.random.default_rng([seed, 99 + number])
     robot = model.robot
-    d, n, bodies = len(learned_variables(robot)), len(robot.actuators), max(1, count // (rounds * states))
+    d, n, bodies = len(learned_variables(robot)), len(robot.actuators), max(1, count // (ROUNDS * states))
     parts: list[JudgedStates] = []
     origin: list[tuple[np.ndarray, np.ndarray]] = []
     scores: list[np.ndarray] = []
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         x = pushed(rng.random((POOL * bodies, d)), rng)
         c = pushed(rng.random((POOL * bodies * states, n)), rng).reshape(-1, states, n)
         x, c = _choose(model, *_climb(model, x, c), rng, bodies)
