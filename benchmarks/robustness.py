@@ -159,7 +159,9 @@ def sensed_policies() -> dict[str, object]:
         for name, file in TRAINED.items():
             config = load_config(CONFIGS / f"{file}.yaml", TrainConfig)
             seeds = {
-                f"{name}, seed {seed}": train(config.model_copy(update={"seed": seed}), Path(folder) / f"{file}_{seed}")
+                f"{name}, seed {seed}": train(
+                    config.model_copy(update={"seed": seed}), Path(folder) / f"{file}_{seed}", progress=False
+                )
                 for seed in TRAINED_SEEDS
             }
             result |= _sensed(seeds, config.environment)
