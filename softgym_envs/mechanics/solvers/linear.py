@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
-
-TOGETHER_FROM = 5_000
-"""Number of equations from which CHOLMOD solves for several columns together; in smaller systems that gains nothing."""
 
 
 class LinearSolver(ABC):
@@ -56,7 +52,7 @@ class LinearSolver(ABC):
         return columns.T @ solved, solved
 
     def expand(self, vector: np.ndarray) -> np.ndarray:
-        """Return ``A^-1 H s`` for ``vector = half @ s``, (n,) or (n, k), with the array ``half`` of `condense`."""
+        """Return ``A^-1 H s``, shape (n,), for ``vector = half @ s`` with the array ``half`` of `condense`."""
         return vector
 
 
@@ -81,7 +77,6 @@ class CholmodSolver(LinearSolver):
         self._identity = matrix((indices == columns).astype(float))
         self._lower = spmatrix(self._identity, matrix(indices.astype(np.int64)), matrix(columns.astype(np.int64)))
         self._order: np.ndarray | None = None
-        self._full: dict[int, Any] = {}  # sparse matrices of so many columns without a zero entry
         options = {} if order is None else {"p": matrix(order.tolist())}
         self._factor = cholmod.symbolic(self._lower, **options)
 
@@ -106,44 +101,26 @@ class CholmodSolver(LinearSolver):
         if self._order is None:
             self._lower.V = self._identity
             self._cholmod.numeric(self._lower, self._factor)
-        return self._elimination()[self._failed : self._failed + count]
-
-    def _elimination(self) -> np.ndarray:
-        """Return the order of elimination, shape (n,), once a matrix has been factorised."""
-        if self._order is None:
             order = self._matrix(np.arange(self.size, dtype=float))
             self._cholmod.solve(self._factor, order, sys=7)  # P
             self._order = np.asarray(order)[:, 0].astype(np.int64)
-        return self._order
-
-    def _solve(self, columns: np.ndarray, system: int) -> np.ndarray:
-        """Solve one of CHOLMOD's systems for columns (n, k).
-
-        CVXOPT passes dense columns to CHOLMOD one by one and sparse ones together. Together they are faster in a large
-        system, though no entry is zero: eight columns take less than half as long.
-        """
-        count = columns.shape[1]
-        if count < 2 or self.size < TOGETHER_FROM:
-            solution = self._matrix(np.asfortranarray(columns))
-            self._cholmod.solve(self._factor, solution, sys=system)
-            return np.asarray(solution)
-        if count not in self._full:
-            rows, places = np.tile(np.arange(self.size), count), np.repeat(np.arange(count), self.size)
-            self._full[count] = self._spmatrix(0.0, self._matrix(rows), self._matrix(places), (self.size, count))
-        full = self._full[count]
-        full.V = self._matrix(columns.ravel(order="F"))
-        return np.asarray(self._matrix(self._cholmod.spsolve(self._factor, full, sys=system)))
+        return self._order[self._failed : self._failed + count]
 
     @property
     def positive_definite(self) -> bool:
         return True  # `factorise` fails on all other matrices
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
-        return self._solve(rhs, 0)
+        solution = self._matrix(np.asfortranarray(rhs))
+        self._cholmod.solve(self._factor, solution)
+        return np.asarray(solution)
 
     def condense(self, columns: np.ndarray, extra: csc_matrix | None = None) -> tuple[np.ndarray, np.ndarray]:
         # With P A P^T = L L^T half of the work suffices: H^T A^-1 H = Y^T Y, L Y = P H.
-        solved = self._solve(columns[self._elimination()], 4)  # L
+        half = self._matrix(np.asfortranarray(columns))
+        self._cholmod.solve(self._factor, half, sys=7)  # P
+        self._cholmod.solve(self._factor, half, sys=4)  # L
+        solved = np.asarray(half)
         if extra is not None:
             entries = extra.tocoo()
             rows, places = (self._matrix(index.astype(np.int64)) for index in (entries.row, entries.col))
@@ -154,9 +131,10 @@ class CholmodSolver(LinearSolver):
         return solved.T @ solved, solved
 
     def expand(self, vector: np.ndarray) -> np.ndarray:
-        solution = np.empty_like(vector)
-        solution[self._elimination()] = self._solve(vector.reshape(self.size, -1), 5).reshape(vector.shape)  # L^T
-        return solution
+        solution = self._matrix(vector)
+        self._cholmod.solve(self._factor, solution, sys=5)  # L^T
+        self._cholmod.solve(self._factor, solution, sys=8)  # P^T
+        return np.asarray(solution)[:, 0]
 
 
 class SuperLUSolver(LinearSolver):

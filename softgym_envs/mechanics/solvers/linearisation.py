@@ -11,18 +11,6 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.cable_friction import CableFriction, CableMemory, FrictionTerms
 from softgym_envs.mechanics.solvers.tangent import Tangent
 
-REFINED_FROM = 10_000
-"""Number of equations from which refinement with the last factor costs less than a new factor."""
-NEAR = 1e-3
-"""Part of the body's extent by which rows may have moved since the last factorisation for its factor to be tried."""
-MAX_SWEEPS = 4
-"""Most corrections of iterative refinement; a tangent that needs more is factorised."""
-LARGEST_REST = 1e-3
-"""Squared relative error of the last factor, in the energy norm, above which the tangent is factorised."""
-SMALL_REST, SMALL_STEP_REST = 1e-9, 1e-6
-"""Squared relative errors, in the energy norm, that refinement leaves of the motions by unit efforts, which are the
-relative errors of ``W``, and of Newton's step."""
-
 
 class Linearisation:
     """Assembles the equations of a model and keeps the factorised tangent with the compliance of its constraints.
@@ -66,10 +54,6 @@ class Linearisation:
         self.current = False
         self.exact = True
         self._model = model
-        used = np.unique(np.concatenate([block.nodes_used for block in model.blocks]))
-        self._near = NEAR * float(np.linalg.norm(np.ptp(model.nodes[used], axis=0)))
-        self._factored: np.ndarray | None = None  # rows at which the tangent was factorised
-        self._columns: np.ndarray | None = None  # A^-1 [H, residual], shape (N, size + 1), where they were refined
         self._friction_terms: FrictionTerms | None = None
         self._terms: ContactTerms | None = None
         self._tangent = Tangent(self.assembly.indptr, self.assembly.indices, model.solver)
@@ -113,14 +97,11 @@ class Linearisation:
 
     def update(self, x: np.ndarray, effort: np.ndarray, *, exact: bool = False) -> bool:
         """Linearise at a state. False if elements are inverted or the tangent is singular."""
-        self._factored = None  # loads or inertia may have changed
         assembled = self.assemble(x, effort)
         return assembled is not None and self.factorise(assembled, x, exact=exact)
 
     def factorise(self, assembled: Assembled, x: np.ndarray, *, exact: bool = False, definite: bool = False) -> bool:
         """Take over the equations that were assembled last and factorise their tangent. False if it is singular.
-
-        Near the state of the last factor, a large body takes that factor with iterative refinement, and not a new one.
 
         Args:
             assembled: the equations.
@@ -128,9 +109,6 @@ class Linearisation:
             exact: do not leave out terms of contact.
             definite: without contact, return False for an indefinite tangent too, which takes far longer to factorise.
         """
-        if self._refine(assembled, x):
-            return True
-        self._factored = self._columns = None
         self.residual, tangent, self.H, self.delta, self.elastic = assembled
         terms, friction = self._terms, self._friction_terms
         extra = None if terms is None else terms.tangent
@@ -178,64 +156,6 @@ class Linearisation:
         self.W = W if self._slips else 0.5 * (W + W.T)
         self.shift = response[:count, count]
         self.current = True
-        large = len(self.residual) >= REFINED_FROM
-        if large and self.exact and not self._slips and friction is None and self._tangent.solver.positive_definite:
-            self._factored = x.copy()
-        return True
-
-    def _refine(self, assembled: Assembled, x: np.ndarray) -> bool:
-        """Linearise at a state near that of the last factor by iterative refinement; for the arguments see `factorise`.
-
-        With ``B = [H, residual]``, an approximate ``X`` and the rest ``R = B - A X``, ``B^T A^-1 B`` is
-        ``B^T X + X^T R`` to second order in the error of ``X``. Each correction multiplies this error by that of the
-        factor.
-
-        Returns:
-            False, with nothing changed, if the state is not near enough.
-        """
-        terms = self._terms
-        if self._factored is None or np.abs(x - self._factored).max() > self._near:
-            return False
-        if terms is not None and terms.directions.shape[1]:
-            return False
-        values, extra = assembled.tangent, None if terms is None else terms.tangent
-        count = self.H.shape[1]
-        B = np.column_stack([assembled.gradients, assembled.residual])
-        X = np.zeros_like(B)
-        motions = self._tangent.solver.expand(self._half) if self._columns is None else self._columns
-        X[:, :count] = motions[:, :count]
-        R = B - self._tangent.multiply(values, extra, X)
-        size = np.maximum(np.diag(self.W), np.finfo(float).tiny)  # zero for a row that cannot move
-        allowed, rates, todo = np.append(SMALL_REST * size, 0.0), np.ones(count + 1), np.arange(count + 1)
-        before = 0.0  # of the residual
-        for sweep in range(MAX_SWEEPS):
-            Y = self._tangent.solver.solve(R[:, todo])
-            rest = (R[:, todo] * Y).sum(axis=0)
-            if sweep == 0:
-                allowed[count] = SMALL_STEP_REST * rest[count]
-                rates[:count] = (rest[:count] / size).max(initial=0.0)
-            elif todo[-1] == count:
-                rates[count] = rest[-1] / before
-            known = rates[:count] if sweep == 0 else rates
-            if not (known <= LARGEST_REST).all():
-                return False
-            before = rest[-1]
-            X[:, todo] += Y
-            R[:, todo] -= self._tangent.multiply(values, extra, Y)
-            todo = todo[rates[todo] * rest > allowed[todo]]
-            if not len(todo):
-                break
-        else:
-            return False
-        gram = B.T @ X + X.T @ R
-        self.residual, _, self.H, self.delta, self.elastic = assembled
-        self.W = 0.5 * (gram[:count, :count] + gram[:count, :count].T)
-        self.shift = gram[:count, count]
-        self._columns = X
-        if terms is not None:
-            assert self.contact is not None
-            self.contact.hold(terms)
-        self.current = True
         return True
 
     def follow(self, assembled: Assembled) -> None:
@@ -245,8 +165,6 @@ class Linearisation:
         """
         self.residual, _, self.H, self.delta, self.elastic = assembled
         self.shift = np.zeros_like(self.shift)
-        if self._columns is not None:
-            self._columns[:, -1] = 0.0
         self._half[:, self.H.shape[1]] = 0.0
         if self._slips:
             self._slip[:, self.H.shape[1]] = 0.0
@@ -254,7 +172,7 @@ class Linearisation:
             self.contact.hold(self._terms)
 
     def solve(self, residual: np.ndarray) -> np.ndarray:
-        """Return ``A^-1 residual``, shape (N,), with the last factor: that of a state nearby after a refinement."""
+        """Return ``A^-1 residual``, shape (N,)."""
         solution = self._tangent.solver.solve(residual[:, None])[:, 0]
         if self._slips:
             slip = np.linalg.solve(self._core, self._loading.T @ solution)
@@ -269,8 +187,6 @@ class Linearisation:
             residual: multiple of the residual of this linearisation to be corrected.
         """
         combined = np.append(effort, -residual)
-        if self._columns is not None:
-            return self._columns @ combined
         half = self._half[:, : len(combined)] @ combined
         if self._slips:
             half = half - self._half[:, self._slide] @ (self._slip @ combined)
@@ -297,7 +213,6 @@ class Linearisation:
             Compliance (size + k, size + k) and values of the constraints (size,); None if the tangent is singular.
         """
         assert self.contact is not None
-        self._factored = None
         assembled = self.assemble(x, effort)
         held = csc_matrix(columns[:, springs > 0.0])
         extra = self.contact.forces_held(x) + (held.multiply(springs[springs > 0.0]) @ held.T).tocsr()

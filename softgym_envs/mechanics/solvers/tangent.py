@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_matrix, tril
 
-from softgym_envs.mechanics.compilation import FAST, njit
 from softgym_envs.mechanics.solvers.linear import CholmodSolver, LinearSolver, SuperLUSolver, make_solver
 from softgym_envs.mechanics.solvers.ordering import nested_dissection
 from softgym_envs.mechanics.solvers.split import SplitCholesky
@@ -15,19 +14,6 @@ def _distinct(keys: np.ndarray) -> np.ndarray:
     """Sorted distinct values; for integers, sorting is far faster than `numpy.unique`."""
     keys = np.sort(keys)
     return keys[np.append(True, keys[1:] != keys[:-1])]
-
-
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def _multiply(indptr, indices, values, columns, out):
-    """Add the product of a symmetric matrix, given by its lower triangle (CSC), with columns (N, k) to ``out``."""
-    for j in range(indptr.shape[0] - 1):
-        for t in range(indptr[j], indptr[j + 1]):
-            i, value = indices[t], values[t]
-            for k in range(columns.shape[1]):
-                out[i, k] += value * columns[j, k]
-            if i != j:
-                for k in range(columns.shape[1]):
-                    out[j, k] += value * columns[i, k]
 
 
 class Tangent:
@@ -81,13 +67,6 @@ class Tangent:
         # Parts that move freely matter only if something loads them, and LU passes over them.
         self.solver = SuperLUSolver(self._preferred.indptr, self._preferred.indices)
         return self.solver.factorise(values)
-
-    def multiply(self, values: np.ndarray, extra: csr_matrix | None, columns: np.ndarray) -> np.ndarray:
-        """Return the product (N, k) of a matrix, given as for `factorise`, with columns (N, k), without a factor."""
-        columns = np.ascontiguousarray(columns)
-        product = np.zeros_like(columns) if extra is None else np.ascontiguousarray(extra @ columns)
-        _multiply(*self._own, values, columns, product)
-        return product
 
     def _merge(self, values: np.ndarray, extra: csr_matrix) -> np.ndarray:
         """Return the values of the sum in the pattern, which grows if it has to."""
