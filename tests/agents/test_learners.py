@@ -20,6 +20,7 @@ from softgym_envs.agents.residual import BatchQP
 from softgym_envs.agents.training import CHECKPOINT, _restore, train
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.robots.modular_arm import KINDS
+from tests.agents.interruption import interrupted_at
 
 CONFIG = TrainConfig.model_validate(
     {
@@ -77,24 +78,14 @@ QUICK = {
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_same_seed_same_policy_and_interruptions_change_nothing(name, tmp_path, monkeypatch):
+def test_same_seed_same_policy_and_interruptions_change_nothing(name, tmp_path):
     config = QUICK[name]
     first = train(config, tmp_path / "first", progress=False).read_bytes()
     assert train(config, tmp_path / "again", progress=False).read_bytes() == first
     assert train(config.model_copy(update={"seed": 1}), tmp_path / "other", progress=False).read_bytes() != first
     module, _, name = LEARNERS[name].partition(":")
-    method = getattr(import_module(module), name)
-    original = method.learn
-
-    def stop(learner, target, progress):
-        if learner.step >= 512:
-            raise KeyboardInterrupt
-        original(learner, target, progress)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(method, "learn", stop)
-        with pytest.raises(KeyboardInterrupt):
-            train(config, tmp_path / "resumed", progress=False)
+    with interrupted_at(getattr(import_module(module), name), 512):
+        train(config, tmp_path / "resumed", progress=False)
     torch.manual_seed(5)  # a new process would have other random states
     assert train(config, tmp_path / "resumed", progress=False).read_bytes() == first
     with pytest.raises(DataError, match="learner"):

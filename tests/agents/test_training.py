@@ -18,6 +18,7 @@ from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.training import train
 from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError, DataError, WeightsError
+from tests.agents.interruption import interrupted_at
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -139,18 +140,9 @@ def test_a_training_that_should_stop_stops_on_resuming(tmp_path, monkeypatch):
     assert card["stopped_early"] and card["steps"] == 200
 
 
-def test_damaged_checkpoint_is_named(tmp_path, monkeypatch):
-    original = SACLearner.learn
-
-    def learn(learner, target, progress):
-        if learner.step >= 200:
-            raise KeyboardInterrupt
-        original(learner, target, progress)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(SACLearner, "learn", learn)
-        with pytest.raises(KeyboardInterrupt):
-            train(CONFIG, tmp_path, progress=False)
+def test_damaged_checkpoint_is_named(tmp_path):
+    with interrupted_at(SACLearner, 200):
+        train(CONFIG, tmp_path, progress=False)
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(WeightsError, match=r"checkpoint\.safetensors.*damaged"):
@@ -189,23 +181,14 @@ def test_an_extended_training_goes_on_with_its_replay_buffer(first, tmp_path):
     assert train(long, folder, progress=False).read_bytes() == uninterrupted.read_bytes()
 
 
-def test_an_interrupted_extension_keeps_the_policy_and_ends_as_an_uninterrupted_one(tmp_path, monkeypatch):
+def test_an_interrupted_extension_keeps_the_policy_and_ends_as_an_uninterrupted_one(tmp_path):
     short = LONG.model_copy(update={"steps": 200})
     uninterrupted = train(LONG, tmp_path / "uninterrupted", progress=False).read_bytes()
     folder = tmp_path / "extended"
     policy = train(short, folder, progress=False, keep_checkpoint=True)
     before = policy.read_bytes()
-    original = SACLearner.learn
-
-    def learn(learner, target, progress):
-        if learner.step >= 400:
-            raise KeyboardInterrupt
-        original(learner, target, progress)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(SACLearner, "learn", learn)
-        with pytest.raises(KeyboardInterrupt):
-            train(LONG, folder, progress=False, keep_checkpoint=True)
+    with interrupted_at(SACLearner, 400):
+        train(LONG, folder, progress=False, keep_checkpoint=True)
     assert policy.read_bytes() == before and Policy(policy).card["steps"] == 200
     assert train(LONG, folder, progress=False).read_bytes() == uninterrupted
     assert load_config(folder / "config.yaml", TrainConfig) == LONG
