@@ -1,7 +1,8 @@
 """Accuracy of the estimator on finite elements: touches at random places of the sensorized finger's grid.
 
 ``python -m benchmarks.estimation [--cavities 2] [--sealed] [--touches 100] [--readings 10]`` prints a line of JSON.
-``softgym bench sealed_finger`` compares volumes of open cavities with pressures of sealed ones, and their stiffness.
+``softgym bench estimation`` has 300 touches of fingers with two and four cavities, ``softgym bench sealed_finger``
+compares volumes of open cavities with pressures of sealed ones, and their stiffness.
 
 Each touch is one body with a random pull, an error of the cable, a force and a place in a cell, constant over a number
 of readings with new noise of the volumes. Its place is one point, which is not a corner of the estimator's cell: the
@@ -27,6 +28,8 @@ from softgym_envs.robots.registry import make_robot
 LENGTH, LARGEST_PULL, FORCE = 0.120, 0.010, 2.0
 TOUCHES, SEED = 60, 0
 """Of the comparison of open with sealed cavities."""
+MANY_TOUCHES = 300
+"""Of the accuracy of the estimator: chance moves a coverage of 95 % by 1.3 points."""
 
 
 @dataclass(frozen=True)
@@ -203,6 +206,13 @@ def measure(
         "updates on finite elements per CPU s": steps / sum(touch.seconds for touch in found),
         "equilibria per update": sum(touch.equilibria for touch in found) / steps,
         "updates per CPU s without a new equilibrium": 1.0 / float(np.mean([t for f in found for t in f.alone])),
+    }
+
+
+def accuracy() -> dict[str, object]:
+    """Errors, coverage and speed of the estimator on finite elements, with two and four open cavities."""
+    return {
+        f"{cavities} cavities": measure(cavities, MANY_TOUCHES, 10, 5e-3, 0.01, SEED, {}) for cavities in (2, 4)
     }
 
 

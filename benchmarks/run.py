@@ -95,6 +95,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "contact_friction": contact_friction.contact_friction,
     "sensor_finger": sensor_finger.published,
     "sensor_accuracy": sensor_accuracy.sensor_accuracy,
+    "estimation": estimation.accuracy,
     "sealed_finger": estimation.sealed_finger,
     "force_limits": force_limits.force_limits,
     "design_optima": design_tools.optima,

@@ -446,6 +446,34 @@ def sealed_stiffness() -> str:
     return markdown([*head, "compliance of the tip along y, sealed [%]", "tip moved [mm]"], rows, "lrrrrr")
 
 
+def estimates() -> str:
+    """Accuracy, coverage and speed of the estimator on finite elements, beside what was wanted."""
+    found = results("estimation")
+    lines = {
+        "touches": ("touches", ".0f", ""),
+        "error of the tip, mean [% of the length]": ("tip error mean [% of length]", ".2f", "1"),
+        "error of the tip, 95th percentile [% of the length]": ("tip error 95th [% of length]", ".2f", ""),
+        "error of the tip, worst [% of the length]": ("tip error worst [% of length]", ".1f", ""),
+        "error of the force, median [%]": ("force error median [%]", ".1f", "10"),
+        "error of the force, mean [%]": ("force error mean [%]", ".1f", "10"),
+        "touches whose force is claimed to 10 % [%]": ("force told to 10 % [% of touches]", ".0f", ""),
+        "error of their force, mean [%]": ("force error of those, mean [%]", ".1f", "10"),
+        "truth within 95 %: tip [% of touches]": ("coverage tip [%]", ".1f", "93 to 97"),
+        "truth within 95 %: force [% of touches]": ("coverage force [%]", ".1f", "93 to 97"),
+        "readings per CPU second without a new equilibrium": (
+            "updates per CPU s without a new equilibrium",
+            ".0f",
+            "200",
+        ),
+        "readings per CPU second, touches being new": ("updates on finite elements per CPU s", ".0f", "200"),
+    }
+    rows = [
+        [title, *(format(row[key], form) for row in found.values()), wanted]
+        for title, (key, form, wanted) in lines.items()
+    ]
+    return markdown(["", *found, "wanted"], rows, "l" + "r" * (len(found) + 1))
+
+
 def sealed_estimates() -> str:
     """Estimates from pressures of sealed cavities beside those from volumes of open ones."""
     found = {key.removeprefix("estimate, "): v for key, v in results("sealed_finger").items() if "estimate" in key}
@@ -550,7 +578,7 @@ TABLES: dict[str, Callable[[], str]] = {
         test_set, buckling, predicted_tracking, trajectories, design_gradients, networks,
         design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, sealed_stiffness,
-        sealed_estimates, side_by_side, stiff_flop,
+        estimates, sealed_estimates, side_by_side, stiff_flop,
         validation, contact, surrogate_speed, fem_speed, deployed, provenance,
     )
 }  # fmt: skip
