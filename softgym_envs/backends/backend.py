@@ -49,9 +49,9 @@ class State:
             surrogate). In dynamics: the tangent of the time step, including inertia, is positive definite.
         uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM without
             learned superelements.
-        trusted: the model may be trusted at the state. FEM is trusted unless a beam folds or a superelement is loaded
+        doubt: why the model is not trusted at the state, 0 if it is: a sum of numbers in
+            `softgym_envs.surrogate.domain.DOUBTS`. FEM is trusted unless a beam folds or a superelement is loaded
             beyond what it has learned.
-        doubt: why it is not trusted, 0 if it is: a sum of numbers in `softgym_envs.surrogate.domain.DOUBTS`.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
         contacts: where the body touches, with forces and gaps; None if it cannot touch anything.
         memory: what the backend needs besides to go on from here: the past of friction, or the motion of a learned
@@ -70,10 +70,14 @@ class State:
     bonds: np.ndarray = field(default_factory=lambda: np.zeros(0))
     stable: bool = True
     uncertainty: float = 0.0
-    trusted: bool = True
     doubt: int = 0
     contacts: Contacts | None = None
     memory: Any = None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the model may be trusted at the state."""
+        return self.doubt == 0
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy holds the condensed model itself, not the learned model that evaluates it.

@@ -19,6 +19,7 @@ from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
 from softgym_envs.surrogate.chain.contact import ChainBatch, Memory, Touching, rows_for
 from softgym_envs.surrogate.chain.model import ChainModel, load_chain
 from softgym_envs.surrogate.chain.rows import contact_rows
+from softgym_envs.surrogate.domain import SELF_CONTACT, SOFT
 
 MAX_NEWTON_STEPS = 30
 """Newton steps in the search for the angle under a torque."""
@@ -131,7 +132,11 @@ class ChainBody:
         full = np.concatenate([effort, np.zeros(3)])
         W = compliance[0]
         free = np.concatenate([displacement, effector]) - W @ full
-        folded = self._self_contact and bool(states.folded[0])
+        doubt = int(self._prepared.doubt[0])
+        if not stable[0]:
+            doubt |= SOFT
+        if self._self_contact and states.folded[0]:
+            doubt |= SELF_CONTACT
         return State(
             command=command.copy(),
             displacement=displacement,
@@ -141,7 +146,7 @@ class ChainBody:
             condensed=CondensedModel(W, free, full, ROLES, self._labels()),
             stable=bool(stable[0]),
             uncertainty=float(self._prepared.tip_uncertainty[0]),
-            trusted=bool(self._prepared.known[0]) and bool(stable[0]) and not folded,
+            doubt=doubt,
             contacts=self._contacts(touch, float(states.clearance[0])),
             memory=memory,
         )

@@ -40,6 +40,7 @@ from softgym_envs.surrogate.chain.hand import (
 )
 from softgym_envs.surrogate.chain.kernels import touch
 from softgym_envs.surrogate.chain.model import ChainModel, load_chain
+from softgym_envs.surrogate.domain import SELF_CONTACT
 
 ROLES = (("a", 3), ("e", 3))
 MAX_CUTS = 5
@@ -212,10 +213,10 @@ class ChainHand:
         return np.array([x, 0.0, z + self.memory.drives[2]])
 
     @property
-    def trusted(self) -> bool:
-        """Whether the body lies where the chain was trained, and no finger touches itself."""
-        folded = self._self_contact and bool(np.isfinite(self.memory.fold).any())
-        return bool(self._prepared.known[0]) and not folded
+    def doubt(self) -> int:
+        """Why the present state is not trusted, 0 if it is (`softgym_envs.surrogate.domain.DOUBTS`)."""
+        folded = self._self_contact and np.isfinite(self.memory.fold).any()
+        return int(self._prepared.doubt[0]) | (SELF_CONTACT if folded else 0)
 
     @property
     def uncertainty(self) -> float:
@@ -448,7 +449,7 @@ class ChainHandBackend(Backend):
             velocity=velocity,
             stable=stable,
             uncertainty=hand.uncertainty,
-            trusted=hand.trusted,
+            doubt=hand.doubt,
             contacts=hand.contacts(),
             memory=memory,
         )

@@ -363,7 +363,6 @@ class FEMBackend(Backend):
             bonds=equilibrium.effort[len(condensed.effort) :],
             stable=equilibrium.stable,
             uncertainty=uncertainty,
-            trusted=doubt == 0,
             doubt=doubt,
             contacts=equilibrium.contacts,
             memory=equilibrium.memory,

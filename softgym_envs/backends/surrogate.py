@@ -233,7 +233,6 @@ class SurrogateBody:
             velocity=np.zeros((self._effectors // 3, 3)),
             memory=None if motion is None else motion.at_rest(self._context, found.displacement, found.effort),
             uncertainty=float(found.uncertainty[0]),
-            trusted=bool(found.doubt[0] == 0),
             doubt=int(found.doubt[0]),
         )
 
