@@ -191,5 +191,22 @@ def test_unknown_bodies_are_given_to_finite_elements(robot, monkeypatch):
     Recorder.steps = 0
     backend = HybridChainBackend(robot, {"e3": 0.002})
     backend.step(np.radians([2.0]))
+    assert backend.learned.state.doubt & OUTSIDE
     assert Recorder.steps == 1
     assert backend.fem_calls == 2
+
+
+def test_copies_and_other_bodies_go_on_with_finite_elements_of_their_own(robot, monkeypatch):
+    """Finite elements may be missing, or be those of another body, where a state goes on that they have found."""
+    monkeypatch.setattr(hybrid_chain, "FEMBackend", Recorder)
+    thin = {"e1": 0.008, "e2": 0.005, "e3": 0.004, "object_gap": 0.0301}
+    backend = HybridChainBackend(robot, thin)
+    assert backend.state.trusted  # at rest, without finite elements
+    closed(backend, 40.0, 20)
+    kept, command = pickle.loads(pickle.dumps(backend.snapshot())), np.radians([39.0])
+    expected = backend.step(command)
+    assert not expected.trusted
+    backend.reset({"e3": 0.002})  # finite elements of this body
+    for other in (backend, HybridChainBackend(robot)):
+        other.go_on_from(kept)
+        np.testing.assert_array_equal(other.step(command).contacts.total, expected.contacts.total)
