@@ -40,7 +40,7 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
 
     Raises:
         WeightsError: if the policy cannot be read.
-        ValueError: for another file ending, a policy with a memory, or if ``onnx`` is not installed.
+        ValueError: for another file ending, a policy that `exported_spaces` refuses, or if ``onnx`` is not installed.
     """
     path = Path(path)
     if path.suffix != ".onnx":
@@ -50,23 +50,36 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
     except ImportError:
         raise ValueError("ONNX files need the package onnx: pip install 'softgym-envs[onnx]'") from None
     policy = policy if isinstance(policy, Policy) else Policy(policy)
-    data = _graph(policy, spaces_of(policy), policy.environment, onnx).SerializeToString()
+    data = _graph(policy, exported_spaces(policy), policy.environment, onnx).SerializeToString()
     with atomic_write(path) as stream:
         stream.write(data)
     return path
 
 
-def spaces_of(policy: Policy) -> AgentSpaces:
+def exported_spaces(policy: Policy) -> AgentSpaces:
     """Return the observation and action spaces of the environment in which a policy was trained.
 
     Raises:
-        ValueError: for a policy with a memory, which the exported formats cannot keep.
+        ValueError: for a policy that the exported formats cannot hold: one that has a memory, or that observes sensors
+            in place of the effector, or a choice of its body.
     """
     if policy.memory is not None:
         raise ValueError(f"policy '{policy.path}' has a memory and cannot be exported; allowed: policies without")
     env = policy.environment.make()
     env.close()
-    return env.unwrapped.spaces  # type: ignore[attr-defined]
+    spaces: AgentSpaces = env.unwrapped.spaces  # type: ignore[attr-defined]
+    if spaces.sensors:
+        raise ValueError(
+            f"policy '{policy.path}' observes sensors in place of the effector and cannot be exported; allowed: "
+            "policies that observe the effector"
+        )
+    space = spaces.robot.design_space
+    if chosen := [name for name in spaces.design_names if space[name].choices]:
+        raise ValueError(
+            f"policy '{policy.path}' observes choices of its body ({', '.join(chosen)}) and cannot be exported; "
+            "allowed: policies that observe numbers only"
+        )
+    return spaces
 
 
 def input_sizes(spaces: AgentSpaces) -> dict[str, int]:

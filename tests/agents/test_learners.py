@@ -8,7 +8,7 @@ import torch
 
 from softgym_envs.agents.config import EvolutionConfig, RecurrentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
-from softgym_envs.agents.export import spaces_of
+from softgym_envs.agents.export import exported_spaces
 from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.learners.analytic import AnalyticLearner
 from softgym_envs.agents.learners.cloning import CloningLearner
@@ -233,7 +233,7 @@ def test_a_memory_is_that_of_torch_and_learns_the_answers_of_the_qp(tmp_path):
     with pytest.raises(ValueError, match="has a memory: call what begin"):
         policy(seen[0, 0])
     with pytest.raises(ValueError, match="has a memory and cannot be exported"):
-        spaces_of(policy)
+        exported_spaces(policy)
     learner.close()
     with pytest.raises(ValueError, match="learner 'recurrent' needs num_envs = 1"):
         RecurrentLearner(config.model_copy(update={"num_envs": 2}))
