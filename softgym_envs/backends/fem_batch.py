@@ -73,6 +73,7 @@ class FEMBatch(BatchBackend):
 
     def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
         impossible: dict[int, InfeasibleDesign] = {}
+        found: dict[int, Design] = {}
         for i, values in zip(index.tolist(), designs, strict=True):
             design = self._design(values)
             try:
@@ -81,7 +82,9 @@ class FEMBatch(BatchBackend):
             except InfeasibleDesign as error:
                 impossible[i] = error
             else:
-                self._designs[i] = design
+                found[i] = design
+        for i, design in found.items():  # now that no error can leave some of them changed
+            self._designs[i] = design
         self._stack()
         self.rest(index)
         return impossible

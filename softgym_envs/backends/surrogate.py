@@ -438,8 +438,9 @@ class SurrogateBatch(BatchBackend):
 
     def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
         context = self.model.context(designs)
+        rest = self._found_rest(context, designs)
         self._context.put(index, context)
-        self._rest.put(index, self._found_rest(context, designs))
+        self._rest.put(index, rest)
         if self._motion is not None:
             self._inertia[index] = self._motion.inertia.body(designs)
         self.rest(index)

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from math import prod
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -96,6 +97,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         )
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode = {render_mode!r} is unknown; allowed: None, 'human', 'rgb_array'")
+        if np.shape(render_size) != (2,) or not all(isinstance(n, Integral) and n > 0 for n in render_size):
+            raise ValueError(f"render_size = {render_size!r} must be two positive integers: width and height in pixels")
         if render_mode == "human":
             from softgym_envs.viewer.scene import check_display
 
@@ -119,7 +122,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.spaces = setup.spaces(moving=self.backend.moving)
         self.action_space = self.spaces.action_space
         self.observation_space = self.spaces.observation_space
-        self._plants, self.plant = setup.plants, Plant()
+        self._plants, self.plant = setup.plants, Plant(cable_friction=self.backend.cable_friction)
         self._sent = np.zeros((0, len(self.robot.actuators)))
         self._sensed: Sensed | None = None
         self._renderer: Any = None
@@ -189,6 +192,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         """
         super().reset(seed=seed)
         given, goal = check_reset_options(options)
+        # Check everything before anything changes.
+        path = None if goal is None else self.task.check_paths(goal)
         if given is None and self._sampled:
             design = self._draw_body()
         else:
@@ -197,10 +202,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if self._plants is not None:
             self._begin_plant(self._plants)
         self._show(design)
-        if goal is None:
-            self._path = self.task.sample(self.np_random, 1, self._kinematics)[0]
-        else:
-            self._path = self.task.check_paths(goal)
+        self._path = self.task.sample(self.np_random, 1, self._kinematics)[0] if path is None else path
         self.task.begin(self.np_random)
         self._step = 0
         if self.render_mode == "human":
@@ -260,10 +262,12 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         return observation, info
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**EzPickle.__getstate__(self), "episode": self.get_state(), "action_space": self.action_space}
+        own = {"spec": self.spec, "episode": self.get_state(), "action_space": self.action_space}
+        return {**EzPickle.__getstate__(self), **own}
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         EzPickle.__setstate__(self, kept)
+        self.spec = kept["spec"]
         self.set_state(kept["episode"])
         self.action_space = self.spaces.action_space = kept["action_space"]  # with its random numbers
 
@@ -321,7 +325,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         measured = self.task.measure(state)
         true = Sensed(state.displacement, state.effort, measured, self.task.sense(state))
         if sense and self.plant.noise:
-            self._sensed = sensed(self.robot, true, self.plant.noise, self.np_random)
+            self._sensed = sensed(self.robot, true, self.plant.noise, self.np_random, self.task.measured_scale)
         distance, terms, _ = self.task.rate(measured, goal, self.spaces.effort_share(state.effort))
         terms |= self.task.state_terms(state)
         reward = float(prod(terms.values())) if converged else 0.0

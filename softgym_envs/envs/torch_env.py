@@ -268,7 +268,7 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
 
         Raises:
             DesignError: for a malformed design.
-            ValueError: for an unknown option, a malformed goal or mask, or another number of seeds.
+            ValueError: for an unknown option, a malformed seed, goal or mask, or another number of seeds.
         """
         rows, options = take_reset_mask({name: _array(value) for name, value in (options or {}).items()}, self.num_envs)
         design, goal = check_reset_options(options)

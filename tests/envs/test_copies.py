@@ -142,3 +142,9 @@ def test_batches_of_tensors_are_copied_in_mid_episode():
     expected = torch.stack([row[0] for row in walk(env, actions[3:])])
     for twin in twins:
         assert (torch.stack([row[0] for row in walk(twin, actions[3:])]) == expected).all()
+
+
+def test_copies_know_their_specification():
+    env = gymnasium.make("SoftGym/FingerReach-v0")
+    for twin in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env)):
+        assert twin.unwrapped.spec == env.unwrapped.spec and twin.spec.id == "SoftGym/FingerReach-v0"
