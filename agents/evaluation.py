@@ -114,8 +114,8 @@ class Evaluation:
 
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain data: the summary, the values for each goal and the cost."""
-        summary = {name: known(getattr(self, name)) for name in _SUMMARY}
-        columns = {name: known(getattr(self, name)) for name in _PER_GOAL}
+        summary = {name: none_for_nan(getattr(self, name)) for name in _SUMMARY}
+        columns = {name: none_for_nan(getattr(self, name)) for name in _PER_GOAL}
         return {**summary, **columns, "steps": self.steps, "seconds": self.seconds, "cpu_seconds": self.cpu_seconds}
 
     @classmethod
@@ -139,16 +139,16 @@ class Evaluation:
         return cls(**columns, steps=cost[0], seconds=cost[1], cpu_seconds=cost[2])
 
 
-def known(values: Any) -> Any:
+def none_for_nan(values: Any) -> Any:
     """Return a number, or numbers as lists, with None for NaN, which JSON lacks."""
     if isinstance(values, np.ndarray):
-        return [known(value) for value in values] if values.ndim else known(values.item())
+        return [none_for_nan(value) for value in values] if values.ndim else none_for_nan(values.item())
     value = values.item() if isinstance(values, np.generic) else values
     return None if isinstance(value, float) and np.isnan(value) else value
 
 
 def _column(values: Any) -> np.ndarray:
-    """Return an array of what `known` made."""
+    """Return an array of what `none_for_nan` made."""
     found = np.asarray(values)
     return found.astype(float) if found.dtype == object else found
 

@@ -102,19 +102,37 @@ class PointForce:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What a backend needs to go on from a state in another object of its class.
+    """What another backend of the same class needs to continue from a state.
 
     Attributes:
         backend: name of the class.
         design: the body.
         state: the present state.
-        more: what the backend needs beyond that.
+        extra: whatever else the next steps depend on.
     """
 
     backend: str
     design: Design
     state: State
-    more: Any = None
+    extra: Any = None
+
+
+def check_numbers(name: str, values: object, count: int) -> np.ndarray:
+    """Return values as an array (count,).
+
+    Raises:
+        ValueError: unless they are ``count`` finite numbers.
+    """
+    array = np.asarray(values, dtype=float)
+    if array.shape != (count,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be {count} finite number{'s' * (count > 1)}, got {array.tolist()}")
+    return array
+
+
+def refuse_force(force: np.ndarray | None) -> None:
+    """Raise ValueError for a force on the effector, which only finite elements take."""
+    if force is not None and np.any(force):
+        raise ValueError(f"force = {np.asarray(force).tolist()} N is taken by backend='fem' only; allowed: None")
 
 
 class Backend(ABC):
@@ -197,22 +215,23 @@ class Backend(ABC):
 
     def snapshot(self) -> Snapshot:
         """Return all that the next steps depend on."""
-        return Snapshot(type(self).__name__, self.design, self.state, self._more())
+        return Snapshot(type(self).__name__, self.design, self.state, self._extra_state())
 
-    def go_on_from(self, kept: Snapshot) -> None:
-        """Go on from a snapshot, also of another backend of the same class and with the same robot.
+    def resume(self, snapshot: Snapshot) -> None:
+        """Continue from a snapshot, also of another backend of the same class and with the same robot.
 
         Raises:
             ValueError: for a snapshot of another class.
         """
-        if kept.backend != type(self).__name__:
-            raise ValueError(f"a state of {kept.backend} cannot go on in {type(self).__name__}")
-        self._put_back(kept)
+        if snapshot.backend != type(self).__name__:
+            raise ValueError(f"a state of {snapshot.backend} cannot continue in {type(self).__name__}")
+        self._resume(snapshot)
 
-    def _more(self) -> Any:
+    def _extra_state(self) -> Any:
         """Return what the next steps depend on besides body and state."""
         return None
 
-    def _put_back(self, kept: Snapshot) -> None:
-        self.reset(kept.design)
-        self.restore(kept.state)
+    def _resume(self, snapshot: Snapshot) -> None:
+        """Continue from a snapshot of the same class."""
+        self.reset(snapshot.design)
+        self.restore(snapshot.state)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_force
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel, Row, point_rows
@@ -67,9 +67,7 @@ class ChainBody:
             ConvergenceError: if it is not found.
             ValueError: for a malformed command.
         """
-        command = np.asarray(command, dtype=float)
-        if command.shape != (1,) or not np.isfinite(command).all():
-            raise ValueError(f"command must be one finite number, got {command.tolist()}")
+        command = check_numbers("command", command, 1)
         if mode == "effort":
             self._reach_torque(start, float(np.clip(command[0], -self._max_effort, self._max_effort)))
         elif mode == "displacement":
@@ -213,8 +211,7 @@ class ChainBackend(Backend):
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        if force is not None and np.any(force):
-            raise ValueError("the surrogate does not support forces on effectors; use backend='fem'")
+        refuse_force(force)
         self.state = self._body.solve(command, mode, self.state)
         return self.state
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.backend import Backend, State, refuse_force
 from softgym_envs.backends.chain import ChainBackend
 from softgym_envs.backends.chain_hand import ChainHandBackend
 from softgym_envs.backends.fem import FEMBackend
@@ -90,8 +90,7 @@ class HybridChainBackend(Backend):
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        if force is not None and np.any(force):
-            raise ValueError("the hybrid backend does not support forces on effectors; use backend='fem'")
+        refuse_force(force)
         known = self._known
         self.calls += 1
         self.learned.restore(known.chain)

@@ -60,7 +60,7 @@ class EpisodeState:
 class SoftRobotEnv(gymnasium.Env, EzPickle):
     """A soft robot with a task. The page of each environment ID has the tables of its spaces.
 
-    A copy or pickle of the environment goes on in mid-episode where the original was, random numbers included. Robot
+    A copy or pickle of the environment continues the episode of the original, with the same random numbers. Robot
     and task objects are copied with it; classes and names stay references, so their modules must be importable where it
     is unpickled. ``spec.to_json`` needs names or paths ``"module:class"``.
 
@@ -251,7 +251,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             if name != own:
                 raise ValueError(f"the state belongs to {kind} '{name}', but the environment has {kind} '{own}'")
         self.backend.cable_friction = state.plant.cable_friction
-        self.backend.go_on_from(state.physics)
+        self.backend.resume(state.physics)
         self.plant, self._sent, self._sensed = state.plant, state.sent.copy(), state.sensed
         self._show(self.backend.design)
         vars(self.task).update(copy.deepcopy(state.progress))
@@ -329,34 +329,21 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         distance, terms, _ = self.task.rate(measured, goal, self.spaces.effort_share(state.effort))
         terms |= self.task.state_terms(state)
         reward = float(prod(terms.values())) if converged else 0.0
-        info: dict[str, Any] = {
-            "effector": state.effector[0].copy(),
+        info = {
             "measured": measured.copy(),
             "goal": goal.copy(),
             "distance": distance,
             "is_success": distance < self.task.success_distance,
             "lost": self.task.lost(state),
             **{f"reward_{name}": term for name, term in terms.items()},
-            "displacement": state.displacement.copy(),
-            "effort": state.effort.copy(),
-            "stable": state.stable,
-            "uncertainty": state.uncertainty,
-            "trusted": state.trusted,
-            "doubt": state.doubt,
             "converged": converged,
+            **_mechanics(state),
         }
-        if state.contacts is not None:
-            contacts = state.contacts
-            info |= {
-                "contact_force": contacts.total,
-                "smallest_gap": contacts.smallest_gap,
-                "sliding": contacts.sliding.mean() if contacts.count else 0.0,
-            }
         if self._plants is not None:
             info |= {f"plant_{name}": value for name, value in asdict(self.plant).items()}
         velocity = state.velocity[0] if self.spaces.moving else None
         shown = self._sensed or true
-        sensors = self._shown(squash(shown.sensors), sense) if self.task.sensors else None
+        sensors = self._sensor_values(squash(shown.sensors), sense) if self.task.sensors else None
         observation = self.spaces.observe(
             self.command,
             shown.displacement,
@@ -369,7 +356,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         )
         return observation, reward, {name: _with_dtype(value) for name, value in info.items()}
 
-    def _shown(self, readings: np.ndarray, new: bool) -> np.ndarray:
+    def _sensor_values(self, readings: np.ndarray, new: bool) -> np.ndarray:
         """Return the sensor values of an observation for readings in [-1, 1] (s,): these, touch, earlier readings."""
         command = (self.command - self.spaces.middle) / self.spaces.half_range
         earlier = self.task.recall(np.concatenate([command, readings]), new)
@@ -410,6 +397,27 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+
+def _mechanics(state: State) -> dict[str, Any]:
+    """Return what ``info`` says of a mechanical state."""
+    info: dict[str, Any] = {
+        "effector": state.effector[0].copy(),
+        "displacement": state.displacement.copy(),
+        "effort": state.effort.copy(),
+        "stable": state.stable,
+        "uncertainty": state.uncertainty,
+        "trusted": state.trusted,
+        "doubt": state.doubt,
+    }
+    if state.contacts is not None:
+        contacts = state.contacts
+        info |= {
+            "contact_force": contacts.total,
+            "smallest_gap": contacts.smallest_gap,
+            "sliding": contacts.sliding.mean() if contacts.count else 0.0,
+        }
+    return info
 
 
 # Gymnasium batches arrays of booleans, but not NumPy's boolean scalars.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from softgym_envs.backends.registry import batches, check_backend
+from softgym_envs.backends.registry import check_backend, is_batched
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.envs.plant import Plants
 from softgym_envs.envs.spaces import AgentSpaces
@@ -105,10 +105,9 @@ class Setup:
     plants: Plants | None = None
 
     @property
-    def together(self) -> bool:
+    def batched(self) -> bool:
         """Whether `SoftRobotVectorEnv` can step many of these environments together."""
-        rated = not (self.task.pushes or self.task.touches or self.task.sensors or self.task.needs_state)
-        return rated and batches(self.backend, self.robot, self.backend_options)
+        return not _what_batches_lack(self.task) and is_batched(self.backend, self.robot, self.backend_options)
 
     def spaces(self, *, moving: bool = False) -> AgentSpaces:
         """Return the agent's spaces; with ``moving``, observations include the effector's velocity."""
@@ -291,10 +290,17 @@ def check_counts(num_envs: int, max_episode_steps: int | None) -> None:
 
 
 def check_batchable(task: Task) -> None:
-    """Raise ValueError for a task that a batched environment on the surrogate cannot rate."""
+    """Raise ValueError for a task that a batched environment cannot rate."""
+    if lacking := _what_batches_lack(task):
+        raise ValueError(f"task '{task.name}' {lacking}")
+
+
+def _what_batches_lack(task: Task) -> str:
+    """Return what a task needs that batched environments do not have, for a message; empty for one that they take."""
     if task.pushes or task.touches:
-        raise ValueError(f"task '{task.name}' pushes the robot, but the batched environment takes no forces")
+        return "pushes the robot, but the batched environment takes no forces"
     if task.sensors:
-        raise ValueError(f"task '{task.name}' shows sensors, which the batched environment does not have")
+        return "shows sensors, which the batched environment does not have"
     if task.needs_state:
-        raise ValueError(f"task '{task.name}' reads forces of contacts, which the batched environment does not have")
+        return "reads forces of contacts, which the batched environment does not have"
+    return ""

@@ -48,7 +48,7 @@ def make_batch(
     """
     own = {name: value for name, value in options.items() if name in EnvironmentOptions.__dataclass_fields__}
     setup = set_up(robot, task, backend, EnvironmentOptions.check(own))
-    if setup.together:
+    if setup.batched:
         from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
         return SoftRobotVectorEnv(robot, task, num_envs, backend=backend, **options)

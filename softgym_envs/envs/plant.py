@@ -48,7 +48,7 @@ LIMITS = {"stiffness": (0.1, 10.0), "cable_friction": (0.0, 5.0), "delay": (0, 1
 
 @dataclass(frozen=True)
 class Plants:
-    """Plants between two.
+    """A range of plants, from which each reset draws one.
 
     Attributes:
         low: smallest value of each attribute.

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from softgym_envs.backends.batch import BatchState
-from softgym_envs.backends.registry import batches, make_batch_backend
+from softgym_envs.backends.registry import is_batched, make_batch_backend
 from softgym_envs.envs.env import MAX_DRAWS
 from softgym_envs.envs.gradients import RewardGradient, StepGradient
 from softgym_envs.envs.options import (
@@ -86,7 +86,7 @@ class SoftRobotVectorEnv(VectorEnv):
         checked = EnvironmentOptions.check(options, own=("max_episode_steps", "autoreset_mode"))
         setup = set_up(robot, task, backend, checked)
         self.robot, self.task = setup.robot, setup.task
-        if not batches(setup.backend, self.robot, setup.backend_options):
+        if not is_batched(setup.backend, self.robot, setup.backend_options):
             raise ValueError(
                 f"backend = {setup.backend!r} of robot '{self.robot.name}' has no batched environment; "
                 "allowed: 'surrogate', or gymnasium.make_vec, which steps it in processes"

@@ -126,7 +126,7 @@ def test_rates_of_an_extended_training_are_those_of_the_new_number_of_steps(tmp_
     train(longer, tmp_path, progress=False, report=lambda step, outcome: step > 1024, keep_checkpoint=True)
     learner = AnalyticLearner(longer)
     _restore(learner, tmp_path / CHECKPOINT)
-    learner._slow_down()
+    learner._set_learning_rate()
     first, last = SHORT.analytic.learning_rate, SHORT.analytic.final_learning_rate
     expected = first + (last - first) * learner.step / 2048
     assert learner.step == 1536 and learner._optimiser.param_groups[0]["lr"] == pytest.approx(expected, rel=1e-9)

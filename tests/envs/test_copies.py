@@ -112,7 +112,7 @@ def test_a_state_of_another_environment_is_refused():
     for other, words in (
         (gymnasium.make("SoftGym/DiamondReach-v0"), "robot 'diamond', but the environment has robot 'finger'"),
         (gymnasium.make("SoftGym/FingerTrack-v0"), "task 'track'"),
-        (gymnasium.make("SoftGym/FingerReach-v0"), "state of SurrogateBackend cannot go on in FEMBackend"),
+        (gymnasium.make("SoftGym/FingerReach-v0"), "state of SurrogateBackend cannot continue in FEMBackend"),
     ):
         with pytest.raises(ValueError, match=words):
             env.set_state(other.unwrapped.get_state())
