@@ -6,6 +6,8 @@ Silver et al., Residual policy learning, 2018.
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 
@@ -25,6 +27,9 @@ class ResidualQP(gymnasium.ActionWrapper):
         super().__init__(env)
         self.scale = scale
         self._qp = InverseQPAgent()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_qp": InverseQPAgent()}  # weak references cannot be pickled; a copy has its own QP
 
     def action(self, action: np.ndarray) -> np.ndarray:
         """Return the action for the wrapped environment, shape (n_a,)."""

@@ -17,7 +17,7 @@ from softgym_envs.backends.backend import Backend, Snapshot, State
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.designs import Design
 from softgym_envs.envs.options import EnvironmentOptions, check_reset_options, set_up
-from softgym_envs.envs.plant import Plant, Plants, Sensed, sensed, stiffened
+from softgym_envs.envs.plant import Plant, Sensed, sensed, stiffened
 from softgym_envs.envs.spaces import squash
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
@@ -122,7 +122,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.spaces = setup.spaces(moving=self.backend.moving)
         self.action_space = self.spaces.action_space
         self.observation_space = self.spaces.observation_space
-        self._plants, self.plant = setup.plants, Plant(cable_friction=self.backend.cable_friction)
+        self._plants = setup.plants
+        self._fixed_plant = self.plant = Plant(cable_friction=self.backend.cable_friction)  # unless there are `_plants`
         self._sent = np.zeros((0, len(self.robot.actuators)))
         self._sensed: Sensed | None = None
         self._renderer: Any = None
@@ -199,8 +200,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         else:
             design = self._fixed_design if given is None else self.design_space.complete(given, self._fixed_design)
             self.backend.reset(design)
-        if self._plants is not None:
-            self._begin_plant(self._plants)
+        self._begin_plant()
         self._show(design)
         self._path = self.task.sample(self.np_random, 1, self._kinematics)[0] if path is None else path
         self.task.begin(self.np_random)
@@ -210,9 +210,9 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         observation, _, info = self._observe()
         return observation, info
 
-    def _begin_plant(self, plants: Plants) -> None:
-        """Draw the plant of an episode, at rest."""
-        self.plant = plants.sample(self.np_random)
+    def _begin_plant(self) -> None:
+        """Choose the plant of an episode, at rest."""
+        self.plant = self._fixed_plant if self._plants is None else self._plants.sample(self.np_random)
         self._sent = np.zeros((self.plant.delay, len(self.robot.actuators)))
         self._sensed = None
         self.backend.cable_friction = self.plant.cable_friction

@@ -10,7 +10,7 @@ Internally, reached displacements ``u`` are scaled to [-1, 1] over the actuators
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -28,6 +28,7 @@ from softgym_envs.envs.options import (
     check_autoreset,
     check_batchable,
     check_counts,
+    check_design_option,
     check_reset_options,
     joined_seed,
     set_up,
@@ -258,10 +259,10 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         Args:
             seed: seed of all random numbers from here on, or a list of ``num_envs`` seeds to make it from; by default
                 the sequence continues, beginning with the seed of the constructor.
-            options: ``"design"``: one body for all for one episode, a mapping, or values of all design variables in
-                their order for each, shape (num_envs, len(design_space)); ``"goal"``: a point (3,) or a path (p, 3)
-                [m] for all, or a path for each (num_envs, p, 3); ``"reset_mask"``: which sub-environments to reset,
-                boolean (num_envs,); default all.
+            options: ``"design"``: one body for all for one episode, a mapping, or one for each: a list of them, or
+                the values of all design variables in their order, shape (num_envs, len(design_space)); ``"goal"``: a
+                point (3,) or a path (p, 3) [m] for all, or a path for each (num_envs, p, 3); ``"reset_mask"``: which
+                sub-environments to reset, boolean (num_envs,); default all.
 
         Returns:
             Observation (num_envs, d) and info.
@@ -296,9 +297,11 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         return int(torch.randint(2**31, (1,), generator=self._generator, device=self.device))
 
     def _check_designs(self, design: Any) -> Tensor:
-        if isinstance(design, Mapping):
+        bodies = [design] if isinstance(design, Mapping) else design
+        if isinstance(bodies, Sequence) and all(isinstance(body, Mapping) for body in bodies):
+            check_design_option(design, self.num_envs)
             fixed = dict(zip(self.design_space.names, self._fixed.tolist(), strict=True))
-            values = self.design_space.complete(design, fixed).array[None]
+            values = np.array([self.design_space.complete(body, fixed).array for body in bodies])
         else:
             values = np.asarray(design, dtype=float)
             shape = (self.num_envs, len(self.design_space))

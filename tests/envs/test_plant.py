@@ -215,3 +215,14 @@ def test_noise_of_a_measured_force_is_a_share_of_the_largest_wanted_force():
     env = gymnasium.make("SoftGym/FingerGrasp-v0", backend="surrogate", plant={"noise": 0.1}).unwrapped
     errors = [env.reset(seed=seed) and env.sensed.effector - env.task.measure(env.state) for seed in range(60)]
     assert np.std(errors) == pytest.approx(0.1 * env.task.forces[1], rel=0.2)
+
+
+def test_the_plant_of_a_foreign_state_ends_with_its_episode():
+    stiff, plain = (gymnasium.make(FINGER, plant=plant).unwrapped for plant in ({"stiffness": 1.2, "delay": 2}, None))
+    stiff.reset(seed=0)
+    plain.set_state(stiff.get_state())
+    assert plain.plant == Plant(stiffness=1.2, delay=2)
+    plain.reset(seed=0)
+    assert plain.plant == Plant()
+    plain.step(np.ones(2))
+    assert (plain.state.command > 0.0).all()
