@@ -54,8 +54,8 @@ class State:
             beyond what it has learned.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
         contacts: where the body touches, with forces and gaps; None if it cannot touch anything.
-        memory: what the backend needs besides to go on from here: the past of friction, or the motion of a learned
-            model; None where the other attributes are enough.
+        memory: what else the backend needs to continue from the state: the past of friction, or the motion of a
+            learned model; None where the other attributes are enough.
     """
 
     command: np.ndarray

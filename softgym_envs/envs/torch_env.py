@@ -25,6 +25,7 @@ from softgym_envs.backends.torch_batch import MAX_NEWTON_STEPS, Bodies, TorchBat
 from softgym_envs.envs.arrays import with_tensors
 from softgym_envs.envs.options import (
     EnvironmentOptions,
+    Setup,
     check_autoreset,
     check_batchable,
     check_counts,
@@ -91,28 +92,14 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         **options: Any,
     ) -> None:
         check_counts(num_envs, max_episode_steps)
-        if dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"dtype = {dtype} is not supported; allowed: torch.float32, torch.float64")
         self.device = torch.device(device)
-        if self.device.type == "cuda" and not torch.cuda.is_available():
-            raise ValueError(
-                f"device = {str(device)!r} is not available here; allowed: 'cpu', on which gymnasium.make_vec is faster"
-            )
-        if cuda_graph and self.device.type != "cuda":
-            raise ValueError(f"cuda_graph needs a CUDA device, got device = {str(device)!r}")
+        _check_torch(self.device, dtype, cuda_graph)
         row = find_row(id)
         setup = set_up(
             robot or row.robot, task or row.task, row.backend, EnvironmentOptions.check(row.defaults | options)
         )
-        if setup.backend != "surrogate":
-            supported = [name for name, other in ENVIRONMENTS.items() if other.backend == "surrogate"]
-            raise ValueError(f"id = {id!r} is not an environment on the surrogate; allowed: {', '.join(supported)}")
-        if setup.backend_options.get("dynamics", False):
-            raise ValueError("dynamics is not available on tensors; allowed: False, or gymnasium.make_vec")
-        if setup.plants is not None:
-            raise ValueError("plant is not available on tensors; allowed: None, or gymnasium.make_vec")
+        _check_setup(id, setup)
         self.robot, self.task, self.spaces = setup.robot, setup.task, setup.spaces()
-        check_batchable(self.task)
         self.design_space = self.robot.design_space
         self.num_envs, self.dtype = num_envs, dtype
         self.max_episode_steps = row.max_episode_steps if max_episode_steps is None else max_episode_steps
@@ -132,8 +119,6 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self._bounds = self._put_double([[v.low, v.high] for v in variables]).T
         self._ends = torch.where(self._log, torch.log(self._bounds), self._bounds)
         self._sampled = [self.design_space.names.index(name) for name in setup.sampled]
-        if chosen := [name for name in setup.shown if self.design_space[name].choices]:
-            raise ValueError(f"design_in_observation = {chosen} are choices, which this environment does not show")
         self._shown = [self.design_space.names.index(name) for name in setup.shown]
         self._fixed = self._put_double(setup.design.array)
 
@@ -462,6 +447,32 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         }
         observation = self._spaces.observe(command, displacement, effort, effector, aim, unit_design)
         return {"observation": observation, "reward": reward, "info": info}
+
+
+def _check_torch(device: torch.device, dtype: torch.dtype, cuda_graph: bool) -> None:
+    """Raise ValueError for a type that is not supported, or a device that is not there."""
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype = {dtype} is not supported; allowed: torch.float32, torch.float64")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(
+            f"device = '{device}' is not available here; allowed: 'cpu', on which gymnasium.make_vec is faster"
+        )
+    if cuda_graph and device.type != "cuda":
+        raise ValueError(f"cuda_graph needs a CUDA device, got device = '{device}'")
+
+
+def _check_setup(id: str, setup: Setup) -> None:
+    """Raise ValueError for an environment that cannot be computed with tensors."""
+    if setup.backend != "surrogate":
+        supported = [name for name, other in ENVIRONMENTS.items() if other.backend == "surrogate"]
+        raise ValueError(f"id = {id!r} is not an environment on the surrogate; allowed: {', '.join(supported)}")
+    if setup.backend_options.get("dynamics", False):
+        raise ValueError("dynamics is not available on tensors; allowed: False, or gymnasium.make_vec")
+    if setup.plants is not None:
+        raise ValueError("plant is not available on tensors; allowed: None, or gymnasium.make_vec")
+    if chosen := [name for name in setup.shown if setup.robot.design_space[name].choices]:
+        raise ValueError(f"design_in_observation = {chosen} are choices, which this environment does not show")
+    check_batchable(setup.task)
 
 
 class _TorchRandom:
