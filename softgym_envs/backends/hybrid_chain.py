@@ -83,7 +83,12 @@ class HybridChainBackend(Backend):
             chain = self.learned.reset(complete)
             rest = replace(chain, memory=Followed(chain, None, ()))
             if not chain.trusted:
-                fem = self._fem_of(complete).reset()
+                try:
+                    fem = self._fem_of(complete).reset()
+                except BaseException:
+                    if self.design is not None:  # the chain goes back to the body that stays
+                        self.learned.reset(self.design)
+                    raise
                 rest = replace(fem, memory=Followed(chain, fem, ()))
             self._rest, self.design = rest, complete
         self.state = self._rest

@@ -210,3 +210,16 @@ def test_copies_and_other_bodies_go_on_with_finite_elements_of_their_own(robot, 
     for other in (backend, HybridChainBackend(robot)):
         other.resume(kept)
         np.testing.assert_array_equal(other.step(command).contacts.total, expected.contacts.total)
+
+
+def test_a_body_that_finite_elements_refuse_changes_nothing(robot, monkeypatch):
+    backend, alone = HybridChainBackend(robot, BODY), ChainBackend(robot, BODY)
+
+    def refuse(*args):
+        raise InfeasibleDesign("the mesh crosses itself")
+
+    monkeypatch.setattr(hybrid_chain, "FEMBackend", refuse)
+    with pytest.raises(InfeasibleDesign, match="crosses itself"):
+        backend.reset({"e3": 0.002})
+    backend.reset(BODY)
+    np.testing.assert_array_equal(closed(backend, 20.0).effort, closed(alone, 20.0).effort)
