@@ -29,7 +29,11 @@ class ResidualQP(gymnasium.ActionWrapper):
         self._qp = InverseQPAgent()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_qp": InverseQPAgent()}  # weak references cannot be pickled; a copy has its own QP
+        # The agent holds weak references, which cannot be pickled; a copy has its own.
+        return {name: value for name, value in self.__dict__.items() if name != "_qp"}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self.__dict__.update(kept, _qp=InverseQPAgent())
 
     def action(self, action: np.ndarray) -> np.ndarray:
         """Return the action for the wrapped environment, shape (n_a,)."""
