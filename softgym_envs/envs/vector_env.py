@@ -132,7 +132,7 @@ class SoftRobotVectorEnv(VectorEnv):
     def _begin_bodies(self, index: np.ndarray, designs: np.ndarray) -> dict[int, InfeasibleDesign]:
         """Change bodies, and return why some of them cannot exist."""
         impossible = dict(self.backend.begin(index, designs))
-        changed = np.array([i not in impossible for i in index.tolist()])
+        changed = np.array([i not in impossible for i in index.tolist()], dtype=bool)
         self.designs[index[changed]] = designs[changed]
         self._unit_design[index] = self.design_space.observe(self.designs[index], self.spaces.design_names)
         return impossible
