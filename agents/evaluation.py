@@ -314,7 +314,7 @@ def _evaluate_one_by_one(
             rows.append(_run_episode(env, act, seed + index, {"design": body, "goal": goals[index]}))
     finally:
         env.close()
-    columns = {name: np.array([row[name] for row in rows]) for name in _PER_GOAL}
+    columns: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in _PER_GOAL}
     return Evaluation(**columns, steps=sum(row["steps"] for row in rows))
 
 
