@@ -29,11 +29,11 @@ class ResidualQP(gymnasium.ActionWrapper):
         self._qp = InverseQPAgent()
 
     def __getstate__(self) -> dict[str, Any]:
-        # The agent holds weak references, which cannot be pickled; a copy has its own.
-        return {name: value for name, value in self.__dict__.items() if name != "_qp"}
+        return _without_qp(self)
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        self.__dict__.update(kept, _qp=InverseQPAgent())
+        self.__dict__.update(kept)
+        self._qp = InverseQPAgent()
 
     def action(self, action: np.ndarray) -> np.ndarray:
         """Return the action for the wrapped environment, shape (n_a,)."""
@@ -71,6 +71,18 @@ class VectorResidualQP(gymnasium.vector.VectorActionWrapper):
         self.scale = scale
         self._qp = BatchQP(env.unwrapped)  # type: ignore[arg-type]
 
+    def __getstate__(self) -> dict[str, Any]:
+        return _without_qp(self)
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self.__dict__.update(kept)
+        self._qp = BatchQP(self.env.unwrapped)  # type: ignore[arg-type]
+
     def actions(self, actions: np.ndarray) -> np.ndarray:
         """Return the actions for the wrapped environment, shape (num_envs, n_a)."""
         return np.clip(self._qp() + self.scale * np.asarray(actions), -1.0, 1.0)
+
+
+def _without_qp(wrapper: ResidualQP | VectorResidualQP) -> dict[str, Any]:
+    """Return the attributes of a wrapper that can be pickled; a copy makes a QP of its own."""
+    return {name: value for name, value in vars(wrapper).items() if name != "_qp"}

@@ -65,6 +65,12 @@ def test_copies_correct_a_qp_of_their_own():
     expected = [env.step(np.full(2, 0.5))[0] for _ in range(2)]
     for twin in twins:
         np.testing.assert_allclose([twin.step(np.full(2, 0.5))[0] for _ in range(2)], expected, atol=1e-7)
+    envs = on("FingerReach", residual_scale=0.5).make_vec(2)
+    envs.reset(seed=3)
+    twins = [pickle.loads(pickle.dumps(envs)), copy.deepcopy(envs)]
+    expected = envs.step(np.full((2, 2), 0.5))[0]
+    for twin in twins:
+        np.testing.assert_allclose(twin.step(np.full((2, 2), 0.5))[0], expected, atol=1e-7)
 
 
 def test_a_zero_action_leaves_the_qp_unchanged():

@@ -118,10 +118,12 @@ def test_a_state_of_another_environment_is_refused():
             env.set_state(other.unwrapped.get_state())
 
 
-def test_batches_are_copied_in_mid_episode():
-    env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=3, sample_design=True, max_episode_steps=5)
+@pytest.mark.parametrize("identifier", ["SoftGym/FingerReach-v0", "SoftGym/TetrapodReach-v0"])
+def test_batches_are_copied_in_mid_episode(identifier):
+    env = gymnasium.make_vec(identifier, num_envs=3, sample_design=True, max_episode_steps=5)
     env.reset(seed=0)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (8, 3, 2)).astype(np.float32)
+    shape = (8, *env.action_space.shape)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
     walk(env, actions[:3])
     twins = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
     expected = [row[0] for row in walk(env, actions[3:])]
