@@ -226,7 +226,7 @@ def check_seeds(seed: int | Sequence[int | None] | None, count: int) -> int | li
     """
     many = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
     seeds: list[Any] = list(seed) if many else [seed]  # type: ignore[arg-type]
-    if not all(one is None or (isinstance(one, Integral) and one >= 0) for one in seeds):
+    if not all(one is None or (isinstance(one, Integral) and int(one) >= 0) for one in seeds):
         raise ValueError(f"seed = {seed!r} must be a non-negative integer, None or a list of {count} of them")
     if many and len(seeds) != count:
         raise ValueError(f"seed must be an integer, None or a list of {count}, got {len(seeds)} seeds")
