@@ -407,6 +407,3 @@ class SoftRobotVectorEnv(VectorEnv):
             info |= {"plant_delay": self._delay.copy(), "plant_noise": self._noise.copy()}
         info |= {f"_{name}": every for name in tuple(info)}
         return info, reward
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Do nothing, because there is nothing to free."""
