@@ -118,7 +118,7 @@ class EnvironmentConfig(Config):
         """Whether many episodes run at once in one process, see `SoftRobotVectorEnv`."""
         row, options = self.row, {**self._options({}), **self.row.defaults}
         del options["backend"]
-        return set_up(row.robot, row.task, self.backend, EnvironmentOptions.check(options)).together
+        return set_up(row.robot, row.task, self.backend, EnvironmentOptions.check(options)).batched
 
     def on(self, backend: str) -> EnvironmentConfig:
         """Return the same environment on another backend, with those options of the present one that mean the same."""

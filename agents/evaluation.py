@@ -20,6 +20,9 @@ from softgym_envs.executors import parallel_map
 if TYPE_CHECKING:
     import gymnasium
 
+Bodies = Mapping[str, float] | Sequence[Mapping[str, float]] | None
+"""The body of all episodes, one for each, or None for that of the environment."""
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -111,8 +114,8 @@ class Evaluation:
 
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain data: the summary, the values for each goal and the cost."""
-        summary = {name: known(getattr(self, name)) for name in _SUMMARY}
-        columns = {name: known(getattr(self, name)) for name in _PER_GOAL}
+        summary = {name: none_for_nan(getattr(self, name)) for name in _SUMMARY}
+        columns = {name: none_for_nan(getattr(self, name)) for name in _PER_GOAL}
         return {**summary, **columns, "steps": self.steps, "seconds": self.seconds, "cpu_seconds": self.cpu_seconds}
 
     @classmethod
@@ -136,16 +139,16 @@ class Evaluation:
         return cls(**columns, steps=cost[0], seconds=cost[1], cpu_seconds=cost[2])
 
 
-def known(values: Any) -> Any:
+def none_for_nan(values: Any) -> Any:
     """Return a number, or numbers as lists, with None for NaN, which JSON lacks."""
     if isinstance(values, np.ndarray):
-        return [known(value) for value in values] if values.ndim else known(values.item())
+        return [none_for_nan(value) for value in values] if values.ndim else none_for_nan(values.item())
     value = values.item() if isinstance(values, np.generic) else values
     return None if isinstance(value, float) and np.isnan(value) else value
 
 
 def _column(values: Any) -> np.ndarray:
-    """Return an array of what `known` made."""
+    """Return an array of what `none_for_nan` made."""
     found = np.asarray(values)
     return found.astype(float) if found.dtype == object else found
 
@@ -176,33 +179,33 @@ def _total_cost(evaluations: Sequence[Evaluation]) -> _Cost:
 
 
 def sample_goals(
-    environment: EnvironmentConfig, count: int, seed: int, design: dict[str, float] | None = None
+    environment: EnvironmentConfig, count: int, seed: int, design: Mapping[str, float] | None = None
 ) -> np.ndarray:
     """Draw goals [m] (count, p, 3) as the task of an environment does, for a body (default the environment's)."""
-    env = environment.make()
-    try:
-        paths = []
-        for i in range(count):
-            env.reset(seed=seed if i == 0 else None, options={"design": design})
-            paths.append(env.unwrapped.path.copy())  # type: ignore[attr-defined]
-        return np.stack(paths)
-    finally:
-        env.close()
+    return _draw_episodes(environment, count, seed, design)[1]
 
 
 def evaluation_set(
     environment: EnvironmentConfig, count: int, seed: int
-) -> tuple[list[dict[str, float]] | None, np.ndarray]:
+) -> tuple[list[Mapping[str, float]] | None, np.ndarray]:
     """Draw ``count`` bodies and goals [m] (count, p, 3) as an environment does; None if it has a single body."""
-    if not environment.sample_design:
-        return None, sample_goals(environment, count, seed)
+    designs, goals = _draw_episodes(environment, count, seed, None)
+    return designs if environment.sample_design else None, goals
+
+
+def _draw_episodes(
+    environment: EnvironmentConfig, count: int, seed: int, design: Mapping[str, float] | None
+) -> tuple[list[Mapping[str, float]], np.ndarray]:
+    """Return the bodies and the goals [m] (count, p, 3) of ``count`` episodes."""
     env = environment.make()
     designs, goals = [], []
-    for i in range(count):
-        env.reset(seed=seed if i == 0 else None)
-        designs.append(env.unwrapped.design)  # type: ignore[attr-defined]
-        goals.append(env.unwrapped.path.copy())  # type: ignore[attr-defined]
-    env.close()
+    try:
+        for i in range(count):
+            env.reset(seed=seed if i == 0 else None, options={"design": design})
+            designs.append(env.unwrapped.design)  # type: ignore[attr-defined]
+            goals.append(env.unwrapped.path.copy())  # type: ignore[attr-defined]
+    finally:
+        env.close()
     return designs, np.stack(goals)
 
 
@@ -235,7 +238,7 @@ def evaluate(
     environment: EnvironmentConfig,
     goals: np.ndarray,
     *,
-    design: dict[str, float] | Sequence[dict[str, float]] | None = None,
+    design: Bodies = None,
     seed: int = 0,
     workers: int = 1,
 ) -> Evaluation:
@@ -247,14 +250,14 @@ def evaluate(
         goals: goals or paths of goals [m], shape (n, 3) or (n, p, 3).
         design: the body, or one for each goal; default the environment's.
         seed: seed of the random agent and of the environment.
-        workers: number of processes, which share the goals and give the same numbers as one. Policies in batched
-            environments run all episodes at once in this process, whatever the number.
+        workers: number of processes, which share the goals and give the same numbers as one. Policies and the QP in
+            batched environments run all episodes at once in this process, whatever the number.
 
     Returns:
         The outcome, whose times include making the environment; the CPU time is that of all processes.
 
     Raises:
-        ValueError: for fewer than one worker.
+        ValueError: for fewer than one worker, goals of another shape, or another number of bodies than goals.
         ConfigError: if the policy was trained for another environment, see `Policy.check_environment`.
         WeightsError: if the policy cannot be read.
     """
@@ -262,139 +265,118 @@ def evaluate(
         raise ValueError(f"workers = {workers} must be 1 or more")
     goals = np.asarray(goals, dtype=float)
     goals = goals[:, None, :] if goals.ndim == 2 else goals
-    if agent not in BASELINES:
+    if goals.ndim != 3 or goals.shape[2] != 3 or not goals.size:
+        raise ValueError(f"goals must have shape (n, 3) or (n, p, 3), with at least one goal, got {goals.shape}")
+    if not (design is None or isinstance(design, Mapping)) and len(design) != len(goals):
+        raise ValueError(f"design must be one body or one for each of {len(goals)} goals, got {len(design)}")
+    if agent in BASELINES:
+        environment = environment.model_copy(update={"residual_scale": 0.0})
+    else:
         Policy(agent).check_environment(environment)
-    together = agent not in BASELINES and environment.batched
-    shares = np.array_split(np.arange(len(goals)), 1 if together else max(1, min(workers, len(goals))))
+    together = environment.batched and (agent not in BASELINES or (agent == "qp" and len(goals) > 1))
+    run = _evaluate_together if together else _evaluate_one_by_one
+    shares = np.array_split(np.arange(len(goals)), 1 if together else min(workers, len(goals)))
     began = time.perf_counter()
-    parts: dict[int, Evaluation] = {}
-    calls = [(agent, environment, goals, design, seed, share) for share in shares]
-    for first, part in parallel_map(_evaluate_share, calls, len(shares)):
-        parts[first] = part
+    calls = [(run, agent, environment, goals, design, seed, share) for share in shares]
+    parts = dict(parallel_map(_evaluate_share, calls, len(shares)))
     merged = Evaluation.merge([parts[first] for first in sorted(parts)])
     return replace(merged, seconds=time.perf_counter() - began)
 
 
 def _evaluate_share(
+    run: Callable[..., Evaluation],
     agent: str | Path,
     environment: EnvironmentConfig,
     goals: np.ndarray,
-    design: dict[str, float] | Sequence[dict[str, float]] | None,
+    design: Bodies,
     seed: int,
     share: np.ndarray,
 ) -> tuple[int, Evaluation]:
     """Evaluate an agent on the goals with the numbers ``share``; return the first of these and the outcome."""
     cpu = time.process_time()
-    outcome = _evaluate(agent, environment, goals, design, seed, share)
-    first = int(share[0]) if len(share) else 0
-    return first, replace(outcome, cpu_seconds=time.process_time() - cpu)
+    outcome = run(agent, environment, goals, design, seed, share)
+    return int(share[0]), replace(outcome, cpu_seconds=time.process_time() - cpu)
 
 
-def _evaluate(
-    agent: str | Path,
-    environment: EnvironmentConfig,
-    goals: np.ndarray,
-    design: dict[str, float] | Sequence[dict[str, float]] | None,
-    seed: int,
-    share: np.ndarray,
+def _evaluate_one_by_one(
+    agent: str | Path, environment: EnvironmentConfig, goals: np.ndarray, design: Bodies, seed: int, share: np.ndarray
 ) -> Evaluation:
-    if agent in BASELINES:
-        environment = environment.model_copy(update={"residual_scale": 0.0})
-        if agent == "qp" and environment.batched and len(goals) > 1:
-            return _evaluate_batch(None, environment, goals, design, seed)
-        act = make_baseline(str(agent), seed)
-    else:
-        policy = Policy(agent)
-        if environment.batched:
-            return _evaluate_batch(policy, environment, goals, design, seed)
-        act = _acting(policy)
+    """Run the episodes with the numbers ``share`` one after the other, on any backend."""
+    act = make_agent(agent, seed)
     env = environment.make(sample_design=False)
     rows = []
-    steps = 0
     try:
-        for index in share:
+        for index in share.tolist():
             if agent == "random":  # each episode draws its own numbers, whichever process runs it
-                act = make_baseline("random", seed + index)
-            path = goals[index]
-            body = design if design is None or isinstance(design, dict) else design[index]
+                act = make_agent(agent, seed + index)
+            body = design if design is None or isinstance(design, Mapping) else design[index]
             # Episodes have touches, plants and noise of their own, whichever process runs them.
-            start = {"design": body, "goal": path}
-            observation, info = env.reset(seed=seed + int(index), options=start)
-            total, effort, distance, doubted, count, ended = 0.0, 0.0, 0.0, 0, 0, False
-            while not ended:
-                action = act(observation, env.unwrapped)
-                observation, reward, terminated, truncated, info = env.step(action)
-                total += float(reward)
-                effort += float(np.abs(info["effort"]).mean())
-                distance += info["distance"]
-                doubted += not info["trusted"]
-                count += 1
-                ended = terminated or truncated
-            steps += count
-            rows.append(
-                (
-                    info["distance"],
-                    distance / count,
-                    total,
-                    info["is_success"] and info["converged"],
-                    effort / count,
-                    info["effector"],
-                    doubted / count,
-                )
-            )
+            rows.append(_run_episode(env, act, seed + index, {"design": body, "goal": goals[index]}))
     finally:
         env.close()
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    distances, means, returns, successes, efforts, ends, untrusted = columns
-    return Evaluation(distances, means, returns, successes.astype(bool), efforts, ends, steps, untrusted)
+    columns: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in _PER_GOAL}
+    return Evaluation(**columns, steps=sum(row["steps"] for row in rows))
 
 
-def _inverse_qp(env: gymnasium.vector.VectorEnv) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the inverse QP of a batch as a function of observations, which it does not need."""
-    control = BatchQP(env.unwrapped)  # type: ignore[arg-type]
-    return lambda _: control()
-
-
-def _evaluate_batch(
-    policy: Policy | None,
-    environment: EnvironmentConfig,
-    goals: np.ndarray,
-    design: dict[str, float] | Sequence[dict[str, float]] | None,
-    seed: int,
-) -> Evaluation:
-    """Run all episodes at once on the batched environment, with a policy or, without one, the inverse QP."""
-    count = len(goals)
-    env = environment.make_vec(count, sample_design=False)
-    act = _inverse_qp(env) if policy is None else policy.begin()
-    columns = {
-        name: np.zeros(count) for name in ("distance", "mean", "return", "success", "effort", "doubted", "length")
+def _run_episode(env: gymnasium.Env, act: Agent, seed: int, options: dict[str, Any]) -> dict[str, Any]:
+    """Return what `Evaluation` says of one episode, by the names of its columns, and its steps."""
+    observation, info = env.reset(seed=seed, options=options)
+    total, effort, distance, untrusted, steps, ended = 0.0, 0.0, 0.0, 0, 0, False
+    while not ended:
+        observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
+        total += float(reward)
+        effort += float(np.abs(info["effort"]).mean())
+        distance += info["distance"]
+        untrusted += not info["trusted"]
+        steps += 1
+        ended = terminated or truncated
+    return {
+        "distances": info["distance"],
+        "mean_distances": distance / steps,
+        "returns": total,
+        "successes": bool(info["is_success"] and info["converged"]),
+        "efforts": effort / steps,
+        "ends": info["effector"],
+        "untrusted": untrusted / steps,
+        "steps": steps,
     }
-    ends = np.zeros((count, 3))
-    running = np.ones(count, dtype=bool)
+
+
+def _evaluate_together(
+    agent: str | Path, environment: EnvironmentConfig, goals: np.ndarray, design: Bodies, seed: int, share: np.ndarray
+) -> Evaluation:
+    """Run all episodes at once on the batched environment, with a policy or the inverse QP; ``share`` is all goals."""
+    count = len(goals)
+    env: Any = environment.make_vec(count, sample_design=False)
+    if agent in BASELINES:
+        control = BatchQP(env.unwrapped)
+        act: Callable[[np.ndarray], np.ndarray] = lambda observation: control()  # noqa: E731
+    else:
+        act = Policy(agent).begin()
+    distances, totals, returns, efforts, untrusted, lengths = np.zeros((6, count))
+    successes, running, ends = np.zeros(count, dtype=bool), np.ones(count, dtype=bool), np.zeros((count, 3))
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
         while running.any():
             observation, reward, terminated, truncated, info = env.step(act(observation))
             last = info.get("final_info", info)
-            columns["distance"] = np.where(running, last["distance"], columns["distance"])
-            ends = np.where(running[:, None], last["effector"], ends)
-            columns["success"] = np.where(running, last["is_success"] & last["converged"], columns["success"])
-            columns["mean"] += running * last["distance"]
-            columns["return"] += running * reward
-            columns["effort"] += running * np.abs(last["effort"]).mean(axis=1)
-            columns["doubted"] += running & ~last["trusted"]
-            columns["length"] += running
+            distances[running], ends[running] = last["distance"][running], last["effector"][running]
+            successes[running] = (last["is_success"] & last["converged"])[running]
+            totals += running * last["distance"]
+            returns += running * reward
+            efforts += running * np.abs(last["effort"]).mean(axis=1)
+            untrusted += running & ~last["trusted"]
+            lengths += running
             running &= ~(terminated | truncated)
     finally:
         env.close()
-    length = columns["length"]
     return Evaluation(
-        columns["distance"],
-        columns["mean"] / length,
-        columns["return"],
-        columns["success"].astype(bool),
-        columns["effort"] / length,
-        ends,
-        int(length.sum()),
-        columns["doubted"] / length,
+        distances=distances,
+        mean_distances=totals / lengths,
+        returns=returns,
+        successes=successes,
+        efforts=efforts / lengths,
+        ends=ends,
+        untrusted=untrusted / lengths,
+        steps=int(lengths.sum()),
     )

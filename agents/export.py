@@ -40,7 +40,7 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
 
     Raises:
         WeightsError: if the policy cannot be read.
-        ValueError: for another file ending, a policy with a memory, or if ``onnx`` is not installed.
+        ValueError: for another file ending, a policy that `exported_spaces` refuses, or if ``onnx`` is not installed.
     """
     path = Path(path)
     if path.suffix != ".onnx":
@@ -50,23 +50,36 @@ def export_policy_onnx(policy: Policy | str | Path, path: str | Path) -> Path:
     except ImportError:
         raise ValueError("ONNX files need the package onnx: pip install 'softgym-envs[onnx]'") from None
     policy = policy if isinstance(policy, Policy) else Policy(policy)
-    data = _graph(policy, spaces_of(policy), policy.environment, onnx).SerializeToString()
+    data = _graph(policy, exported_spaces(policy), policy.environment, onnx).SerializeToString()
     with atomic_write(path) as stream:
         stream.write(data)
     return path
 
 
-def spaces_of(policy: Policy) -> AgentSpaces:
+def exported_spaces(policy: Policy) -> AgentSpaces:
     """Return the observation and action spaces of the environment in which a policy was trained.
 
     Raises:
-        ValueError: for a policy with a memory, which the exported formats cannot keep.
+        ValueError: for a policy that the exported formats cannot hold: one that has a memory, or that observes sensors
+            in place of the effector, or a choice of its body.
     """
     if policy.memory is not None:
         raise ValueError(f"policy '{policy.path}' has a memory and cannot be exported; allowed: policies without")
     env = policy.environment.make()
     env.close()
-    return env.unwrapped.spaces  # type: ignore[attr-defined]
+    spaces: AgentSpaces = env.unwrapped.spaces  # type: ignore[attr-defined]
+    if spaces.sensors:
+        raise ValueError(
+            f"policy '{policy.path}' observes sensors in place of the effector and cannot be exported; allowed: "
+            "policies that observe the effector"
+        )
+    space = spaces.robot.design_space
+    if chosen := [name for name in spaces.design_names if space[name].choices]:
+        raise ValueError(
+            f"policy '{policy.path}' observes choices of its body ({', '.join(chosen)}) and cannot be exported; "
+            "allowed: policies that observe numbers only"
+        )
+    return spaces
 
 
 def input_sizes(spaces: AgentSpaces) -> dict[str, int]:
@@ -108,30 +121,14 @@ def _graph(policy: Policy, spaces: AgentSpaces, config: EnvironmentConfig, onnx:
     robot, n = spaces.robot, len(spaces.robot.actuators)
     sizes = input_sizes(spaces)
     g = _Nodes(onnx)
-    middle, half = 0.5 * (spaces.lower + spaces.upper), 0.5 * (spaces.upper - spaces.lower)
-    parts = [g("Div", g("Sub", name, middle), half) for name in ("command", "displacement")]
-    parts.append(g.squashed(g("Div", "effort", robot.effort_scale)))
-    parts += [g("Div", name, spaces.position_scale) for name in ("effector", "goal")]
-    parts.append(g.squashed(g("Mul", g("Sub", "goal", "effector"), spaces.axes / spaces.error_scale)))
-    if spaces.moving:
-        parts.append(g.squashed(g("Div", "velocity", robot.size)))
-    if spaces.design_names:
-        parts.append(_unit_design(spaces, g))
-    h = g("Clip", g("Concat", *parts, axis=-1), -1.0, 1.0)
+    h = _observation(spaces, g)
     for weight, bias in policy.hidden:
         h = g("Relu", g("Add", g("MatMul", h, weight), bias))
     weight, bias = policy.mean
     action = g("Tanh", g("Add", g("MatMul", h, weight), bias), output="action")
     outputs = ["action"]
     if not config.residual_scale:
-        outputs.append("next_command")
-        if spaces.action_mode == "increment":
-            target = g("Add", "command", g("Mul", action, spaces.rates))
-        else:
-            step = g("Sub", g("Add", g("Mul", action, half), middle), "command")
-            step = g("Min", g("Max", step, -spaces.rates), spaces.rates)
-            target = g("Add", "command", step)
-        g("Min", g("Max", target, spaces.lower), spaces.upper, output="next_command")
+        outputs.append(_next_command(spaces, g, action))
 
     def value(name: str, size: int) -> Any:
         return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["B", size])
@@ -162,6 +159,29 @@ def _graph(policy: Policy, spaces: AgentSpaces, config: EnvironmentConfig, onnx:
     onnx.helper.set_model_props(model, described)
     onnx.checker.check_model(model)
     return model
+
+
+def _observation(spaces: AgentSpaces, g: _Nodes) -> str:
+    """Add the nodes of `AgentSpaces.observe`; return their output."""
+    parts = [g("Div", g("Sub", name, spaces.middle), spaces.half_range) for name in ("command", "displacement")]
+    parts.append(g.squashed(g("Div", "effort", spaces.effort_scale)))
+    parts += [g("Div", name, spaces.position_scale) for name in ("effector", "goal")]
+    parts.append(g.squashed(g("Mul", g("Sub", "goal", "effector"), spaces.axes / spaces.error_scale)))
+    if spaces.moving:
+        parts.append(g.squashed(g("Div", "velocity", spaces.robot.size)))
+    if spaces.design_names:
+        parts.append(_unit_design(spaces, g))
+    return g("Clip", g("Concat", *parts, axis=-1), -1.0, 1.0)
+
+
+def _next_command(spaces: AgentSpaces, g: _Nodes, action: str) -> str:
+    """Add the nodes of `AgentSpaces.command`; return their output."""
+    if spaces.action_mode == "increment":
+        target = g("Add", "command", g("Mul", action, spaces.rates))
+    else:
+        step = g("Sub", g("Add", g("Mul", action, spaces.half_range), spaces.middle), "command")
+        target = g("Add", "command", g("Min", g("Max", step, -spaces.rates), spaces.rates))
+    return g("Min", g("Max", target, spaces.lower), spaces.upper, output="next_command")
 
 
 def _unit_design(spaces: AgentSpaces, g: _Nodes) -> str:

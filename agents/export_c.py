@@ -8,7 +8,7 @@ from string import Template
 
 import numpy as np
 
-from softgym_envs.agents.export import input_sizes, spaces_of
+from softgym_envs.agents.export import exported_spaces, input_sizes
 from softgym_envs.agents.policy import Policy
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.storage import atomic_write
@@ -36,15 +36,13 @@ def export_policy_c(policy: Policy | str | Path, path: str | Path, *, name: str 
 
     Raises:
         WeightsError: if the policy cannot be read.
-        ValueError: for another file ending, a prefix that is not an identifier, or a policy that sees sensors.
+        ValueError: for another file ending, a prefix that is not an identifier, or a policy that `exported_spaces`
+            refuses.
     """
     path = check_path(path, ".h")
     check_identifier(name)
     policy = policy if isinstance(policy, Policy) else Policy(policy)
-    spaces = spaces_of(policy)
-    if spaces.sensors:
-        raise ValueError("policies that see sensors in place of the effector cannot be exported to C")
-    text = _header(policy, spaces, name)
+    text = _header(policy, exported_spaces(policy), name)
     with atomic_write(path, "w") as stream:
         stream.write(text)
     return path

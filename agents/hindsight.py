@@ -33,13 +33,16 @@ class HindsightBuffer(ReplayBuffer):
             (size, num_envs).
 
     Raises:
-        ValueError: for a task whose goal moves, as later positions then belong to other goals.
+        ValueError: for a task whose goal moves, as later positions then belong to other goals, or that hides the
+            effector.
     """
 
     def __init__(self, *args: Any, spaces: AgentSpaces, task: Task, share: float, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if task.horizon != 1:
             raise ValueError(f"hindsight = {share} needs a fixed goal, but task '{task.name}' moves it; allowed: 0")
+        if task.sensors:
+            raise ValueError(f"hindsight = {share} needs the effector, but task '{task.name}' hides it; allowed: 0")
         self.spaces, self.task, self.share = spaces, task, share
         self.ends = np.full((self.buffer_size, self.n_envs), -1, dtype=np.int64)
 

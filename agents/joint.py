@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.storage import read_json, write_json
 
 if TYPE_CHECKING:
@@ -31,12 +32,17 @@ class DesignProposer(ABC):
         """Start drawing the bodies of a training, continuing where an interrupted run stopped.
 
         Raises:
-            ValueError: if the environment does not sample bodies.
+            ValueError: if the environment does not sample bodies, or is not batched.
         """
         if not config.environment.sample_design:
             raise ValueError("joint training needs environment.sample_design, the names of the variables to optimise")
         env: Any = model.get_env()
         vector = env.env.unwrapped
+        if not isinstance(vector, SoftRobotVectorEnv):
+            raise ValueError(
+                f"joint training needs a batched environment, but {config.environment.title} on backend "
+                f"'{config.environment.backend}' is not"
+            )
         self.config, self.folder = config, folder
         self.names: tuple[str, ...] = tuple(vector.sampled_variables)
         self.size = len(self.names)

@@ -31,7 +31,7 @@ def record_episodes(
         environment: the environment.
         episodes: number of episodes.
         design: body of all episodes; by default that of the environment.
-        seed: of the first episode; the others count on.
+        seed: of the first episode; each later one has the next integer.
 
     Returns:
         The dataset, whose steps also hold the environment's information.

@@ -6,6 +6,8 @@ Silver et al., Residual policy learning, 2018.
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 
@@ -24,6 +26,13 @@ class ResidualQP(gymnasium.ActionWrapper):
     def __init__(self, env: gymnasium.Env, scale: float) -> None:
         super().__init__(env)
         self.scale = scale
+        self._qp = InverseQPAgent()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return _without_qp(self)
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self.__dict__.update(kept)
         self._qp = InverseQPAgent()
 
     def action(self, action: np.ndarray) -> np.ndarray:
@@ -62,6 +71,18 @@ class VectorResidualQP(gymnasium.vector.VectorActionWrapper):
         self.scale = scale
         self._qp = BatchQP(env.unwrapped)  # type: ignore[arg-type]
 
+    def __getstate__(self) -> dict[str, Any]:
+        return _without_qp(self)
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self.__dict__.update(kept)
+        self._qp = BatchQP(self.env.unwrapped)  # type: ignore[arg-type]
+
     def actions(self, actions: np.ndarray) -> np.ndarray:
         """Return the actions for the wrapped environment, shape (num_envs, n_a)."""
         return np.clip(self._qp() + self.scale * np.asarray(actions), -1.0, 1.0)
+
+
+def _without_qp(wrapper: ResidualQP | VectorResidualQP) -> dict[str, Any]:
+    """Return the attributes of a wrapper that can be pickled; a copy makes a QP of its own."""
+    return {name: value for name, value in vars(wrapper).items() if name != "_qp"}

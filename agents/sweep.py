@@ -15,7 +15,7 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,7 +35,7 @@ TEST_SEED = 2_000_003
 """Seed of the goals that are used neither for training nor for choosing policies."""
 
 
-def unseen_goals(environment: EnvironmentConfig, count: int) -> tuple[list[dict[str, float]] | None, np.ndarray]:
+def unseen_goals(environment: EnvironmentConfig, count: int) -> tuple[list[Mapping[str, float]] | None, np.ndarray]:
     """Return bodies (None: the single body) and goals [m] (n, p, 3) of the final evaluation; n = 1 if all are equal."""
     from softgym_envs.agents.evaluation import evaluation_set
 

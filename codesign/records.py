@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from softgym_envs.agents.evaluation import Evaluation, known
+from softgym_envs.agents.evaluation import Evaluation, none_for_nan
 from softgym_envs.codesign.objectives import Measurement
 from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json, write_json
@@ -293,7 +293,7 @@ class TestGroup:
         if len(self.tests) > 1:
             names = ("distances", "mean_distances", "returns", "successes", "efforts", "ends")
             data["seeds"] = [test.seed for test in self.tests]
-            data["of_seeds"] = {name: known(self.table(name)) for name in names}
+            data["of_seeds"] = {name: none_for_nan(self.table(name)) for name in names}
         return data
 
 

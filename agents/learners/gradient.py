@@ -77,7 +77,7 @@ class GradientLearner(NetworkLearner):
         if isinstance(env, SoftRobotVectorEnv):
             env.steps = rng.integers(0, env.max_episode_steps, env.num_envs)
         while self.step < target:
-            self._slow_down()
+            self._set_learning_rate()
             observation = self.advance(observation, rng)
             self.step += env.num_envs
             progress(env.num_envs)

@@ -31,7 +31,7 @@ class NetworkLearner(Learner):
         self.step, self._parameters, self._options = 0, dict(parameters), options
         self._optimiser = torch.optim.Adam(self._parameters.values(), lr=options.learning_rate, fused=True)
 
-    def _slow_down(self) -> None:
+    def _set_learning_rate(self) -> None:
         """Set the learning rate of the present step."""
         options, share = self._options, min(self.step / self.config.steps, 1.0)
         for group in self._optimiser.param_groups:

@@ -68,7 +68,7 @@ class PPOLearner(SB3Learner):
             seed=config.seed,
             device="cpu",
         )
-        self.let_rate_fall(ppo.learning_rate, ppo.final_learning_rate)
+        self.schedule_learning_rate(ppo.learning_rate, ppo.final_learning_rate)
 
     def begin(self) -> None:
         """Start episodes that end at different times, so that a batch holds states of all ages."""

@@ -64,7 +64,7 @@ class RecurrentLearner(NetworkLearner):
         options = self.config.recurrent
         rng = np.random.default_rng([self.config.seed, self.step])
         while self.step < target:
-            self._slow_down()
+            self._set_learning_rate()
             led = bool(rng.random() < 1.0 - self.step / (options.lead * self.config.steps))
             made = self._episode(int(rng.integers(2**31)), led)
             for _ in range(options.gradient_steps):

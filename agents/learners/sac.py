@@ -31,7 +31,7 @@ class SACLearner(SB3Learner):
     def __init__(self, config: TrainConfig) -> None:
         super().__init__(config)
         self.model = make_model(config)
-        self.let_rate_fall(config.sac.learning_rate, config.sac.final_learning_rate)
+        self.schedule_learning_rate(config.sac.learning_rate, config.sac.final_learning_rate)
 
     def begin(self) -> None:
         """End the running episodes in the replay buffer."""

@@ -54,7 +54,7 @@ class SB3Learner(Learner):
     def optimisers(self) -> dict[str, Optimizer]:
         """Return the optimisers by name."""
 
-    def let_rate_fall(self, first: float, last: float) -> None:
+    def schedule_learning_rate(self, first: float, last: float) -> None:
         """Let the learning rate fall linearly over all steps of the training.
 
         stable-baselines3 measures progress within one call of its ``learn``, but a training consists of many.

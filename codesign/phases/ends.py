@@ -196,7 +196,7 @@ def _follow(asked: _Questions, agent: str | Path, last_steps: int) -> tuple[dict
             env.reset(seed=0, options={"design": asked.design, "goal": asked.points[k]})
             try:
                 try:  # on from the last goal
-                    inner.backend.go_on_from(last or inner.backend.snapshot())
+                    inner.backend.resume(last or inner.backend.snapshot())
                     inner.backend.step(command)
                 except ConvergenceError:  # again from rest
                     inner.backend.reset()

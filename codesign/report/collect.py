@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from softgym_envs.agents.evaluation import known
+from softgym_envs.agents.evaluation import none_for_nan
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.goals import Stratum
 from softgym_envs.codesign.objectives import Objective
@@ -134,28 +134,29 @@ def _with_mesh(
         ratio: of the sizes of elements, or None for what follows from the unknowns.
         dimension: of the elements: with half their size there are about 2 ** dimension times as many.
     """
-    coarse = [found.get((trial, row.agent, "fem")) for trial in trials]
-    fine = [found.get((trial, row.agent, REFINED)) for trial in trials]
-    if row.backend != "fem" or None in coarse or None in fine:
+    tests = [[found.get((trial, row.agent, physics)) for trial in trials] for physics in ("fem", REFINED)]
+    coarse, fine = ([group for group in pair if group is not None] for pair in tests)
+    if row.backend != "fem" or len(coarse) < 2 or len(fine) < 2:
         return row
-    both = [[group for group in groups if group is not None] for groups in (coarse, fine)]
     if ratio is None:
-        few, many = (groups[0].unknowns for groups in both)
+        few, many = coarse[0].unknowns, fine[0].unknowns
         if few is None or many is None or few >= many:
             return row
         ratio = (few / many) ** (1.0 / dimension)
 
-    def part(tables: Sequence[Sequence[np.ndarray]], interval: Interval) -> MeshPart:
-        (before, after), (before_fine, after_fine) = ([table.mean(axis=0) for table in pair] for pair in tables)
-        numbers = both[1][0].numbers
-        return mesh_part((after - before)[numbers], after_fine - before_fine, ratio, interval, strata)
+    def part(column: Callable[[TestGroup], np.ndarray | None], interval: Interval | None) -> MeshPart | None:
+        changes = []
+        for pair in (coarse, fine):
+            before, after = (column(group) for group in pair)
+            if before is None or after is None or interval is None:
+                return None
+            changes.append(after.mean(axis=0) - before.mean(axis=0))
+        return mesh_part(changes[0][fine[0].numbers], changes[1], ratio, interval, strata)
 
-    distances = [[group.table("distances") for group in groups] for groups in both]
-    own = [[table for group in groups if (table := group.objective_table) is not None] for groups in both]
     return replace(
         row,
-        distance_mesh=part(distances, row.distance_change_interval),
-        objective_mesh=part(own, row.objective_change_interval) if all(len(pair) == 2 for pair in own) else None,
+        distance_mesh=part(lambda group: group.table("distances"), row.distance_change_interval),
+        objective_mesh=part(lambda group: group.objective_table, row.objective_change_interval),
     )
 
 
@@ -167,7 +168,7 @@ def _statistics(group: TestGroup, objective: Objective) -> BodyStatistics:
         mean_distance=mean.mean_distance,
         distance_interval=mean_interval(group.table("distances")),
         worst_distance=group.worst_distance,
-        mean_return=known(mean.mean_return),
+        mean_return=none_for_nan(mean.mean_return),
         mean_effort=mean.mean_effort,
         objective=group.value(objective.name),
         objective_interval=None if own is None else mean_interval(own),

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from softgym_envs.agents.evaluation import Evaluation, known
+from softgym_envs.agents.evaluation import Evaluation, none_for_nan
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.records import Finalist, TestGroup, TrialResult
 from softgym_envs.codesign.report.collect import collect
@@ -38,7 +38,7 @@ def _write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 
 
 def _field(evaluation: Evaluation | None, name: str) -> float | None:
-    return None if evaluation is None else known(getattr(evaluation, name))
+    return None if evaluation is None else none_for_nan(getattr(evaluation, name))
 
 
 def _trial_row(trial: TrialResult, config: StudyConfig, units: Mapping[str, str]) -> dict[str, Any]:

@@ -89,9 +89,8 @@ def _description(snapshot: StudySnapshot, results: StudyResults, trial: TrialRes
     values = {**trial.design, **trial.options}
     lines = [f"<b>trial {trial.number}</b> ({trial.origin})"]
     for name in results.objectives:
-        lines.append(
-            snapshot.config.objectives[name].label + ": " + snapshot.config.objectives[name].text(trial.values[name])
-        )
+        objective = snapshot.config.objectives[name]
+        lines.append(f"{objective.label}: {objective.text(trial.values[name])}")
     for variable in results.variables:
         if variable.optimised:
             lines.append(f"{variable.name.replace('_', ' ')}: {present(values[variable.name], variable.unit)}")
@@ -304,33 +303,40 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
     for trace in traces(length - 1, whole=True):  # at first at the goal
         figure.add_trace(trace)
     moving = list(range(len(figure.data)))
+    _add_goals(figure, episodes[0], outcomes)
+    figure.frames = [Frame(name=str(k), data=traces(k, whole=False), traces=moving) for k in range(length)]
+    _add_player(figure, episodes, picks, length)
+    return figure
+
+
+def _add_goals(figure: Figure, episode: Episode, outcomes: GoalOutcomes | None) -> None:
+    """Add all goals by their outcome, and the goal or path of the episode that is shown."""
     if outcomes is not None:
         for kind, (name, symbol, colour, _) in enumerate(GOAL_KINDS):
             chosen = outcomes.kinds == kind
             if chosen.any():
                 x, y, z = 1e3 * outcomes.points[chosen].T
-                text = outcomes.texts(chosen)
-                marker = {"color": colour, "symbol": symbol, "size": 4}
                 figure.add_scatter3d(
                     x=x,
                     y=y,
                     z=z,
                     mode="markers",
                     name=f"goals {name}",
-                    text=text,
-                    marker=marker,
+                    text=outcomes.texts(chosen),
+                    marker={"color": colour, "symbol": symbol, "size": 4},
                     hovertemplate="%{text}<extra></extra>",
                 )
-    if episodes[0].has_places:
-        x, y, z = 1e3 * episodes[0].path.T
-        goal = {"color": "#d97706", "size": 9, "symbol": "circle-open", "line": {"width": 3}}
-        mode = "markers" if len(x) == 1 else "lines"
+    if episode.has_places:
+        x, y, z = 1e3 * episode.path.T
         figure.add_scatter3d(
-            x=x, y=y, z=z, mode=mode, name="goal of this episode", marker=goal, line={"color": "#d97706", "width": 5}
+            x=x,
+            y=y,
+            z=z,
+            mode="markers" if len(x) == 1 else "lines",
+            name="goal of this episode",
+            marker={"color": "#d97706", "size": 9, "symbol": "circle-open", "line": {"width": 3}},
+            line={"color": "#d97706", "width": 5},
         )
-    figure.frames = [Frame(name=str(k), data=traces(k, whole=False), traces=moving) for k in range(length)]
-    _add_player(figure, episodes, picks, length)
-    return figure
 
 
 def _scene() -> dict[str, Any]:
@@ -350,7 +356,12 @@ def _body_trace(role: str, points: np.ndarray, faces: np.ndarray | None) -> dict
         i, j, k = faces.T.astype(np.int32)
         winner = role == "winner"
         trace |= {
-            **{"i": i, "j": j, "k": k, "name": role, "showlegend": True, "hoverinfo": "name"},
+            "i": i,
+            "j": j,
+            "k": k,
+            "name": role,
+            "showlegend": True,
+            "hoverinfo": "name",
             "color": WINNER if winner else BASELINE,
             "opacity": 1.0 if winner else 0.3,
             "flatshading": True,
@@ -390,7 +401,12 @@ def _add_player(figure: Figure, episodes: Sequence[Episode], picks: Sequence[lis
         margin={"l": 0, "r": 0, "t": 10, "b": 0},
         updatemenus=[
             {
-                **{"type": "buttons", "direction": "left", "x": 0, "y": 0, "xanchor": "left", "yanchor": "top"},
+                "type": "buttons",
+                "direction": "left",
+                "x": 0,
+                "y": 0,
+                "xanchor": "left",
+                "yanchor": "top",
                 "pad": {"t": 28, "l": 8},
                 "buttons": [
                     {"label": "Play", "method": "animate", "args": [None, play]},
@@ -400,15 +416,13 @@ def _add_player(figure: Figure, episodes: Sequence[Episode], picks: Sequence[lis
         ],
         sliders=[
             {
-                **{
-                    "x": 0.2,
-                    "len": 0.78,
-                    "y": 0,
-                    "yanchor": "top",
-                    "pad": {"t": 18},
-                    "active": length - 1,
-                    "ticklen": 0,
-                },
+                "x": 0.2,
+                "len": 0.78,
+                "y": 0,
+                "yanchor": "top",
+                "pad": {"t": 18},
+                "active": length - 1,
+                "ticklen": 0,
                 "currentvalue": {
                     "prefix": f"{episodes[0].task.distance_scale.name} at ",
                     "xanchor": "left",

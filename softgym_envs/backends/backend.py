@@ -49,13 +49,13 @@ class State:
             surrogate). In dynamics: the tangent of the time step, including inertia, is positive definite.
         uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM without
             learned superelements.
-        trusted: the model may be trusted at the state. FEM is trusted unless a beam folds or a superelement is loaded
+        doubt: why the model is not trusted at the state, 0 if it is: a sum of numbers in
+            `softgym_envs.surrogate.domain.DOUBTS`. FEM is trusted unless a beam folds or a superelement is loaded
             beyond what it has learned.
-        doubt: why it is not trusted, 0 if it is: a sum of numbers in `softgym_envs.surrogate.domain.DOUBTS`.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
         contacts: where the body touches, with forces and gaps; None if it cannot touch anything.
-        memory: what the backend needs besides to go on from here: the past of friction, or the motion of a learned
-            model; None where the other attributes are enough.
+        memory: what else the backend needs to continue from the state: the past of friction, or the motion of a
+            learned model; None where the other attributes are enough.
     """
 
     command: np.ndarray
@@ -70,10 +70,14 @@ class State:
     bonds: np.ndarray = field(default_factory=lambda: np.zeros(0))
     stable: bool = True
     uncertainty: float = 0.0
-    trusted: bool = True
     doubt: int = 0
     contacts: Contacts | None = None
     memory: Any = None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the model may be trusted at the state."""
+        return self.doubt == 0
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy holds the condensed model itself, not the learned model that evaluates it.
@@ -98,19 +102,37 @@ class PointForce:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What a backend needs to go on from a state in another object of its class.
+    """What another backend of the same class needs to continue from a state.
 
     Attributes:
         backend: name of the class.
         design: the body.
         state: the present state.
-        more: what the backend needs beyond that.
+        extra: whatever else the next steps depend on.
     """
 
     backend: str
     design: Design
     state: State
-    more: Any = None
+    extra: Any = None
+
+
+def check_numbers(name: str, values: object, count: int) -> np.ndarray:
+    """Return values as an array (count,).
+
+    Raises:
+        ValueError: unless they are ``count`` finite numbers.
+    """
+    array = np.asarray(values, dtype=float)
+    if array.shape != (count,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be {count} finite number{'s' * (count > 1)}, got {array.tolist()}")
+    return array
+
+
+def refuse_force(force: np.ndarray | None) -> None:
+    """Raise ValueError for a force on the effector, which only finite elements take."""
+    if force is not None and np.any(force):
+        raise ValueError(f"force = {np.asarray(force).tolist()} N is taken by backend='fem' only; allowed: None")
 
 
 class Backend(ABC):
@@ -193,22 +215,23 @@ class Backend(ABC):
 
     def snapshot(self) -> Snapshot:
         """Return all that the next steps depend on."""
-        return Snapshot(type(self).__name__, self.design, self.state, self._more())
+        return Snapshot(type(self).__name__, self.design, self.state, self._extra_state())
 
-    def go_on_from(self, kept: Snapshot) -> None:
-        """Go on from a snapshot, also of another backend of the same class and with the same robot.
+    def resume(self, snapshot: Snapshot) -> None:
+        """Continue from a snapshot, also of another backend of the same class and with the same robot.
 
         Raises:
             ValueError: for a snapshot of another class.
         """
-        if kept.backend != type(self).__name__:
-            raise ValueError(f"a state of {kept.backend} cannot go on in {type(self).__name__}")
-        self._put_back(kept)
+        if snapshot.backend != type(self).__name__:
+            raise ValueError(f"a state of {snapshot.backend} cannot continue in {type(self).__name__}")
+        self._resume(snapshot)
 
-    def _more(self) -> Any:
+    def _extra_state(self) -> Any:
         """Return what the next steps depend on besides body and state."""
         return None
 
-    def _put_back(self, kept: Snapshot) -> None:
-        self.reset(kept.design)
-        self.restore(kept.state)
+    def _resume(self, snapshot: Snapshot) -> None:
+        """Continue from a snapshot of the same class."""
+        self.reset(snapshot.design)
+        self.restore(snapshot.state)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_force
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel, Row, point_rows
@@ -19,6 +19,7 @@ from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
 from softgym_envs.surrogate.chain.contact import ChainBatch, Memory, Touching, rows_for
 from softgym_envs.surrogate.chain.model import ChainModel, load_chain
 from softgym_envs.surrogate.chain.rows import contact_rows
+from softgym_envs.surrogate.domain import SELF_CONTACT, SOFT
 
 MAX_NEWTON_STEPS = 30
 """Newton steps in the search for the angle under a torque."""
@@ -66,9 +67,7 @@ class ChainBody:
             ConvergenceError: if it is not found.
             ValueError: for a malformed command.
         """
-        command = np.asarray(command, dtype=float)
-        if command.shape != (1,) or not np.isfinite(command).all():
-            raise ValueError(f"command must be one finite number, got {command.tolist()}")
+        command = check_numbers("command", command, 1)
         if mode == "effort":
             self._reach_torque(start, float(np.clip(command[0], -self._max_effort, self._max_effort)))
         elif mode == "displacement":
@@ -131,7 +130,11 @@ class ChainBody:
         full = np.concatenate([effort, np.zeros(3)])
         W = compliance[0]
         free = np.concatenate([displacement, effector]) - W @ full
-        folded = self._self_contact and bool(states.folded[0])
+        doubt = int(self._prepared.doubt[0])
+        if not stable[0]:
+            doubt |= SOFT
+        if self._self_contact and states.folded[0]:
+            doubt |= SELF_CONTACT
         return State(
             command=command.copy(),
             displacement=displacement,
@@ -141,7 +144,7 @@ class ChainBody:
             condensed=CondensedModel(W, free, full, ROLES, self._labels()),
             stable=bool(stable[0]),
             uncertainty=float(self._prepared.tip_uncertainty[0]),
-            trusted=bool(self._prepared.known[0]) and bool(stable[0]) and not folded,
+            doubt=doubt,
             contacts=self._contacts(touch, float(states.clearance[0])),
             memory=memory,
         )
@@ -208,8 +211,7 @@ class ChainBackend(Backend):
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        if force is not None and np.any(force):
-            raise ValueError("the surrogate does not support forces on effectors; use backend='fem'")
+        refuse_force(force)
         self.state = self._body.solve(command, mode, self.state)
         return self.state
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_force
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel, Row, point_rows
@@ -40,6 +40,7 @@ from softgym_envs.surrogate.chain.hand import (
 )
 from softgym_envs.surrogate.chain.kernels import touch
 from softgym_envs.surrogate.chain.model import ChainModel, load_chain
+from softgym_envs.surrogate.domain import SELF_CONTACT
 
 ROLES = (("a", 3), ("e", 3))
 MAX_CUTS = 5
@@ -212,10 +213,10 @@ class ChainHand:
         return np.array([x, 0.0, z + self.memory.drives[2]])
 
     @property
-    def trusted(self) -> bool:
-        """Whether the body lies where the chain was trained, and no finger touches itself."""
-        folded = self._self_contact and bool(np.isfinite(self.memory.fold).any())
-        return bool(self._prepared.known[0]) and not folded
+    def doubt(self) -> int:
+        """Why the present state is not trusted, 0 if it is (`softgym_envs.surrogate.domain.DOUBTS`)."""
+        folded = self._self_contact and np.isfinite(self.memory.fold).any()
+        return int(self._prepared.doubt[0]) | (SELF_CONTACT if folded else 0)
 
     @property
     def uncertainty(self) -> float:
@@ -367,18 +368,19 @@ class ChainHandBackend(Backend):
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        if force is not None and np.any(force):
-            raise ValueError("the surrogate does not support forces on effectors; use backend='fem'")
-        self._drive(self._checked(command, mode), self.control_step)
-        self.state = self._state(np.asarray(command, dtype=float))
+        refuse_force(force)
+        command = self._checked(command, mode)
+        self._drive(command, self.control_step)
+        self.state = self._state(command)
         return self.state
 
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
         """Return the equilibrium under a command without going there."""
         kept = self._hand.memory
         try:
-            self._drive(self._checked(command, mode), None)
-            return self._state(np.asarray(command, dtype=float), still=True)
+            command = self._checked(command, mode)
+            self._drive(command, None)
+            return self._state(command, still=True)
         finally:
             self._hand.memory = kept
 
@@ -394,12 +396,9 @@ class ChainHandBackend(Backend):
         self.state = state
 
     def _checked(self, command: np.ndarray, mode: str) -> np.ndarray:
-        command = np.asarray(command, dtype=float)
-        if command.shape != (3,) or not np.isfinite(command).all():
-            raise ValueError(f"command must be 3 finite numbers, got {command.tolist()}")
         if mode != "displacement":
             raise ValueError(f"mode = {mode!r} is not possible on a learned hand; allowed: 'displacement'")
-        return command
+        return check_numbers("command", command, 3)
 
     def _drive(self, command: np.ndarray, duration: float | None) -> None:
         """Move the drives, and take back servos whose torque is too large."""
@@ -448,7 +447,7 @@ class ChainHandBackend(Backend):
             velocity=velocity,
             stable=stable,
             uncertainty=hand.uncertainty,
-            trusted=hand.trusted,
+            doubt=hand.doubt,
             contacts=hand.contacts(),
             memory=memory,
         )

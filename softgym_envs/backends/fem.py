@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State
+from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_numbers
 from softgym_envs.backends.time_steps import TimeSteps
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import ContactModel
@@ -102,7 +102,7 @@ class FEMBackend(Backend):
         complete = self.design if design is None else self.robot.design_space.complete(design)
         if complete != self.design:
             model = self.robot.build(complete)
-            self._rub(model)
+            self._set_friction(model)
             statics = Statics(model)
             zero = np.zeros(len(self.robot.actuators))
             try:
@@ -144,7 +144,7 @@ class FEMBackend(Backend):
         friction = self._checked_friction(friction)
         if friction != self._friction:
             self._friction = friction
-            self._rub(self.model)
+            self._set_friction(self.model)
             self._statics = Statics(self.model)
             self._rest = replace(self._rest, memory=self._statics.memory)
             self.restore(self._rest)
@@ -156,7 +156,7 @@ class FEMBackend(Backend):
             raise ValueError(f"cable_friction = {friction} is computed in statics only; allowed in dynamics: 0")
         return float(friction)
 
-    def _rub(self, model: MechanicalModel) -> None:
+    def _set_friction(self, model: MechanicalModel) -> None:
         """Set the friction of the model's cables."""
         cables = [constraint for constraint in model.constraints["a"] if isinstance(constraint, Cable)]
         if self._friction and not cables:
@@ -165,11 +165,11 @@ class FEMBackend(Backend):
             cable.friction = self._friction
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        command = self._checked("command", command, len(self.largest_efforts))
+        command = check_numbers("command", command, len(self.largest_efforts))
         load = None
         if force is not None:
             load = np.zeros(self.state.condensed.delta.e.size)
-            load[:3] = self._checked("force", force, 3)
+            load[:3] = check_numbers("force", force, 3)
         kept = self._motion
         try:
             if self._dynamics is None:
@@ -184,17 +184,10 @@ class FEMBackend(Backend):
             raise
         return self.state
 
-    @staticmethod
-    def _checked(name: str, values: np.ndarray, count: int) -> np.ndarray:
-        array = np.asarray(values, dtype=float)
-        if array.shape != (count,) or not np.isfinite(array).all():
-            raise ValueError(f"{name} must be {count} finite numbers, got {array.tolist()}")
-        return array
-
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
         """Return the static equilibrium under a command without going there."""
         kept = self._motion
-        command = self._checked("command", command, len(self.largest_efforts))
+        command = check_numbers("command", command, len(self.largest_efforts))
         try:
             return self._state(self._statics.solve(command, mode), command, still=True)
         finally:
@@ -261,13 +254,13 @@ class FEMBackend(Backend):
             nodes=x.copy(),
         )
 
-    def _more(self) -> tuple[str, tuple | None, PointForce | None]:
+    def _extra_state(self) -> tuple[str, tuple | None, PointForce | None]:
         return self._mode, self._motion, self._touch
 
-    def _put_back(self, kept: Snapshot) -> None:
-        self.reset(kept.design)
-        self.state = kept.state
-        self._mode, motion, touch = kept.more
+    def _resume(self, snapshot: Snapshot) -> None:
+        self.reset(snapshot.design)
+        self.state = snapshot.state
+        self._mode, motion, touch = snapshot.extra
         self.touch(touch)
         self._go_back(motion)
 
@@ -298,36 +291,31 @@ class FEMBackend(Backend):
         assert motion is not None
         return self._state(motion.equilibrium, command, motion)
 
-    def _drive(self, solver: Any, command: np.ndarray, mode: str, load: np.ndarray | None) -> Any:
+    def _drive(self, solver: Statics, command: np.ndarray, mode: str, load: np.ndarray | None) -> Any:
         """Solve once, with actuators saturated at their largest effort."""
-        go = solver.advance if isinstance(solver, Dynamics) else solver.solve
-        if not self._limited or mode == "effort":
-            if mode == "effort":
-                command = np.clip(command, -self.largest_efforts, self.largest_efforts)
-            return go(command, mode, effector_force=load)
-        present = solver.effort[: len(command)]
-        saturated, sign = np.abs(present) >= self.largest_efforts * SATURATED, np.sign(present)
-        count = len(command)
+        solve = solver.advance if isinstance(solver, Dynamics) else solver.solve
+        limit, count = self.largest_efforts, len(command)
+        if mode == "effort":
+            return solve(np.clip(command, -limit, limit), mode, effector_force=load)
+        if not self._limited:
+            return solve(command, mode, effector_force=load)
+        start, present = solver.snapshot, solver.effort[:count]
+        saturated, sign = np.abs(present) >= limit * SATURATED, np.sign(present)
         for attempt in range(2 * count + 2):
-            # A saturated actuator is released when its command asks for less than it has reached.
-            target = np.where(saturated, sign * self.largest_efforts, command)
+            target = np.where(saturated, sign * limit, command)
             modes = ["effort" if s else "displacement" for s in saturated]
-            kept = (solver.x, solver.effort, solver.memory, getattr(solver, "snapshot", None))
-            found = go(target, modes, effector_force=load)
+            found = solve(target, modes, effector_force=load)
             equilibrium = found.equilibrium if isinstance(found, Motion) else found
-            effort, reached = equilibrium.effort[: len(command)], equilibrium.delta[: len(command)]
-            over = ~saturated & (np.abs(effort) > self.largest_efforts)
-            # Stop releasing actuators after a while, so that the loop terminates.
+            effort, reached = equilibrium.effort[:count], equilibrium.delta[:count]
+            over = ~saturated & (np.abs(effort) > limit)
+            # A saturated actuator is released when its command asks for less than it has reached; none after a while,
+            # so that the loop terminates.
             back = saturated & (sign * (command - reached) < 0.0) & (attempt <= count)
             if not (over.any() or back.any()):
                 break
             sign = np.where(over, np.sign(effort), sign)
             saturated = (saturated | over) & ~back
-            if isinstance(solver, Dynamics):
-                assert kept[3] is not None
-                solver.snapshot = kept[3]
-            else:
-                solver.restore(kept[0], kept[1], memory=kept[2])
+            solver.snapshot = start
         return found
 
     def _state(
@@ -363,7 +351,6 @@ class FEMBackend(Backend):
             bonds=equilibrium.effort[len(condensed.effort) :],
             stable=equilibrium.stable,
             uncertainty=uncertainty,
-            trusted=doubt == 0,
             doubt=doubt,
             contacts=equilibrium.contacts,
             memory=equilibrium.memory,

@@ -38,12 +38,9 @@ class FEMBatch(BatchBackend):
     def __init__(self, robot: Robot, designs: np.ndarray, **options: Any) -> None:
         self.robot = robot
         self._options = options
-        self._owners: dict[Design, FEMBackend] = {}
         self._designs = [self._design(values) for values in designs]
-        for design in dict.fromkeys(self._designs):
-            self._owners[design] = FEMBackend(robot, design, **options)
-        first = self._owners[self._designs[0]]
-        self._first = first
+        self._build()
+        first = self._first
         self.moving = first.moving
         count, size = len(designs), len(_rest(first)[1])
         self._slices = first.state.condensed.slices
@@ -55,8 +52,24 @@ class FEMBatch(BatchBackend):
         self.command = np.zeros((count, len(robot.actuators)))
         self._converged = np.ones(count, dtype=bool)
         self._stable = np.ones(count, dtype=bool)
-        self._stack()
         self.rest(np.arange(count))
+
+    def _build(self) -> None:
+        """Make the finite elements of all bodies."""
+        self._owners = {
+            design: FEMBackend(self.robot, design, **self._options) for design in dict.fromkeys(self._designs)
+        }
+        self._first = self._owners[self._designs[0]]
+        self._stack()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Factors of matrices cannot be pickled: a copy makes its finite elements anew.
+        made = ("_owners", "_first", "_numbers", "_frames", "_beams")
+        return {name: value for name, value in self.__dict__.items() if name not in made}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self.__dict__.update(kept)
+        self._build()
 
     def _design(self, values: np.ndarray) -> Design:
         return self.robot.design_space.complete(dict(zip(self.robot.design_space.names, values, strict=True)))
@@ -73,6 +86,7 @@ class FEMBatch(BatchBackend):
 
     def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
         impossible: dict[int, InfeasibleDesign] = {}
+        found: dict[int, Design] = {}
         for i, values in zip(index.tolist(), designs, strict=True):
             design = self._design(values)
             try:
@@ -81,7 +95,9 @@ class FEMBatch(BatchBackend):
             except InfeasibleDesign as error:
                 impossible[i] = error
             else:
-                self._designs[i] = design
+                found[i] = design
+        for i, design in found.items():  # now that no error can leave some of them changed
+            self._designs[i] = design
         self._stack()
         self.rest(index)
         return impossible

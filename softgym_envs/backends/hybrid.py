@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, Snapshot, State
+from softgym_envs.backends.backend import Backend, Snapshot, State, refuse_force
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBody
 from softgym_envs.errors import ConvergenceError, DataError
@@ -131,13 +131,12 @@ class HybridBackend(Backend):
         self._kept: dict[tuple[float, ...], list[np.ndarray]] = {}
         self._store = StateStore(robot, folder)
         self._learned = 0  # number of states in the store that the model has learned
-        self._body: SurrogateBody | None = None
         self.design = None  # type: ignore[assignment]  # until the first reset
         if self._store.count:
             data = self._store.data
             for body, displacement in zip(data["design"].tolist(), data["displacement"], strict=True):
                 self._kept.setdefault(tuple(body), []).append(displacement / (robot.upper - robot.lower))
-            self._resume()
+            self._load_learned()
         self.reset(robot.design_space.complete(design))
 
     # -- the interface ----------------------------------------------------------------------------------------------
@@ -163,9 +162,7 @@ class HybridBackend(Backend):
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        if force is not None and np.any(force):
-            raise ValueError("the hybrid backend does not support forces on effectors; use backend='fem'")
-        assert self._body is not None
+        refuse_force(force)
         try:
             found = self._body.solve(command, mode, self.state)
         except ConvergenceError:
@@ -179,19 +176,19 @@ class HybridBackend(Backend):
     def restore(self, state: State) -> None:
         self.state = state
 
-    def _more(self) -> _Episode:
+    def _extra_state(self) -> _Episode:
         # Without the kept states: a copy collects its own for the ensemble to learn.
         return _Episode(self.model.tensors, self.model.card, self._learned, self._rest, tuple(self._known))
 
-    def _put_back(self, kept: Snapshot) -> None:
+    def _resume(self, snapshot: Snapshot) -> None:
         self._flush()
-        self.design = self.robot.design_space.complete(kept.design)
-        more: _Episode = kept.more
-        self._learned = min(more.learned, self._store.count)
-        self._use(Model(self.robot, more.tensors, more.card))
-        if more.known:
+        self.design = self.robot.design_space.complete(snapshot.design)
+        episode: _Episode = snapshot.extra
+        self._learned = min(episode.learned, self._store.count)
+        self._use(Model(self.robot, episode.tensors, episode.card))
+        if episode.known:
             self._build_fem(self.design)
-        self._known, self._rest, self.state = list(more.known), more.rest, kept.state
+        self._known, self._rest, self.state = list(episode.known), episode.rest, snapshot.state
 
     # -- finite elements --------------------------------------------------------------------------------------------
 
@@ -309,7 +306,7 @@ class HybridBackend(Backend):
         if self.design is not None:
             self._body = SurrogateBody(model, self.design)
 
-    def _resume(self) -> None:
+    def _load_learned(self) -> None:
         """Continue from the states of an earlier run: load the weights that learned them, or train on them now."""
         assert self._store.folder is not None
         data = self._store.data

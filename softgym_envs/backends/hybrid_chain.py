@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, State
+from softgym_envs.backends.backend import Backend, State, refuse_force
 from softgym_envs.backends.chain import ChainBackend
 from softgym_envs.backends.chain_hand import ChainHandBackend
 from softgym_envs.backends.fem import FEMBackend
@@ -83,15 +83,19 @@ class HybridChainBackend(Backend):
             chain = self.learned.reset(complete)
             rest = replace(chain, memory=Followed(chain, None, ()))
             if not chain.trusted:
-                fem = self._at_rest(complete)
+                try:
+                    fem = self._fem_of(complete).reset()
+                except BaseException:
+                    if self.design is not None:  # the chain goes back to the body that stays
+                        self.learned.reset(self.design)
+                    raise
                 rest = replace(fem, memory=Followed(chain, fem, ()))
             self._rest, self.design = rest, complete
         self.state = self._rest
         return self.state
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        if force is not None and np.any(force):
-            raise ValueError("the hybrid backend does not support forces on effectors; use backend='fem'")
+        refuse_force(force)
         known = self._known
         self.calls += 1
         self.learned.restore(known.chain)
@@ -103,7 +107,7 @@ class HybridChainBackend(Backend):
         if found and chain.trusted:
             self.state = replace(chain, memory=Followed(chain, known.fem, path))
         else:
-            fem = self._follow(known.fem, path)
+            fem = self._follow(known.fem, path).state
             self.state = replace(fem, memory=Followed(chain, fem, ()))
         return self.state
 
@@ -112,9 +116,7 @@ class HybridChainBackend(Backend):
         if known.path or known.fem is None:
             self.learned.restore(known.chain)
             return self.learned.contact_model(friction=friction)
-        assert self._fem is not None
-        self._fem.restore(known.fem)
-        return self._fem.contact_model(friction=friction)
+        return self._follow(known.fem, ()).contact_model(friction=friction)
 
     def restore(self, state: State) -> None:
         """Go back to a state of this backend.
@@ -135,22 +137,25 @@ class HybridChainBackend(Backend):
         """Return the finite elements for a body."""
         return FEMBackend(self.robot, design)
 
-    def _at_rest(self, design: Design) -> State:
-        """Return the state of the finite elements at rest, for a new body."""
-        self.fem_calls += 1
+    def _fem_of(self, design: Design) -> FEMBackend:
+        """Return the finite elements of a body, which are built, and solved at rest, when they are first needed."""
         if self._fem is None:
             self._fem = self._finite_elements(design)
-        return self._fem.reset(design)
-
-    def _follow(self, start: State | None, path: tuple[tuple[np.ndarray, str], ...]) -> State:
-        """Return the state of the finite elements after commands from a state, or from rest."""
-        state = self._at_rest(self.design) if start is None else start
-        assert self._fem is not None
-        self._fem.restore(state)
-        for command, mode in path:
-            state = self._fem.step(command, mode)
             self.fem_calls += 1
-        return state
+        elif self._fem.design != design:
+            self._fem.reset(design)
+            self.fem_calls += 1
+        return self._fem
+
+    def _follow(self, start: State | None, path: tuple[tuple[np.ndarray, str], ...]) -> FEMBackend:
+        """Return the finite elements of the present body after commands from a state, or from rest."""
+        # A copy or another episode may have left them at another body.
+        fem = self._fem_of(self.design)
+        fem.restore(fem.reset() if start is None else start)
+        for command, mode in path:
+            fem.step(command, mode)
+            self.fem_calls += 1
+        return fem
 
 
 class HybridHandBackend(HybridChainBackend):
@@ -193,10 +198,9 @@ class HybridHandBackend(HybridChainBackend):
             chain = None
         if chain is not None and chain.trusted:
             return chain
-        self._follow(known.fem, known.path)
-        assert self._fem is not None
+        fem = self._follow(known.fem, known.path)
         self.fem_calls += 1
-        return self._fem.probe(command, mode)
+        return fem.probe(command, mode)
 
     def _finite_elements(self, design: Design) -> FEMBackend:
         return FEMBackend(

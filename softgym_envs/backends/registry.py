@@ -78,7 +78,7 @@ def make_backend(name: str, robot: Robot, **options: object) -> Backend:
     return LEARNED[robot.learned].make(name, robot, **options)
 
 
-def batches(name: str, robot: Robot, options: Mapping[str, object]) -> bool:
+def is_batched(name: str, robot: Robot, options: Mapping[str, object]) -> bool:
     """Whether a backend with options steps many bodies of a robot at once (`BATCHES`)."""
     if name == "fem":
         return robot.made_of_beams and not robot.touches and options.get("scheme", "euler") == "euler"
@@ -86,6 +86,6 @@ def batches(name: str, robot: Robot, options: Mapping[str, object]) -> bool:
 
 
 def make_batch_backend(name: str, robot: Robot, **options: object) -> BatchBackend:
-    """Return the batched backend with a name, for a robot for which `batches` holds."""
+    """Return the batched backend with a name, for a robot for which `is_batched` holds."""
     made: BatchBackend = BATCHES.resolve(name)(robot, **options)  # `check_backend` checks the options
     return made

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State
+from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_numbers, refuse_force
 from softgym_envs.backends.batch import BatchBackend, BatchState
 from softgym_envs.backends.surrogate_motion import MotionState, SurrogateMotion
 from softgym_envs.backends.time_steps import TimeSteps
@@ -173,7 +173,7 @@ class SurrogateBody:
             ConvergenceError: if the search does not find it.
             ValueError: for a malformed command.
         """
-        command = self._checked(command)
+        command = check_numbers("command", command, self.model.count)
         place = start.displacement[None]
         if mode == "displacement":
             found = solve_displacements(
@@ -197,7 +197,7 @@ class SurrogateBody:
             ValueError: for a malformed command, or for commanded efforts.
         """
         assert self._motion is not None
-        command = self._checked(command)
+        command = check_numbers("command", command, self.model.count)
         if mode != "displacement":
             raise ValueError(f"mode = {mode!r} is not available in motion on the surrogate; allowed: 'displacement'")
         moved, found = self._motion.advance(
@@ -205,19 +205,13 @@ class SurrogateBody:
         )
         if not found[0]:
             raise ConvergenceError(f"the surrogate cannot move to displacements {command.tolist()}")
-        state = self._state(command, self._motion.judged(self._context, moved, command[None], found))
+        state = self._state(command, self._motion.batch_state(self._context, moved, command[None], found))
         return replace(
             state,
-            condensed=partial(_first, self._motion, moved),
+            condensed=partial(_condensed_in_motion, self._motion, moved),
             velocity=self._motion.effector_velocity(moved).reshape(-1, 3),
             memory=moved,
         )
-
-    def _checked(self, command: np.ndarray) -> np.ndarray:
-        command = np.asarray(command, dtype=float)
-        if command.shape != (self.model.count,) or not np.isfinite(command).all():
-            raise ValueError(f"command must be {self.model.count} finite numbers, got {command.tolist()}")
-        return command
 
     def _state(self, command: np.ndarray, found: BatchState) -> State:
         displacement, effort, effector = found.displacement[0], found.effort[0], found.effector[0]
@@ -233,7 +227,6 @@ class SurrogateBody:
             velocity=np.zeros((self._effectors // 3, 3)),
             memory=None if motion is None else motion.at_rest(self._context, found.displacement, found.effort),
             uncertainty=float(found.uncertainty[0]),
-            trusted=bool(found.doubt[0] == 0),
             doubt=int(found.doubt[0]),
         )
 
@@ -260,7 +253,7 @@ def _condensed(
     return CondensedModel(W, delta - W @ full, full, roles, tuple(model.rows[k] for k in kept))
 
 
-def _first(motion: SurrogateMotion, state: MotionState) -> CondensedModel:
+def _condensed_in_motion(motion: SurrogateMotion, state: MotionState) -> CondensedModel:
     """Condensed model of the last time step of one body."""
     many = motion.condensed(state)
     return CondensedModel(many.compliance[0], many.free[0], many.effort[0], many.roles, many.rows)
@@ -331,12 +324,12 @@ class SurrogateBackend(Backend):
         self.steps = TimeSteps(control_step, time_step, mass_damping, stiffness_damping)
         self._motion = _motion_of(self.model, weights, dynamics, self.steps)
         self.moving = dynamics
-        self._body: SurrogateBody | None = None
+        self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)
-        if self._body is None or complete != self.design:
+        if complete != self.design:
             body = SurrogateBody(self.model, complete, self._motion, effectors=3 * len(self.robot.effectors))
             self._rest = body.rest()
             self._untouched, self.design = body, complete
@@ -355,18 +348,16 @@ class SurrogateBackend(Backend):
             self._body = SurrogateBody(self.model, self.design, self._motion, effectors=effectors, touch=touch)
         self._touch = load
 
-    def _more(self) -> PointForce | None:
+    def _extra_state(self) -> PointForce | None:
         return self._touch
 
-    def _put_back(self, kept: Snapshot) -> None:
-        self.reset(kept.design)
-        self.touch(kept.more)
-        self.restore(kept.state)
+    def _resume(self, snapshot: Snapshot) -> None:
+        self.reset(snapshot.design)
+        self.touch(snapshot.extra)
+        self.restore(snapshot.state)
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        if force is not None and np.any(force):
-            raise ValueError("the surrogate does not support forces on effectors; use backend='fem'")
-        assert self._body is not None
+        refuse_force(force)
         if self.moving:
             self.state = self._body.advance(command, mode, self.state)
         else:
@@ -375,7 +366,6 @@ class SurrogateBackend(Backend):
 
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
         """Return the static equilibrium under a command without going there."""
-        assert self._body is not None
         return self._body.solve(command, mode, self.state)
 
     def restore(self, state: State) -> None:
@@ -419,7 +409,7 @@ class SurrogateBatch(BatchBackend):
         # One body for all rows, until they differ.
         self._context = Context.shared(self.model.context(designs[:1]), count)
         self.command = np.zeros((count, len(robot.actuators)))
-        rest = self._found_rest(self._context.rows(np.zeros(1, dtype=np.int64)), designs[:1])
+        rest = self._rest_states(self._context.rows(np.zeros(1, dtype=np.int64)), designs[:1])
         self._rest, self.state = rest.repeat(count), rest.repeat(count)
         if self._motion is not None:
             self._inertia = self._motion.inertia.body(designs)
@@ -429,7 +419,7 @@ class SurrogateBatch(BatchBackend):
         if len(other):
             self.begin(other, designs[other])
 
-    def _found_rest(self, context: Context, designs: np.ndarray) -> BatchState:
+    def _rest_states(self, context: Context, designs: np.ndarray) -> BatchState:
         rest = rest_state(self.model, context, self._unilateral)
         if not rest.converged.all():
             lost = designs[np.flatnonzero(~rest.converged)[0]].tolist()
@@ -439,8 +429,9 @@ class SurrogateBatch(BatchBackend):
 
     def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
         context = self.model.context(designs)
+        rest = self._rest_states(context, designs)
         self._context.put(index, context)
-        self._rest.put(index, self._found_rest(context, designs))
+        self._rest.put(index, rest)
         if self._motion is not None:
             self._inertia[index] = self._motion.inertia.body(designs)
         self.rest(index)
@@ -465,7 +456,7 @@ class SurrogateBatch(BatchBackend):
         else:
             moved, solved = self._motion.advance(self._context, self._inertia, self._moving, self.command, command)
             self._moving = moved.where(solved, self._moving)
-            state = self._motion.judged(self._context, self._moving, command, solved)
+            state = self._motion.batch_state(self._context, self._moving, command, solved)
         found = state.converged.copy()
         if found.all():
             self.command, self.state = command, replace(state, converged=found)

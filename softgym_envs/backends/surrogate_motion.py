@@ -170,7 +170,7 @@ class SurrogateMotion:
         force[:, :n_a] += effort
         return force
 
-    def judged(self, context: Context, state: MotionState, command: np.ndarray, found: np.ndarray) -> BatchState:
+    def batch_state(self, context: Context, state: MotionState, command: np.ndarray, found: np.ndarray) -> BatchState:
         """Return what the environment sees of states that commands (B, n_a) led to; ``found`` (B,): they are solved."""
         n_a, model = self._actuators, self.model
         q, effector = state.place[:, :n_a].copy(), state.place[:, n_a : self._values].copy()

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from math import prod
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -16,7 +17,7 @@ from softgym_envs.backends.backend import Backend, Snapshot, State
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.designs import Design
 from softgym_envs.envs.options import EnvironmentOptions, check_reset_options, set_up
-from softgym_envs.envs.plant import Plant, Plants, Sensed, sensed, stiffened
+from softgym_envs.envs.plant import Plant, Sensed, sensed, stiffened
 from softgym_envs.envs.spaces import squash
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
@@ -59,7 +60,7 @@ class EpisodeState:
 class SoftRobotEnv(gymnasium.Env, EzPickle):
     """A soft robot with a task. The page of each environment ID has the tables of its spaces.
 
-    A copy or pickle of the environment goes on in mid-episode where the original was, random numbers included. Robot
+    A copy or pickle of the environment continues the episode of the original, with the same random numbers. Robot
     and task objects are copied with it; classes and names stay references, so their modules must be importable where it
     is unpickled. ``spec.to_json`` needs names or paths ``"module:class"``.
 
@@ -96,6 +97,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         )
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode = {render_mode!r} is unknown; allowed: None, 'human', 'rgb_array'")
+        if np.shape(render_size) != (2,) or not all(isinstance(n, Integral) and n > 0 for n in render_size):
+            raise ValueError(f"render_size = {render_size!r} must be two positive integers: width and height in pixels")
         if render_mode == "human":
             from softgym_envs.viewer.scene import check_display
 
@@ -119,7 +122,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.spaces = setup.spaces(moving=self.backend.moving)
         self.action_space = self.spaces.action_space
         self.observation_space = self.spaces.observation_space
-        self._plants, self.plant = setup.plants, Plant()
+        self._plants = setup.plants
+        self._fixed_plant = self.plant = Plant(cable_friction=self.backend.cable_friction)  # unless there are `_plants`
         self._sent = np.zeros((0, len(self.robot.actuators)))
         self._sensed: Sensed | None = None
         self._renderer: Any = None
@@ -189,18 +193,16 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         """
         super().reset(seed=seed)
         given, goal = check_reset_options(options)
+        # Check everything before anything changes.
+        path = None if goal is None else self.task.check_paths(goal)
         if given is None and self._sampled:
             design = self._draw_body()
         else:
             design = self._fixed_design if given is None else self.design_space.complete(given, self._fixed_design)
             self.backend.reset(design)
-        if self._plants is not None:
-            self._begin_plant(self._plants)
+        self._begin_plant()
         self._show(design)
-        if goal is None:
-            self._path = self.task.sample(self.np_random, 1, self._kinematics)[0]
-        else:
-            self._path = self.task.check_paths(goal)
+        self._path = self.task.sample(self.np_random, 1, self._kinematics)[0] if path is None else path
         self.task.begin(self.np_random)
         self._step = 0
         if self.render_mode == "human":
@@ -208,9 +210,9 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         observation, _, info = self._observe()
         return observation, info
 
-    def _begin_plant(self, plants: Plants) -> None:
-        """Draw the plant of an episode, at rest."""
-        self.plant = plants.sample(self.np_random)
+    def _begin_plant(self) -> None:
+        """Choose the plant of an episode, at rest."""
+        self.plant = self._fixed_plant if self._plants is None else self._plants.sample(self.np_random)
         self._sent = np.zeros((self.plant.delay, len(self.robot.actuators)))
         self._sensed = None
         self.backend.cable_friction = self.plant.cable_friction
@@ -249,7 +251,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             if name != own:
                 raise ValueError(f"the state belongs to {kind} '{name}', but the environment has {kind} '{own}'")
         self.backend.cable_friction = state.plant.cable_friction
-        self.backend.go_on_from(state.physics)
+        self.backend.resume(state.physics)
         self.plant, self._sent, self._sensed = state.plant, state.sent.copy(), state.sensed
         self._show(self.backend.design)
         vars(self.task).update(copy.deepcopy(state.progress))
@@ -260,10 +262,12 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         return observation, info
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**EzPickle.__getstate__(self), "episode": self.get_state(), "action_space": self.action_space}
+        own = {"spec": self.spec, "episode": self.get_state(), "action_space": self.action_space}
+        return {**EzPickle.__getstate__(self), **own}
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         EzPickle.__setstate__(self, kept)
+        self.spec = kept["spec"]
         self.set_state(kept["episode"])
         self.action_space = self.spaces.action_space = kept["action_space"]  # with its random numbers
 
@@ -321,38 +325,25 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         measured = self.task.measure(state)
         true = Sensed(state.displacement, state.effort, measured, self.task.sense(state))
         if sense and self.plant.noise:
-            self._sensed = sensed(self.robot, true, self.plant.noise, self.np_random)
+            self._sensed = sensed(self.robot, true, self.plant.noise, self.np_random, self.task.measured_scale)
         distance, terms, _ = self.task.rate(measured, goal, self.spaces.effort_share(state.effort))
         terms |= self.task.state_terms(state)
         reward = float(prod(terms.values())) if converged else 0.0
-        info: dict[str, Any] = {
-            "effector": state.effector[0].copy(),
+        info = {
             "measured": measured.copy(),
             "goal": goal.copy(),
             "distance": distance,
             "is_success": distance < self.task.success_distance,
             "lost": self.task.lost(state),
             **{f"reward_{name}": term for name, term in terms.items()},
-            "displacement": state.displacement.copy(),
-            "effort": state.effort.copy(),
-            "stable": state.stable,
-            "uncertainty": state.uncertainty,
-            "trusted": state.trusted,
-            "doubt": state.doubt,
             "converged": converged,
+            **_mechanics(state),
         }
-        if state.contacts is not None:
-            contacts = state.contacts
-            info |= {
-                "contact_force": contacts.total,
-                "smallest_gap": contacts.smallest_gap,
-                "sliding": contacts.sliding.mean() if contacts.count else 0.0,
-            }
         if self._plants is not None:
             info |= {f"plant_{name}": value for name, value in asdict(self.plant).items()}
         velocity = state.velocity[0] if self.spaces.moving else None
         shown = self._sensed or true
-        sensors = self._shown(squash(shown.sensors), sense) if self.task.sensors else None
+        sensors = self._sensor_values(squash(shown.sensors), sense) if self.task.sensors else None
         observation = self.spaces.observe(
             self.command,
             shown.displacement,
@@ -365,7 +356,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         )
         return observation, reward, {name: _with_dtype(value) for name, value in info.items()}
 
-    def _shown(self, readings: np.ndarray, new: bool) -> np.ndarray:
+    def _sensor_values(self, readings: np.ndarray, new: bool) -> np.ndarray:
         """Return the sensor values of an observation for readings in [-1, 1] (s,): these, touch, earlier readings."""
         command = (self.command - self.spaces.middle) / self.spaces.half_range
         earlier = self.task.recall(np.concatenate([command, readings]), new)
@@ -406,6 +397,27 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+
+def _mechanics(state: State) -> dict[str, Any]:
+    """Return what ``info`` says of a mechanical state."""
+    info: dict[str, Any] = {
+        "effector": state.effector[0].copy(),
+        "displacement": state.displacement.copy(),
+        "effort": state.effort.copy(),
+        "stable": state.stable,
+        "uncertainty": state.uncertainty,
+        "trusted": state.trusted,
+        "doubt": state.doubt,
+    }
+    if state.contacts is not None:
+        contacts = state.contacts
+        info |= {
+            "contact_force": contacts.total,
+            "smallest_gap": contacts.smallest_gap,
+            "sliding": contacts.sliding.mean() if contacts.count else 0.0,
+        }
+    return info
 
 
 # Gymnasium batches arrays of booleans, but not NumPy's boolean scalars.

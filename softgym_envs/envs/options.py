@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from softgym_envs.backends.registry import batches, check_backend
+from softgym_envs.backends.registry import check_backend, is_batched
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.envs.plant import Plants
 from softgym_envs.envs.spaces import AgentSpaces
@@ -51,6 +52,12 @@ class EnvironmentOptions:
     plant: Mapping[str, float | Sequence[float]] | None = None
     defaults: Mapping[str, Any] | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("robot_options", "task_options", "backend_options", "plant"):
+            value = getattr(self, name)
+            if not (value is None or isinstance(value, Mapping)):
+                raise ValueError(f"{name} = {value!r} must be a mapping from names to values")
+
     @classmethod
     def check(cls, options: Mapping[str, Any], *, own: Sequence[str] = ()) -> EnvironmentOptions:
         """Return the options in a mapping.
@@ -60,7 +67,7 @@ class EnvironmentOptions:
             own: further options that a user may give the environment, for the message.
 
         Raises:
-            ValueError: for an unknown name.
+            ValueError: for an unknown name, or a value of the wrong kind.
         """
         names = [field.name for field in fields(cls)]
         for name in options:
@@ -98,10 +105,9 @@ class Setup:
     plants: Plants | None = None
 
     @property
-    def together(self) -> bool:
+    def batched(self) -> bool:
         """Whether `SoftRobotVectorEnv` can step many of these environments together."""
-        rated = not (self.task.pushes or self.task.touches or self.task.sensors or self.task.needs_state)
-        return rated and batches(self.backend, self.robot, self.backend_options)
+        return not _what_batches_lack(self.task) and is_batched(self.backend, self.robot, self.backend_options)
 
     def spaces(self, *, moving: bool = False) -> AgentSpaces:
         """Return the agent's spaces; with ``moving``, observations include the effector's velocity."""
@@ -145,6 +151,8 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
     check_backend(backend, made, backend_options)
     space = made.design_space
     plant = defaults.get("plant") if options.plant is None else options.plant
+    if plant and "cable_friction" in backend_options:
+        plant = {"cable_friction": backend_options["cable_friction"], **plant}
     return Setup(
         robot=made,
         task=make_task(task, made, **{**defaults.get("task_options", {}), **(options.task_options or {})}),
@@ -169,13 +177,19 @@ def design_names(space: DesignSpace, choice: bool | Sequence[str]) -> tuple[str,
     """Return the variables in an option that is False, True (all variables) or a list of names.
 
     Raises:
-        DesignError: for an unknown name, or a name that is not in a list.
+        DesignError: for an unknown or repeated name, or another kind of value.
     """
     if isinstance(choice, bool):
         return space.names if choice else ()
-    if isinstance(choice, str):
-        raise DesignError(f"design variables = {choice!r} must be True, False or a list of names, such as [{choice!r}]")
-    return tuple(space[name].name for name in choice)
+    if isinstance(choice, str) or not isinstance(choice, Iterable):
+        example = choice if isinstance(choice, str) else space.names[0]
+        raise DesignError(
+            f"design variables = {choice!r} must be True, False or a list of names, such as [{example!r}]"
+        )
+    names = tuple(space[name].name for name in choice)
+    if len(set(names)) < len(names):
+        raise DesignError(f"design variables = {list(names)} must differ from each other")
+    return names
 
 
 def check_autoreset(mode: AutoresetMode | str) -> AutoresetMode:
@@ -204,6 +218,22 @@ def take_reset_mask(options: Mapping[str, Any] | None, count: int) -> tuple[np.n
     return np.flatnonzero(mask), rest
 
 
+def check_seeds(seed: int | Sequence[int | None] | None, count: int) -> int | list[int | None] | None:
+    """Return the seed of ``count`` sub-environments, or a list of one for each, as Python's integers.
+
+    Raises:
+        ValueError: for another number of seeds, or one that is neither None nor a non-negative integer.
+    """
+    many = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
+    seeds: list[Any] = list(seed) if many else [seed]  # type: ignore[arg-type]
+    if not all(one is None or (isinstance(one, Integral) and int(one) >= 0) for one in seeds):
+        raise ValueError(f"seed = {seed!r} must be a non-negative integer, None or a list of {count} of them")
+    if many and len(seeds) != count:
+        raise ValueError(f"seed must be an integer, None or a list of {count}, got {len(seeds)} seeds")
+    integers = [None if one is None else int(one) for one in seeds]
+    return integers if many else integers[0]
+
+
 def joined_seed(seed: int | Sequence[int | None] | None, count: int, draw: Callable[[], int]) -> int | None:
     """Return the one seed that stands for the seeds of ``count`` sub-environments.
 
@@ -213,15 +243,14 @@ def joined_seed(seed: int | Sequence[int | None] | None, count: int, draw: Calla
         draw: returns a random integer, which replaces None in a list with other seeds.
 
     Raises:
-        ValueError: for another number of seeds.
+        ValueError: as `check_seeds`.
     """
-    if seed is None or isinstance(seed, (int, np.integer)):
-        return None if seed is None else int(seed)
-    if len(seed) != count:
-        raise ValueError(f"seed must be an integer, None or a list of {count}, got {len(seed)} seeds")
-    if all(one is None for one in seed):
+    seeds = check_seeds(seed, count)
+    if not isinstance(seeds, list):
+        return seeds
+    if all(one is None for one in seeds):
         return None
-    return int(np.random.SeedSequence([draw() if one is None else one for one in seed]).generate_state(1)[0])
+    return int(np.random.SeedSequence([draw() if one is None else one for one in seeds]).generate_state(1)[0])
 
 
 def check_reset_options(options: Mapping[str, Any] | None) -> tuple[Any, Any]:
@@ -237,18 +266,41 @@ def check_reset_options(options: Mapping[str, Any] | None) -> tuple[Any, Any]:
     return options.get("design"), options.get("goal")
 
 
+def check_design_option(design: Any, count: int) -> list[Any] | None:
+    """Return the bodies of ``count`` sub-environments from the option ``design`` of `reset`; None for the same body.
+
+    Raises:
+        ValueError: unless it is None, one mapping or a list of ``count``.
+    """
+    if design is None or isinstance(design, Mapping):
+        return None
+    if not isinstance(design, Sequence) or isinstance(design, str):
+        raise ValueError(f"design must be one body or a list of {count}, got {design!r}")
+    if len(design) != count:
+        raise ValueError(f"design must be one body or a list of {count}, got {len(design)}")
+    return list(design)
+
+
 def check_counts(num_envs: int, max_episode_steps: int | None) -> None:
-    """Raise ValueError for numbers of sub-environments or steps below 1."""
-    for name, value in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
-        if value is not None and value < 1:
-            raise ValueError(f"{name} = {value} must be at least 1")
+    """Raise ValueError for numbers of sub-environments or steps that are not positive integers."""
+    limit = 1 if max_episode_steps is None else max_episode_steps  # None is no limit
+    for name, value in (("num_envs", num_envs), ("max_episode_steps", limit)):
+        if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"{name} = {value!r} must be an integer of at least 1")
 
 
 def check_batchable(task: Task) -> None:
-    """Raise ValueError for a task that a batched environment on the surrogate cannot rate."""
+    """Raise ValueError for a task that a batched environment cannot rate."""
+    if lacking := _what_batches_lack(task):
+        raise ValueError(f"task '{task.name}' {lacking}")
+
+
+def _what_batches_lack(task: Task) -> str:
+    """Return what a task needs that batched environments do not have, for a message; empty for one that they take."""
     if task.pushes or task.touches:
-        raise ValueError(f"task '{task.name}' pushes the robot, but the batched environment takes no forces")
+        return "pushes the robot, but the batched environment takes no forces"
     if task.sensors:
-        raise ValueError(f"task '{task.name}' shows sensors, which the batched environment does not have")
+        return "shows sensors, which the batched environment does not have"
     if task.needs_state:
-        raise ValueError(f"task '{task.name}' reads forces of contacts, which the batched environment does not have")
+        return "reads forces of contacts, which the batched environment does not have"
+    return ""

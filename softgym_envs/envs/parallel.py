@@ -15,7 +15,15 @@ from gymnasium.vector.async_vector_env import AsyncState
 from gymnasium.wrappers import TimeLimit
 
 from softgym_envs.envs.env import SoftRobotEnv
-from softgym_envs.envs.options import EnvironmentOptions, check_autoreset, check_counts, set_up
+from softgym_envs.envs.options import (
+    EnvironmentOptions,
+    check_autoreset,
+    check_counts,
+    check_design_option,
+    check_seeds,
+    set_up,
+    take_reset_mask,
+)
 
 if TYPE_CHECKING:
     from softgym_envs.envs.registration import RobotSource, TaskSource
@@ -40,7 +48,7 @@ def make_batch(
     """
     own = {name: value for name, value in options.items() if name in EnvironmentOptions.__dataclass_fields__}
     setup = set_up(robot, task, backend, EnvironmentOptions.check(own))
-    if setup.together:
+    if setup.batched:
         from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
         return SoftRobotVectorEnv(robot, task, num_envs, backend=backend, **options)
@@ -98,13 +106,17 @@ class ParallelVectorEnv(AsyncVectorEnv):
         Raises:
             DesignError: for a malformed design.
             InfeasibleDesign: if a body cannot exist.
-            ValueError: for an unknown option or a malformed goal.
+            ValueError: for an unknown option, a malformed seed or goal, or another number of seeds, bodies or goals.
         """
         given = dict(options or {})
+        check_design_option(given.get("design"), self.num_envs)
         for name in _options_by_row(given):
             if len(given[name]) != self.num_envs:
                 raise ValueError(f"{name} must be one for all or {self.num_envs}, got {len(given[name])}")
-        return super().reset(seed=seed, options=given)
+        if "reset_mask" in given:
+            rows, _ = take_reset_mask(given, self.num_envs)
+            given["reset_mask"] = np.isin(np.arange(self.num_envs), rows)
+        return super().reset(seed=check_seeds(seed, self.num_envs), options=given)
 
     def _raise_if_errors(self, successes: Iterable[bool]) -> None:
         # In place of Gymnasium's, which shows all tracebacks as warnings and leaves the other processes running.

@@ -24,7 +24,7 @@ class Plant:
         cable_friction: coefficient of friction of cables on their guides, by the capstan law; finite elements only.
         delay: control steps between sending a command and its arrival at the drives.
         noise: standard deviation of all sensors: of displacements over their range, of efforts and of sensor rows over
-            their scale, of effectors over the robot's size.
+            their scale, of effectors over the robot's size, of measured forces over the largest wanted one.
     """
 
     stiffness: float = 1.0
@@ -48,7 +48,7 @@ LIMITS = {"stiffness": (0.1, 10.0), "cable_friction": (0.0, 5.0), "delay": (0, 1
 
 @dataclass(frozen=True)
 class Plants:
-    """Plants between two.
+    """A range of plants, from which each reset draws one.
 
     Attributes:
         low: smallest value of each attribute.
@@ -81,15 +81,7 @@ class Plants:
         for name, given in option.items():
             if name not in names:
                 raise ValueError(unknown_name("plant option", name, names))
-            ends = np.atleast_1d(np.asarray(given, dtype=float))
-            least, most = LIMITS[name]
-            whole = name != "delay" or (ends == np.round(ends)).all()
-            inside = ends.shape in ((1,), (2,)) and least <= ends[0] <= ends[-1] <= most
-            if not (inside and whole):
-                word = "integers" if name == "delay" else "numbers"
-                raise ValueError(f"plant {name} = {given!r}; allowed: one or two {word} from {least} to {most}, rising")
-            typed = int if name == "delay" else float
-            low[name], high[name] = typed(ends[0]), typed(ends[-1])
+            low[name], high[name] = _ends(name, given)
         found = cls(replace(Plant(), **low), replace(Plant(), **high))
         if found.high.cable_friction and backend != "fem":
             raise ValueError(f"plant cable_friction needs backend 'fem': '{backend}' has no friction of cables")
@@ -140,15 +132,44 @@ class Sensed:
     sensors: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
-def sensed(robot: Robot, true: Sensed, noise: np.ndarray | float, rng: np.random.Generator) -> Sensed:
-    """Return true values with Gaussian noise of a standard deviation (...), see `Plant`."""
+def _ends(name: str, given: object) -> tuple[float, float]:
+    """Return the smallest and largest value of an attribute of a plant, integers for a delay.
+
+    Raises:
+        ValueError: unless the given value is one number or two, in order and within `LIMITS`.
+    """
+    typed: type = int if name == "delay" else float
+    least, most = LIMITS[name]
+    try:
+        ends = np.atleast_1d(np.asarray(given, dtype=float))
+        valid = ends.shape in ((1,), (2,)) and least <= ends[0] <= ends[-1] <= most
+    except (TypeError, ValueError):
+        valid = False
+    if not valid or any(end != typed(end) for end in ends):
+        word = "integers" if typed is int else "numbers"
+        raise ValueError(f"plant {name} = {given!r}; allowed: one or two {word} from {least} to {most}, rising")
+    return typed(ends[0]), typed(ends[-1])
+
+
+def sensed(
+    robot: Robot, true: Sensed, noise: np.ndarray | float, rng: np.random.Generator, measured_scale: float
+) -> Sensed:
+    """Return true values with Gaussian noise of a standard deviation (...), see `Plant`.
+
+    Args:
+        robot: the robot.
+        true: the true values.
+        noise: relative standard deviation, shape (...).
+        rng: random numbers.
+        measured_scale: that of the task, see `Task`.
+    """
     if not np.any(noise):
         return true
     level = np.asarray(noise)[..., None]
     return Sensed(
         true.displacement + level * (robot.upper - robot.lower) * rng.normal(size=true.displacement.shape),
         true.effort + level * robot.effort_scale * rng.normal(size=true.effort.shape),
-        true.effector + level * robot.size * rng.normal(size=true.effector.shape),
+        true.effector + level * measured_scale * rng.normal(size=true.effector.shape),
         true.sensors + level * rng.normal(size=true.sensors.shape) if true.sensors.size else true.sensors,
     )
 

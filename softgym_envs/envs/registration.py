@@ -164,13 +164,11 @@ def register_environment(
     if id in gymnasium.registry:
         raise ValueError(f"environment '{id}' is already registered")
     ROBOTS.class_of(robot)
-    if max_episode_steps is None:
-        max_episode_steps = TASKS.class_of(task).max_episode_steps
-    row = EnvironmentRow(
-        robot, task, max_episode_steps, backend, robot_options or {}, task_options or {}, backend_options or {}
-    )
-    ENVIRONMENTS[id] = row
+    kind = TASKS.class_of(task)
+    steps = kind.max_episode_steps if max_episode_steps is None else max_episode_steps
+    row = EnvironmentRow(robot, task, steps, backend, robot_options or {}, task_options or {}, backend_options or {})
     _register(row.spec(id))
+    ENVIRONMENTS[id] = row
 
 
 def register_environments() -> None:

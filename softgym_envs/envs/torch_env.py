@@ -10,7 +10,7 @@ Internally, reached displacements ``u`` are scaled to [-1, 1] over the actuators
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -25,9 +25,11 @@ from softgym_envs.backends.torch_batch import MAX_NEWTON_STEPS, Bodies, TorchBat
 from softgym_envs.envs.arrays import with_tensors
 from softgym_envs.envs.options import (
     EnvironmentOptions,
+    Setup,
     check_autoreset,
     check_batchable,
     check_counts,
+    check_design_option,
     check_reset_options,
     joined_seed,
     set_up,
@@ -90,28 +92,14 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         **options: Any,
     ) -> None:
         check_counts(num_envs, max_episode_steps)
-        if dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"dtype = {dtype} is not supported; allowed: torch.float32, torch.float64")
         self.device = torch.device(device)
-        if self.device.type == "cuda" and not torch.cuda.is_available():
-            raise ValueError(
-                f"device = {str(device)!r} is not available here; allowed: 'cpu', on which gymnasium.make_vec is faster"
-            )
-        if cuda_graph and self.device.type != "cuda":
-            raise ValueError(f"cuda_graph needs a CUDA device, got device = {str(device)!r}")
+        _check_torch(self.device, dtype, cuda_graph)
         row = find_row(id)
         setup = set_up(
             robot or row.robot, task or row.task, row.backend, EnvironmentOptions.check(row.defaults | options)
         )
-        if setup.backend != "surrogate":
-            supported = [name for name, other in ENVIRONMENTS.items() if other.backend == "surrogate"]
-            raise ValueError(f"id = {id!r} is not an environment on the surrogate; allowed: {', '.join(supported)}")
-        if setup.backend_options.get("dynamics", False):
-            raise ValueError("dynamics is not available on tensors; allowed: False, or gymnasium.make_vec")
-        if setup.plants is not None:
-            raise ValueError("plant is not available on tensors; allowed: None, or gymnasium.make_vec")
+        _check_setup(id, setup)
         self.robot, self.task, self.spaces = setup.robot, setup.task, setup.spaces()
-        check_batchable(self.task)
         self.design_space = self.robot.design_space
         self.num_envs, self.dtype = num_envs, dtype
         self.max_episode_steps = row.max_episode_steps if max_episode_steps is None else max_episode_steps
@@ -131,8 +119,6 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self._bounds = self._put_double([[v.low, v.high] for v in variables]).T
         self._ends = torch.where(self._log, torch.log(self._bounds), self._bounds)
         self._sampled = [self.design_space.names.index(name) for name in setup.sampled]
-        if chosen := [name for name in setup.shown if self.design_space[name].choices]:
-            raise ValueError(f"design_in_observation = {chosen} are choices, which this environment does not show")
         self._shown = [self.design_space.names.index(name) for name in setup.shown]
         self._fixed = self._put_double(setup.design.array)
 
@@ -258,17 +244,17 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         Args:
             seed: seed of all random numbers from here on, or a list of ``num_envs`` seeds to make it from; by default
                 the sequence continues, beginning with the seed of the constructor.
-            options: ``"design"``: one body for all for one episode, a mapping, or values of all design variables in
-                their order for each, shape (num_envs, len(design_space)); ``"goal"``: a point (3,) or a path (p, 3)
-                [m] for all, or a path for each (num_envs, p, 3); ``"reset_mask"``: which sub-environments to reset,
-                boolean (num_envs,); default all.
+            options: ``"design"``: one body for all for one episode, a mapping, or one for each: a list of them, or
+                the values of all design variables in their order, shape (num_envs, len(design_space)); ``"goal"``: a
+                point (3,) or a path (p, 3) [m] for all, or a path for each (num_envs, p, 3); ``"reset_mask"``: which
+                sub-environments to reset, boolean (num_envs,); default all.
 
         Returns:
             Observation (num_envs, d) and info.
 
         Raises:
             DesignError: for a malformed design.
-            ValueError: for an unknown option, a malformed goal or mask, or another number of seeds.
+            ValueError: for an unknown option, a malformed seed, goal or mask, or another number of seeds.
         """
         rows, options = take_reset_mask({name: _array(value) for name, value in (options or {}).items()}, self.num_envs)
         design, goal = check_reset_options(options)
@@ -296,9 +282,11 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         return int(torch.randint(2**31, (1,), generator=self._generator, device=self.device))
 
     def _check_designs(self, design: Any) -> Tensor:
-        if isinstance(design, Mapping):
+        bodies = [design] if isinstance(design, Mapping) else design
+        if isinstance(bodies, Sequence) and all(isinstance(body, Mapping) for body in bodies):
+            check_design_option(design, self.num_envs)
             fixed = dict(zip(self.design_space.names, self._fixed.tolist(), strict=True))
-            values = self.design_space.complete(design, fixed).array[None]
+            values = np.array([self.design_space.complete(body, fixed).array for body in bodies])
         else:
             values = np.asarray(design, dtype=float)
             shape = (self.num_envs, len(self.design_space))
@@ -459,6 +447,32 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         }
         observation = self._spaces.observe(command, displacement, effort, effector, aim, unit_design)
         return {"observation": observation, "reward": reward, "info": info}
+
+
+def _check_torch(device: torch.device, dtype: torch.dtype, cuda_graph: bool) -> None:
+    """Raise ValueError for a type that is not supported, or a device that is not there."""
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype = {dtype} is not supported; allowed: torch.float32, torch.float64")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(
+            f"device = '{device}' is not available here; allowed: 'cpu', on which gymnasium.make_vec is faster"
+        )
+    if cuda_graph and device.type != "cuda":
+        raise ValueError(f"cuda_graph needs a CUDA device, got device = '{device}'")
+
+
+def _check_setup(id: str, setup: Setup) -> None:
+    """Raise ValueError for an environment that cannot be computed with tensors."""
+    if setup.backend != "surrogate":
+        supported = [name for name, other in ENVIRONMENTS.items() if other.backend == "surrogate"]
+        raise ValueError(f"id = {id!r} is not an environment on the surrogate; allowed: {', '.join(supported)}")
+    if setup.backend_options.get("dynamics", False):
+        raise ValueError("dynamics is not available on tensors; allowed: False, or gymnasium.make_vec")
+    if setup.plants is not None:
+        raise ValueError("plant is not available on tensors; allowed: None, or gymnasium.make_vec")
+    if chosen := [name for name in setup.shown if setup.robot.design_space[name].choices]:
+        raise ValueError(f"design_in_observation = {chosen} are choices, which this environment does not show")
+    check_batchable(setup.task)
 
 
 class _TorchRandom:

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from softgym_envs.backends.batch import BatchState
-from softgym_envs.backends.registry import batches, make_batch_backend
+from softgym_envs.backends.registry import is_batched, make_batch_backend
 from softgym_envs.envs.env import MAX_DRAWS
 from softgym_envs.envs.gradients import RewardGradient, StepGradient
 from softgym_envs.envs.options import (
@@ -21,6 +21,7 @@ from softgym_envs.envs.options import (
     check_autoreset,
     check_batchable,
     check_counts,
+    check_design_option,
     check_reset_options,
     joined_seed,
     set_up,
@@ -85,7 +86,7 @@ class SoftRobotVectorEnv(VectorEnv):
         checked = EnvironmentOptions.check(options, own=("max_episode_steps", "autoreset_mode"))
         setup = set_up(robot, task, backend, checked)
         self.robot, self.task = setup.robot, setup.task
-        if not batches(setup.backend, self.robot, setup.backend_options):
+        if not is_batched(setup.backend, self.robot, setup.backend_options):
             raise ValueError(
                 f"backend = {setup.backend!r} of robot '{self.robot.name}' has no batched environment; "
                 "allowed: 'surrogate', or gymnasium.make_vec, which steps it in processes"
@@ -119,6 +120,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self._paths = np.zeros((num_envs, 1, 3))
         self._counts = np.ones(num_envs, dtype=np.int64)  # goals in each path
         self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._begun = np.zeros(num_envs, dtype=bool)  # sub-environments that have been reset
         self._ended = np.zeros(num_envs, dtype=bool)  # episodes that are over and not reset yet
         self._changed = np.zeros(num_envs, dtype=bool)  # bodies given in reset that differ from the fixed one
 
@@ -130,12 +132,10 @@ class SoftRobotVectorEnv(VectorEnv):
     def _begin_bodies(self, index: np.ndarray, designs: np.ndarray) -> dict[int, InfeasibleDesign]:
         """Change bodies, and return why some of them cannot exist."""
         impossible = dict(self.backend.begin(index, designs))
-        self.designs[index] = designs
-        self._show_designs(index)
-        return impossible
-
-    def _show_designs(self, index: np.ndarray) -> None:
+        changed = np.array([i not in impossible for i in index.tolist()], dtype=bool)
+        self.designs[index[changed]] = designs[changed]
         self._unit_design[index] = self.design_space.observe(self.designs[index], self.spaces.design_names)
+        return impossible
 
     def _draw_bodies(self, index: np.ndarray) -> None:
         """Draw the sampled variables; bodies that cannot exist are drawn again.
@@ -168,9 +168,9 @@ class SoftRobotVectorEnv(VectorEnv):
         if design is not None:
             given = [design] * len(index) if isinstance(design, Mapping) else design
             designs = np.array([self.design_space.complete(d, self._fixed_design).array for d in given])
+            self._changed[index] = True  # also if some of the bodies cannot exist
             for error in self._begin_bodies(index, designs).values():
                 raise error
-            self._changed[index] = True
         elif self.sampled_variables:
             self._draw_bodies(index)
         elif self._changed[index].any():
@@ -183,7 +183,7 @@ class SoftRobotVectorEnv(VectorEnv):
             self._sent[:, index] = 0.0
         self.backend.rest(index)
         self._steps[index] = 0
-        self._ended[index] = False
+        self._begun[index], self._ended[index] = True, False
         if goal is not None:
             paths = goal
         else:
@@ -266,15 +266,15 @@ class SoftRobotVectorEnv(VectorEnv):
 
         Raises:
             DesignError: for a malformed design.
-            ValueError: for an unknown option, a malformed goal or mask, or another number of seeds.
+            InfeasibleDesign: if a body cannot exist.
+            ValueError: for an unknown option, a malformed seed, goal or mask, or another number of seeds or bodies.
         """
         super().reset(seed=joined_seed(seed, self.num_envs, lambda: int(self.np_random.integers(2**31))))
         index, options = take_reset_mask(options, self.num_envs)
         design, goal = check_reset_options(options)
-        if design is not None and not isinstance(design, Mapping):
-            if len(design) != self.num_envs:
-                raise ValueError(f"design must be one body or a list of {self.num_envs}, got {len(design)}")
-            design = [design[i] for i in index]
+        bodies = check_design_option(design, self.num_envs)
+        if bodies is not None:
+            design = [bodies[i] for i in index]
         if goal is not None:
             shared = np.ndim(goal) < 3
             goal = self.task.check_paths(goal, () if shared else (self.num_envs,))
@@ -287,7 +287,7 @@ class SoftRobotVectorEnv(VectorEnv):
 
         Raises:
             ValueError: for actions with a wrong shape or values that are not finite.
-            ResetNeeded: without autoreset, if an episode is over.
+            ResetNeeded: before the first `reset`, or without autoreset if an episode is over.
         """
         self._advance(self._checked(actions))
         return self._finish_step()
@@ -303,7 +303,7 @@ class SoftRobotVectorEnv(VectorEnv):
 
         Raises:
             ValueError: for actions with a wrong shape or values that are not finite.
-            ResetNeeded: without autoreset, if an episode is over.
+            ResetNeeded: before the first `reset`, or without autoreset if an episode is over.
             ImportError: without torch, which differentiates the task.
         """
         if len(self._sent) > 1:
@@ -318,6 +318,9 @@ class SoftRobotVectorEnv(VectorEnv):
         actions = self.spaces.check_action(actions)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
+        if not self._begun.all():
+            waiting = np.flatnonzero(~self._begun).tolist()
+            raise ResetNeeded(f"step was called before reset of sub-environments {waiting}")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
             ended = np.flatnonzero(self._ended).tolist()
             raise ResetNeeded(f"the episodes of sub-environments {ended} are over; reset them with a reset_mask")
@@ -372,7 +375,7 @@ class SoftRobotVectorEnv(VectorEnv):
     def _observe(self) -> np.ndarray:
         state = self._state
         shown = Sensed(state.displacement, state.effort, state.effector[:, :3])
-        shown = sensed(self.robot, shown, self._noise, self.np_random)
+        shown = sensed(self.robot, shown, self._noise, self.np_random, self.task.measured_scale)
         return self.spaces.observe(
             self.command,
             shown.displacement,
@@ -404,6 +407,3 @@ class SoftRobotVectorEnv(VectorEnv):
             info |= {"plant_delay": self._delay.copy(), "plant_noise": self._noise.copy()}
         info |= {f"_{name}": every for name in tuple(info)}
         return info, reward
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Do nothing, because there is nothing to free."""

@@ -11,8 +11,8 @@ import numpy as np
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.robots.base import Robot
 
-#: Why a state is not trusted. Batched states hold the sum of these numbers, 0 for a trusted state.
-OUTSIDE, SPREAD, SOFT, LOADED, FOLDED, UNEXPLAINED = 1, 2, 4, 8, 16, 32
+#: Why a state is not trusted. States hold the sum of these numbers, 0 for a trusted state.
+OUTSIDE, SPREAD, SOFT, LOADED, FOLDED, UNEXPLAINED, SELF_CONTACT = 1, 2, 4, 8, 16, 32, 64
 
 DOUBTS = {
     OUTSIDE: "outside box",
@@ -21,11 +21,13 @@ DOUBTS = {
     LOADED: "loads",
     FOLDED: "folded beam",
     UNEXPLAINED: "unexplained readings",
+    SELF_CONTACT: "self-contact",
 }
 """The reasons in words: body or displacements lie outside the box of the training states; the uncertainty is above the
 limit; the actuators are so soft that the body may be about to buckle, or a body of superelements has; a learned
 superelement carries larger loads than those that it was learned under; an element of a beam bends farther than it can
-resist, which it would not do on a finer mesh; an estimate explains the readings of the sensors badly."""
+resist, which it would not do on a finer mesh; an estimate explains the readings of the sensors badly; a finger on
+learned chains would touch itself."""
 
 SLACK = 1e-3
 """Actuators that end farther beyond their commands than this are slack [half their range]."""

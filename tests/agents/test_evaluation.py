@@ -116,7 +116,29 @@ def test_processes_share_goals_and_give_the_same_numbers(agent):
     assert len(set(one.returns)) == 3  # episodes differ
 
 
-def test_a_number_of_workers_must_be_positive():
+@pytest.mark.parametrize("agent", ["finger_reach", "qp"])
+def test_episodes_that_run_together_are_not_shared_by_processes(agent):
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0", max_episode_steps=3)
+    goals = sample_goals(environment, 4, seed=5)
+    one, two = (evaluate(agent, environment, goals, workers=workers) for workers in (1, 2))
+    assert len(two) == 4 and two.steps == 12
+    np.testing.assert_array_equal(two.distances, one.distances)
+
+
+def test_wrong_arguments_are_refused():
     environment = EnvironmentConfig(id="SoftGym/FingerReach-v0")
     with pytest.raises(ValueError, match="workers = 0 must be 1 or more"):
         evaluate("qp", environment, np.zeros((1, 3)), workers=0)
+    for shape in ((3,), (0, 3), (2, 2), (2, 0, 3)):
+        with pytest.raises(ValueError, match="goals must have shape"):
+            evaluate("qp", environment, np.zeros(shape))
+    with pytest.raises(ValueError, match="one for each of 2 goals, got 1"):
+        evaluate("random", environment, np.zeros((2, 3)), design=[{}])
+
+
+def test_the_body_of_an_environment_can_be_evaluated():
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0", max_episode_steps=2)
+    body = environment.make(design={"length": 0.041}).unwrapped.design
+    goals = sample_goals(environment, 1, seed=0, design=body)
+    given = evaluate("qp", environment, goals, design=body)
+    np.testing.assert_array_equal(given.ends, evaluate("qp", environment, goals, design=dict(body)).ends)

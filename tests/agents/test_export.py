@@ -159,6 +159,24 @@ int main(void)
     assert np.linalg.norm(effector - [0.0, 0.05, -0.10]) < 0.003
 
 
+@pytest.mark.parametrize("export", [export_policy_c, export_policy_onnx])
+@pytest.mark.parametrize(
+    ("policy", "reason"),
+    [
+        ("sensorized_finger_reach_sac", "observes sensors in place of the effector"),
+        ("modular_reach_structures", r"observes choices of its body \(kind_1, "),
+        ("sensorized_finger_reach_recurrent", "has a memory"),
+    ],
+)
+def test_policies_that_formats_cannot_hold_are_refused(policy, reason, export, tmp_path):
+    if export is export_policy_onnx:
+        pytest.importorskip("onnx")
+    path = tmp_path / f"policy{'.onnx' if export is export_policy_onnx else '.h'}"
+    with pytest.raises(ValueError, match=reason):
+        export(policy, path)
+    assert not path.exists()
+
+
 def test_exports_name_what_is_wrong(softgym, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"must end with \.onnx"):
         export_policy_onnx("finger_reach", tmp_path / "policy.h")

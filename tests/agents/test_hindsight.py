@@ -161,6 +161,13 @@ def test_a_moving_goal_is_refused():
         make_buffer(env, share=0.5)
 
 
+def test_a_hidden_effector_is_refused():
+    env = EnvironmentConfig(id="SoftGym/SensorizedFingerReach-v0", backend="surrogate").make_vec(1)
+    with pytest.raises(ValueError, match="needs the effector, but task 'sensed_reach' hides it"):
+        make_buffer(env, share=0.5, size=10)
+    env.close()
+
+
 def test_a_force_reached_later_is_a_goal_and_factors_of_the_state_stay():
     task = make_task("grasp", make_robot("grasping_finger"))
     spaces = AgentSpaces(

@@ -136,3 +136,11 @@ def test_needs_sampled_bodies(tmp_path):
         CriticProposer().attach(model, plain, tmp_path)
     assert isinstance(model.get_env(), SB3VecEnv)
     model.get_env().close()
+
+
+def test_needs_a_batched_environment(tmp_path):
+    grasp = config(environment={"id": "SoftGym/FingerGrasp-v0", "backend": "surrogate", "sample_design": ["e1"]})
+    model = make_model(grasp)
+    with pytest.raises(ValueError, match="needs a batched environment, but SoftGym/FingerGrasp-v0 on backend"):
+        CriticProposer().attach(model, grasp, tmp_path)
+    model.get_env().close()

@@ -8,7 +8,7 @@ import torch
 
 from softgym_envs.agents.config import EvolutionConfig, RecurrentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
-from softgym_envs.agents.export import spaces_of
+from softgym_envs.agents.export import exported_spaces
 from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.learners.analytic import AnalyticLearner
 from softgym_envs.agents.learners.cloning import CloningLearner
@@ -126,7 +126,7 @@ def test_rates_of_an_extended_training_are_those_of_the_new_number_of_steps(tmp_
     train(longer, tmp_path, progress=False, report=lambda step, outcome: step > 1024, keep_checkpoint=True)
     learner = AnalyticLearner(longer)
     _restore(learner, tmp_path / CHECKPOINT)
-    learner._slow_down()
+    learner._set_learning_rate()
     first, last = SHORT.analytic.learning_rate, SHORT.analytic.final_learning_rate
     expected = first + (last - first) * learner.step / 2048
     assert learner.step == 1536 and learner._optimiser.param_groups[0]["lr"] == pytest.approx(expected, rel=1e-9)
@@ -233,7 +233,7 @@ def test_a_memory_is_that_of_torch_and_learns_the_answers_of_the_qp(tmp_path):
     with pytest.raises(ValueError, match="has a memory: call what begin"):
         policy(seen[0, 0])
     with pytest.raises(ValueError, match="has a memory and cannot be exported"):
-        spaces_of(policy)
+        exported_spaces(policy)
     learner.close()
     with pytest.raises(ValueError, match="learner 'recurrent' needs num_envs = 1"):
         RecurrentLearner(config.model_copy(update={"num_envs": 2}))

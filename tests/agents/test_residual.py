@@ -1,5 +1,8 @@
 """Agents on top of the QP, and the QPs themselves."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
@@ -52,6 +55,22 @@ def test_the_executed_action_is_the_clipped_sum():
         env.step(action)
         done = env.unwrapped.spaces.command(expected, before)
         assert np.abs(env.unwrapped.state.command - done).max() < 1e-9
+
+
+def test_copies_correct_a_qp_of_their_own():
+    env = on("FingerReach", residual_scale=0.5).make()
+    env.reset(seed=3)
+    env.step(np.zeros(2))
+    twins = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
+    expected = [env.step(np.full(2, 0.5))[0] for _ in range(2)]
+    for twin in twins:
+        np.testing.assert_allclose([twin.step(np.full(2, 0.5))[0] for _ in range(2)], expected, atol=1e-7)
+    envs = on("FingerReach", residual_scale=0.5).make_vec(2)
+    envs.reset(seed=3)
+    twins = [pickle.loads(pickle.dumps(envs)), copy.deepcopy(envs)]
+    expected = envs.step(np.full((2, 2), 0.5))[0]
+    for twin in twins:
+        np.testing.assert_allclose(twin.step(np.full((2, 2), 0.5))[0], expected, atol=1e-7)
 
 
 def test_a_zero_action_leaves_the_qp_unchanged():

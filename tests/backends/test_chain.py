@@ -14,6 +14,7 @@ from softgym_envs.backends.registry import make_backend
 from softgym_envs.errors import InfeasibleDesign, WeightsError
 from softgym_envs.mechanics.contact.obstacles import Sphere
 from softgym_envs.robots.registry import make_robot
+from softgym_envs.surrogate.domain import OUTSIDE, SELF_CONTACT
 
 BODY = {"e1": 0.009, "e2": 0.006, "e3": 0.005}
 
@@ -77,7 +78,7 @@ def test_efforts(robot):
     assert backend.step(state.displacement).effort == pytest.approx(wanted, rel=1e-6)
     with pytest.raises(ValueError, match="mode = 'force' is unknown"):
         backend.step(wanted, "force")
-    with pytest.raises(ValueError, match="one finite number"):
+    with pytest.raises(ValueError, match="must be 1 finite number, got"):
         backend.step([np.nan])
 
 
@@ -133,7 +134,7 @@ def test_folds_are_not_trusted(robot):
     backend = ChainBackend(robot, thin)
     trusted = [backend.step(np.radians([2.0 * k])).trusted for k in range(1, 21)]
     assert all(trusted[:14])
-    assert not trusted[-1]
+    assert not trusted[-1] and backend.state.doubt == SELF_CONTACT
     assert backend.state.contacts.smallest_gap < robot.contact_distance
     without = ChainBackend(make_robot("grasping_finger", self_contact=False), thin)
     assert closed(without, 40.0, 20).trusted
@@ -190,5 +191,35 @@ def test_unknown_bodies_are_given_to_finite_elements(robot, monkeypatch):
     Recorder.steps = 0
     backend = HybridChainBackend(robot, {"e3": 0.002})
     backend.step(np.radians([2.0]))
+    assert backend.learned.state.doubt & OUTSIDE
     assert Recorder.steps == 1
     assert backend.fem_calls == 2
+
+
+def test_copies_and_other_bodies_go_on_with_finite_elements_of_their_own(robot, monkeypatch):
+    """Finite elements may be missing, or be those of another body, where a state goes on that they have found."""
+    monkeypatch.setattr(hybrid_chain, "FEMBackend", Recorder)
+    thin = {"e1": 0.008, "e2": 0.005, "e3": 0.004, "object_gap": 0.0301}
+    backend = HybridChainBackend(robot, thin)
+    assert backend.state.trusted  # at rest, without finite elements
+    closed(backend, 40.0, 20)
+    kept, command = pickle.loads(pickle.dumps(backend.snapshot())), np.radians([39.0])
+    expected = backend.step(command)
+    assert not expected.trusted
+    backend.reset({"e3": 0.002})  # finite elements of this body
+    for other in (backend, HybridChainBackend(robot)):
+        other.resume(kept)
+        np.testing.assert_array_equal(other.step(command).contacts.total, expected.contacts.total)
+
+
+def test_a_body_that_finite_elements_refuse_changes_nothing(robot, monkeypatch):
+    backend, alone = HybridChainBackend(robot, BODY), ChainBackend(robot, BODY)
+
+    def refuse(*args):
+        raise InfeasibleDesign("the mesh crosses itself")
+
+    monkeypatch.setattr(hybrid_chain, "FEMBackend", refuse)
+    with pytest.raises(InfeasibleDesign, match="crosses itself"):
+        backend.reset({"e3": 0.002})
+    backend.reset(BODY)
+    np.testing.assert_array_equal(closed(backend, 20.0).effort, closed(alone, 20.0).effort)

@@ -14,6 +14,7 @@ from softgym_envs.backends.hybrid_chain import HybridHandBackend
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.robots.registry import make_robot
+from softgym_envs.surrogate.domain import OUTSIDE
 
 GRAVITY = 9.81
 STEP = 0.05
@@ -182,7 +183,7 @@ def test_hybrid_hands_follow_with_finite_elements(monkeypatch):
     before = closed(backend)
     np.testing.assert_array_equal(before.effector, closed(alone).effector)
     assert before.trusted and not asked
-    monkeypatch.setattr(ChainHand, "trusted", property(lambda self: False))
+    monkeypatch.setattr(ChainHand, "doubt", property(lambda self: OUTSIDE))
     found, expected = lifted(backend), lifted(alone)
     assert len(asked) == 14  # nine to close, five to lift
     np.testing.assert_array_equal(found.contacts.total, expected.contacts.total)

@@ -201,7 +201,7 @@ def test_errors(robot, weights):
     with pytest.raises(WeightsError, match="2 or more"):
         make_backend("hybrid", robot, weights=weights, members=1)
     backend = make_backend("hybrid", robot, weights=weights)
-    with pytest.raises(ValueError, match="forces.*fem"):
+    with pytest.raises(ValueError, match="force = .*fem"):
         backend.step(np.array([0.001]), force=np.ones(3))
     with pytest.raises(ValueError, match="finite"):
         backend.step(np.array([np.nan]))

@@ -157,7 +157,7 @@ def test_going_back_and_copies():
     backend.restore(there)
     np.testing.assert_array_equal(backend.step(second).effector, after.effector)
     backend.restore(there)
-    other.go_on_from(backend.snapshot())
+    other.resume(backend.snapshot())
     np.testing.assert_array_equal(other.step(second).effector, after.effector)
 
 

@@ -48,7 +48,7 @@ def test_a_touch_ends_and_goes_on_from_a_snapshot(robot):
     touched = backend.step(COMMAND)
     kept = backend.snapshot()
     other = SurrogateBackend(robot)
-    other.go_on_from(kept)
+    other.resume(kept)
     np.testing.assert_allclose(other.step(COMMAND).effector, touched.effector, atol=1e-9)
     backend.touch(None)
     np.testing.assert_allclose(backend.step(COMMAND).effector, free.effector, atol=1e-9)

@@ -112,16 +112,18 @@ def test_a_state_of_another_environment_is_refused():
     for other, words in (
         (gymnasium.make("SoftGym/DiamondReach-v0"), "robot 'diamond', but the environment has robot 'finger'"),
         (gymnasium.make("SoftGym/FingerTrack-v0"), "task 'track'"),
-        (gymnasium.make("SoftGym/FingerReach-v0"), "state of SurrogateBackend cannot go on in FEMBackend"),
+        (gymnasium.make("SoftGym/FingerReach-v0"), "state of SurrogateBackend cannot continue in FEMBackend"),
     ):
         with pytest.raises(ValueError, match=words):
             env.set_state(other.unwrapped.get_state())
 
 
-def test_batches_are_copied_in_mid_episode():
-    env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=3, sample_design=True, max_episode_steps=5)
+@pytest.mark.parametrize("identifier", ["SoftGym/FingerReach-v0", "SoftGym/TetrapodReach-v0"])
+def test_batches_are_copied_in_mid_episode(identifier):
+    env = gymnasium.make_vec(identifier, num_envs=3, sample_design=True, max_episode_steps=5)
     env.reset(seed=0)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (8, 3, 2)).astype(np.float32)
+    shape = (8, *env.action_space.shape)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
     walk(env, actions[:3])
     twins = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
     expected = [row[0] for row in walk(env, actions[3:])]
@@ -142,3 +144,9 @@ def test_batches_of_tensors_are_copied_in_mid_episode():
     expected = torch.stack([row[0] for row in walk(env, actions[3:])])
     for twin in twins:
         assert (torch.stack([row[0] for row in walk(twin, actions[3:])]) == expected).all()
+
+
+def test_copies_know_their_specification():
+    env = gymnasium.make("SoftGym/FingerReach-v0")
+    for twin in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env)):
+        assert twin.unwrapped.spec == env.unwrapped.spec and twin.spec.id == "SoftGym/FingerReach-v0"

@@ -329,6 +329,13 @@ def test_backends_agree():
         ({"task_options": {"goals": "easy"}}, ValueError, ["easy", "reachable"]),
         ({"backend_options": {"weights": "/nowhere"}}, ValueError, None),
         ({"render_mode": "hologram"}, ValueError, ["hologram", "rgb_array"]),
+        ({"render_size": (0, 480)}, ValueError, ["render_size", "(0, 480)", "pixels"]),
+        ({"render_size": 480}, ValueError, ["render_size", "480", "two"]),
+        ({"sample_design": 1}, DesignError, ["1", "True, False or a list of names", "length"]),
+        ({"design_in_observation": ["length", "length"]}, DesignError, ["length", "differ"]),
+        ({"robot_options": 5}, ValueError, ["robot_options", "5", "mapping"]),
+        ({"plant": 0.1}, ValueError, ["plant", "0.1", "mapping"]),
+        ({"plant": {"noise": "low"}}, ValueError, ["plant noise", "low", "from 0.0 to 1.0"]),
     ],
 )
 def test_bad_options_are_named(options, error, words):
@@ -363,6 +370,9 @@ def test_bad_actions_and_reset_options(backend):
         env.reset(options={"goal": np.zeros((5, 3))})
     with pytest.raises(DesignError, match="length"):
         env.reset(options={"design": {"length": 1.0}})
+    with pytest.raises(ValueError, match="goal"):
+        env.reset(options={"design": {"length": 0.041}, "goal": [0.0, np.nan, 0.0]})
+    assert env.state is before and env.design["length"] == 0.04
     env.reset()
     assert np.isfinite(env.step(np.array([5.0, -5.0]))[0]).all()  # values out of range are clipped
 

@@ -112,6 +112,11 @@ def test_own_identifiers(monkeypatch):
         register_environment("Lab/SpikeApproach-v0", robot=Spike, task=Approach)
     with pytest.raises(ValueError, match="unknown robot 'fingr'; did you mean 'finger'"):
         register_environment("Lab/Fingr-v0", robot="fingr", task="reach")
+    with pytest.raises(ValueError, match="unknown task 'reech'; did you mean 'reach'"):
+        register_environment("Lab/Reech-v0", robot="finger", task="reech", max_episode_steps=5)
+    with pytest.raises(gymnasium.error.Error, match="Malformed environment ID"):
+        register_environment("Lab/Finger Reach", robot="finger", task="reach")
+    assert not {"Lab/Reech-v0", "Lab/Finger Reach"} & registration.ENVIRONMENTS.keys()
 
 
 def test_own_tasks_have_names(monkeypatch):

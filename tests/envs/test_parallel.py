@@ -48,6 +48,16 @@ def test_processes_step_as_single_environments(backend):
             np.testing.assert_allclose(effector[i], expected[4]["effector"], atol=1e-9)
 
 
+def test_resets_take_what_those_of_the_batch_take():
+    """Integers of NumPy as seeds, and a list as a mask."""
+    env = gymnasium.make_vec(FINGER, 2, backend="fem")
+    goals = env.reset(seed=np.int64(3))[1]["goal"]
+    assert (env.reset(seed=list(np.array([3, 4])))[1]["goal"] == goals).all()
+    again = env.reset(seed=[4, None], options={"reset_mask": [True, False]})[1]
+    assert (again["goal"][0] == goals[1]).all()
+    env.close()
+
+
 def test_the_batch_of_an_id_follows_backend_and_task():
     for identifier, options, kind in (
         (FINGER, {}, SoftRobotVectorEnv),
@@ -65,11 +75,16 @@ def test_errors_of_a_process_keep_type_and_message():
     with pytest.raises(DesignError, match="length"):
         env.reset(options={"design": [{"length": 0.04}, {"length": 1.0}]})
     assert env.closed and not any(process.is_alive() for process in env.unwrapped.processes)
-    for wrong, words in (({"design": [{}]}, "design must be one for all or 2, got 1"), ({"colour": 1}, "colour")):
+    for wrong, words in (
+        ({"design": [{}]}, "design must be one body or a list of 2, got 1"),
+        ({"colour": 1}, "colour"),
+    ):
         env = gymnasium.make_vec(FINGER, 2, backend="fem")
         with pytest.raises(ValueError, match=words):
             env.reset(options=wrong)
         env.close()
+    with pytest.raises(ValueError, match="seed must be an integer, None or a list of 2, got 3 seeds"):
+        env.reset(seed=[1, 2, 3])
     with pytest.raises(DesignError, match="lenght"):
         gymnasium.make_vec(FINGER, 2, backend="fem", design={"lenght": 0.04})
 

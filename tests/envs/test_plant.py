@@ -199,3 +199,30 @@ def test_a_fixed_plant_draws_no_random_numbers():
     plants = Plants.check({"stiffness": 1.2, "delay": 2}, make_robot("finger"), "surrogate")
     assert plants.sample(rng) == Plant(stiffness=1.2, delay=2)
     assert rng.bit_generator.state == before
+
+
+@pytest.mark.parametrize(("plant", "friction"), [(None, 0.4), ({"noise": 0.01}, 0.4), ({"cable_friction": 0.1}, 0.1)])
+def test_friction_of_the_backend_stays_where_the_plant_says_nothing_of_it(plant, friction):
+    env = gymnasium.make(FINGER, backend="fem", backend_options={"cable_friction": 0.4}, plant=plant).unwrapped
+    env.reset(seed=0)
+    assert env.backend.cable_friction == friction
+    env.set_state(env.get_state())
+    assert env.backend.cable_friction == friction and copy.deepcopy(env).backend.cable_friction == friction
+
+
+def test_noise_of_a_measured_force_is_a_share_of_the_largest_wanted_force():
+    """FingerGrasp measures a force [N] in place of the effector [m]."""
+    env = gymnasium.make("SoftGym/FingerGrasp-v0", backend="surrogate", plant={"noise": 0.1}).unwrapped
+    errors = [env.reset(seed=seed) and env.sensed.effector - env.task.measure(env.state) for seed in range(60)]
+    assert np.std(errors) == pytest.approx(0.1 * env.task.forces[1], rel=0.2)
+
+
+def test_the_plant_of_a_foreign_state_ends_with_its_episode():
+    stiff, plain = (gymnasium.make(FINGER, plant=plant).unwrapped for plant in ({"stiffness": 1.2, "delay": 2}, None))
+    stiff.reset(seed=0)
+    plain.set_state(stiff.get_state())
+    assert plain.plant == Plant(stiffness=1.2, delay=2)
+    plain.reset(seed=0)
+    assert plain.plant == Plant()
+    plain.step(np.ones(2))
+    assert (plain.state.command > 0.0).all()

@@ -213,6 +213,10 @@ def test_given_bodies_hold_one_episode():
     assert (env.designs[:, list(env.design_space.names).index("height")] == 0.021).all()
     env.reset()
     assert (env.designs[:, 0] == 0.040).all()
+    env.reset(options={"design": [{"length": 0.0385}, {}, {"length": 0.0415}]})
+    assert env.designs[:, 0].tolist() == [0.0385, 0.040, 0.0415]
+    with pytest.raises(ValueError, match="design must be one body or a list of 3, got 1"):
+        env.reset(options={"design": [{}]})
 
 
 def test_given_bodies_do_not_stay_where_others_are_sampled():

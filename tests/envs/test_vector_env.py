@@ -3,11 +3,12 @@
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 import softgym_envs
 from softgym_envs.agents.vec_env import SB3VecEnv
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
-from softgym_envs.errors import DesignError
+from softgym_envs.errors import DesignError, InfeasibleDesign
 
 
 @pytest.mark.parametrize("identifier", [i for i, row in softgym_envs.ENVIRONMENTS.items() if row.robot == "finger"])
@@ -86,6 +87,9 @@ def test_bad_input():
     with pytest.raises(ValueError, match="fem.*surrogate"):
         SoftRobotVectorEnv("finger", num_envs=2, backend="fem")
     env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2)
+    env.reset(seed=0, options={"reset_mask": [True, False]})
+    with pytest.raises(ResetNeeded, match=r"before reset of sub-environments \[1\]"):
+        env.step(np.zeros((2, 2)))
     env.reset(seed=0)
     for actions in (np.zeros((3, 2)), np.zeros(2), np.full((2, 2), np.nan)):
         with pytest.raises(ValueError, match="action"):
@@ -94,6 +98,35 @@ def test_bad_input():
         env.reset(options={"goal": np.zeros((5, 1, 3))})
     with pytest.raises(DesignError, match="height"):
         env.reset(options={"design": {"height": 3.0}})
+    for design in (5, "long", [{}]):
+        with pytest.raises(ValueError, match="design must be one body or a list of 2, got"):
+            env.reset(options={"design": design})
+    for seed in (1.5, -1, "abc", [1, 2.5]):
+        with pytest.raises(ValueError, match="must be a non-negative integer, None or a list of 2 of them"):
+            env.reset(seed=seed)
+    for counts in ({"num_envs": 2.0}, {"num_envs": 2, "max_episode_steps": 2.5}):
+        with pytest.raises(ValueError, match="must be an integer of at least 1"):
+            gymnasium.make_vec("SoftGym/FingerReach-v0", **counts)
+
+
+def test_bodies_are_the_fixed_ones_again_after_a_reset_that_failed(monkeypatch):
+    env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=3, design_in_observation=True).unwrapped
+    shown = env.spaces.slices["design"]
+    expected = env.reset(seed=0)[0][:, shown]
+    begin = env.backend.begin
+
+    def refuse(index, designs):
+        begin(index[1:], designs[1:])
+        return {int(index[0]): InfeasibleDesign("the body cannot exist")}
+
+    with monkeypatch.context() as patched:
+        patched.setattr(env.backend, "begin", refuse)
+        with pytest.raises(InfeasibleDesign):
+            env.reset(options={"design": {"length": 0.042}})
+    assert env.designs[:, 0].tolist() == [0.04, 0.042, 0.042]  # the first row keeps its body
+    assert (env.reset(seed=0)[0][:, shown] == expected).all() and (env.designs == env.designs[0]).all()
+    effectors = env.backend.state.effector
+    assert (effectors == effectors[0]).all()
 
 
 def test_stable_baselines_adapter():

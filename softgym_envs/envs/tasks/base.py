@@ -127,6 +127,7 @@ class Task(ABC):
         success_distance: distance below which a goal counts as reached [m].
         goal_scale: unit of goals and of what is compared with them in observations [m].
         error_scale: distance to the goal that is observed as one half [m].
+        measured_scale: unit of the noise of what is compared with goals [m]: the robot's size.
     """
 
     #: Whether the task applies forces to the effector, which not every backend supports.
@@ -155,6 +156,7 @@ class Task(ABC):
         self.axes: Array = np.asarray(robot.goal_axes, dtype=float)
         self.success_distance = robot.goal_tolerance
         self.goal_scale = 1.25 * robot.size
+        self.measured_scale = robot.size
         self.error_scale = robot.workspace_scale / 2.5
 
     @abstractmethod

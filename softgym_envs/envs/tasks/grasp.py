@@ -56,6 +56,7 @@ class Grasp(Task):
         self.success_distance = tolerance
         self.resistance = resistance
         self.goal_scale = 2.0 * self.forces[1]
+        self.measured_scale = self.forces[1]
         self.error_scale = 0.1 * self.forces[1]
 
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:

@@ -118,6 +118,16 @@ class Statics:
         self._remember(memory)
 
     @property
+    def snapshot(self) -> tuple:
+        """State that a solve starts from; assign it to undo solves."""
+        return self.x, self.effort, self.memory
+
+    @snapshot.setter
+    def snapshot(self, kept: tuple) -> None:
+        x, effort, memory = kept
+        self.restore(x, effort, memory=memory)
+
+    @property
     def memory(self) -> ContactMemory | CableMemory | None:
         """What friction remembers at the current state; None without contact and friction of cables."""
         return self.linearisation.memory

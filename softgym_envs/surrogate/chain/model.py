@@ -15,6 +15,7 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.chain.body import ChainBodies, FingerChain
 from softgym_envs.surrogate.chain.equilibrium import advance, condense
 from softgym_envs.surrogate.chain.segments import segment_stiffness
+from softgym_envs.surrogate.domain import OUTSIDE, SPREAD
 from softgym_envs.surrogate.weight_files import card_of, read_weights, write_weights
 
 NETWORK = "chain"
@@ -47,7 +48,8 @@ class PreparedChains:
         bodies: their geometry.
         stiffness: of the segments at the baseline modulus, shape (S, N - 1, 3, 3).
         relative: Young's modulus relative to the baseline, shape (S,).
-        known: whether the design lies where the chain was trained and the members agree about it, shape (S,).
+        doubt: `OUTSIDE` where the chain was not trained, plus `SPREAD` where the members disagree; 0 for known bodies,
+            shape (S,).
         uncertainty: bound on the relative error of the compliance, shape (S,).
         tip_uncertainty: bound on 95 % of the errors of the tip in contact [m], shape (S,).
         depth: compliance of the tip along z at the baseline modulus [m/N], shape (S,).
@@ -57,13 +59,18 @@ class PreparedChains:
     bodies: ChainBodies
     stiffness: np.ndarray
     relative: np.ndarray
-    known: np.ndarray
+    doubt: np.ndarray
     uncertainty: np.ndarray
     tip_uncertainty: np.ndarray
     depth: np.ndarray
 
     def __len__(self) -> int:
         return len(self.relative)
+
+    @property
+    def known(self) -> np.ndarray:
+        """Whether the chain knows each body, shape (S,)."""
+        return self.doubt == 0
 
     @property
     def segments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -149,7 +156,7 @@ class ChainModel:
             bodies=bodies,
             stiffness=members.mean(axis=0),
             relative=relative_stiffness(self.robot, designs),
-            known=inside & (spread <= self._limit),
+            doubt=np.where(inside, 0, OUTSIDE) | np.where(spread <= self._limit, 0, SPREAD),
             uncertainty=self._inflation * spread,
             tip_uncertainty=self._tip_inflation * spread,
             depth=self.depth(designs),
