@@ -558,5 +558,5 @@ if __name__ == "__main__":
     if sys.argv[1] == "quality":
         write_json(KEPT, json.loads(KEPT.read_text()) | {"quality": measure(Path(sys.argv[2]))[1]})
     else:
-        budget = int(sys.argv[2]) if len(sys.argv) > 2 else 60
+        budget = int(sys.argv[2]) if len(sys.argv) > 2 else 300
         write_json(KEPT, {**run(Path(sys.argv[1]), budget), "provenance": provenance()})
