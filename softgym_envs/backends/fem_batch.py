@@ -167,10 +167,7 @@ class FEMBatch(BatchBackend):
         for k, i in enumerate(index.tolist()):
             owner = self._owners[self._designs[i]]
             owner.reset()
-            try:
-                found[k] = owner.probe(commands[k]).effector[0]
-            except ConvergenceError:
-                pass
+            found[k] = owner.reach(commands[k])
         return found
 
     @property
