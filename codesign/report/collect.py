@@ -144,11 +144,11 @@ def _with_mesh(
             return row
         ratio = (few / many) ** (1.0 / dimension)
 
-    def part(column: Callable[[TestGroup], np.ndarray | None], interval: Interval | None) -> MeshPart | None:
+    def part(column: Callable[[TestGroup], np.ndarray | None], interval: Interval) -> MeshPart | None:
         changes = []
         for pair in (coarse, fine):
             before, after = (column(group) for group in pair)
-            if before is None or after is None or interval is None:
+            if before is None or after is None:
                 return None
             changes.append(after.mean(axis=0) - before.mean(axis=0))
         return mesh_part(changes[0][fine[0].numbers], changes[1], ratio, interval, strata)
