@@ -174,11 +174,11 @@ def module_bounds() -> dict[str, object]:
             others = np.unique(body[fold != part])
             drawn = [rng.choice(others, int(SHARE * len(others)), replace=False) for _ in range(MEMBERS)]
             models = [learning.fit(recipe, name, states.rows(np.isin(body, some)), {}) for some in (others, *drawn)]
-            found = np.array([learning.wrong_strains(model, left) for model in models])
+            found = np.array([learning.strain_errors(model, left) for model in models])
             sizes = np.linalg.norm(left.strain, axis=1)
             wrong.append(np.linalg.norm(found[0], axis=1) / sizes)
             spread.append(np.sqrt(found[1:].var(axis=0).sum(axis=1)) / sizes)
-            share.append(models[0].share(models[0].unit(left.designs)))
+            share.append(models[0].edge_share(models[0].unit(left.designs)))
         error, spreads, shares = (np.concatenate(each) for each in (wrong, spread, share))
         slope = max(float(np.polyfit(shares, np.log(error), 1)[0]), 0.0)
         scales = {
