@@ -146,6 +146,9 @@ class ExactArm:
                 return state, energies
 
 
+EVERYTHING = "all modules"
+
+
 def kinds() -> dict[str, object]:
     """Errors of the arm of eight cells of all kinds, also if only the modules of one kind have learned energies.
 
@@ -158,7 +161,7 @@ def kinds() -> dict[str, object]:
 
     cells, commands = ARMS["eight cells of all kinds"]
     robot, rng = ModularArm(cells=cells), np.random.default_rng(0)
-    space, everything = robot.design_space, "all modules"
+    space = robot.design_space
     errors: dict[str, list[tuple[float, float]]] = {}
     stiffness: dict[str, list[tuple[float, float, float]]] = {}
     for design in [space.baseline, *(space.sample(rng) for _ in range(RANDOM_BODIES))]:
@@ -171,9 +174,9 @@ def kinds() -> dict[str, object]:
         ]
         for command in np.array(commands):
             true, about = arm.solve(command, solver.solve(command))
-            for which in (everything, *dict.fromkeys(arm.names)):
+            for which in (EVERYTHING, *dict.fromkeys(arm.names)):
                 for name, block, *energies in zip(arm.names, superelements(arm.model), about, learned, strict=True):
-                    block.energy = energies[which in (everything, name)]
+                    block.energy = energies[which in (EVERYTHING, name)]
                 other = Statics(arm.model)
                 other.restore(true.x, true.effort)
                 found = _errors(other.solve(command).condensed, true.condensed, rest)
@@ -405,6 +408,19 @@ def modular_arm_table() -> str:
     return markdown([*head, "superelements", "finite elements"], rows, "lrrrrr")
 
 
+def modular_arm_kinds_table() -> str:
+    """Errors of the arm of eight cells if all modules, or only those of one kind, have learned energies."""
+    rows, end = [], " learned: tip, largest error [% of its motion]"
+    for which in (name.removesuffix(end) for name in results("modular_arm_kinds") if name.endswith(end)):
+        keys = [end, " learned: compliance of the tip, wires held, largest error [%]"]
+        if which != EVERYTHING:
+            keys += [f": stiffness {where}, largest error [%]" for where in ("at rest", "in the states")]
+        errors = [figure("modular_arm_kinds", which + key, ".2f") + " %" for key in keys]
+        rows.append([which if which == EVERYTHING else f"only `{which}`", *errors, *[""] * (4 - len(errors))])
+    head = ["learned energies", "tip: largest error", "compliance of the tip, wires held: largest error"]
+    return markdown([*head, "stiffness of such modules at rest", "in the states"], rows, "lrrrr")
+
+
 def module_energies_table() -> str:
     """Errors of the learned energies that come with the package, on bodies that were not learned."""
     from softgym_envs.robots.modules import learned_module
@@ -440,6 +456,7 @@ def module_bounds_table() -> str:
 
 TABLES = {
     "modular_arm": modular_arm_table,
+    "modular_arm_kinds": modular_arm_kinds_table,
     "module_energies": module_energies_table,
     "module_bounds": module_bounds_table,
 }
