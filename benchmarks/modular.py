@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from benchmarks.recorded import figure, records, results
 from benchmarks.tables import markdown
-from softgym_envs.mechanics.condensation import RoleMatrix
+from softgym_envs.mechanics.condensation import CondensedModel, RoleMatrix
+from softgym_envs.mechanics.elements.superelement import Superelement
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.robots.modular_arm import ModularArm
 
 ARMS = {
     "four leaves": (("leaf_x", "leaf_y") * 2, ((0.004, 0.0), (0.006, -0.005))),
@@ -32,6 +37,165 @@ RANDOM_BODIES = 2
 def _held(W: RoleMatrix) -> np.ndarray:
     """Return the compliance of the tip with the wires held, shape (3, 3)."""
     return W.ee - W.ea @ np.linalg.solve(W.aa, W.ae)
+
+
+def _largest(found: np.ndarray, true: np.ndarray) -> float:
+    """Return the largest error of a stiffness or compliance over all directions [%]."""
+    root = np.linalg.inv(np.linalg.cholesky(true))
+    return 100.0 * float(np.abs(np.linalg.eigvalsh(root @ found @ root.T) - 1.0).max())
+
+
+def _errors(found: CondensedModel, true: CondensedModel, rest: np.ndarray) -> tuple[float, float]:
+    """Return the errors of a state: tip [% of its motion from ``rest`` (3,)] and compliance, wires held [%]."""
+    tip = np.linalg.norm(found.delta.e - true.delta.e) / np.linalg.norm(true.delta.e - rest)
+    return 100.0 * float(tip), _largest(_held(found.W), _held(true.W))
+
+
+@dataclass(frozen=True)
+class Expanded:
+    """Energy of a module to second order about one state, where its force and its stiffness are exact.
+
+    Attributes:
+        strains: of the state [m, 1], shape (6,).
+        gradient: of the energy at the state, shape (6,) [N, N m].
+        hessian: of the energy at the state, shape (6, 6).
+    """
+
+    strains: np.ndarray
+    gradient: np.ndarray
+    hessian: np.ndarray
+
+    def evaluate(self, strains: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        off = strains - self.strains
+        force = self.gradient + self.hessian @ off
+        return 0.5 * float((self.gradient + force) @ off), force, self.hessian
+
+    def knows(self, strains: np.ndarray) -> bool:
+        return True
+
+
+CHANGE = 1e-8
+"""Largest change of the frames of an exact arm [m, 1] by its last step."""
+
+
+def superelements(model: MechanicalModel) -> list[Superelement]:
+    """Return the superelements of an arm from the base to the tip."""
+    return [block for block in model.blocks if isinstance(block, Superelement)]
+
+
+class ExactArm:
+    """An arm of superelements whose energies are exact where it is: condensed from finite elements of each module.
+
+    Its equilibria and condensed models are those of the finite elements of the whole body, because the ports are rigid.
+
+    Args:
+        cells: from the base to the tip.
+        design: complete.
+
+    Attributes:
+        model: the arm.
+        names: of its modules.
+        designs: of its modules.
+    """
+
+    def __init__(self, cells: Sequence[str], design: Mapping[str, float]) -> None:
+        from softgym_envs.mechanics.solvers.statics import Statics
+        from softgym_envs.robots.modular_arm import CELLS
+        from softgym_envs.robots.modules import MODULES, learned_module
+
+        self.model = ModularArm(cells=cells).build(design)
+        self.names = [CELLS[cell][0] for cell in cells]
+        self.designs = [
+            {dimension: design[f"{dimension}_{number}"] for dimension in learned_module(name).box}
+            | {"young_modulus": design["young_modulus"]}
+            for number, name in enumerate(self.names, start=1)
+        ]
+        self._axes = [CELLS[cell][1] for cell in cells]
+        self._parts = [Statics(MODULES[n]().model(own)) for n, own in zip(self.names, self.designs, strict=True)]
+
+    def energies(self, x: np.ndarray) -> list[Expanded]:
+        """Return the energy of each module about a state with frames ``x`` (n, 3), its ports held where they are."""
+        from softgym_envs.robots.modules.states import MODULUS, in_strains
+
+        found = []
+        for part, block, axes in zip(self._parts, superelements(self.model), self._axes, strict=True):
+            near, far = np.split(x[block.rows], 2)
+            turned = near[1:].T @ axes
+            rows = part.model.nodes.copy()
+            rows[-4] = (far[0] - near[0]) @ turned
+            rows[-3:] = axes.T @ far[1:] @ turned
+            pose = np.concatenate([constraint.value(rows) for constraint in part.model.constraints["a"]])
+            strain, gradient, hessian, *_ = in_strains(part.solve(pose).condensed, block.length)
+            scale, unit = np.array([block.length] * 3 + [1.0] * 3), MODULUS * block.length**3
+            found.append(Expanded(scale * strain, unit * gradient / scale, unit * hessian / np.outer(scale, scale)))
+        return found
+
+    def solve(self, command: np.ndarray, start: Equilibrium) -> tuple[Equilibrium, list[Expanded]]:
+        """Return the equilibrium under a command, and the energies about it, by Newton's method from a state."""
+        from softgym_envs.mechanics.solvers.statics import Statics
+
+        state = start
+        while True:
+            energies = self.energies(state.x)
+            for block, energy in zip(superelements(self.model), energies, strict=True):
+                block.energy = energy
+            solver, last = Statics(self.model), state.x
+            solver.restore(state.x, state.effort)
+            state = solver.solve(command)
+            if np.abs(state.x - last).max() < CHANGE:
+                return state, energies
+
+
+EVERYTHING = "all modules"
+
+
+def kinds() -> dict[str, object]:
+    """Errors of the arm of eight cells of all kinds, also if only the modules of one kind have learned energies.
+
+    Bodies and commands are those of its comparison with finite elements of the whole body, whose states are found here
+    from finite elements of the modules. Also the errors of the stiffness of the modules at rest and in these states,
+    and the share of dimensions at the bounds of their box of the body that is worst at rest.
+    """
+    from softgym_envs.mechanics.solvers.statics import Statics
+    from softgym_envs.robots.modules import learned_module
+
+    cells, commands = ARMS["eight cells of all kinds"]
+    robot, rng = ModularArm(cells=cells), np.random.default_rng(0)
+    space = robot.design_space
+    errors: dict[str, list[tuple[float, float]]] = {}
+    stiffness: dict[str, list[tuple[float, float, float]]] = {}
+    for design in [space.baseline, *(space.sample(rng) for _ in range(RANDOM_BODIES))]:
+        solver, arm = Statics(robot.build(design)), ExactArm(cells, space.complete(design))
+        learned = [block.energy for block in superelements(solver.model)]
+        rest = solver.model.constraints["e"][0].value(solver.model.nodes)
+        at_rest = [
+            _largest(energy.evaluate(exact.strains)[2], exact.hessian)
+            for energy, exact in zip(learned, arm.energies(solver.model.nodes), strict=True)
+        ]
+        for command in np.array(commands):
+            true, about = arm.solve(command, solver.solve(command))
+            for which in (EVERYTHING, *dict.fromkeys(arm.names)):
+                for name, block, *energies in zip(arm.names, superelements(arm.model), about, learned, strict=True):
+                    block.energy = energies[which in (EVERYTHING, name)]
+                other = Statics(arm.model)
+                other.restore(true.x, true.effort)
+                found = _errors(other.solve(command).condensed, true.condensed, rest)
+                errors.setdefault(which, []).append(found)
+            for name, own, *energies, unloaded in zip(arm.names, arm.designs, about, learned, at_rest, strict=True):
+                module, exact = learned_module(name), energies[0]
+                edge = module.edge_share(module.unit(np.array([[own[dimension] for dimension in module.box]])))[0]
+                loaded = _largest(energies[1].evaluate(exact.strains)[2], exact.hessian)
+                stiffness.setdefault(name, []).append((unloaded, loaded, float(edge)))
+    result: dict[str, object] = {}
+    for which, pairs in errors.items():
+        tip, compliance = np.max(pairs, axis=0)
+        result[f"{which} learned: tip, largest error [% of its motion]"] = float(tip)
+        result[f"{which} learned: compliance of the tip, wires held, largest error [%]"] = float(compliance)
+    for name, triples in stiffness.items():
+        result[f"{name}: stiffness at rest, largest error [%]"] = max(triples)[0]
+        result[f"{name}: stiffness in the states, largest error [%]"] = max(triple[1] for triple in triples)
+        result[f"{name}: share of dimensions at their bounds, worst body at rest"] = max(triples)[2]
+    return result
 
 
 def compare(name: str) -> dict[str, object]:
@@ -78,10 +242,9 @@ def compare(name: str) -> dict[str, object]:
                 definite.append(float(np.linalg.eigvalsh(root[:, None] * W * root)[0]))
             off = np.linalg.norm(learned.condensed.delta.e - true.condensed.delta.e)
             covered.append(bool(off <= bounds[-1]))
-            tip.append(100.0 * off / np.linalg.norm(true.condensed.delta.e - rest))
-            root = np.linalg.inv(np.linalg.cholesky(_held(true.condensed.W)))
-            relative = root @ _held(learned.condensed.W) @ root.T
-            compliance.append(100.0 * np.abs(np.linalg.eigvalsh(relative) - 1.0).max())
+            errors = _errors(learned.condensed, true.condensed, rest)
+            tip.append(errors[0])
+            compliance.append(errors[1])
     fast, slow = (float(np.median(seconds[body])) for body in ("superelements", "solid"))
     known = np.array(trusted)
     return {
@@ -174,11 +337,11 @@ def module_bounds() -> dict[str, object]:
             others = np.unique(body[fold != part])
             drawn = [rng.choice(others, int(SHARE * len(others)), replace=False) for _ in range(MEMBERS)]
             models = [learning.fit(recipe, name, states.rows(np.isin(body, some)), {}) for some in (others, *drawn)]
-            found = np.array([learning.wrong_strains(model, left) for model in models])
+            found = np.array([learning.strain_errors(model, left) for model in models])
             sizes = np.linalg.norm(left.strain, axis=1)
             wrong.append(np.linalg.norm(found[0], axis=1) / sizes)
             spread.append(np.sqrt(found[1:].var(axis=0).sum(axis=1)) / sizes)
-            share.append(models[0].share(models[0].unit(left.designs)))
+            share.append(models[0].edge_share(models[0].unit(left.designs)))
         error, spreads, shares = (np.concatenate(each) for each in (wrong, spread, share))
         slope = max(float(np.polyfit(shares, np.log(error), 1)[0]), 0.0)
         scales = {
@@ -209,6 +372,7 @@ def module_meshes() -> dict[str, object]:
 
 
 BENCHMARKS = {benchmark(name): of(name) for name in ARMS} | {
+    "modular_arm_kinds": kinds,
     "modular_arm_stability": stability,
     "module_bounds": module_bounds,
     "module_meshes": module_meshes,
@@ -242,6 +406,19 @@ def modular_arm_table() -> str:
         )
     head = ["arm", "tip: largest error", "compliance of the tip, wires held: largest error", "trusted"]
     return markdown([*head, "superelements", "finite elements"], rows, "lrrrrr")
+
+
+def modular_arm_kinds_table() -> str:
+    """Errors of the arm of eight cells if all modules, or only those of one kind, have learned energies."""
+    rows, end = [], " learned: tip, largest error [% of its motion]"
+    for which in (name.removesuffix(end) for name in results("modular_arm_kinds") if name.endswith(end)):
+        keys = [end, " learned: compliance of the tip, wires held, largest error [%]"]
+        if which != EVERYTHING:
+            keys += [f": stiffness {where}, largest error [%]" for where in ("at rest", "in the states")]
+        errors = [figure("modular_arm_kinds", which + key, ".2f") + " %" for key in keys]
+        rows.append([which if which == EVERYTHING else f"only `{which}`", *errors, *[""] * (4 - len(errors))])
+    head = ["learned energies", "tip: largest error", "compliance of the tip, wires held: largest error"]
+    return markdown([*head, "stiffness of such modules at rest", "in the states"], rows, "lrrrr")
 
 
 def module_energies_table() -> str:
@@ -279,6 +456,7 @@ def module_bounds_table() -> str:
 
 TABLES = {
     "modular_arm": modular_arm_table,
+    "modular_arm_kinds": modular_arm_kinds_table,
     "module_energies": module_energies_table,
     "module_bounds": module_bounds_table,
 }

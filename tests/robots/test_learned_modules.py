@@ -184,15 +184,16 @@ def test_learned_modules_know_how_wrong_they_may_be(name):
     middle = {each: (low * high) ** 0.5 for each, (low, high) in learned.box.items()}
     corner = {each: high for each, (_, high) in learned.box.items()}
     inside, outside = (learned.energy({**design, "young_modulus": 1e7}) for design in (middle, corner))
-    np.testing.assert_allclose(inside.error, learned.bounds["inside"])
-    np.testing.assert_allclose(outside.error, learned.bounds["corners"])
-    assert (0.0 < inside.error).all() and (inside.error <= outside.error).all() and outside.error.max() < 0.1
+    np.testing.assert_allclose(inside.error_bounds, learned.bounds["inside"])
+    np.testing.assert_allclose(outside.error_bounds, learned.bounds["corners"])
+    assert (0.0 < inside.error_bounds).all() and (inside.error_bounds <= outside.error_bounds).all()
+    assert outside.error_bounds.max() < 0.1
     scale = np.array([module.length(module.design_space.complete(middle))] * 3 + [1.0] * 3)
     strains = 0.3 * scale * learned.largest_strains * np.sign(np.arange(6) - 2.5)
     assert not inside.possible_errors(np.zeros(6)).any()
     compliance = np.linalg.inv(inside.evaluate(strains)[2])
     off = np.array([compliance @ row / scale for row in inside.possible_errors(strains)])
-    np.testing.assert_allclose(off, np.linalg.norm(strains / scale) * np.diag(inside.error), atol=1e-9)
+    np.testing.assert_allclose(off, np.linalg.norm(strains / scale) * np.diag(inside.error_bounds), atol=1e-9)
 
 
 def test_strains_that_were_not_learned_are_not_known():

@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from benchmarks.modular import ExactArm
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import DesignError, InfeasibleDesign
@@ -30,6 +31,18 @@ def test_the_modular_arm_follows_finite_elements_of_the_whole_body(cells, comman
     moved = found["solid"].delta.e - robot.effector_rest
     assert np.linalg.norm(moved) > 0.002
     assert np.linalg.norm(found["superelements"].delta.e - found["solid"].delta.e) < 0.01 * np.linalg.norm(moved)
+
+
+def test_an_arm_of_exact_energies_has_the_states_of_finite_elements_of_the_whole_body():
+    """So errors of an arm of superelements are errors of its learned energies: neither ports nor meshes add any."""
+    cells, command = ("leaf_y", "notch_x"), np.array([0.002, -0.001])
+    design = make_robot("modular_arm", cells=cells).design_space.complete({"young_modulus": 3e7})
+    models = {body: make_robot("modular_arm", cells=cells, body=body).build(design) for body in BODIES}
+    true, learned = (Statics(models[body]).solve(command).condensed for body in ("solid", "superelements"))
+    found = ExactArm(cells, design).solve(command, Statics(models["superelements"]).solve(command))[0].condensed
+    np.testing.assert_allclose(found.delta.e, true.delta.e, atol=1e-8)
+    np.testing.assert_allclose(found.compliance, true.compliance, rtol=1e-4, atol=1e-7)
+    assert np.abs(learned.delta.e - true.delta.e).max() > 1e-7
 
 
 def test_the_arm_sinks_under_its_weight_as_finite_elements_do():

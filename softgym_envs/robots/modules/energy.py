@@ -192,7 +192,7 @@ class ModuleEnergy:
         rotation: the largest load that was learned, as the angle by which it would turn the softest rotation [rad];
             see `softgym_envs.robots.modules.states.solve_states`. Default any load.
         largest_strains: size of each strain that was learned, the first three over the length, shape (6,). Default any.
-        error: bounds on the errors of the strains under a load, relative to the size of all, the first three over the
+        error_bounds: on the errors of the strains under a load, relative to the size of all, the first three over the
             length, shape (6,). Default none.
 
     Raises:
@@ -208,9 +208,9 @@ class ModuleEnergy:
         order: int = 3,
         rotation: float = np.inf,
         largest_strains: np.ndarray | float = np.inf,
-        error: np.ndarray | float = 0.0,
+        error_bounds: np.ndarray | float = 0.0,
     ) -> None:
-        self.error = np.broadcast_to(np.asarray(error, dtype=float), 6)
+        self.error_bounds = np.broadcast_to(np.asarray(error_bounds, dtype=float), 6)
         self.stiffness = np.array(stiffness, dtype=float)
         self.corrections = np.array(corrections, dtype=float)
         if not (self.stiffness > 0.0).all():
@@ -233,7 +233,7 @@ class ModuleEnergy:
         Row i is that of strains which are off along their axis i by its bound. If errors along different axes are
         independent, the root of the sum of squares of the work of all rows along a motion bounds the work of all.
         """
-        off = self.error * np.linalg.norm(self._scale * strains) / self._scale
+        off = self.error_bounds * np.linalg.norm(self._scale * strains) / self._scale
         return off[:, None] * self.evaluate(strains)[2]
 
     def load(self, strains: np.ndarray) -> float:

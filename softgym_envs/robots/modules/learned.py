@@ -104,21 +104,21 @@ class LearnedModule:
             self.order,
             self.rotation,
             self.largest_strains,
-            self.error(unit[0]),
+            self.error_bounds(unit[0]),
         )
 
-    def share(self, unit: np.ndarray) -> np.ndarray:
+    def edge_share(self, unit: np.ndarray) -> np.ndarray:
         """Return the share of dimensions at the bounds of the box, of bodies (..., v) in [-1, 1]; see `EDGE`."""
         return np.clip((np.abs(unit) - 1.0) / EDGE + 1.0, 0.0, 1.0).mean(axis=-1)
 
-    def error(self, unit: np.ndarray) -> np.ndarray:
+    def error_bounds(self, unit: np.ndarray) -> np.ndarray:
         """Return the bounds (..., 6) on the error of each strain over the size of all, of bodies (..., v) in [-1, 1].
 
         Their logarithms are linear in the share of dimensions at their bounds, as in `softgym_envs.surrogate.domain`.
         """
         if not self.bounds:
             return np.zeros((*unit.shape[:-1], 6))
-        share = self.share(unit)[..., None]
+        share = self.edge_share(unit)[..., None]
         return self.bounds["inside"] ** (1.0 - share) * self.bounds["corners"] ** share
 
     def cavity(self, design: Mapping[str, float] | None = None) -> CavityVolume:

@@ -334,13 +334,13 @@ def fit(
     return model
 
 
-def wrong_strains(model: LearnedModule, states: ModuleStates) -> np.ndarray:
-    """Return by how much the strains of states are wrong under their loads, to first order, shape (n, 6)."""
+def strain_errors(model: LearnedModule, states: ModuleStates) -> np.ndarray:
+    """Return the errors of the strains of states under their loads, to first order, shape (n, 6)."""
     found = _corrected(model, states, _products(states.strain, model.terms))
     return np.einsum("nij,nj->ni", np.linalg.inv(states.hessian), found.gradient() - states.gradient)
 
 
-def wrong_stiffness(model: LearnedModule, states: ModuleStates) -> np.ndarray:
+def stiffness_errors(model: LearnedModule, states: ModuleStates) -> np.ndarray:
     """Return the largest relative errors of the stiffness of states over all directions of motion, shape (n,)."""
     found = _corrected(model, states, _products(states.strain, model.terms))
     root = _weights(states, 1.0).root
@@ -355,13 +355,14 @@ def errors(model: LearnedModule, states: ModuleStates) -> dict[str, float]:
         ``strain_mean`` and ``strain_max``: error of the strains under the load of a state over the largest strain of
         the states, to first order; ``stiffness_mean`` and ``stiffness_max``: largest relative error of the stiffness
         over all directions of motion; ``loaded``: the number of states under load, and ``covered``: the share of
-        the six errors of their strains that are within the bounds of `LearnedModule.error`.
+        the six errors of their strains that are within the bounds of `LearnedModule.error_bounds`.
     """
-    wrong, stiffness = np.linalg.norm(wrong_strains(model, states), axis=1), wrong_stiffness(model, states)
+    wrong, stiffness = np.linalg.norm(strain_errors(model, states), axis=1), stiffness_errors(model, states)
     sizes = np.linalg.norm(states.strain, axis=1)
     values = {"strain_mean": wrong.mean() / sizes.max(), "strain_max": wrong.max() / sizes.max()}
     values |= {"stiffness_mean": stiffness.mean(), "stiffness_max": stiffness.max()}
-    within = np.abs(wrong_strains(model, states)) <= model.error(model.unit(states.designs)) * sizes[:, None]
+    bounds = model.error_bounds(model.unit(states.designs)) * sizes[:, None]
+    within = np.abs(strain_errors(model, states)) <= bounds
     values |= {"loaded": (sizes > 0.0).sum(), "covered": within[sizes > 0.0].mean()}
     return {name: float(value) for name, value in values.items()}
 
@@ -373,21 +374,22 @@ def folds(states: ModuleStates) -> np.ndarray:
 
 
 def calibrated(model: LearnedModule, recipe: Recipe, states: ModuleStates) -> LearnedModule:
-    """Return a model with bounds on the errors of its strains, from models that did not learn a part of the bodies.
+    """Return a model with bounds on the errors of its strains, from models that each leave a part of the bodies out.
 
-    Each part of the bodies is left out once, and a model of the others predicts their states under load. The logarithm
-    of the errors, relative to the size of the strains, is a line over the share of dimensions at the bounds of the box
-    (`LearnedModule.error`). For each strain the line is raised until `CONFIDENCE` of its errors, and one more, are
-    below it (conformal prediction over folds). States of one body are not independent, so the share holds only about.
+    Each part of the bodies is left out once, and a model that learned the others predicts their states under load. The
+    logarithm of the error, relative to the size of the strains, is taken as a line over the share of dimensions at the
+    bounds of the box (`LearnedModule.error_bounds`). For each strain the line is raised until `CONFIDENCE` of the
+    errors are below it (conformal prediction over folds). States of one body are not independent, so the share of
+    errors within the bounds holds only about.
     """
     fold = folds(states)
     moved = (states.strain != 0.0).any(axis=1)
     wrong = np.empty((len(states), 6))
     for part in range(FOLDS):
         other = fit(recipe, model.module, states.rows(fold != part), model.others)
-        wrong[fold == part] = wrong_strains(other, states.rows(fold == part))
+        wrong[fold == part] = strain_errors(other, states.rows(fold == part))
     wrong = wrong[moved] / np.linalg.norm(states.strain[moved], axis=1)[:, None]
-    share = model.share(model.unit(states.designs))[moved]
+    share = model.edge_share(model.unit(states.designs))[moved]
     slope = max(float(np.polyfit(share, np.log(np.linalg.norm(wrong, axis=1)), 1)[0]), 0.0)
     above = np.sort(np.abs(wrong) * np.exp(-slope * share)[:, None], axis=0)
     level = above[min(int(np.ceil(CONFIDENCE * (len(above) + 1))), len(above)) - 1]

@@ -92,7 +92,7 @@ def solve_states(
         solver = Statics(module.model(design, refine=refine))
         # A closed module has no pressure, which would be its seventh effort.
         rest = solver.solve(np.zeros(6 + module.closed), "effort").condensed
-        kept.append((row, *_in_strains(rest, length)))
+        kept.append((row, *in_strains(rest, length)))
         moment = rotation / np.diag(rest.W.aa)[3:6].max()
         scale = np.array([2.0 * moment / length] * 3 + [moment] * 3)
         for _ in range(rays):
@@ -109,7 +109,7 @@ def solve_states(
                     break
                 if np.linalg.norm(found.condensed.delta.a[3:6]) > LARGEST_SINE:
                     break
-                kept.append((row, *_in_strains(found.condensed, length)))
+                kept.append((row, *in_strains(found.condensed, length)))
     return ModuleStates(*(np.array(column) for column in zip(*kept, strict=True)))
 
 
@@ -122,7 +122,7 @@ def pose_rows(pose: np.ndarray, length: float) -> np.ndarray:
     return np.vstack([frame_rows(np.zeros(3)), frame_rows(pose[:3] + [0.0, 0.0, length], rotation)])
 
 
-def _in_strains(state: CondensedModel, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+def in_strains(state: CondensedModel, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
     """Turn a state over a far port's pose into one over strains: the fields of `ModuleStates`."""
     effort, W = state.lambda_.a[:6], state.W.aa
     pose = state.delta.a[:6] if effort.any() else np.zeros(6)  # at rest without round-off
