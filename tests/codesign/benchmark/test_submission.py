@@ -8,6 +8,7 @@ import yaml
 
 from softgym_envs.agents.policy import policy_path
 from softgym_envs.codesign.benchmark import Search, board, frozen, problem, submit, verify
+from softgym_envs.codesign.benchmark import submission as submission_module
 from softgym_envs.codesign.benchmark.frozen import file_hash
 from softgym_envs.codesign.benchmark.problem import goal_key
 from softgym_envs.codesign.benchmark.scoring import reference
@@ -52,6 +53,12 @@ def test_a_true_submission_is_accepted_and_recorded(submission, tiny, tmp_path, 
     for forged in (verdict.scores[0][0] * 0.9, float("inf"), float("nan")):
         submission.claimed = [[forged]]
         refused(submission, tmp_path, r"the score on the test goals is .*, but running the body again gives", data)
+
+
+def test_differences_below_the_tolerance_of_the_inverse_qp_are_rounding():
+    baseline = [-1.8e-3]
+    assert submission_module._agree([-5.511e-7], [-5.523e-7], 1e-3, baseline)  # two processors, measured
+    assert not submission_module._agree([-5.5e-7], [-6.0e-7], 1e-3, baseline)
 
 
 def test_steps_behind_the_shared_policy_are_counted(submission, tiny):
