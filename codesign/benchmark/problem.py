@@ -239,9 +239,7 @@ class Evaluator:
                     config = self._training(design, options, share, seed)
                     start = initial or problem.policy
                     agent = train(config, Path(keep or folder) / "policy", initial=start, progress=False)
-                    reports = -(-config.steps // config.report_every)
-                    result.environment_steps += config.steps
-                    result.environment_steps += reports * config.evaluation_episodes * problem.episode_steps
+                    result.environment_steps += self.training_steps(share)
                 found = assess(agent, problem, tested, goals, design)
             result.values = {name: float(value) for name, value in found.values.items()}
             result.environment_steps += found.evaluation.steps
@@ -255,13 +253,23 @@ class Evaluator:
         result.cpu_seconds = working_seconds() - began
         return result
 
+    def training_steps(self, share: float = 1.0) -> int:
+        """Return the environment steps of a training for one body, its learning curve included."""
+        training = self.problem.training
+        steps = self._steps(share)
+        reports = -(-steps // min(steps, training.report_every))
+        return steps + reports * training.evaluation_episodes * self.problem.episode_steps
+
+    def _steps(self, share: float) -> int:
+        return max(self.problem.training.num_envs, round(share * self.problem.training.steps))
+
     def _training(
         self, design: Mapping[str, float], options: Mapping[str, float], share: float, seed: int
     ) -> TrainConfig:
         problem, training = self.problem, self.problem.training
         environment = problem.environment_of(options)
         goals = {"goals": self.training_goals.tolist()} if len(self.training_goals) else {}
-        steps = max(training.num_envs, round(share * training.steps))
+        steps = self._steps(share)
         return TrainConfig(
             environment=environment.model_copy(
                 update={

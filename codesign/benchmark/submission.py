@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
@@ -14,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from softgym_envs.agents.policy import Policy, policy_path
 from softgym_envs.codesign.benchmark.frozen import FrozenProblem, file_hash, load_problem
-from softgym_envs.codesign.benchmark.problem import JUDGES, LEVELS, Budget, Score, goal_key
+from softgym_envs.codesign.benchmark.problem import JUDGES, LEVELS, Budget, Evaluator, Score, goal_key
 from softgym_envs.codesign.benchmark.scoring import DATA, Reference, front, make_reference, normalised, write_reference
 from softgym_envs.codesign.benchmark.search import Search
 from softgym_envs.codesign.records import Record
@@ -28,7 +29,7 @@ from softgym_envs.errors import (
     WeightsError,
     unknown_name,
 )
-from softgym_envs.storage import read_json
+from softgym_envs.storage import atomic_write, read_json
 
 TOLERANCE = {"qp": 1e-3, "shared": 1e-3, "trained": 5e-2, "policy": 1e-3}
 """Controller -> largest difference between a claimed score and the verified one, relative to the larger of both.
@@ -36,9 +37,19 @@ TOLERANCE = {"qp": 1e-3, "shared": 1e-3, "trained": 5e-2, "policy": 1e-3}
 On one machine both agree to the last digit. Other processors round differently, and a training amplifies that.
 """
 
+FLOOR = 1e-5
+"""Difference that is always allowed, relative to the baseline's score on the test goals.
+
+Below the tolerance of the inverse QP, at distances of less than a micrometre, processors differ by more than 0.1 %.
+"""
+
 
 class SubmissionRefused(DataError):
     """A submission whose score does not stand."""
+
+
+POLICY, CARD = "policy.safetensors", "policy.json"
+"""Files of a policy that is submitted, in its folder beside the submission."""
 
 
 @dataclass(eq=False)
@@ -55,8 +66,8 @@ class Submission(Record):
         seed: of the search.
         designs: the winner; with several objectives, at most eight bodies of the front.
         controller: who controls it in the test: a judge, or ``"policy"``.
-        policy: for ``"policy"``: ``file`` beside the submission, its ``sha256`` (first half), and ``goals``, the hashes
-            of the goals that it was trained on.
+        policy: for ``"policy"``: ``file``, relative to the folder of the submission, its ``sha256`` (first half), and
+            ``goals``, the hashes of the goals that it was trained on.
         claimed: scores of each body on the test goals, on finite elements; empty if they were not computed.
         ledger: all scores of the search.
         optimiser_seconds: CPU time of the optimiser itself [s].
@@ -81,6 +92,28 @@ class Submission(Record):
     pretraining_steps: int = 0
     provenance: dict[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self._files: dict[str, bytes] = {}  # policy and card, which `write` puts beside the submission
+
+    def attach(self, policy: str | Path) -> Path:
+        """Let a policy control the winner in the test, and return its file; `write` copies it with its card."""
+        found = Policy(policy)
+        self.controller = "policy"
+        self.policy = {"file": POLICY, "sha256": file_hash(found.path), "goals": sorted(_trained_on(found))}
+        self._files = {POLICY: found.path.read_bytes(), CARD: found.path.with_suffix(".json").read_bytes()}
+        return found.path
+
+    def write(self, path: str | Path) -> None:
+        """Write the file, and for ``NAME.json`` an attached policy into the folder ``NAME_policy`` beside it."""
+        path = Path(path)
+        for name, content in self._files.items():
+            folder = path.with_name(f"{path.stem}_policy")
+            folder.mkdir(parents=True, exist_ok=True)
+            with atomic_write(folder / name) as stream:
+                stream.write(content)
+            self.policy = {**(self.policy or {}), "file": f"{folder.name}/{POLICY}"}
+        super().write(path)
+
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
         """Return the submission that `to_json` wrote.
@@ -92,6 +125,12 @@ class Submission(Record):
         for number, row in enumerate(found.ledger):
             _typed(Score, row, f"ledger.{number}")
         return found
+
+
+def _trained_on(policy: Policy) -> set[str]:
+    """Return the hashes of the goals that the card of a policy names."""
+    goals = policy.environment.task_options.get("goals") or []
+    return {goal_key(np.asarray(goal, dtype=float)) for goal in goals}
 
 
 RecordT = TypeVar("RecordT", bound=Record)
@@ -135,19 +174,30 @@ class Verdict:
 
 
 def submit(
-    search: Search, method: str, *, author: str = "", optimiser_seconds: float = 0.0, test: bool = False
+    search: Search,
+    method: str,
+    *,
+    author: str = "",
+    optimiser_seconds: float = 0.0,
+    policy: str | Path | None = None,
+    test: bool = False,
 ) -> Submission:
     """Return the submission of a finished search.
+
+    Where the problem trains a policy for each body, the test trains that of the winner again and attaches it: the check
+    then runs this policy in place of another training.
 
     Args:
         search: the search; its best body is submitted, with several objectives the bodies of its front.
         method: name of the optimiser.
         author: who submits.
         optimiser_seconds: CPU time of the optimiser itself [s].
+        policy: file of a policy of your own that controls the winner in the test, with its card beside it.
         test: whether to test the bodies on finite elements now, and claim these scores.
 
     Raises:
         DataError: if the search found no feasible body.
+        WeightsError: if the policy cannot be read.
     """
     problem, best = search.problem, search.best
     if best is None:
@@ -168,8 +218,13 @@ def submit(
         pretraining_steps=_pretraining(problem, str(search.judge)),
         provenance=provenance(),
     )
-    if test:
-        submission.claimed = _tested(problem, submission, None)
+    file = None if policy is None else submission.attach(policy)
+    if not test:
+        return submission
+    with tempfile.TemporaryDirectory() as folder:
+        submission.claimed = _tested(problem, submission, file, Path(folder))
+        if submission.controller == "trained" and len(winners) == 1:
+            submission.attach(Path(folder) / "0" / "policy" / POLICY)
     return submission
 
 
@@ -200,12 +255,12 @@ def verify(path: str | Path, *, data: Path | None = None, record: bool = False) 
     problem = _checked_problem(submission)
     rows = _checked_ledger(problem, submission)
     policy = _checked_policy(problem, submission, path.parent)
-    _check_search_score(problem, submission, rows)
-    scores = _tested(problem, submission, policy)
-    for claimed, found in zip(submission.claimed, scores, strict=False):
-        _compare(submission.controller, "score on the test goals", claimed, found)
     data = data or DATA
     known = make_reference(problem, data)
+    _check_search_score(problem, submission, rows, policy, known)
+    scores = _tested(problem, submission, policy)
+    for claimed, found in zip(submission.claimed, scores, strict=False):
+        _compare(submission.controller, "score on the test goals", claimed, found, known)
     exploitation = None
     if problem.definition.score_count == 1 and problem.definition.environment.backend == "surrogate":
         evaluator = problem.evaluator("search", "fem")
@@ -337,9 +392,7 @@ def _checked_policy(problem: FrozenProblem, submission: Submission, folder: Path
         policy = Policy(path)
     except WeightsError as error:
         raise SubmissionRefused(str(error)) from None
-    named = set(map(str, given["goals"]))
-    trained = policy.environment.task_options.get("goals") or []
-    named |= {goal_key(np.asarray(goal, dtype=float)) for goal in trained}
+    named = set(map(str, given["goals"])) | _trained_on(policy)
     if not problem.single_path and (leaked := sorted(named & problem.test_keys)):
         raise SubmissionRefused(
             f"the policy '{path.name}' was trained on {len(leaked)} of the {len(problem.test_keys)} test goals of "
@@ -348,12 +401,16 @@ def _checked_policy(problem: FrozenProblem, submission: Submission, folder: Path
     return path
 
 
-def _check_search_score(problem: FrozenProblem, submission: Submission, rows: list[Score]) -> None:
+def _check_search_score(
+    problem: FrozenProblem, submission: Submission, rows: list[Score], policy: Path | None, known: Reference
+) -> None:
     """Score each submitted body again on the search goals, as the search did."""
+    evaluator, judge = problem.evaluator("search"), submission.judge
     for design in submission.designs:
         row = next(row for row in rows if _same(problem, row.design, design) and row.share == 1.0)
-        found = problem.evaluate(design, judge=submission.judge, seed=submission.seed)  # type: ignore[arg-type]
-        _compare(submission.judge, "score in the ledger", row.scores, found.scores)
+        found = _trained_score(evaluator, row, policy, known) if policy is not None and judge == "trained" else None
+        found = found or evaluator(design, judge, seed=submission.seed)  # type: ignore[arg-type]
+        _compare(judge, "score in the ledger", row.scores, found.scores, known)
         if row.environment_steps < found.environment_steps:
             raise SubmissionRefused(
                 f"the ledger counts {row.environment_steps} environment steps for the submitted body, but scoring it "
@@ -361,10 +418,31 @@ def _check_search_score(problem: FrozenProblem, submission: Submission, rows: li
             )
 
 
-def _compare(controller: str, what: str, claimed: list[float], found: list[float]) -> None:
+def _trained_score(evaluator: Evaluator, row: Score, policy: Path, known: Reference) -> Score | None:
+    """Return the score of a body under a submitted policy and the cost of training it; None if the search had another.
+
+    A policy that is trained again differs as soon as a processor rounds differently.
+    """
+    try:
+        found = evaluator(row.design, "trained", policy=policy)
+    except ConfigError:  # a policy of another environment, which the test refuses
+        return None
+    found.environment_steps += evaluator.training_steps()
+    return found if _agree(row.scores, found.scores, TOLERANCE["policy"], known.baseline) else None
+
+
+def _agree(claimed: list[float], found: list[float], tolerance: float, baseline: list[float]) -> bool:
+    """Return whether scores are equal, up to a tolerance relative to the larger of both and up to `FLOOR`."""
+    return len(claimed) == len(found) and all(
+        isfinite(a) and abs(a - b) <= max(tolerance * max(abs(a), abs(b)), FLOOR * abs(scale))
+        for a, b, scale in zip(claimed, found, baseline, strict=False)
+    )
+
+
+def _compare(controller: str, what: str, claimed: list[float], found: list[float], known: Reference) -> None:
     tolerance = TOLERANCE[controller]
-    for a, b in zip(claimed, found, strict=False):
-        if not abs(a - b) <= tolerance * max(abs(a), abs(b)):
+    for a, b, scale in zip(claimed, found, known.baseline, strict=False):
+        if not _agree([a], [b], tolerance, [scale]):
             raise SubmissionRefused(
                 f"the {what} is {a:.6g}, but running the body again gives {b:.6g} (tolerance {100 * tolerance:g} %)"
             )
@@ -372,13 +450,16 @@ def _compare(controller: str, what: str, claimed: list[float], found: list[float
         raise SubmissionRefused(f"the {what} has {len(claimed)} values, but running the body again gives {len(found)}")
 
 
-def _tested(problem: FrozenProblem, submission: Submission, policy: Path | None) -> list[list[float]]:
-    """Return the scores of the bodies on the test goals, on finite elements."""
+def _tested(
+    problem: FrozenProblem, submission: Submission, policy: Path | None, keep: Path | None = None
+) -> list[list[float]]:
+    """Return the scores of the bodies on the test goals, on finite elements; trained policies can be kept."""
     evaluator, found = problem.evaluator("test", "fem"), []
     judge: Any = problem.definition.judge if policy is not None else submission.controller
-    for design in submission.designs:
+    for number, design in enumerate(submission.designs):
+        folder = None if keep is None else keep / str(number)
         try:
-            score = evaluator(design, judge, seed=submission.seed, policy=policy)
+            score = evaluator(design, judge, seed=submission.seed, policy=policy, keep=folder)
         except (InfeasibleDesign, ConvergenceError, ConfigError) as error:  # or a policy of another environment
             raise SubmissionRefused(f"the body cannot be tested: {error}") from None
         if not score.feasible:

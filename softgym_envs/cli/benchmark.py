@@ -62,7 +62,7 @@ def show(name: str) -> None:
     known = reference(problem)
     if known is not None:
         baseline, best = _scores([known.baseline]), _scores(known.best)
-        click.echo(f"on finite elements, test goals: baseline {baseline}, best known {best}")
+        click.echo(f"on finite elements, test goals, SI: baseline {baseline}, best known {best}")
 
 
 @benchmark.command()

@@ -4,15 +4,18 @@ import shutil
 
 import numpy as np
 import pytest
+import yaml
 
 from softgym_envs.agents.policy import policy_path
-from softgym_envs.codesign.benchmark import Search, board, submit, verify
+from softgym_envs.codesign.benchmark import Search, board, frozen, problem, submit, verify
+from softgym_envs.codesign.benchmark import submission as submission_module
 from softgym_envs.codesign.benchmark.frozen import file_hash
 from softgym_envs.codesign.benchmark.problem import goal_key
 from softgym_envs.codesign.benchmark.scoring import reference
 from softgym_envs.codesign.benchmark.submission import SubmissionRefused
-from softgym_envs.errors import DataError
+from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.storage import read_json, write_json
+from tests.codesign.benchmark.conftest import tiny_definition
 
 
 @pytest.fixture
@@ -47,8 +50,15 @@ def test_a_true_submission_is_accepted_and_recorded(submission, tiny, tmp_path, 
     assert "| by hand | a test | small |" in board.leaderboard(tmp_path / "none", data, [path])
     again = verify(path, data=data)
     assert again.scores == verdict.scores and not again.record
-    submission.claimed = [[verdict.scores[0][0] * 0.9]]
-    refused(submission, tmp_path, r"the score on the test goals is .*, but running the body again gives", data)
+    for forged in (verdict.scores[0][0] * 0.9, float("inf"), float("nan")):
+        submission.claimed = [[forged]]
+        refused(submission, tmp_path, r"the score on the test goals is .*, but running the body again gives", data)
+
+
+def test_differences_below_the_tolerance_of_the_inverse_qp_are_rounding():
+    baseline = [-1.8e-3]
+    assert submission_module._agree([-5.511e-7], [-5.523e-7], 1e-3, baseline)  # two processors, measured
+    assert not submission_module._agree([-5.5e-7], [-6.0e-7], 1e-3, baseline)
 
 
 def test_steps_behind_the_shared_policy_are_counted(submission, tiny):
@@ -180,6 +190,45 @@ def test_policies(submission, tiny, tmp_path, data):
     submission.policy = {"file": "mine.safetensors", "sha256": file_hash(source), "goals": []}
     submission.write(tmp_path / "submission.json")
     assert len(verify(tmp_path / "submission.json", data=data).scores) == 1
+
+
+@pytest.fixture
+def trained(problems):
+    """The problem ``tiny-v1`` whose bodies act through policies that are trained for them."""
+    (problems / "tiny-v1.yaml").write_text(yaml.safe_dump(tiny_definition(judge="trained")))
+    frozen.freeze("tiny-v1")
+    return frozen.load_problem("tiny-v1")
+
+
+def test_a_policy_that_was_trained_for_the_winner_need_not_be_trained_again(trained, tmp_path, data, monkeypatch):
+    search = Search(trained)
+    search.evaluate(trained.definition.baseline_values)
+    submission = submit(search, "by hand", test=True)
+    path = tmp_path / "mine.json"
+    submission.write(path)
+    assert (tmp_path / "mine_policy" / "policy.json").is_file()
+    assert submission.policy["file"] == "mine_policy/policy.safetensors"
+    assert submission.policy["goals"] == sorted(goal_key(goal) for goal in trained.goals["training"])
+    with monkeypatch.context() as patch:
+        patch.setattr(problem, "train", lambda *_, **__: pytest.fail("the check trains a policy"))
+        assert verify(path, data=data).scores == submission.claimed
+    steps = submission.ledger[0]["environment_steps"]
+    submission.ledger[0]["environment_steps"] = steps - 1
+    refused(submission, tmp_path, rf"counts {steps - 1} environment steps .* but scoring it takes {steps}", data)
+    submission.ledger[0].update(environment_steps=steps, scores=[0.9 * submission.ledger[0]["scores"][0]])
+    refused(submission, tmp_path, r"the score in the ledger is .*, but running the body again gives", data)
+
+
+def test_a_policy_of_ones_own_is_attached_with_its_card(tiny, tmp_path):
+    search = Search(tiny, judge="qp")
+    search.evaluate(tiny.definition.baseline_values)
+    submission = submit(search, "by hand", policy="finger_reach_designs")
+    submission.write(tmp_path / "mine.json")
+    assert submission.controller == "policy"
+    copy = tmp_path / "mine_policy" / "policy.safetensors"
+    assert file_hash(copy) == submission.policy["sha256"] == file_hash(policy_path("finger_reach_designs"))
+    with pytest.raises(WeightsError, match=r"policy 'none.safetensors' does not exist"):
+        submit(search, "by hand", policy="none.safetensors")
 
 
 def test_files_that_cannot_be_read(submission, tmp_path, data):
