@@ -19,9 +19,6 @@ SEED = 12
 BODIES, ATTACKS = 16, 2000
 """Most bodies of a stratum, and states of the search. Rows recorded earlier have up to 32 bodies."""
 
-FEWER_ATTACKS = {"two_finger_gripper": 100, "three_finger_gripper": 500}
-"""States of the search for weights of which hardly any state is trusted, or whose states take longer."""
-
 
 def trust(variant: str, folder: str | Path = "results/trust") -> dict[str, object]:
     """Errors, coverage and trust of weights by stratum, on FEM states that their calibration has not seen.
@@ -42,7 +39,7 @@ def trust(variant: str, folder: str | Path = "results/trust") -> dict[str, objec
     if expensive := "mesh" in robot.mechanics_key:
         rows = cross_validated(model, calibration_states(model, kept))
     else:
-        attacked = attack(model, FEWER_ATTACKS.get(variant, ATTACKS), sizes["states"], SEED, kept)
+        attacked = attack(model, ATTACKS, sizes["states"], SEED, kept)
         states = judged_states(model, min(sizes["bodies"], BODIES), sizes["states"], SEED, kept)
         rows = report(model, states) | {"adversarial": report(model, attacked)["adversarial"]}
     result: dict[str, object] = {
