@@ -211,9 +211,7 @@ def measure(
 
 def accuracy() -> dict[str, object]:
     """Errors, coverage and speed of the estimator on finite elements, with two and four open cavities."""
-    return {
-        f"{cavities} cavities": measure(cavities, MANY_TOUCHES, 10, 5e-3, 0.01, SEED, {}) for cavities in (2, 4)
-    }
+    return {f"{cavities} cavities": measure(cavities, MANY_TOUCHES, 10, 5e-3, 0.01, SEED, {}) for cavities in (2, 4)}
 
 
 def sealed_finger() -> dict[str, object]:

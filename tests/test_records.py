@@ -22,8 +22,7 @@ COMMIT = "[0-9a-f]{7,40}"
 
 ROOT = Path(__file__).parent.parent
 
-REWRITTEN = {
-}
+REWRITTEN = {}
 """Results whose commit was rewritten before it landed, and which take too long to measure again."""
 
 

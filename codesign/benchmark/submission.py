@@ -286,14 +286,14 @@ def verify(path: str | Path, *, data: Path | None = None, record: bool = False) 
 
 
 def is_better(known: Reference, scores: list[list[float]]) -> bool:
-    """Return whether bodies beat the best known ones, and the baseline."""
+    """Return whether bodies beat the best known ones, by more than rounding, and the baseline."""
     level = Reference(known.problem, known.hash, known.baseline, scores)
     if normalised(level, scores) is None:  # not better than the baseline
         return False
     if not known.best:
         return True
     value = normalised(known, scores)
-    return value is None or value > 1.0
+    return value is None or value > 1.0 + FLOOR
 
 
 def _checked_problem(submission: Submission) -> FrozenProblem:
