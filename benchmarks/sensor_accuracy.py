@@ -98,6 +98,7 @@ def compare(trials: Path, limit: int, mesh_size: float | None = None) -> dict[st
 @click.command()
 @click.argument("trials", type=click.Path(path_type=Path))
 @click.option("--limit", default=100, show_default=True, help="number of trials, spread evenly over the file")
+@click.option("--mesh-size", type=float, help="size of the accurate mesh [mm]; default: its own")
 @click.option(
     "--output", type=click.Path(path_type=Path), default=Path("results/sensor_trials.json"), show_default=True
 )
