@@ -94,14 +94,16 @@ RECIPES = {
         rays=2,
         degrees=(2, 1),
     ),
-    # Stiffer rotations carry several times the load that turns the softest one.
+    # Stiffer rotations carry several times the load that turns the softest one. With corrections of first degree in
+    # the dimensions, or without the corners, bodies near corners are up to 4 % too soft at rest.
     "accordion": Recipe(
         {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)},
         0.9,
         bodies=16,
         rays=2,
-        degrees=(3, 1),
+        degrees=(3, 2),
         order=5,
+        corners=True,
     ),
     "crossed_leaves": Recipe(
         {"leaf_length": (0.012, 0.020), "width": (0.012, 0.018), "thickness": (0.001, 0.0018)},
