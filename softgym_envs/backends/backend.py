@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import Design
-from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.mechanics.solvers.dynamics import Motion
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.domain import FOLDED
 
 
 class _Evaluated:
@@ -188,17 +186,6 @@ class Backend(ABC):
             return self.step(command, mode)
         finally:
             self.restore(kept)
-
-    def reach(self, command: np.ndarray) -> np.ndarray:
-        """Return the first effector [m] (3,) that a command leads to, for goals.
-
-        It is NaN without an equilibrium, and in one with folded beams: motion need not lead there.
-        """
-        try:
-            state = self.probe(command)
-        except ConvergenceError:
-            return np.full(3, np.nan)
-        return np.full(3, np.nan) if state.doubt & FOLDED else state.effector[0]
 
     def touch(self, load: PointForce | None) -> None:
         """Touch the body at a point from the next `step` on, or no longer; `reset` ends a touch.

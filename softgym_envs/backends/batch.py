@@ -102,7 +102,7 @@ class BatchBackend(ABC):
 
     @abstractmethod
     def effectors(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Return the first effectors [m] (len(index), 3) that commands lead to; NaN as in `Backend.reach`."""
+        """Return the first effectors [m] (len(index), 3) of equilibria under commands; NaN where there is none."""
 
     @property
     def velocity(self) -> np.ndarray | None:

@@ -167,7 +167,10 @@ class FEMBatch(BatchBackend):
         for k, i in enumerate(index.tolist()):
             owner = self._owners[self._designs[i]]
             owner.reset()
-            found[k] = owner.reach(commands[k])
+            try:
+                found[k] = owner.probe(commands[k]).effector[0]
+            except ConvergenceError:
+                pass
         return found
 
     @property

@@ -363,8 +363,11 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         return np.concatenate([readings, self.task.feel(), earlier])
 
     def _kinematics(self, commands: np.ndarray) -> np.ndarray:
-        """Return the effectors [m] (1, 3) that commands (1, n_a) lead to; NaN for commands that give no goal."""
-        return self.backend.reach(commands[0])[None]
+        """Return the effectors [m] (1, 3) that commands (1, n_a) lead to; NaN without an equilibrium."""
+        try:
+            return self.backend.probe(commands[0]).effector[:1]
+        except ConvergenceError:
+            return np.full((1, 3), np.nan)
 
     def render(self) -> np.ndarray | None:
         """Return an image (height, width, 3) of the body, its cables, effector and goal.
