@@ -89,7 +89,7 @@ def test_possible_errors_bound_how_far_wrong_strains_put_the_tip():
     """The tip moves by at most the bound, and for the worst of many errors of the bound's size nearly by it."""
     rng = np.random.default_rng(2)
     k, c = np.array([2.0, 3.0, 4.0, 0.5, 0.3, 0.2]), 0.2 * rng.normal(size=len(terms()))
-    known, learned = ModuleEnergy(LENGTH, k, c), ModuleEnergy(LENGTH, k, c, error=1e-4)
+    known, learned = ModuleEnergy(LENGTH, k, c), ModuleEnergy(LENGTH, k, c, error_bounds=1e-4)
     force = np.array([1.0, -2.0, 0.5])
 
     def solve(energy, held):
