@@ -1,8 +1,8 @@
 """Fingers grown from examples: a latent space of side views against seven parameters, at an equal number of bodies.
 
 ``python -m benchmarks.grown_shapes FOLDER [BODIES]`` trains the variational autoencoder, searches with both for three
-seeds, and writes ``benchmarks/data/grown_shapes.json``; what is in FOLDER is not computed again. With ``quality
-FOLDER`` only what the autoencoder is worth is measured, and replaced in that file.
+seeds of 300 bodies each, and writes ``benchmarks/data/grown_shapes.json``; what is in FOLDER is not computed again.
+With ``quality FOLDER`` only what the autoencoder is worth is measured, and replaced in that file.
 
 A finger is a side view, extruded to the width of the Soft Finger. The side view is where a function of the place along
 the finger (s) and across it (y) is negative: near its surface the signed distance. Examples have one to four notches,

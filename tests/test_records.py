@@ -35,7 +35,7 @@ REWRITTEN = {
 }
 """What comes from a commit that was rewritten before it landed, or had uncommitted changes.
 
-It takes long to make again, or an idle machine. Nothing may be added here.
+Making it again takes long or needs an idle machine. Nothing may be added here.
 """
 
 

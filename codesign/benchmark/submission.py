@@ -293,7 +293,7 @@ def is_better(known: Reference, scores: list[list[float]]) -> bool:
     if not known.best:
         return True
     value = normalised(known, scores)
-    return value is None or value > 1.0 + FLOOR
+    return value is None or value > 1.0 + FLOOR  # 1 is the gain of the best known ones over the baseline
 
 
 def _checked_problem(submission: Submission) -> FrozenProblem:

@@ -94,8 +94,8 @@ RECIPES = {
         rays=2,
         degrees=(2, 1),
     ),
-    # Stiffer rotations carry several times the load that turns the softest one. With corrections of first degree in
-    # the dimensions, or without the corners, bodies near corners are up to 4 % too soft at rest.
+    # Stiffer rotations carry several times the load that turns the softest one. Without the corners, or with
+    # corrections of first degree in the dimensions, bodies near corners are up to 4 % too soft at rest.
     "accordion": Recipe(
         {"pitch": (0.006, 0.010), "width": (0.008, 0.014), "amplitude": (0.003, 0.006)},
         0.9,
