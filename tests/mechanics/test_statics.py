@@ -444,3 +444,18 @@ def test_short_increments_pass_over_indefinite_tangents(notched, solver):
     # Its driven tip does not let the compressed beam buckle, so there is no way around indefinite tangents.
     found = Statics(model).solve([], contact=tip - [0.004, 0.0, 0.0], contact_mode="displacement")
     assert not found.stable and found.increments > 1
+
+
+def test_a_command_that_changes_nothing_costs_no_iteration(fingers):
+    _, model = fingers(2, "corotational")
+    statics = Statics(model)
+    before = statics.solve([0.006, 0.005])
+    again = statics.solve([0.006, 0.005])
+    assert again.iterations == 0
+    np.testing.assert_array_equal(again.x, before.x)
+    np.testing.assert_array_equal(again.condensed.compliance, before.condensed.compliance)
+    forced = statics.solve(again.effort[:2], "effort")  # the same equilibrium, commanded in another way
+    assert forced.iterations == 0
+    assert statics.solve(1.0001 * again.effort[:2], "effort").iterations > 0
+    model.set_gravity((0.0, 0.0, -9.81))
+    assert statics.solve([0.006, 0.005]).iterations > 0  # loads have changed

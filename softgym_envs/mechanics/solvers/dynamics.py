@@ -424,8 +424,9 @@ class Dynamics(Statics):
                 raise ConvergenceError("the starting state has no unique acceleration", fraction=0.0) from None
         return step / h**2
 
-    def _accept(self) -> ContactMemory:
+    def _accept(self) -> None:
         contact = self.linearisation.contact
-        assert contact is not None
-        self._dissipated += contact.commit(self.x)
-        return contact.memory
+        if contact is None:
+            super()._accept()
+        else:
+            self._dissipated += contact.commit(self.x)

@@ -64,6 +64,11 @@ class Linearisation:
         return self._slips > 0
 
     @property
+    def rubs(self) -> bool:
+        """Whether points or cables can slide with friction, which starts anew from each equilibrium."""
+        return self.cable_friction is not None or (self.contact is not None and self.contact.rubs)
+
+    @property
     def memory(self) -> ContactMemory | CableMemory | None:
         """What friction remembers; None without contact and friction of cables."""
         rubbing = self.contact or self.cable_friction

@@ -398,6 +398,18 @@ class Statics:
             length *= 0.5
         return None
 
+    def _rests(self, goal: np.ndarray, driven: np.ndarray) -> bool:
+        """Whether the last equilibrium is the commanded one, and nothing else has changed; see `_correction`."""
+        linear = self.linearisation
+        if linear.rubs or not (linear.current and linear.exact):
+            return False
+        try:
+            step_q, step_effort = self._correction(None, linear.delta, self.effort, goal, driven)
+        except NewtonFailure:
+            return False
+        self._displacement(self.x, step_q)  # raises ValueError for a part that nothing holds
+        return self._norm(step_q) <= self.tolerance and not np.delete(step_effort, driven).any()
+
     def _values(self, x: np.ndarray) -> np.ndarray:
         """Values of all constraints (size,) at rows ``x`` (n, 3)."""
         return np.concatenate([np.zeros(0), *(c.value(x) for c, _ in self.model.rows)])
@@ -458,7 +470,10 @@ class Statics:
         if self._elasticity_version != self.model.elasticity_version:
             self._elasticity_version = self.model.elasticity_version
             linear.current = False
-        linear.loads = self._current_loads
+        loads, start_loads = self.model.loads, self._current_loads
+        linear.loads, ramped = start_loads, bool((loads != start_loads).any())
+        if not ramped and self._rests(goal, driven):
+            return self._state(goal, driven, 0, 0)
         if not linear.current and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
@@ -466,8 +481,6 @@ class Statics:
         start = self.effort.copy()
         start[driven] = linear.delta[driven]
         done, size, iterations, increments = 0.0, 1.0, 0, 0
-        loads, start_loads = self.model.loads, self._current_loads
-        ramped = bool((loads != start_loads).any())
         while done < 1.0:
             level = min(1.0, done + size)
             kept = self.x, self.effort
@@ -494,11 +507,9 @@ class Statics:
             done, self._current_loads = level, linear.loads
             size *= 1.5
             found = self._state(target, driven, iterations, increments)
-            if linear.cable_friction is not None:
-                linear.cable_friction.commit(self.x)
+            if linear.rubs:
+                self._accept()
                 found = replace(found, memory=self.memory)
-            if linear.contact is not None and linear.contact.rubs:
-                found = replace(found, memory=self._accept())
         return found
 
     def contact_model(self, *, each_point: bool = False, friction: bool = False) -> ContactModel:
@@ -539,13 +550,12 @@ class Statics:
         largest = np.abs(motions).max(axis=0, initial=0.0)
         return motions[:, largest > 0.0] / largest[largest > 0.0]
 
-    def _accept(self) -> ContactMemory:
+    def _accept(self) -> None:
         """Let friction remember the current state, at which the next increment starts."""
-        contact = self.linearisation.contact
-        assert contact is not None
-        # Forces stay as they are, so the linearisation stays current; sliding points are expected to slide on.
-        contact.commit(self.x)
-        return contact.memory
+        # Forces of contact stay as they are, so the linearisation stays current; sliding points are to slide on.
+        for rubbing in (self.linearisation.contact, self.linearisation.cable_friction):
+            if rubbing is not None:
+                rubbing.commit(self.x)
 
     def _state(self, target: np.ndarray, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
         linear, effort = self.linearisation, self.effort.copy()

@@ -230,6 +230,19 @@ def test_equal_increments_predict_each_other():
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
 
 
+@pytest.mark.parametrize("coefficient", [0.0, 0.4])
+def test_a_load_that_does_not_change_costs_nothing_without_friction(coefficient):
+    plane = Plane((0.0, 0.0, -4e-4), (0.0, 0.0, 1.0), friction=coefficient)
+    statics = Statics(clamped_block([plane]), tolerance=1e-9)
+    load = np.array([0.5, 0.0, -2.0])
+    first = statics.solve([], effector_force=load)
+    again = statics.solve([], effector_force=load)
+    assert (again.iterations == 0) == (coefficient == 0.0)
+    if coefficient == 0.0:
+        np.testing.assert_array_equal(again.x, first.x)
+        np.testing.assert_array_equal(again.condensed.compliance, first.condensed.compliance)
+
+
 def test_bend_grows_with_the_square_of_the_increment():
     bend = Bend(np.array([1.0, 2.0]), np.array([0.1, 0.0, 0.3]))
     np.testing.assert_allclose(bend.expected(np.array([0.5, 1.0])), [0.025, 0.0, 0.075])
