@@ -9,13 +9,17 @@ bound. The published mesh is compared with the same converged value.
 from __future__ import annotations
 
 import math
+import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import gymnasium
 import numpy as np
 
+import softgym_envs  # noqa: F401  (registers the environments)
+from benchmarks.recorded import results
 from softgym_envs.designs import DesignSpace
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.model import MechanicalModel
@@ -212,7 +216,48 @@ def errors(rows: Sequence[Level], levels: Sequence[str], given: Sequence[float] 
     return found
 
 
-# -- the finger's shape: fillets, and remeshing along a line of designs ---------------------------------------------
+# -- the finger: what elements cost, fillets, and remeshing along a line of designs -----------------------------------
+
+
+STEPS, SIZES = 20, {"16.7 mm": 10 * MM / 0.6, "13 mm": 13 * MM, "10 mm (`accurate`)": 10 * MM}
+"""Control steps, and sizes of the elements, in the comparison of costs."""
+
+
+def finger_costs() -> dict[str, object]:
+    """Control steps per CPU second of the accurate finger against the size of its elements, beside their errors.
+
+    Steps are those of FingerReach under random actions, with self-contact. Errors are those of the baseline and the
+    random bodies of the finger's study against its recorded converged values.
+    """
+    study, known = STUDIES["finger"], results("convergence_finger")
+    rows = []
+    for name, size in SIZES.items():
+        options = {"mesh": "accurate", "mesh_size": size}
+        env = gymnasium.make("SoftGym/FingerReach-v0", backend="fem", robot_options=options)
+        env.action_space.seed(0)
+        env.reset(seed=0)
+        seconds = []
+        for _ in range(STEPS):
+            start = time.process_time()
+            env.step(env.action_space.sample())
+            seconds.append(time.process_time() - start)
+        robot, tips, efforts = make_robot("finger", **options, **study.options), [], []
+        for body, converged in known["errors"].items():
+            level = measure(robot, known["designs"][body], body, name, study)
+            tip = np.array(converged["tip [mm]"])
+            tips.append(float(np.linalg.norm(level.tip - tip) / np.linalg.norm(tip)))
+            efforts.append(level.effort / converged["effort"] - 1.0)
+        rows.append(
+            {
+                "elements": name,
+                "unknowns": level.unknowns,
+                "steps per CPU second": 1.0 / statistics.median(seconds),
+                "tip": tips,
+                "effort": efforts,
+            }
+        )
+        print(f"  {rows[-1]}", flush=True)
+    return {"bodies": list(known["errors"]), "rows": rows}
 
 
 def fillets() -> dict[str, object]:
@@ -293,6 +338,7 @@ def of(name: str) -> Callable[[], dict[str, object]]:
 
 BENCHMARKS = {
     "convergence_guides": guides,
+    "convergence_finger_costs": finger_costs,
     "convergence_fillets": fillets,
     "convergence_scatter": scatter,
     **{f"convergence_{name}": of(name) for name in STUDIES},

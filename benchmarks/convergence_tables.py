@@ -160,8 +160,23 @@ def convergence_scatter() -> str:
     return markdown(head, rows, "lrrrr")
 
 
+def finger_costs() -> str:
+    """Speed and errors of the accurate finger against the size of its elements."""
+    rows = []
+    for row in results("convergence_finger_costs")["rows"]:
+        cells = []
+        for quantity in ("tip", "effort"):
+            own, *others = row[quantity]
+            cells += [percent(own), percent(float(np.median(others))), percent(max(others, key=abs))]
+        rows.append([row["elements"], f"{row['unknowns']:,}", f"{row['steps per CPU second']:.1f}", *cells])
+    head = ["elements", "unknowns", "control steps per CPU second"]
+    head += [f"{quantity}, {of}" for quantity in ("tip", "tension") for of in ("baseline", "median body", "worst")]
+    return markdown(head, rows, "lrrrrrrrr")
+
+
 CONVERGENCE_TABLES = {
     "convergence": convergence,
+    "finger_costs": finger_costs,
     "convergence_limits": convergence_limits,
     "convergence_corrections": convergence_corrections,
     "convergence_guides": convergence_guides,
