@@ -63,7 +63,7 @@ def headlines() -> str:
         interval = _interval(row) or ()
         change = "{:.1f}\u00a0to\u00a0{:.1f}\u00a0mm".format(*interval)
         rows.append([name, *_ends(row), change, checked, f"`{study['command']}`"])
-    head = ["robot; controller", "baseline", "winner", "change, 95%", "change on two meshes", "command"]
+    head = ["robot; controller", "baseline", "winner", "change, 95%", "study's → finer mesh", "command"]
     return markdown(head, rows, "lrrrrl")
 
 
