@@ -41,7 +41,7 @@ class State:
         effort: actuator efforts [N, ...], shape (n_a,).
         effector: effector positions [m], shape (k, 3).
         slack: which actuators are slack, shape (n_a,).
-        condensed: condensed model at the state; learned models evaluate it when it is first read.
+        condensed: condensed model at the state; learned models, and FEM in contact, evaluate it when it is first read.
         bonds: forces in the bonds of the body [N], in the order of its model; empty if it has none.
         velocity: effector velocities [m/s], shape (k, 3); zero without dynamics.
         motion: time, velocities and energies of the body; None without dynamics, and on the surrogate.
@@ -80,7 +80,7 @@ class State:
         return self.doubt == 0
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy holds the condensed model itself, not the learned model that evaluates it.
+        # A copy holds the condensed model itself, not the model that evaluates it.
         return {**self.__dict__, "condensed": self.condensed}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

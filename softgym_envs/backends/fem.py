@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
+from softgym_envs.mechanics.solvers.later import condensed_at
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import TOUCH_RADIUS, Robot
@@ -103,7 +105,7 @@ class FEMBackend(Backend):
         if complete != self.design:
             model = self.robot.build(complete)
             self._set_friction(model)
-            statics = Statics(model)
+            statics = self._solver(model)
             zero = np.zeros(len(self.robot.actuators))
             try:
                 rest = statics.solve(zero, self.robot.rest_mode)
@@ -145,9 +147,17 @@ class FEMBackend(Backend):
         if friction != self._friction:
             self._friction = friction
             self._set_friction(self.model)
-            self._statics = Statics(self.model)
+            self._statics = self._solver(self.model)
             self._rest = replace(self._rest, memory=self._statics.memory)
             self.restore(self._rest)
+
+    def _solver(self, model: MechanicalModel) -> Statics:
+        """Return the static solver of a body."""
+        statics = Statics(model)
+        linear, learned = statics.linearisation, any(block.learned for block in model.blocks)
+        # In contact the last factorisation of a step serves W alone, which is computed when it is read.
+        statics.exact_compliance = linear.contact is None or linear.rubs or learned
+        return statics
 
     def _checked_friction(self, friction: float) -> float:
         if not (np.isfinite(friction) and friction >= 0.0):
@@ -168,7 +178,7 @@ class FEMBackend(Backend):
         command = check_numbers("command", command, len(self.largest_efforts))
         load = None
         if force is not None:
-            load = np.zeros(self.state.condensed.delta.e.size)
+            load = np.zeros(self.state.effector.size)
             load[:3] = check_numbers("force", force, 3)
         kept = self._motion
         try:
@@ -322,6 +332,7 @@ class FEMBackend(Backend):
         self, equilibrium: Equilibrium, command: np.ndarray, motion: Motion | None = None, *, still: bool = False
     ) -> State:
         condensed, slices = equilibrium.condensed, equilibrium.condensed.slices
+        exact = motion is not None or self._statics.exact_compliance
         effector = equilibrium.delta[slices["e"]].reshape(-1, 3)
         velocity = np.zeros_like(effector)
         if motion is not None and not still:
@@ -344,7 +355,7 @@ class FEMBackend(Backend):
             effort=equilibrium.effort[slices["a"]],
             effector=effector,
             slack=equilibrium.slack,
-            condensed=condensed,
+            condensed=condensed if exact else partial(condensed_at, self._statics, equilibrium),
             nodes=equilibrium.x,
             velocity=velocity,
             motion=motion,

@@ -11,6 +11,8 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
+from softgym_envs.mechanics.contact.obstacles import Plane
+from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.surrogate.potential.model import Model
 
 
@@ -36,6 +38,48 @@ def test_a_copy_holds_the_condensed_model_but_not_the_learned_one(backend, dupli
     expected = backend.state.condensed.compliance
     np.testing.assert_array_equal(state.condensed.compliance, expected)
     assert len(pickle.dumps(state)) < 4000  # the learned model has hundreds of kilobytes
+
+
+@pytest.fixture
+def pressed():
+    """Return a function that steps a Diamond below a ceiling on FEM and returns its backend and states."""
+    robot = make_robot("diamond", obstacles=[Plane((0.0, 0.0, 0.1263), (0.0, 0.0, -1.0))])
+    commands = np.array([[0.1, 0.1, 0.0, 0.0], [0.2, 0.1, 0.1, 0.0], [0.5, 0.0, 0.0, 0.0], [0.1, 0.0, 0.0, 0.1]])
+
+    def run(**attributes):
+        backend = make_backend("fem", robot)
+        vars(backend._statics).update(attributes)
+        return backend, [backend.step(1e-3 * command) for command in commands]
+
+    return run
+
+
+def test_in_contact_finite_elements_compute_the_compliance_when_it_is_read(pressed, monkeypatch):
+    calls, factorise = [], Linearisation.factorise
+    monkeypatch.setattr(
+        Linearisation, "factorise", lambda *args, **options: calls.append(1) or factorise(*args, **options)
+    )
+    _, expected = pressed(exact_compliance=True)
+    eager = len(calls)
+    backend, states = pressed()
+    assert len(calls) - eager < eager
+    assert states[-1].contacts.force.any()
+    present, *earlier = reversed(states)
+    copied = pickle.loads(pickle.dumps(earlier[0]))
+    backend.reset({"leg_width": 1.1})  # the earlier states remain those of their body
+    for state, known in zip([present, copied, *earlier[1:]], reversed(expected), strict=True):
+        np.testing.assert_allclose(state.effector, known.effector, rtol=0, atol=1e-9)
+        scale = np.abs(known.condensed.compliance).max()
+        np.testing.assert_allclose(state.condensed.compliance, known.condensed.compliance, rtol=0, atol=1e-6 * scale)
+
+
+def test_reading_the_compliance_does_not_disturb_the_next_step(pressed):
+    backend, states = pressed()
+    assert states[1].condensed.W.aa.shape == (4, 4)
+    np.testing.assert_array_equal(backend.state.nodes, states[-1].nodes)
+    fresh, _ = pressed()
+    found, known = (body.step(np.full(4, 2e-4)) for body in (backend, fresh))
+    np.testing.assert_allclose(found.nodes, known.nodes, rtol=0, atol=1e-9)
 
 
 def test_a_state_is_not_changed(backend):

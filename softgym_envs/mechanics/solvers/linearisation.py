@@ -197,6 +197,20 @@ class Linearisation:
             half = half - self._half[:, self._slide] @ (self._slip @ combined)
         return self._tangent.solver.expand(half)
 
+    def motions(self, count: int) -> np.ndarray:
+        """Return the motions of the equations that the efforts of the first constraints cause.
+
+        Args:
+            count: number of constraints.
+
+        Returns:
+            Shape (N, k), with a largest component of one; constraints that move nothing are left out.
+        """
+        units = np.eye(self.H.shape[1])[:count]
+        motions = np.reshape([self.response(effort) for effort in units], (count, len(self.residual))).T
+        largest = np.abs(motions).max(axis=0, initial=0.0)
+        return motions[:, largest > 0.0] / largest[largest > 0.0]
+
     @property
     def _slide(self) -> slice:
         """Columns of the directions of sliding points."""

@@ -53,7 +53,7 @@ class Statics:
         max_iterations: limit of Newton iterations per load increment.
         max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the whole step.
         exact_compliance: compute ``W`` at each equilibrium. Otherwise, with contact, ``W`` may be that of the last
-            iterate, which saves one factorisation per increment.
+            iterate, which saves one factorisation per increment; `later.condensed_at` computes it later.
         compiled: solve bodies of beams in compiled code (`BeamMotion`) where that converges fast; it gives the same
             equilibria to the tolerance.
 
@@ -532,23 +532,16 @@ class Statics:
         contact = self.linearisation.contact
         if contact is None:
             raise ValueError("the model has no contact; call its 'set_contact' before making the solver")
-        found = contact.rows(self.x, self._motions_of_actuators(), each_point=each_point, friction=friction)
+        if not self.linearisation.current and not self._linearise(exact=True):
+            raise ConvergenceError("the tangent of the current state is singular", fraction=0.0)
+        motions = self.linearisation.motions(self._actuators)
+        found = contact.rows(self.x, motions, each_point=each_point, friction=friction)
         rows = ContactRows.of(found, self.model.equations, friction)
         solved = self.linearisation.without_contact(self.x, self.effort, rows.gradients, rows.springs)
         self.linearisation.current = False
         if solved is None:
             raise ConvergenceError("the body has no stable equilibrium without its contacts", fraction=0.0)
         return rows.condensed(*solved, self.effort, self._layout, self._bonds)
-
-    def _motions_of_actuators(self) -> np.ndarray:
-        """Motions (N, n_a) of the equations that each actuator's effort causes, with a largest component of one."""
-        linear = self.linearisation
-        if not linear.current and not self._linearise(exact=True):
-            raise ConvergenceError("the tangent of the current state is singular", fraction=0.0)
-        units = np.eye(len(self.effort))[: self._actuators]
-        motions = np.reshape([linear.response(effort) for effort in units], (len(units), self.model.equations)).T
-        largest = np.abs(motions).max(axis=0, initial=0.0)
-        return motions[:, largest > 0.0] / largest[largest > 0.0]
 
     def _accept(self) -> None:
         """Let friction remember the current state, at which the next increment starts."""
