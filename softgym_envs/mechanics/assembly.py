@@ -53,14 +53,15 @@ class Assembled(NamedTuple):
 
     Attributes:
         residual: ``grad E - sum effort_i grad delta_i`` over the equations, shape (N,).
-        tangent: lower-triangle values of its derivative, a buffer that the next call overwrites.
+        tangent: lower-triangle values of its derivative, a buffer that the next call overwrites; None if it was not
+            asked for.
         gradients: constraint gradients ``H``, shape (N, size), Fortran order.
         delta: constraint values, shape (size,).
         energy: elastic energy [J].
     """
 
     residual: np.ndarray
-    tangent: np.ndarray
+    tangent: np.ndarray | None
     gradients: np.ndarray
     delta: np.ndarray
     energy: float
@@ -217,7 +218,13 @@ class Assembly:
         return direct
 
     def evaluate(
-        self, x: np.ndarray, effort: np.ndarray, loads: np.ndarray, inertia: Inertia | None = None
+        self,
+        x: np.ndarray,
+        effort: np.ndarray,
+        loads: np.ndarray,
+        inertia: Inertia | None = None,
+        *,
+        tangent: bool = True,
     ) -> Assembled | None:
         """Return the equilibrium equations at one state, or None if an element is inverted there.
 
@@ -226,10 +233,12 @@ class Assembly:
             effort: efforts of all constraint rows, shape (size,).
             loads: dead loads [N], shape (n, 3).
             inertia: terms that a time step adds; None in statics.
+            tangent: compute the tangent too.
         """
-        gradient, values = self._gradient, self._values
+        gradient, values = self._gradient, self._values if tangent else None
         np.negative(loads, out=gradient)
-        values[:] = 0.0
+        if values is not None:
+            values[:] = 0.0
         energy = 0.0
         for block, scatter in zip(self.blocks, self._block_maps, strict=True):
             stored, inverted = block.add(x, gradient, values, scatter)
@@ -246,7 +255,7 @@ class Assembly:
             self._rows, self._targets, self._hessian_maps, strict=True
         ):
             part = effort[rows]
-            if mapping is not None and part.any():
+            if values is not None and mapping is not None and part.any():
                 hessian = constraint.hessian(x, part)
                 assert hessian is not None
                 _subtract_entries(values, mapping, hessian.ravel())
@@ -254,7 +263,7 @@ class Assembly:
             H[equations, rows] = jacobian[:, keep].T
         residual = np.zeros(n)
         residual[: len(kinematics.free_dofs)] = gradient.ravel()[kinematics.free_dofs]
-        for bond, places in zip(self._bonds, self._bond_maps, strict=True):
+        for bond, places in zip(self._bonds, self._bond_maps, strict=True) if values is not None else ():
             jacobian = bond.jacobian(x)
             _subtract_entries(values, places, (-self.bond_stiffness * (jacobian.T @ jacobian)).ravel())
         if kinematics.map is not None:
@@ -265,11 +274,12 @@ class Assembly:
             turning = kinematics.map.transposed
             residual += turning @ gradient[carried].ravel()
             H = np.asfortranarray(H[:n] + turning @ H[n:])
-            kinematics.map.expand(values, self._entries, self._expansion, self._expansion_target)
-            kinematics.map.add_curvature(values, arms, pull, self.spin_target)
+            if values is not None:
+                kinematics.map.expand(values, self._entries, self._expansion, self._expansion_target)
+                kinematics.map.add_curvature(values, arms, pull, self.spin_target)
         if effort.any():
             residual -= H @ effort
-        return Assembled(residual, values[: self._entries], H, delta, energy)
+        return Assembled(residual, None if values is None else values[: self._entries], H, delta, energy)
 
     # -- dynamics ---------------------------------------------------------------------------------------------------
 
@@ -320,11 +330,12 @@ class Assembly:
         drag = inertia.body.mass_damping * float(np.vdot(velocity, inertia.body.mass.rows @ velocity))
         return drag + self._add_damping(inertia, x, velocity, np.zeros_like(x), None)
 
-    def _add_inertia(self, inertia: Inertia, x: np.ndarray, gradient: np.ndarray, values: np.ndarray) -> None:
+    def _add_inertia(self, inertia: Inertia, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None) -> None:
         body = inertia.body
         velocity, acceleration = inertia.motion(x)
         gradient += body.mass.rows @ (acceleration + body.mass_damping * velocity)
-        values += (inertia.acceleration_factor + body.mass_damping * inertia.velocity_factor) * body.mass.entries
+        if values is not None:
+            values += (inertia.acceleration_factor + body.mass_damping * inertia.velocity_factor) * body.mass.entries
         self._add_damping(inertia, x, velocity, gradient, values)
 
     def _add_damping(

@@ -88,13 +88,17 @@ class Linearisation:
         """Whether the factorised tangent is exact and positive definite."""
         return self.exact and self._tangent.solver.positive_definite
 
-    def assemble(self, x: np.ndarray, effort: np.ndarray) -> Assembled | None:
-        """Return the equations at rows ``x`` (n, 3) and efforts (size,), or None if an element is inverted."""
+    def assemble(self, x: np.ndarray, effort: np.ndarray, *, tangent: bool = True) -> Assembled | None:
+        """Return the equations at rows ``x`` (n, 3) and efforts (size,), or None if an element is inverted.
+
+        Without the ``tangent``, `factorise` assembles it. That is faster where it is not likely to be needed.
+        """
         loads = self.loads
         if self.contact is not None:
             self._terms = self.contact.evaluate(x)
             loads = loads - self._terms.gradient
-        assembled = self.assembly.evaluate(x, effort, loads, self.inertia)
+        self._effort = effort
+        assembled = self.assembly.evaluate(x, effort, loads, self.inertia, tangent=tangent)
         if assembled is None or self.cable_friction is None:
             return assembled
         self._friction_terms = self.cable_friction.evaluate(x, effort)
@@ -114,7 +118,12 @@ class Linearisation:
             exact: do not leave out terms of contact.
             definite: without contact, return False for an indefinite tangent too, which takes far longer to factorise.
         """
+        if assembled.tangent is None:
+            complete = self.assemble(x, self._effort)
+            assert complete is not None  # without the tangent no element was inverted either
+            assembled = complete
         self.residual, tangent, self.H, self.delta, self.elastic = assembled
+        assert tangent is not None
         terms, friction = self._terms, self._friction_terms
         extra = None if terms is None else terms.tangent
         if friction is not None:
@@ -235,7 +244,7 @@ class Linearisation:
         assembled = self.assemble(x, effort)
         held = csc_matrix(columns[:, springs > 0.0])
         extra = self.contact.forces_held(x) + (held.multiply(springs[springs > 0.0]) @ held.T).tocsr()
-        if assembled is None or not self._tangent.factorise(assembled.tangent, extra):
+        if assembled is None or assembled.tangent is None or not self._tangent.factorise(assembled.tangent, extra):
             return None
         gram, _ = self._tangent.solver.condense(np.asfortranarray(np.hstack([assembled.gradients, columns])))
         return (gram, assembled.delta) if np.isfinite(gram).all() else None

@@ -277,7 +277,7 @@ class Statics:
             pull = linear.residual + linear.H @ self.effort  # derivative of the energy
             slope = float((pull - linear.H[:, forced] @ target[forced]) @ step_q)
             slope -= float(weight @ violation(linear.delta))
-            found = None
+            found, polished = None, norm**2 <= 1e2 * self.tolerance * self._longest_step
             if iteration == 0 and expected is not None:
                 found = self._search(step_q + expected, step_effort, penalty, slope, shortest=1.0)
                 if found is None:
@@ -285,7 +285,8 @@ class Statics:
             if found is None:
                 # Sliding friction has no potential, so that a good step can climb: it is known by being shorter.
                 climbs = linear.sliding and slope > 0.0 and norm < 0.5 * previous
-                found = self._search(step_q, step_effort, penalty, slope, anyway=climbs or norm < self._round_off)
+                anyway = climbs or norm < self._round_off
+                found = self._search(step_q, step_effort, penalty, slope, anyway=anyway, tangent=not polished)
             if found is None:
                 raise NewtonFailure
             x, effort, assembled, length = found
@@ -300,7 +301,7 @@ class Statics:
                 if expected is not None:
                     corrections += expected
             remaining = np.inf
-            if full and norm**2 <= 1e2 * self.tolerance * self._longest_step:
+            if full and polished:
                 x, effort, assembled, added, remaining = self._polish(x, effort, assembled, norm, target, driven)
                 corrections += added
             self.x, self.effort = x, effort
@@ -347,7 +348,7 @@ class Statics:
             if linear.contact.free_path(x, closer) < 1.0:
                 break
             x, effort, total, norm = closer, effort + step_effort, total + step_q, remaining
-            found = linear.assemble(x, effort)
+            found = linear.assemble(x, effort, tangent=False)
             if found is None:
                 raise NewtonFailure
             assembled = found
@@ -362,6 +363,7 @@ class Statics:
         *,
         shortest: float = 1e-6,
         anyway: bool = False,
+        tangent: bool = True,
     ) -> tuple[np.ndarray, np.ndarray, Assembled, float] | None:
         """Find how far a step can go: nothing collides on the way, and energy plus penalty decrease.
 
@@ -372,6 +374,7 @@ class Statics:
             slope: derivative of energy plus penalty at the start [J].
             shortest: smallest part of the step to try.
             anyway: accept any change of the energy, for steps that it cannot resolve.
+            tangent: assemble the tangent there.
 
         Returns:
             Rows (n, 3), efforts (size,) and equations at the end of the step, and the part of it; None if the part
@@ -389,7 +392,7 @@ class Statics:
                 length *= max(part, 0.05)  # the way bends, so it is tested again
                 continue
             barrier = linear.contact.energy(x)
-            assembled = linear.assemble(x, effort) if np.isfinite(barrier) else None
+            assembled = linear.assemble(x, effort, tangent=tangent) if np.isfinite(barrier) else None
             if assembled is not None:
                 after = linear.energy(x, assembled.energy + barrier) + penalty(assembled.delta)
                 after += linear.inertial_work(self.x, x)
