@@ -19,7 +19,10 @@ from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.tools.config import CalibrationConfig, OptimiseConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import SoftGymError
+from softgym_envs.estimation.loads import Payload, Touch, finger_grid
+from softgym_envs.estimation.readings import Noise
 from softgym_envs.mechanics import MechanicalModel
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.robots import Actuator
 from softgym_envs.surrogate.training import FitConfig
 from softgym_envs.testing import box_mesh
@@ -37,6 +40,12 @@ def from_file(folder):
     path = folder / "body.vtk"
     meshio.Mesh(1e3 * NODES, [("tetra", TETRAHEDRA)]).write(path)
     return MechanicalModel.from_file(path, fixed_box=(-1.0, 1.0, -1.0, 1.0, -1.0, 1.0))
+
+
+def carried(_):
+    builder = ModelBuilder()
+    builder.add_solid(NODES, TETRAHEDRA, fixed=NODES[:, 0] == 0.0)
+    builder.carry(builder.add_frame([0.1, 0.01, 0.01]), NODES[:, 0] == 0.1)
 
 
 def reset(**options):
@@ -193,6 +202,50 @@ MISTAKES = {
     "rate of an actuator": (
         lambda _: Actuator("cable", low=0.0, high=0.02, rate=0.0),
         "actuator 'cable': rate = 0 must be positive",
+    ),
+    "range of an actuator without its command at rest": (
+        lambda _: Actuator("cable", low=0.002, high=0.02, rate=0.001),
+        "actuator 'cable': the range 0.002 to 0.02 m must contain 0, which is its command at rest",
+    ),
+    "mask of another mesh": (
+        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=np.ones(3, dtype=bool)),
+        "'fixed' must be numbers of nodes from 0 to 19, or a mask (20,) or (20, 3), got an array of shape (3,) of bool",
+    ),
+    "clamped node that does not exist": (
+        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=[0, 99]),
+        "'fixed' must be numbers of nodes from 0 to 19, *, got integers of shape (2,) from 0 to 99",
+    ),
+    "clamped node counted from the end": (
+        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=[-1]),
+        "'fixed' must be numbers of nodes from 0 to 19, *",
+    ),
+    "two pull points": (
+        lambda _: body().add_cable("cable", np.array([[0.05, 0.01, 0.01]]), np.zeros((2, 3))),
+        "the pull point of cable 'cable' must be three finite numbers, got *",
+    ),
+    "pull point that is not finite": (
+        lambda _: body().add_cable("cable", np.array([[0.05, 0.01, 0.01]]), [0.0, np.nan, 0.0]),
+        "the pull point of cable 'cable' must be three finite numbers, got *nan*",
+    ),
+    "mask of nodes that a frame carries": (
+        carried,
+        "rows that frame 20 carries must be numbers from 0 to 23, got an array of shape (20,) of bool",
+    ),
+    "noise of an exact actuator": (
+        lambda _: Noise(displacement=0.0),
+        "noise: displacement = 0.0 must be positive and finite",
+    ),
+    "touch without a force": (
+        lambda _: Touch(finger_grid(), (0, 0), 0.0),
+        "expected_force = 0.0 N must be positive and finite",
+    ),
+    "payload without a mass": (
+        lambda _: Payload(expected_mass=float("nan")),
+        "expected_mass = nan kg must be positive and finite",
+    ),
+    "touch cells without a size": (
+        lambda _: finger_grid(0.0),
+        "pitch = 0.0 m of touch cells is out of bounds; allowed: up to 0.015 m",
     ),
     "empty configuration": (
         lambda f: config(f, FitConfig, {}),

@@ -18,6 +18,7 @@ from softgym_envs.codesign.variables import split_values
 from softgym_envs.errors import ConfigError
 from softgym_envs.estimation.information import touch_slopes
 from softgym_envs.mechanics.constraints.cavity import Cavity
+from softgym_envs.mechanics.surfaces import check_cavities
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
 from softgym_envs.robots.grasping import Grasp
@@ -106,7 +107,10 @@ class Evaluator:
         self._options: dict[str, float] = {}
 
     def course(self, design: Mapping[str, float]) -> Course:
-        """Return the states of one design; raises `InfeasibleDesign` and `ConvergenceError`."""
+        """Return the states of one design; raises `InfeasibleDesign` and `ConvergenceError`.
+
+        With metrics of its sensors, a design is infeasible if the walls of a cavity pass through each other.
+        """
         variables = self._choose_robot(design)
         # A backend keeps its body in memory, so every design gets a new one.
         backend = make_backend(self.backend, self.robot, design=variables, **self._backend_options)
@@ -116,6 +120,10 @@ class Evaluator:
         if isinstance(backend, FEMBackend):
             material = torch.tensor([backend.model.volume], dtype=torch.float64)
             volumes = [c.rest_volume for c in backend.model.constraints["s"] if isinstance(c, Cavity)]
+            if volumes and any(metric.needs == "sensors" for metric in self.metrics):
+                for state in states:
+                    assert state.nodes is not None
+                    check_cavities(backend.model.constraints["s"], state.nodes)
             if volumes:
                 sensor = _stack([np.array(volumes) + state.condensed.delta.s for state in states])
         return Course(

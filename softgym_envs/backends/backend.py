@@ -94,10 +94,17 @@ class PointForce:
     Attributes:
         point: of the undeformed body [m], shape (3,).
         force: [N], shape (3,).
+
+    Raises:
+        ValueError: unless both are three finite numbers.
     """
 
     point: np.ndarray
     force: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("point", "force"):
+            object.__setattr__(self, name, check_numbers(f"{name} of a touch", getattr(self, name), 3))
 
 
 @dataclass(frozen=True)

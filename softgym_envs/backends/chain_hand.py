@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,6 +81,60 @@ class HandMemory:
     fold: np.ndarray
 
 
+class _FingerData(NamedTuple):
+    """A finger of a hand, in the order in which the compiled solver takes it.
+
+    Attributes:
+        place: distance of the feet from the middle of the hand, and their height above the table [m], shape (2,).
+        held: the clamped node [m, m, rad], shape (3,).
+        drive: axis of the servo, and the first node from it [m], shape (4,).
+        length: of the segments [m], shape (N - 1,).
+        along: their directions at rest, shape (N - 1, 2).
+        stiffness: of the segments, shape (N - 1, 3, 3).
+        weights: of the nodes [N], shape (N,).
+    """
+
+    place: np.ndarray
+    held: np.ndarray
+    drive: np.ndarray
+    length: np.ndarray
+    along: np.ndarray
+    stiffness: np.ndarray
+    weights: np.ndarray
+
+
+class _Skin(NamedTuple):
+    """The P points of a finger that touch the box, in the order in which the compiled solver takes them.
+
+    Attributes:
+        nodes: of the chain beside each point, shape (P, 2).
+        shares: where the point lies between them, shape (P,).
+        arms: from both nodes to the ends of the edge on which it lies [m], shape (P, 4).
+        heights: of the points across the plane [m], shape (P,).
+        areas: [m2], shape (P,).
+    """
+
+    nodes: np.ndarray
+    shares: np.ndarray
+    arms: np.ndarray
+    heights: np.ndarray
+    areas: np.ndarray
+
+
+class _Underside(NamedTuple):
+    """The T points of the box over the table.
+
+    Attributes:
+        offsets: from the middle of the box along x and z [m], shape (T, 2).
+        areas: [m2], shape (T,).
+        plane: the table as an obstacle, shape (17,).
+    """
+
+    offsets: np.ndarray
+    areas: np.ndarray
+    plane: np.ndarray
+
+
 class ChainHand:
     """One hand of two equal learned fingers, with its box on the table.
 
@@ -103,18 +158,18 @@ class ChainHand:
         modulus = design["young_modulus"]
         stiffness = STIFFNESS * modulus if robot.contact_stiffness is None else robot.contact_stiffness
         distance = robot.contact_distance
-        law = np.array([distance, stiffness, STICK * stiffness / distance])
+        self._law = np.array([distance, stiffness, STICK * stiffness / distance])
         half = np.array([0.5 * length for length in robot.box])
         friction = design["friction"]
         # In the plane of a finger the box is a prism along z of that plane.
         flat = RoundedPrism.box((half[0], half[2], half[1]), ROUNDING, friction=friction)
-        obstacles, edges = table_of([flat])
+        self._obstacles, self._edges = table_of([flat])
         plane, _ = table_of([Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), friction=friction)])
         frame = np.concatenate([np.zeros((1, 3)), np.eye(3)])
         weights, areas = surface_of(frame, (), (box_skin(0, half.tolist(), frame),)).points
         places = weights.toarray()[:, 1:]
         below = places[:, 2] < -half[2] + 1e-9
-        self._table = (places[below][:, [0, 2]].copy(), areas[below], plane[0], law)
+        self._underside = _Underside(places[below][:, [0, 2]].copy(), areas[below], plane[0])
         drive, length, along, segments = (each[0] for each in prepared.segments)
         nodes, shares, arms, heights, skin_areas = prepared.skin
         rest = prepared.at_rest[0]
@@ -122,9 +177,9 @@ class ChainHand:
         gravity = -robot.gravity[2]
         mass = 0.5 * finger.density * finger.thickness * length * prepared.bodies.thickness[0]
         node_weights = gravity * (np.append(mass, 0.0) + np.append(0.0, mass))
-        self._finger = (place, rest[-1].copy(), drive, length, along, segments * prepared.relative[0], node_weights)
-        self._contact = ((nodes, shares, arms[0], heights, skin_areas[0]), obstacles, edges)
-        self._law = law
+        segments = segments * prepared.relative[0]
+        self._finger = _FingerData(place, rest[-1].copy(), drive, length, along, segments, node_weights)
+        self._skin = _Skin(nodes, shares, arms[0], heights, skin_areas[0])
         mass_of_box = design["object_mass"]
         self._masses = np.array([mass_of_box, mass_of_box, mass_of_box * (half[0] ** 2 + half[2] ** 2) / 3.0])
         self._weight = mass_of_box * gravity
@@ -138,18 +193,18 @@ class ChainHand:
     def _at_rest(self, nodes: np.ndarray) -> HandMemory:
         box, pose = np.array([0.0, self._height + ON_TABLE, 0.0]), np.empty(3)
         q = np.empty((FINGERS, *nodes.shape))
-        place, held, drive = self._finger[:3]
+        finger = self._finger
         for f in range(FINGERS):
-            pose_of(box, place, f, pose)
+            pose_of(box, finger.place, f, pose)
             c, s = np.cos(pose[2]), np.sin(pose[2])
             q[f, :, :2] = (nodes[:, :2] - pose[:2]) @ np.array([[c, -s], [s, c]])
             q[f, :, 2] = nodes[:, 2] - pose[2]
-            place_ends(q[f], held, drive, 0.0, pose)
+            place_ends(q[f], finger.held, finger.drive, 0.0, pose)
         zero = np.zeros(3)
-        shape = (FINGERS, 1, len(self._contact[0][4]), 3)
+        shape, below = (FINGERS, 1, len(self._skin.areas), 3), (len(self._underside.areas), 3)
         memory = HandMemory(
-            q, box, zero, zero, zero, np.zeros(shape), np.zeros(shape), np.zeros((len(self._table[1]), 3)),
-            np.zeros((len(self._table[1]), 3)), box, zero, np.full(FINGERS, np.inf),
+            q, box, zero, zero, zero, np.zeros(shape), np.zeros(shape), np.zeros(below), np.zeros(below), box, zero,
+            np.full(FINGERS, np.inf),
         )  # fmt: skip
         touch_at = self._touching(memory)
         if not (touch_at[1] > 0.0).all():
@@ -201,8 +256,9 @@ class ChainHand:
 
     def _parts(self, anchors: np.ndarray, table: np.ndarray) -> tuple[tuple, tuple]:
         """Return fingers and table as the compiled solver takes them."""
-        points, areas, plane, law = self._table
-        return (*self._finger, *self._contact, anchors, self._law), (points, areas, table, plane, law)
+        offsets, areas, plane = self._underside
+        finger = (*self._finger, tuple(self._skin), self._obstacles, self._edges, anchors, self._law)
+        return finger, (offsets, areas, table, plane, self._law)
 
     # -- what is measured -------------------------------------------------------------------------------------------
 
@@ -235,7 +291,8 @@ class ChainHand:
         _, definite = eliminate(
             memory.q, memory.box, memory.drives[:2], memory.drives[2], finger, below,
             (memory.masses, memory.free, self._weight), False, np.zeros(memory.anchors.shape[:3]),
-            np.zeros(len(self._table[1])), reduced, gradient, np.empty((FINGERS, count, 3, 5)), np.empty((FINGERS, 3)),
+            np.zeros(len(self._underside.areas)), reduced, gradient, np.empty((FINGERS, count, 3, 5)),
+            np.empty((FINGERS, 3)),
         )  # fmt: skip
         reduced[2, 2] += TABLE_STIFFNESS
         rows = np.zeros((6, 6))
@@ -258,11 +315,11 @@ class ChainHand:
             place, force = turn @ (signs * points[f, k, :2]) + middle, turn @ (signs * forces[f, k])
             found.append((1, place, gaps[f, k], force, pressing[f, k], bool(sliding[f, k])))
         places = self._table_points(memory)
-        offsets, areas, plane, law = self._table
+        _, areas, plane = self._underside
         pull, tangent, edges = np.empty(2), np.empty((2, 2)), np.empty((1, 7))
         for k, place in enumerate(places):
             _, gap, normal, slides = touch(
-                place, areas[k], plane, edges, memory.table_before[k], law, False, pull, tangent
+                place, areas[k], plane, edges, memory.table_before[k], self._law, False, pull, tangent
             )
             if normal > 0.0:
                 found.append((0, place[:2] - [0.0, memory.drives[2]], gap, -pull, normal, bool(slides)))
@@ -289,20 +346,21 @@ class ChainHand:
 
     def _touching(self, memory: HandMemory) -> tuple[np.ndarray, ...]:
         """Return points, gaps, forces, pressing and sliding of the skins of both fingers, in the frame of the box."""
-        (nodes, shares, arms, heights, areas), obstacles, edges = self._contact
+        nodes, shares, arms, heights, areas = self._skin
         shape = (FINGERS, 1, len(areas))
         points, gaps, forces = np.zeros((FINGERS, len(areas), 3)), np.zeros(shape), np.zeros((*shape, 2))
         pressing, sliding = np.zeros(shape), np.zeros(shape, dtype=bool)
         touching(
             memory.q, np.zeros(FINGERS, dtype=np.int64), nodes, shares, arms[None], heights, areas[None],
-            np.stack([obstacles] * FINGERS), np.stack([edges] * FINGERS), memory.before,
+            np.stack([self._obstacles] * FINGERS), np.stack([self._edges] * FINGERS), memory.before,
             np.stack([self._law] * FINGERS), points, gaps, forces, pressing, sliding,
         )  # fmt: skip
         return points, gaps[:, 0], forces[:, 0], pressing[:, 0], sliding[:, 0]
 
     def _table_points(self, memory: HandMemory) -> np.ndarray:
-        points, arm = np.zeros((len(self._table[1]), 3)), np.empty(2)
-        for point, offset in zip(points, self._table[0], strict=True):
+        offsets = self._underside.offsets
+        points, arm = np.zeros((len(offsets), 3)), np.empty(2)
+        for point, offset in zip(points, offsets, strict=True):
             table_point(memory.box, memory.drives[2], offset, point, arm)
         return points
 

@@ -20,6 +20,7 @@ from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
 from softgym_envs.mechanics.solvers.later import condensed_at
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
+from softgym_envs.mechanics.solvers.schemes import SCHEMES
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import TOUCH_RADIUS, Robot
 from softgym_envs.surrogate.domain import FOLDED, LOADED, SOFT, SPREAD
@@ -79,6 +80,8 @@ class FEMBackend(Backend):
     ) -> None:
         if not isinstance(dynamics, bool):
             raise ValueError(f"dynamics = {dynamics!r} is unknown; allowed: True, False")
+        if scheme not in SCHEMES:
+            raise ValueError(f"scheme = {scheme!r} is unknown; allowed: {', '.join(SCHEMES)}")
         self.robot = robot
         self.moving = dynamics
         self.steps = TimeSteps(control_step, time_step, mass_damping, stiffness_damping)
@@ -143,13 +146,19 @@ class FEMBackend(Backend):
 
     @cable_friction.setter
     def cable_friction(self, friction: float) -> None:
-        friction = self._checked_friction(friction)
-        if friction != self._friction:
+        friction, kept = self._checked_friction(friction), self._friction
+        if friction == kept:
+            return
+        try:
             self._friction = friction
             self._set_friction(self.model)
             self._statics = self._solver(self.model)
-            self._rest = replace(self._rest, memory=self._statics.memory)
-            self.restore(self._rest)
+        except ValueError:
+            self._friction = kept
+            self._set_friction(self.model)
+            raise
+        self._rest = replace(self._rest, memory=self._statics.memory)
+        self.restore(self._rest)
 
     def _solver(self, model: MechanicalModel) -> Statics:
         """Return the static solver of a body."""
@@ -175,7 +184,7 @@ class FEMBackend(Backend):
             cable.friction = self._friction
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        command = check_numbers("command", command, len(self.largest_efforts))
+        command = self._checked(command, mode)
         load = None
         if force is not None:
             load = np.zeros(self.state.effector.size)
@@ -194,12 +203,19 @@ class FEMBackend(Backend):
             raise
         return self.state
 
+    def _checked(self, command: np.ndarray, mode: str) -> np.ndarray:
+        if mode not in ("displacement", "effort"):
+            raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
+        return check_numbers("command", command, len(self.largest_efforts))
+
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
-        """Return the static equilibrium under a command without going there."""
+        """Return the static equilibrium under a command, found from the present shape, without going there."""
         kept = self._motion
-        command = check_numbers("command", command, len(self.largest_efforts))
+        command = self._checked(command, mode)
         try:
-            return self._state(self._statics.solve(command, mode), command, still=True)
+            if self._dynamics is not None:
+                self.restore(self.state)  # statics are where they were left before the last steps of the motion
+            return self._state(self._drive(self._statics, command, mode, None), command, still=True)
         finally:
             self._go_back(kept)
 

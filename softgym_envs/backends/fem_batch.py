@@ -15,6 +15,7 @@ from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.elements.beams import are_folded
 from softgym_envs.mechanics.solvers.beam_batch import BeamBatch, BeamStates
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
+from softgym_envs.mechanics.solvers.equilibrium import RowLayout
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.domain import FOLDED
 
@@ -44,6 +45,7 @@ class FEMBatch(BatchBackend):
         self.moving = first.moving
         count, size = len(designs), len(_rest(first)[1])
         self._slices = first.state.condensed.slices
+        self._play = RowLayout.of(first.model).play
         self._is_driven = np.arange(size) < len(robot.actuators)
         body = _beams(first).body
         self._present = BeamStates.of(body, size, count, factors=self.moving)
@@ -181,7 +183,7 @@ class FEMBatch(BatchBackend):
         a, e = self._slices["a"], self._slices["e"]
         displacement, effort = states.delta[:, a], states.effort[:, a]
         # The sign of the effort alone does not suffice: at rest it is round-off.
-        slack = self.robot.unilateral & (effort <= 0.0) & (displacement > self.command + 1e-9)
+        slack = self.robot.unilateral & (effort <= 0.0) & (displacement > self.command + self._play)
         count = len(effort)
         return BatchState(
             displacement.copy(),

@@ -18,6 +18,7 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBody
 from softgym_envs.errors import ConvergenceError, DataError
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
+from softgym_envs.mechanics.solvers.equilibrium import RowLayout
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_tuned_from
 from softgym_envs.surrogate.potential.model import Model
@@ -200,6 +201,7 @@ class HybridBackend(Backend):
         elif self._fem.design != design:
             self._fem.reset(design)
             self.fem_calls += 1
+        self._play = RowLayout.of(self._fem.model).play
         rest = self._fem.reset()
         self._known = [rest]
         return rest
@@ -267,7 +269,7 @@ class HybridBackend(Backend):
             displacement=displacement,
             effort=effort,
             effector=(free.e + W.ea @ effort).reshape(-1, 3),
-            slack=self._unilateral & (mode == "displacement") & (displacement > command + 1e-9),
+            slack=self._unilateral & (mode == "displacement") & (displacement > command + self._play),
             condensed=replace(condensed, effort=full),
         )
 

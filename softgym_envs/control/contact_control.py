@@ -37,12 +37,18 @@ class ContactControl:
         friction: whether the linear model knows friction. Without, friction forces stay as they are during a step, and
             an object that only friction holds cannot be controlled.
 
+    Raises:
+        ValueError: if the controller commands displacements of some actuators and efforts of others.
+
     Attributes:
         size: of the next step over the controller's rates.
         error: before the last step [m], see `ContactQP.error`; inf before the first one.
     """
 
     def __init__(self, backend: Backend, controller: ContactQP, *, friction: bool = False) -> None:
+        self._mode = "effort" if controller.by_effort.all() else "displacement"
+        if controller.by_effort.any() and self._mode != "effort":
+            raise ValueError("contact control commands all actuators in one mode: its ContactQP mixes two")
         self.backend = backend
         self.controller = controller
         self.friction = friction
@@ -78,13 +84,13 @@ class ContactControl:
         self.error = self.controller.error(condensed, goal, forces)
         present = dict(zip(self.controller.contact_names(condensed), condensed.lambda_.c.tolist(), strict=True))
         aims = [self._aim(force, present) for force in forces]
-        state, mode = self.backend.state, "effort" if self.controller.by_effort.all() else "displacement"
+        state = self.backend.state
         while True:
             command = self.controller.solve(condensed, goal, state.command, state.slack, forces=aims, size=self.size)
             predicted = self.controller.contact_force.tolist()
             self._planned = {name: (present[name], after) for name, after in zip(present, predicted, strict=True)}
             try:
-                return self.backend.step(command, mode)
+                return self.backend.step(command, self._mode)
             except ConvergenceError:
                 if self.size <= SMALLEST_STEP:
                     raise
@@ -115,16 +121,17 @@ class ContactControl:
             goal: see `step`.
             forces: see `step`.
             steps: most steps.
-            tolerance: of actuators, in shares of their rates.
+            tolerance: of commands, in shares of their rates.
 
         Raises:
             ValueError: as `step`.
             ConvergenceError: as `step`.
         """
-        states = [self.backend.state]
+        states, controller = [self.backend.state], self.controller
+        rates = controller.effort_rates if self._mode == "effort" else controller.rates
         for _ in range(steps):
             states.append(self.step(goal, forces=forces))
             moved = np.abs(states[-1].command - states[-2].command)
-            if (moved <= tolerance * self.controller.rates).all():
+            if (moved <= tolerance * rates).all():
                 break
         return states[1:]

@@ -56,8 +56,11 @@ class PICorrection:
         """Return the corrected goal [m], shape (n_e,), for a measured effector (n_e,).
 
         Raises:
-            ValueError: if the measurement has another shape or is not finite, as with a lost sensor.
+            ValueError: if the goal is not finite, or the measurement has another shape or is not finite, as with a lost
+                sensor.
         """
+        if not np.isfinite(goal).all():
+            raise ValueError(f"goal must be finite coordinates, got {np.asarray(goal).tolist()}")
         measured = np.asarray(measured, dtype=float).ravel()
         if measured.shape != goal.shape or not np.isfinite(measured).all():
             raise ValueError(f"measured effector must be {goal.size} finite coordinates, got {measured.tolist()}")
@@ -178,7 +181,7 @@ class EmbeddedLoop:
             aim = closed.correct(goal, np.where(chosen, seen, goal) if seen.shape == goal.shape else seen)
         try:
             self.command = self.controller.solve(condensed, aim, self.command, slack)
-        except ConvergenceError:
+        except (ConvergenceError, ValueError):
             if closed is not None and summed is not None:
                 closed.correction = summed  # do not integrate an error without acting on it
             raise
@@ -220,7 +223,12 @@ def settle(
     displacement = np.where(unilateral & (start > command + SLACK * rates), start, command)
     for _ in range(MAX_SETTLING_STEPS):
         condensed = model(displacement)
-        change = complementary_step(condensed.W.aa, displacement - command, condensed.lambda_.a, unilateral)
+        try:
+            change = complementary_step(condensed.W.aa, displacement - command, condensed.lambda_.a, unilateral)
+        except np.linalg.LinAlgError:
+            raise ConvergenceError(
+                f"the model at displacements {displacement.tolist()} is unstable: its W_aa is not positive definite"
+            ) from None
         step = condensed.W.aa @ change
         if (np.abs(step) <= SETTLED * rates).all():
             break

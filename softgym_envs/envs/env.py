@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from math import prod
@@ -23,6 +24,8 @@ from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 if TYPE_CHECKING:
     from softgym_envs.envs.registration import RobotSource, TaskSource
+    from softgym_envs.envs.tasks.base import Task
+    from softgym_envs.robots.base import Robot
 
 MAX_DRAWS = 100
 """Number of infeasible bodies that are drawn in turn before `reset` gives up."""
@@ -35,6 +38,7 @@ class EpisodeState:
     Attributes:
         robot: name of the robot.
         task: name of the task.
+        options: robot and task as they were made: name -> value, as text.
         physics: body and mechanical state.
         path: goals of the episode [m, or the unit of the task's goals], shape (p, 3).
         step: control steps so far.
@@ -47,6 +51,7 @@ class EpisodeState:
 
     robot: str
     task: str
+    options: Mapping[str, str]
     physics: Snapshot
     path: np.ndarray
     step: int
@@ -108,6 +113,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         checked = EnvironmentOptions.check(options, own=("render_mode", "render_size"))
         setup = set_up(robot, task, backend, checked)
         self.robot, self.task = setup.robot, setup.task
+        self._made = _option_texts(self.robot, self.task)
         self.design_space = self.robot.design_space
         self._fixed_design, self._sampled = setup.design, setup.sampled
         self.backend: Backend = make_backend(
@@ -228,6 +234,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         return EpisodeState(
             robot=self.robot.name,
             task=self.task.name,
+            options=self._made,
             physics=self.backend.snapshot(),
             path=self._path.copy(),
             step=self._step,
@@ -245,11 +252,15 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             Observation and info of that moment.
 
         Raises:
-            ValueError: for a state of another robot, task or backend.
+            ValueError: for a state of another robot, task or backend, or of a robot or task with other options.
         """
         for kind, name, own in (("robot", state.robot, self.robot.name), ("task", state.task, self.task.name)):
             if name != own:
                 raise ValueError(f"the state belongs to {kind} '{name}', but the environment has {kind} '{own}'")
+        for option in sorted({*state.options, *self._made}):
+            theirs, mine = (made.get(option, "its default") for made in (state.options, self._made))
+            if theirs != mine:
+                raise ValueError(f"the state belongs to a {option} = {theirs}, but the environment has {mine}")
         self.backend.cable_friction = state.plant.cable_friction
         self.backend.resume(state.physics)
         self.plant, self._sent, self._sensed = state.plant, state.sent.copy(), state.sensed
@@ -268,6 +279,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
     def __setstate__(self, kept: dict[str, Any]) -> None:
         EzPickle.__setstate__(self, kept)
         self.spec = kept["spec"]
+        self._made = kept["episode"].options  # a task object may have changed since
         self.set_state(kept["episode"])
         self.action_space = self.spaces.action_space = kept["action_space"]  # with its random numbers
 
@@ -397,6 +409,22 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+
+def _option_texts(robot: Robot, task: Task) -> dict[str, str]:
+    """Return what a new robot and task were made with, as texts that can be compared; what has none is left out."""
+    try:
+        values = {f"robot with {name}": value for name, value in robot.mechanics_key.items()}
+    except TypeError:  # an option that cannot be stored
+        values = {}
+    values |= {f"task with {name}": value for name, value in vars(task).items() if not name.startswith("_")}
+    texts = {}
+    for name, value in values.items():
+        try:
+            texts[name] = json.dumps(value, default=lambda array: array.tolist())
+        except (AttributeError, TypeError, ValueError):
+            continue
+    return texts
 
 
 def _mechanics(state: State) -> dict[str, Any]:

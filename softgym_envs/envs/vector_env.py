@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -115,6 +116,7 @@ class SoftRobotVectorEnv(VectorEnv):
         self._delay = np.zeros(num_envs, dtype=np.int64)
         longest = 0 if setup.plants is None else setup.plants.longest_delay
         self._sent = np.zeros((longest + 1, num_envs, len(self.robot.actuators)))  # the newest command first
+        self._sensed: Sensed | None = None  # what the sensors showed when they were last read
         self._reward_gradient: RewardGradient | None = None  # made when it is first needed, because it loads torch
         self._unit_design = self.design_space.observe(self.designs, self.spaces.design_names)
         self._paths = np.zeros((num_envs, 1, 3))
@@ -280,7 +282,7 @@ class SoftRobotVectorEnv(VectorEnv):
             goal = self.task.check_paths(goal, () if shared else (self.num_envs,))
             goal = np.broadcast_to(goal, (self.num_envs, *goal.shape[-2:]))[index]
         self._begin_episodes(index, design, goal)
-        return self._observe(), self._info()[0]
+        return self._observe(index), self._info()[0]
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Apply actions (num_envs, n_a) in [-1, 1].
@@ -367,15 +369,14 @@ class SoftRobotVectorEnv(VectorEnv):
             for i in ended:
                 final_obs[i] = observation[i].copy()
             self._begin_episodes(ended)
-            observation = self._observe()
+            observation = self._observe(ended)
             info = {**self._info()[0], "final_info": final_info, "_final_info": truncated.copy()}
             info |= {"final_obs": final_obs, "_final_obs": truncated.copy()}
         return observation, reward, np.zeros(self.num_envs, dtype=bool), truncated, info
 
-    def _observe(self) -> np.ndarray:
-        state = self._state
-        shown = Sensed(state.displacement, state.effort, state.effector[:, :3])
-        shown = sensed(self.robot, shown, self._noise, self.np_random, self.task.measured_scale)
+    def _observe(self, index: np.ndarray | None = None) -> np.ndarray:
+        """Return observations; only the sensors of sub-environments ``index`` (default all) are read anew."""
+        shown = self._read(index)
         return self.spaces.observe(
             self.command,
             shown.displacement,
@@ -385,6 +386,22 @@ class SoftRobotVectorEnv(VectorEnv):
             self._unit_design,
             self.backend.velocity,
         )
+
+    def _read(self, index: np.ndarray | None) -> Sensed:
+        """Read the sensors of sub-environments ``index`` (default all), and return what those of all show."""
+        state = self._state
+        true = Sensed(state.displacement, state.effort, state.effector[:, :3])
+        if self._plants is None or not self._plants.high.noise:
+            return true
+        if index is None or self._sensed is None:
+            index = np.arange(self.num_envs)
+        rows = Sensed(true.displacement[index], true.effort[index], true.effector[index])
+        new = sensed(self.robot, rows, self._noise[index], self.np_random, self.task.measured_scale)
+        shown = copy.deepcopy(self._sensed or true)
+        for name in ("displacement", "effort", "effector"):
+            getattr(shown, name)[index] = getattr(new, name)
+        self._sensed = shown
+        return shown
 
     def _info(self) -> tuple[dict[str, Any], np.ndarray]:
         state, goals = self._state, self.goals

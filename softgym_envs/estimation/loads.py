@@ -100,7 +100,13 @@ class TouchGrid:
 
 
 def finger_grid(pitch: float = 5e-3) -> TouchGrid:
-    """Return the grid on the flat back of the sensorized finger (y = 0), from 15 to 115 mm below its flange."""
+    """Return the grid on the flat back of the sensorized finger (y = 0), from 15 to 115 mm below its flange.
+
+    Raises:
+        ValueError: for a pitch [m] with which no cell fits across the back.
+    """
+    if not 0.0 < pitch <= 0.015:
+        raise ValueError(f"pitch = {pitch} m of touch cells is out of bounds; allowed: up to 0.015 m")
     columns, rows = int(0.015 / pitch + 1e-9), int(0.100 / pitch + 1e-9)
     corner = (-0.5 * columns * pitch, 0.0, -0.015)
     return TouchGrid(corner, (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (columns, rows), pitch)
@@ -124,11 +130,17 @@ class Touch:
         grid: of which a cell is touched.
         cell: the touched cell.
         expected_force: standard deviation of the force before any reading [N].
+
+    Raises:
+        ValueError: for a force that is not positive and finite.
     """
 
     grid: TouchGrid
     cell: Cell
     expected_force: float = 2.0
+
+    def __post_init__(self) -> None:
+        _check_positive("expected_force", self.expected_force, "N")
 
     @property
     def points(self) -> np.ndarray:
@@ -173,6 +185,11 @@ class Touch:
         return np.kron(across, along), np.kron(across, by_u), np.kron(by_v, along)
 
 
+def _check_positive(name: str, value: float, unit: str) -> None:
+    if not (np.isfinite(value) and value > 0.0):
+        raise ValueError(f"{name} = {value} {unit} must be positive and finite")
+
+
 def _quadratic(place: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of -1, 0 and 1 in quadratic interpolation at a place, and their derivatives."""
     weights = np.array([0.5 * place * (place - 1.0), 1.0 - place**2, 0.5 * place * (place + 1.0)])
@@ -186,10 +203,16 @@ class Payload:
     Args:
         gravity: acceleration [m/s2].
         expected_mass: standard deviation of the mass before any reading [kg].
+
+    Raises:
+        ValueError: for a mass that is not positive and finite.
     """
 
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     expected_mass: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check_positive("expected_mass", self.expected_mass, "kg")
 
     @property
     def points(self) -> np.ndarray:

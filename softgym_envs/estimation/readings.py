@@ -24,6 +24,9 @@ class Noise:
         pressure: of the measured pressure of the air in a sealed cavity [Pa].
         effort: of the measured effort of an actuator [N]; None if it is not measured.
         drift: of each parameter of the load from one reading to the next, as a part of its spread before any reading.
+
+    Raises:
+        ValueError: for a standard deviation that is not positive and finite, or a negative drift.
     """
 
     displacement: float = 1e-4
@@ -31,6 +34,14 @@ class Noise:
     pressure: float = 10.0
     effort: float | None = None
     drift: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("displacement", "volume", "pressure", "effort"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"noise: {name} = {value} must be positive and finite")
+        if not (np.isfinite(self.drift) and self.drift >= 0.0):
+            raise ValueError(f"noise: drift = {self.drift} must be finite and not negative")
 
 
 @dataclass(frozen=True)

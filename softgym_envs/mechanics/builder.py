@@ -14,7 +14,7 @@ from softgym_envs.mechanics.elements.rigid import RigidBody
 from softgym_envs.mechanics.elements.superelement import PortEnergy, Superelement
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solids import Fixed, solid_part
+from softgym_envs.mechanics.solids import Fixed, are_rows, described, solid_part
 
 
 class ModelBuilder:
@@ -94,11 +94,23 @@ class ModelBuilder:
         return start
 
     def carry(self, frame: int, rows: np.ndarray) -> None:
-        """Attach mesh nodes to the frame at a row, so that they move with it."""
+        """Attach mesh nodes to the frame at a row, so that they move with it.
+
+        Args:
+            frame: first row of the frame.
+            rows: of the nodes, as numbers: those of a mask are ``start + np.flatnonzero(mask)``.
+        """
         if frame not in self._frames:
             raise ValueError(f"frame = {frame} is not the first row of a frame; frames start at rows {self._frames}")
+        rows = np.asarray(rows)
+        if rows.size and not are_rows(rows, self.size):
+            raise ValueError(
+                f"rows that frame {frame} carries must be numbers from 0 to {self.size - 1}, got {described(rows)}"
+            )
         index = self._frames.index(frame)
-        self._carried[index] = np.concatenate([self._carried.get(index, np.empty(0, dtype=np.int64)), rows])
+        self._carried[index] = np.concatenate(
+            [self._carried.get(index, np.empty(0, dtype=np.int64)), rows.astype(np.int64)]
+        )
 
     def add_beam(self, frames: Sequence[int] | np.ndarray, *, section: Section | list[Section], **options) -> None:
         """Add beam elements along frames that were added before; options as for `Beam`."""

@@ -29,7 +29,17 @@ from softgym_envs.mechanics.io import read_mesh
 from softgym_envs.mechanics.kinematics import Kinematics
 from softgym_envs.mechanics.materials import Material
 from softgym_envs.mechanics.skins import Skin
-from softgym_envs.mechanics.solids import MAX_BODY_SIZE, Fixed, PerElement, check_distance, check_size, solid_part
+from softgym_envs.mechanics.solids import (
+    MAX_BODY_SIZE,
+    Fixed,
+    PerElement,
+    are_rows,
+    check_distance,
+    check_size,
+    described,
+    fixed_mask,
+    solid_part,
+)
 from softgym_envs.mechanics.surfaces import cavity_around
 from softgym_envs.mechanics.warping import Warping
 
@@ -84,9 +94,7 @@ class MechanicalModel:
         self.blocks = list(blocks)
         n = len(self.nodes)
         body_frames = Frames(self.nodes, np.asarray(frames), carried, mounted)
-        held = np.zeros((n, 3), dtype=bool)
-        chosen = np.asarray(fixed)
-        held[chosen if chosen.size else chosen.astype(int)] = True
+        held = fixed_mask(fixed, n)
         held_spin = np.zeros((len(body_frames), 3), dtype=bool)
         if fixed_spin is not None:
             flags = np.asarray(fixed_spin, dtype=bool)
@@ -285,9 +293,12 @@ class MechanicalModel:
             radius: of the channel's part on which a guide acts [m], see `embed`.
 
         Raises:
-            ValueError: if a guide is farther from the body than its size, or the pull point than ten times its size.
+            ValueError: if a guide is farther from the body than its size, or the pull point than ten times its size, or
+                the pull point is not three finite numbers.
         """
         origin = np.asarray(pull_point, dtype=float)
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise ValueError(f"the pull point of cable '{name}' must be three finite numbers, got {origin.tolist()}")
         check_distance(origin, self._solid_nodes, f"the pull point of cable '{name}'", 10.0)
         embedding = self.embed(points, hint, block=block, name=f"a guide of cable '{name}'", radius=radius)
         cable = Cable(name, embedding, origin, unilateral=unilateral)
@@ -392,8 +403,14 @@ class MechanicalModel:
             settings: self-contact, and the law of contact; default `ContactSettings`.
 
         Raises:
-            ValueError: if there is no Young's modulus to choose the stiffness of contact from.
+            ValueError: if there is no Young's modulus to choose the stiffness of contact from, or for excluded rows
+                that do not exist or are a mask.
         """
+        excluded = np.asarray(excluded)
+        if excluded.size and not are_rows(excluded, len(self.nodes)):
+            raise ValueError(
+                f"'excluded' must be numbers of rows from 0 to {len(self.nodes) - 1}, got {described(excluded)}"
+            )
         settings = ContactSettings() if settings is None else settings
         if settings.stiffness is None:
             stiffness = 0.1 * max((block.largest_young_modulus for block in self.blocks), default=0.0)

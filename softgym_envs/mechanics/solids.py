@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,9 +67,7 @@ def solid_part(
         raise ValueError(unknown_name("element", element, SOLIDS))
     nodes, tetrahedra = check_nodes(nodes), np.asarray(tetrahedra)
     check_size(nodes, max_size, "for nodes in millimetres pass 1e-3 * nodes")
-    mask = np.zeros((len(nodes), 3), dtype=bool)
-    chosen = np.asarray(fixed(nodes) if callable(fixed) else fixed)
-    mask[chosen if chosen.size else chosen.astype(int)] = True
+    mask = fixed_mask(fixed(nodes) if callable(fixed) else fixed, len(nodes))
     if element == "quadratic" and tetrahedra.ndim == 2 and tetrahedra.shape[1] == 4:
         count = len(nodes)
         nodes, tetrahedra = add_midside_nodes(nodes, tetrahedra)
@@ -85,6 +83,42 @@ def solid_part(
             raise ValueError(f"total_mass = {total_mass} kg must be positive and finite")
         options["density"] = total_mass / kind(nodes, tetrahedra).volume  # type: ignore[call-arg]
     return SolidPart(nodes, tetrahedra, mask, kind, options)
+
+
+def fixed_mask(fixed: np.ndarray | Sequence[int], count: int) -> np.ndarray:
+    """Return which components of nodes are clamped, mask (count, 3).
+
+    Args:
+        fixed: numbers of nodes, a mask (count,), or a mask (count, 3) by axis.
+        count: number of nodes.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    chosen = np.asarray(fixed)
+    if chosen.size == 0:
+        chosen = np.zeros(0, dtype=np.int64)
+    is_mask = chosen.dtype == bool and chosen.shape in ((count,), (count, 3))
+    if not is_mask and not (chosen.ndim == 1 and are_rows(chosen, count)):
+        raise ValueError(
+            f"'fixed' must be numbers of nodes from 0 to {count - 1}, or a mask ({count},) or ({count}, 3), got "
+            f"{described(chosen)}"
+        )
+    mask = np.zeros((count, 3), dtype=bool)
+    mask[chosen] = True
+    return mask
+
+
+def described(numbers: np.ndarray) -> str:
+    """Return what an array holds, for messages: which integers, or its shape and type."""
+    if numbers.dtype.kind in "iu" and numbers.size:
+        return f"integers of shape {numbers.shape} from {numbers.min()} to {numbers.max()}"
+    return f"an array of shape {numbers.shape} of {numbers.dtype}"
+
+
+def are_rows(numbers: np.ndarray, count: int) -> bool:
+    """Return whether an array holds integers from 0 to ``count - 1``, and not a mask."""
+    return numbers.dtype.kind in "iu" and bool(((numbers >= 0) & (numbers < count)).all())
 
 
 def check_size(nodes: np.ndarray, max_size: float, hint: str) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.constraints.cavity import enclosed_volume
+from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir, enclosed_volume
+from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 
 
@@ -116,3 +120,22 @@ def self_intersection(points: np.ndarray, triangles: np.ndarray) -> np.ndarray |
     low, high = corners.min(axis=1)[:, axes], corners.max(axis=1)[:, axes]
     i, j = _first_crossing(points, triangles, np.argsort(low[:, 0]), low, high, 1e-9)
     return None if i < 0 else 0.5 * (corners[i].mean(axis=0) + corners[j].mean(axis=0))
+
+
+def check_cavities(cavities: Iterable[Constraint], x: np.ndarray) -> None:
+    """Check that no cavity closes: without self-contact, its walls then pass through each other.
+
+    Args:
+        cavities: constraints, of which those without a cavity are left out.
+        x: rows of a state [m], shape (n, 3).
+
+    Raises:
+        InfeasibleDesign: if the surface of a cavity crosses itself.
+    """
+    for constraint in cavities:
+        cavity = constraint.cavity if isinstance(constraint, SealedAir) else constraint
+        if isinstance(cavity, Cavity) and (place := self_intersection(x, cavity.flat_triangles)) is not None:
+            raise InfeasibleDesign(
+                f"the walls of '{cavity.name}' pass through each other near {np.round(place, 4).tolist()} m, because "
+                "they do not touch each other in this model"
+            )

@@ -21,7 +21,8 @@ class Actuator:
         max_effort: largest effort either way; beyond it a commanded displacement is not reached.
 
     Raises:
-        ValueError: for an empty or infinite range, or a rate or largest effort that is not positive.
+        ValueError: for an empty or infinite range, one without zero, which is the command at rest, or a rate or largest
+            effort that is not positive.
     """
 
     name: str
@@ -36,6 +37,11 @@ class Actuator:
         """Check the numbers."""
         if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
             raise ValueError(f"actuator '{self.name}': low {self.low:g} must be below high {self.high:g}, both finite")
+        if not self.low <= 0.0 <= self.high:
+            raise ValueError(
+                f"actuator '{self.name}': the range {self.low:g} to {self.high:g} {self.unit} must contain 0, which is "
+                "its command at rest"
+            )
         for label, value in (("rate", self.rate), ("max_effort", self.max_effort)):
             if not value > 0.0:
                 raise ValueError(f"actuator '{self.name}': {label} = {value:g} must be positive")

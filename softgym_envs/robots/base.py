@@ -405,7 +405,14 @@ class Robot(ABC):
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != (count,):
                 raise ValueError(f"robot '{self.name}': {name} must have shape ({count},), got {value.shape}")
+            if not np.isfinite(value).all():
+                raise ValueError(f"robot '{self.name}': {name} must be finite, got {value.tolist()}")
             setattr(self, name, value)
+        # Rewards and observations are divided by these.
+        for name in ("size", "effort_scale", "sensor_scale", "goal_tolerance", "workspace_scale"):
+            value = np.asarray(getattr(self, name), dtype=float)
+            if not (np.isfinite(value) & (value > 0.0)).all():
+                raise ValueError(f"robot '{self.name}': {name} must be positive and finite, got {value.tolist()}")
         lengths = {"size": self.size, "effector_rest": float(np.abs(self.effector_rest).max())}
         bounded = [(a.name, a.high, a.unit) for a in self.actuators]
         bounded += [(v.name, v.high, v.unit) for v in self.design_space]

@@ -20,6 +20,7 @@ from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.mechanics.surfaces import check_cavities
 from softgym_envs.robots.base import TOUCH_RADIUS, Actuator, MeshedRobot
 from softgym_envs.robots.geometry.finger_shape import (
     THICKNESS,
@@ -294,7 +295,7 @@ class SensorizedFinger(MeshedRobot):
 
         Raises:
             DesignError: for a malformed design.
-            InfeasibleDesign: if the geometry cannot exist.
+            InfeasibleDesign: if the geometry cannot exist, or walls of a cavity pass through each other.
             ConvergenceError: if there is no equilibrium.
         """
         model = self.build(design)
@@ -304,6 +305,7 @@ class SensorizedFinger(MeshedRobot):
         increments = 1 if self.tier.element == "linear" else 4
         for share in range(1, increments + 1):
             state = statics.solve([pull * share / increments])
+        check_cavities(model.constraints["s"], state.x)
         pulled = _volumes(model, state.condensed.delta.s)
         tip = state.condensed.delta.e
         change = abs(float(pulled[0] - rest[0]))
@@ -312,7 +314,9 @@ class SensorizedFinger(MeshedRobot):
             point = model.embed(np.array(_LATERAL_POINT) * 1e-3, radius=self.guide_radius)
             np.add.at(model.nodal_loads[:, 0], point.node_ids[0], lateral_force * point.weights[0])
             statics.reset()
-            pushed = _volumes(model, statics.solve([0.0]).condensed.delta.s)
+            aside = statics.solve([0.0])
+            check_cavities(model.constraints["s"], aside.x)
+            pushed = _volumes(model, aside.condensed.delta.s)
             sensitivity = min(change, abs(float(pushed[0] - rest[0]))) / float(rest[0])
         return SensorReadings(
             volume_change=change,

@@ -13,8 +13,10 @@ from gymnasium.utils.env_checker import check_env
 import softgym_envs  # noqa: F401  (registers the environments)
 from benchmarks import robot_dynamics as cases
 from softgym_envs import make_robot
+from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.surrogate.domain import FOLDED
 
 SMALL = {"SoftGym/FingerReach-v0": {}, "SoftGym/DiamondReach-v0": {"mesh_size": 30e-3}}
 
@@ -131,6 +133,27 @@ def test_a_servo_saturates_at_its_torque_limit_and_is_released(dynamics):
     np.testing.assert_allclose(state.effector, free.effector, atol=1e-5)
 
 
+@pytest.mark.parametrize("dynamics", [False, True])
+def test_a_probe_obeys_the_torque_limit(dynamics):
+    """Goals of tasks are probed: beyond the largest torque nothing reaches them."""
+    backend, command = FEMBackend(weak(0.04), dynamics=dynamics), np.array([-1.2, 0.0, 0.0, 0.0])
+    probed = backend.probe(command)
+    assert probed.effort[0] == pytest.approx(-0.04, rel=1e-9)
+    np.testing.assert_allclose(probed.effector, FEMBackend(weak(0.04)).step(command).effector, atol=1e-8)
+    np.testing.assert_array_equal(backend.probe(command, "effort").effort, [-0.04, 0.0, 0.0, 0.0])
+
+
+def test_a_probe_starts_from_the_present_shape():
+    """A motion that has folded legs goes on from there, whether or not there was a probe before."""
+    backend = FEMBackend(make_robot("tetrapod"), dynamics=True)
+    path = np.arange(1, 13)[:, None] / 12 * 0.5 * np.pi * np.array([1.0, 1.0, -1.0, 1.0])
+    for command in path:
+        backend.step(command)
+    first, again = (backend.probe(path[-1]) for _ in range(2))
+    assert first.doubt == FOLDED
+    np.testing.assert_allclose(first.effector, again.effector, atol=1e-9)
+
+
 def test_efforts_are_cut_to_the_limit():
     backend = FEMBackend(weak(0.04))
     state = backend.step(np.array([-1.0, 0.01, 0.02, 1.0]), "effort")
@@ -221,6 +244,27 @@ def test_restoring_a_state():
     assert backend.state.motion is None and not backend._dynamics.velocity.any()
 
 
+@pytest.mark.parametrize("dynamics", [False, True])
+@pytest.mark.parametrize("mode", ["torque", ["effort", "displacement", "displacement", "displacement"]])
+def test_an_unknown_mode_is_refused(mode, dynamics):
+    backend = FEMBackend(make_robot("tetrapod"), dynamics=dynamics)
+    for call in (backend.step, backend.probe):
+        with pytest.raises(ValueError, match="mode = .* is unknown; allowed: 'displacement', 'effort'"):
+            call(np.zeros(4), mode)
+
+
+def test_a_state_of_another_mesh_is_refused():
+    backend, other = (FEMBackend(make_robot("tetrapod", elements=n)) for n in (4, 6))
+    with pytest.raises(ValueError, match=r"nodes of shape \(\d+, 3\) .* but the body has"):
+        backend.restore(other.state)
+
+
+@pytest.mark.parametrize(("name", "wrong"), [("point", [0.0, 0.0]), ("force", [0.0, np.nan, 0.0])])
+def test_a_touch_needs_finite_numbers(name, wrong):
+    with pytest.raises(ValueError, match=f"{name} of a touch must be 3 finite numbers"):
+        PointForce(**{"point": np.zeros(3), "force": np.zeros(3), name: wrong})
+
+
 @pytest.mark.parametrize("name", ["control_step", "time_step"])
 @pytest.mark.parametrize("value", [0.0, -0.1, np.nan, np.inf])
 def test_bad_steps(name, value):
@@ -228,9 +272,10 @@ def test_bad_steps(name, value):
         FEMBackend(make_robot("tetrapod"), **{name: value})
 
 
-def test_a_scheme_is_checked():
+@pytest.mark.parametrize("dynamics", [False, True])
+def test_a_scheme_is_checked(dynamics):
     with pytest.raises(ValueError, match="scheme = 'verlet' is unknown; allowed: euler, generalised_alpha"):
-        FEMBackend(make_robot("tetrapod"), dynamics=True, scheme="verlet")
+        FEMBackend(make_robot("tetrapod"), dynamics=dynamics, scheme="verlet")
 
 
 # -- environments ---------------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -145,3 +147,30 @@ def test_backends_without_contact_say_so():
         FEMBackend(trunk).contact_model()
     with pytest.raises(ValueError, match="dynamics=False"):
         FEMBackend(trunk, dynamics=True).contact_model()
+
+
+class Pushed(Spring):
+    """The same, commanded by the effort of its actuator."""
+
+    def step(self, command, mode="displacement", *, force=None):
+        assert mode == "effort"
+        self.state = replace(super().step(1e-3 * command), command=command)
+        return self.state
+
+
+def test_a_loop_of_efforts_ends_when_they_hardly_change():
+    free = np.full(1, np.inf)
+    rates, loose = np.full(1, 0.5), np.zeros(1, dtype=bool)
+    controller = ContactQP(-free, free, free, loose, effort_rates=rates, mode="effort")
+    states = ContactControl(Pushed(reach=10.0), controller).reach(
+        None, forces=[ForceGoal({"contact 1": 1.0}, 1.0)], steps=40
+    )
+    assert 10 < len(states) < 40
+    assert abs(states[-1].command - states[-2].command) < 1e-5 * rates
+
+
+def test_two_kinds_of_commands_at_once_are_refused():
+    two = np.ones(2)
+    controller = ContactQP(-two, two, two, np.zeros(2, dtype=bool), effort_rates=two, mode=["effort", "displacement"])
+    with pytest.raises(ValueError, match="its ContactQP mixes two"):
+        ContactControl(Spring(), controller)

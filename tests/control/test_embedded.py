@@ -10,7 +10,7 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.control import EmbeddedLoop, InverseQP, PICorrection
-from softgym_envs.control.embedded import follow
+from softgym_envs.control.embedded import follow, settle
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 
@@ -221,3 +221,24 @@ def test_a_finger_of_the_wrong_stiffness_is_corrected():
     print(f"open loop {1e3 * before:.3f} mm, closed {1e3 * after:.5f} mm, tensions {np.round(loop.effort, 3)} N")
     assert before > 2e-3
     assert after < 1e-5
+
+
+def test_a_goal_that_is_not_finite_leaves_no_trace():
+    """The integral of a NaN would be NaN for ever."""
+    loops = [EmbeddedLoop(ChamberRobot(), controller(), PICorrection(0.1, 0.05)) for _ in range(2)]
+    goal, measured = ChamberRobot.rest + [0.005, 0.0, 0.0], ChamberRobot.rest
+    for loop in loops:
+        loop.step(goal, measured)
+    with pytest.raises(ValueError, match="goal must be finite"):
+        loops[0].step(np.array([np.nan, 0.0, 0.1]), measured)
+    np.testing.assert_array_equal(*(loop.step(goal, measured) for loop in loops))
+
+
+def test_an_unstable_model_is_no_singular_matrix():
+    def unstable(displacement):
+        pushing = np.array([-1.0, 0.0, 0.0, 0.0])
+        return CondensedModel(-np.eye(4), np.zeros(4), pushing, (("a", 1), ("e", 3)))
+
+    controller = InverseQP(np.zeros(1), np.ones(1), np.ones(1), np.ones(1, dtype=bool))
+    with pytest.raises(ConvergenceError, match="unstable"):
+        settle(unstable, controller, np.array([0.5]), np.zeros(1))

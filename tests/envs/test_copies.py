@@ -118,6 +118,27 @@ def test_a_state_of_another_environment_is_refused():
             env.set_state(other.unwrapped.get_state())
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"task_options": {"command_low": 0.5}}, "a task with command_low = 0.5, but the environment has 0.0"),
+        (
+            {"task_options": {"goals": [[0.0, 0.04, -0.1]]}},
+            "a task with fixed_goals = .*, but .* has null",
+        ),
+        ({"robot_options": {"element": "averaged"}}, 'a robot with element = "averaged", but .* has its default'),
+    ],
+)
+def test_a_state_of_other_options_is_refused(options, words):
+    env, other = (gymnasium.make("SoftGym/FingerReach-v0", backend="fem", **each).unwrapped for each in ({}, options))
+    env.reset(seed=0)
+    other.reset(seed=0)
+    before = vars(env.task).copy()
+    with pytest.raises(ValueError, match=words):
+        env.set_state(other.get_state())
+    assert vars(env.task) == before
+
+
 @pytest.mark.parametrize("identifier", ["SoftGym/FingerReach-v0", "SoftGym/TetrapodReach-v0"])
 def test_batches_are_copied_in_mid_episode(identifier):
     env = gymnasium.make_vec(identifier, num_envs=3, sample_design=True, max_episode_steps=5)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import softgym_envs  # noqa: F401
+from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.envs.plant import Plant, Plants
 from softgym_envs.robots.registry import make_robot
 
@@ -151,6 +152,28 @@ def test_batched_environments_draw_and_delay_row_by_row():
     assert 0.009 < error.std() / spaces.robot.size < 0.011
 
 
+@pytest.mark.parametrize("mode", ["Disabled", "SameStep"])
+def test_only_sensors_of_rows_that_are_reset_are_read_anew(mode):
+    options = {"plant": {"noise": 0.01}, "autoreset_mode": mode, "max_episode_steps": 5}
+    envs = gymnasium.make_vec(FINGER, num_envs=4, **options)
+    action, mask = np.full((4, 2), 0.5, dtype=np.float32), np.array([False, True, True, False])
+    drawn = []
+    for _ in range(2):
+        envs.reset(seed=3)
+        envs.step(action)
+        if mode == "Disabled":
+            before = envs.step(action)[0]
+            after = envs.reset(options={"reset_mask": mask})[0]
+        else:
+            envs.unwrapped.steps = np.where(mask, 4, 1)
+            after, *_, info = envs.step(action)
+            before = np.stack([info["final_obs"][i] if mask[i] else after[i] for i in range(4)])
+        np.testing.assert_array_equal(after[~mask], before[~mask])
+        assert (after[mask] != before[mask]).any(axis=1).all()
+        drawn.append(np.concatenate([after, envs.step(action)[0]]))
+    np.testing.assert_array_equal(*drawn)
+
+
 def test_derivatives_know_the_stiffness_and_refuse_a_delay():
     envs = gymnasium.make_vec(FINGER, num_envs=3, plant={"stiffness": 1.3}).unwrapped
     goal, step = {"goal": np.array([0.0, 0.04, -0.1])}, 1e-3
@@ -191,6 +214,16 @@ def test_wrong_plants_are_refused(id, plant, message):
 def test_friction_needs_cables():
     with pytest.raises(ValueError, match="robot 'trunk' has no cables"):
         gymnasium.make("SoftGym/TrunkReach-v0", backend="fem", plant={"cable_friction": 0.3}).reset(seed=0)
+
+
+@pytest.mark.parametrize("name", ["trunk", "tetrapod"])
+def test_friction_that_is_refused_changes_nothing(name):
+    backend = FEMBackend(make_robot(name))
+    with pytest.raises(ValueError, match="has no cables"):
+        backend.cable_friction = 0.3
+    assert backend.cable_friction == 0.0
+    variable = next(iter(backend.robot.design_space))
+    backend.reset({variable.name: variable.low})
 
 
 def test_a_fixed_plant_draws_no_random_numbers():

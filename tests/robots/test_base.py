@@ -172,6 +172,10 @@ def test_attributes_may_be_set_after_the_base_constructor():
         ({"effector_rest": [0.0, 1.0]}, ValueError, r"effector_rest must have shape \(3,\), got \(2,\)"),
         ({"effector_rest": [0.0, 0.0, 50.0]}, ValueError, "effector_rest = 50 m; did you mean 0.05 m?"),
         ({"size": 50.0}, ValueError, "robot 'odd': size = 50 m; did you mean 0.05 m?"),
+        ({"size": -0.1}, ValueError, "robot 'odd': size must be positive and finite, got -0.1"),
+        ({"effort_scale": [0.0]}, ValueError, r"effort_scale must be positive and finite, got \[0.0\]"),
+        ({"goal_tolerance": np.nan}, ValueError, "goal_tolerance must be positive and finite, got nan"),
+        ({"effector_rest": [0.0, np.nan, 0.0]}, ValueError, r"effector_rest must be finite, got \[0.0, nan, 0.0\]"),
         (
             {"actuators": (Actuator("cable", 0.0, 20.0, 1.0),)},
             ValueError,
@@ -183,7 +187,10 @@ def test_attributes_may_be_set_after_the_base_constructor():
             "high of 'length' = 70 m; did you mean 0.07 m",
         ),
     ],
-    ids=["effectors", "effort_scale", "effector_rest", "rest in millimetres", "size", "stroke", "variable"],
+    ids=[
+        *("effectors", "effort_scale", "effector_rest", "rest in millimetres", "size", "negative size", "no effort"),
+        *("no tolerance", "no rest", "stroke", "variable"),
+    ],
 )
 def test_malformed_attributes(attributes, error, message):
     with pytest.raises(error, match=message):

@@ -10,6 +10,7 @@ import pytest
 from benchmarks.robots import PUBLISHED_COMPLIANCE
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.backends.fem_batch import FEMBatch
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.control import InverseQP
 from softgym_envs.errors import DesignError, WeightsError
@@ -31,6 +32,24 @@ for module in ("base", "tip"):
 @pytest.fixture(scope="module")
 def rest():
     return Statics(StiffFlop().build()).solve(np.zeros(6), "effort")
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_chambers_that_are_stretched_beyond_their_command_are_slack(batched):
+    """Also by less than 1e-9 m3, which is much for a chamber of 3e-8 m3."""
+    robot, rng = make_robot("trunk"), np.random.default_rng(0)
+    backend = FEMBatch(robot, robot.design_space.baseline.array[None]) if batched else FEMBackend(robot)
+    beyond, slack = [], []
+    for _ in range(30):
+        command = rng.uniform(robot.lower, robot.upper) * (rng.random(6) < 0.5)
+        backend.step(command[None] if batched else command)
+        state = backend.state.rows(np.zeros(1, dtype=int)) if batched else backend.state
+        beyond.append((state.displacement - command).ravel())
+        slack.append(state.slack.ravel())
+    beyond, slack = np.array(beyond), np.array(slack)
+    assert ((beyond > 1e-13) & (beyond < UL)).any()
+    np.testing.assert_array_equal(slack, beyond > 1e-13)
+    assert np.abs(beyond[~slack]).max() < 1e-15
 
 
 def test_rest_compliance_is_the_published_one(rest):

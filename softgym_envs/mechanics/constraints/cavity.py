@@ -113,6 +113,13 @@ class Cavity(Constraint):
         self._gradient = np.empty(len(self.dofs))
         self._entries = np.empty(18 * len(triples))
 
+    @property
+    def flat_triangles(self) -> np.ndarray:
+        """The surface as flat triangles, shape (t, 3): quadratic ones are split at their midside nodes."""
+        if self.triangles.shape[1] == 3:
+            return self.triangles
+        return self.triangles[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]].reshape(-1, 3)
+
     def volume(self, x: np.ndarray) -> float:
         """Enclosed volume [m3] at node positions ``x`` (n, 3)."""
         return _weighted_volume(x, self._triples, self._weights)

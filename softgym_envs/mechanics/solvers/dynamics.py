@@ -27,7 +27,7 @@ from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.cable_friction import CableFriction, CableMemory
-from softgym_envs.mechanics.solvers.equilibrium import AppliedLoads, Equilibrium, NewtonFailure, slack_rows
+from softgym_envs.mechanics.solvers.equilibrium import AppliedLoads, Equilibrium, NewtonFailure
 from softgym_envs.mechanics.solvers.schemes import SCHEMES, GeneralisedAlpha, ImplicitEuler, StartingAcceleration
 from softgym_envs.mechanics.solvers.statics import Statics
 
@@ -314,7 +314,7 @@ class Dynamics(Statics):
             found.effort.copy(),
             found.delta,
             found.compliance,
-            slack_rows(found.effort, found.delta, targets[-1], np.flatnonzero(is_driven), self.unilateral),
+            self._layout.slack(found.effort, found.delta, targets[-1], np.flatnonzero(is_driven), self.unilateral),
             stable=found.stable,
             iterations=found.iterations,
         )

@@ -15,6 +15,8 @@ from softgym_envs.mechanics.solvers.cable_friction import CableMemory
 
 SATURATED = 1.0 - 1e-9
 """Part of its largest effort from which an actuator counts as saturated: round-off."""
+ROUND_OFF = 1e-9
+"""Motion of the nodes that does not count [m]."""
 CAUTIOUS = 0.25
 """Increments of displacements longer than this part of a step are divided where they meet an indefinite tangent."""
 
@@ -69,21 +71,45 @@ class RowLayout:
         roles: role letters and sizes without bonds.
         labels: names and units of these rows.
         bonds: number of bond rows.
+        play: by how much more than commanded a taut actuator may be displaced, by round-off [m, m3, ...], shape (n_a,).
     """
 
     roles: Roles
     labels: tuple[Row, ...]
     bonds: int
+    play: np.ndarray
 
     @classmethod
     def of(cls, model: MechanicalModel) -> RowLayout:
         """Return the layout of a model's rows."""
         groups = [group for letter, group in model.constraints.items() if letter != "b"]
+        # A volume changes by the motion of the nodes times an area.
+        slopes = [np.abs(c.jacobian(model.nodes)).sum(axis=1) for c in model.constraints["a"]]
         return cls(
             roles=tuple(role for role in model.roles if role[0] != "b"),
             labels=tuple(row for group in groups for c in group for row in c.rows()),
             bonds=dict(model.roles).get("b", 0),
+            play=ROUND_OFF * np.concatenate([np.zeros(0), *slopes]).clip(max=1.0),
         )
+
+    def slack(
+        self, effort: np.ndarray, delta: np.ndarray, target: np.ndarray, driven: np.ndarray, unilateral: np.ndarray
+    ) -> np.ndarray:
+        """Return which actuators hang slack, shape (n_a,): unilateral ones that are driven beyond where they are.
+
+        Args:
+            effort: of all rows, shape (size,).
+            delta: values of all rows, shape (size,).
+            target: values that driven rows are commanded to, shape (size,) or (n_a,).
+            driven: driven rows, shape (d,).
+            unilateral: actuators that cannot push, shape (n_a,).
+        """
+        slack = np.zeros(len(unilateral), dtype=bool)
+        rows = driven[driven < len(unilateral)]
+        rows = rows[unilateral[rows]] if len(rows) else rows
+        # The sign of the effort alone does not suffice: at rest it is round-off.
+        slack[rows] = (effort[rows] <= 0.0) & (delta[rows] > target[rows] + self.play[rows])
+        return slack
 
     def equilibrium(
         self,
@@ -122,26 +148,6 @@ class RowLayout:
                 W = 0.5 * (W + W.T)
         condensed = CondensedModel(W, delta[:count] - W @ effort[:count], effort[:count], self.roles, self.labels)
         return Equilibrium(x, condensed, delta, effort, slack, stable, iterations, increments, contacts, memory)
-
-
-def slack_rows(
-    effort: np.ndarray, delta: np.ndarray, target: np.ndarray, driven: np.ndarray, unilateral: np.ndarray
-) -> np.ndarray:
-    """Return which actuators hang slack, shape (n_a,): unilateral ones that are driven beyond where they are.
-
-    Args:
-        effort: of all rows, shape (size,).
-        delta: values of all rows, shape (size,).
-        target: values that driven rows are commanded to, shape (size,) or (n_a,).
-        driven: driven rows, shape (d,).
-        unilateral: actuators that cannot push, shape (n_a,).
-    """
-    slack = np.zeros(len(unilateral), dtype=bool)
-    rows = driven[driven < len(unilateral)]
-    rows = rows[unilateral[rows]] if len(rows) else rows
-    # The sign of the effort alone does not suffice: at rest it is round-off.
-    slack[rows] = (effort[rows] <= 0.0) & (delta[rows] > target[rows] + 1e-9)
-    return slack
 
 
 def checked(name: str, values: Sequence[float] | np.ndarray, count: int) -> np.ndarray:

@@ -35,7 +35,6 @@ from softgym_envs.mechanics.solvers.equilibrium import (
     RowLayout,
     checked,
     checked_modes,
-    slack_rows,
 )
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.mechanics.solvers.prediction import LARGEST_BEND, Bend
@@ -111,7 +110,15 @@ class Statics:
             x: node positions [m].
             effort: efforts of all rows.
             memory: what friction remembers at this state; by default there are no friction forces.
+
+        Raises:
+            ValueError: for another number of nodes or efforts, as those of another body.
         """
+        if x.shape != self.model.nodes.shape or effort.shape != (self._assembly.size,):
+            raise ValueError(
+                f"the state has nodes of shape {x.shape} and efforts of shape {effort.shape}, but the body has "
+                f"{self.model.nodes.shape} and {(self._assembly.size,)}"
+            )
         self.x = x.copy()
         self.effort = effort.copy()
         self._current_loads = self.model.loads
@@ -560,7 +567,7 @@ class Statics:
             effort,
             linear.delta.copy(),
             linear.W.copy(),
-            slack_rows(effort, linear.delta, target, driven, self.unilateral),
+            self._layout.slack(effort, linear.delta, target, driven, self.unilateral),
             stable=linear.positive_definite,
             iterations=iterations,
             increments=increments,
@@ -591,6 +598,6 @@ class Statics:
             return None
         self.x, self.effort = found.x, found.effort.copy()
         self.linearisation.current = False
-        slack = slack_rows(found.effort, found.delta, goal, driven, self.unilateral)
+        slack = self._layout.slack(found.effort, found.delta, goal, driven, self.unilateral)
         solved = found.x.copy(), found.effort, found.delta, found.compliance, slack
         return self._layout.equilibrium(*solved, stable=True, iterations=found.iterations)

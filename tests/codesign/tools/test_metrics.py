@@ -12,7 +12,7 @@ from softgym_envs.codesign.tools import metrics
 from softgym_envs.codesign.tools.bodies import Evaluator, LearnedBodies, full_command
 from softgym_envs.codesign.tools.box import Box
 from softgym_envs.codesign.tools.metrics import METRICS
-from softgym_envs.errors import ConfigError, DesignError
+from softgym_envs.errors import ConfigError, DesignError, InfeasibleDesign
 from softgym_envs.mechanics.solvers.statics import Statics
 
 STATES = tuple(name for name, metric in METRICS.items() if metric.needs == "states")
@@ -95,6 +95,20 @@ def test_sensorized_finger_reads_what_the_robot_reads():
     assert found["relative_volume_change"] == pytest.approx(readings.relative_volume_change)
     assert found["cavity_volume"] == pytest.approx(readings.initial_volume)
     assert found["angular_displacement"] == pytest.approx(readings.bending_angle)
+
+
+def test_a_cavity_whose_walls_pass_through_each_other_is_infeasible():
+    """They do not touch each other; its relative change would be the best of all."""
+    robot = make_robot("sensorized_finger")
+    lengths = {"outer_radius": 0.009046666, "joint_height": 0.006523373, "bellow_height": 0.008001691}
+    lengths |= {"wall_thickness": 0.003899209, "cork_thickness": 0.004741054, "plateau_height": 0.003413125}
+    design = {"slope": 0.5589782, **lengths}
+    for name in ("relative_volume_change", "volume_change"):
+        with pytest.raises(InfeasibleDesign, match="walls of 'cavity_1' pass through each other"):
+            Evaluator(robot, [name], actuation=[PULL])(design)
+    assert Evaluator(robot, ["angular_displacement"], actuation=[PULL])(design)["angular_displacement"] > 0.4
+    with pytest.raises(InfeasibleDesign, match="walls of 'cavity_1' pass through each other"):
+        robot.readings(design)
 
 
 def test_four_cavities_have_a_pressure_sensitivity():
