@@ -178,7 +178,7 @@ def _method(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, s
         ("Physics", f"{backend} in the search; {_tested(snapshot)}"),
         ("Controller", CONTROLLERS[config.strategy]),
         ("Goals", f"{_origin_of_goals(snapshot)}; {others}"),
-        ("Budget", f"{config.trials} bodies ({done})"),
+        ("Budget", f"{max(config.trials, len(snapshot.trials))} bodies ({done})"),
     ]
     if config.plan.trains:
         rows.append(("Training", f"{config.training.steps:,} environment steps in each trial"))
