@@ -77,6 +77,7 @@ def run_study(
     count = config.workers if workers is None else workers
     if count < 1:
         raise ConfigError(f"workers = {count} is out of bounds; allowed: 1 or more")
+    config = config.model_copy(update={"workers": count})  # the report names it
     # Find mistakes before anything is written or started.
     _check_policy(config)
     known = StudyFolder(folder)

@@ -131,7 +131,7 @@ def key_figures(snapshot: StudySnapshot, results: StudyResults) -> list[KeyFigur
         label = f"rank correlation of surrogate and FEM, {len(transfer[0].trials)} bodies"
         add(f"{transfer[0].spearman:.2f}", label)
     cpu = sum(results.cost.cpu_seconds.values())
-    add(f"{cpu / 60:.1f} min", f"CPU time for {results.trials['requested']} bodies")
+    add(f"{cpu / 60:.1f} min", f"CPU time for {results.bodies} bodies")
     return figures
 
 
@@ -178,7 +178,7 @@ def _method(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, s
         ("Physics", f"{backend} in the search; {_tested(snapshot)}"),
         ("Controller", CONTROLLERS[config.strategy]),
         ("Goals", f"{_origin_of_goals(snapshot)}; {others}"),
-        ("Budget", f"{max(config.trials, len(snapshot.trials))} bodies ({done})"),
+        ("Budget", f"{max(config.trials, results.bodies)} bodies ({done})"),
     ]
     if config.plan.trains:
         rows.append(("Training", f"{config.training.steps:,} environment steps in each trial"))

@@ -381,6 +381,8 @@ def test_a_study_that_goes_on_with_fewer_trials_counts_those_that_it_has(study, 
     monkeypatch.setattr("softgym_envs.codesign.study.run_workers", interrupt)
     config = folder.config.model_copy(update={"trials": 2})
     with pytest.raises(KeyboardInterrupt):
-        run_study(config, folder.path)
+        run_study(config, folder.path, workers=3)
     out = capsys.readouterr().out
     assert "4 bodies of study 'tiny', 3 of them finished before" in out and "interrupted: 3 trials finished" in out
+    page = write_report(folder.path).read_text()
+    assert "3 bodies (3 complete, 0 pruned, 0 infeasible)" in page and "3; with several, the bodies" in page
