@@ -99,6 +99,7 @@ def run(
     An interrupted call continues where it stopped.
     """
     from softgym_envs.codesign.benchmark import references, runs
+    from softgym_envs.codesign.benchmark.frozen import load_definition
     from softgym_envs.codesign.benchmark.table import Table
 
     require("codesign")
@@ -112,7 +113,8 @@ def run(
                     found = runs.run(folder, name, method, judge, level, seed, listed, bodies)  # type: ignore[arg-type]
                     click.echo(
                         f"{name} {method} {found.judge} seed {seed}: {found.bodies} bodies, "
-                        f"{found.spent['cpu_seconds']:.1f} CPU s, best {_scores(found.search_scores[:1])}"
+                        f"{found.spent['cpu_seconds']:.1f} CPU s, best {', '.join(load_definition(name).score_names)}: "
+                        f"{_scores(found.search_scores[:1])} (SI)"
                     )
                     if fem:
                         references.check_winners(folder, [found])
