@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from softgym_envs.cli import options
+from softgym_envs.errors import ConfigError
 from softgym_envs.extras import require
 
 FOLDER = Path("results/benchmark")
@@ -212,16 +213,21 @@ def verify(path: Path, record: bool, as_json: bool) -> None:
 @click.option("--store", is_flag=True, help="Add the runs of the folder to the stored ones (source checkout).")
 @results
 def table_(folder: Path, store: bool) -> None:
-    """Show the stored runs, or those of a folder, one row per problem, judge and method."""
+    """Show the runs of a folder, one row per problem, judge and method.
+
+    Where the default folder has no runs, those that ship with the package.
+    """
     from softgym_envs.codesign.benchmark import board, runs
 
+    own = (folder / "runs").is_dir()
+    if not own and folder != FOLDER:
+        raise ConfigError(f"folder '{folder}' has no runs; 'softgym benchmark run ... --folder {folder}' makes them")
     if store:
         click.echo(f"wrote {runs.collect(folder)}")
-    if (folder / "runs").is_dir():
+    if own:
         runs.collect(folder, folder)
-        click.echo(board.method_table(runs.stored_runs(folder)))
-    else:
-        click.echo(board.method_table(runs.stored_runs()))
+    click.echo(f"runs of {folder}:" if own else "runs that ship with the package:", err=True)
+    click.echo(board.method_table(runs.stored_runs(folder) if own else runs.stored_runs()))
 
 
 @benchmark.command(name="board")
