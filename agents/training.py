@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from softgym_envs.agents.learners import make_learner
 from softgym_envs.agents.learners.base import Learner, Tensors
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.config import difference, load_stored, provenance, save_config, save_resolved
-from softgym_envs.errors import DataError
+from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_json, write_json
 
@@ -68,9 +68,10 @@ def train(
     (all episodes restart after each evaluation). The saved policy is the one with the largest mean return in an
     evaluation; the card gives its step, and the CPU time of all processes that took part in the training.
 
-    A folder with a checkpoint is extended by the same configuration with more ``steps``. What a learner plans over all
-    steps, such as its learning rate, is from then on that of a training of the new number of steps. Until the extended
-    training ends, the folder keeps the previous policy. ``provenance.json`` and the card list each extension.
+    A folder with a checkpoint is extended by the same configuration with more ``steps``; a training that has not ended
+    may also be shortened, to any number of steps from where it stands. What a learner plans over all steps, such as its
+    learning rate, is from then on that of a training of the new number of steps. Until the training ends, the folder
+    keeps the previous policy, if there is one. ``provenance.json`` and the card list each change of the steps.
 
     Args:
         config: configuration of the training.
@@ -90,7 +91,7 @@ def train(
     Raises:
         ValueError: if the environment cannot be made; a new folder is then not created.
         ConfigError: if ``initial`` was trained for another environment, or the folder's configuration cannot be read.
-        DataError: if the folder holds the training of another configuration, or one that cannot be extended.
+        DataError: if the folder holds the training of another configuration, or one that cannot end at these steps.
         WeightsError: if ``initial`` or a checkpoint is damaged or does not fit the configuration.
     """
     require("train")
@@ -108,7 +109,7 @@ def train(
     # Files are written after all checks, so that invalid values neither leave a folder behind nor change one.
     if earlier is None:
         save_resolved(folder, config)
-    elif earlier < config.steps:
+    elif earlier != config.steps:
         _save_extension(folder, config, earlier, run.learner.step)
     run.learner.log_to(folder)
 
@@ -127,8 +128,13 @@ def train(
 
 def is_finished(folder: str | Path, steps: int) -> bool:
     """Return whether a folder holds the policy of a finished training of at least so many steps."""
+    return _finished_steps(folder) >= steps
+
+
+def _finished_steps(folder: str | Path) -> int:
+    """Return the steps of the finished training whose policy a folder holds; 0 if it holds none."""
     card = (Path(folder) / POLICY).with_suffix(".json")  # written after the policy
-    return card.exists() and read_json(card)["config"]["steps"] >= steps
+    return read_json(card)["config"]["steps"] if card.exists() else 0
 
 
 def _earlier_steps(config: TrainConfig, folder: Path) -> int | None:
@@ -136,7 +142,7 @@ def _earlier_steps(config: TrainConfig, folder: Path) -> int | None:
 
     Raises:
         ConfigError: if the folder's configuration cannot be read.
-        DataError: if it is that of another training, or of one that cannot be extended to the steps of ``config``.
+        DataError: if it is that of another training, or of a finished one that cannot go on to the steps of ``config``.
     """
     if not (folder / "config.yaml").exists():
         return None
@@ -147,14 +153,22 @@ def _earlier_steps(config: TrainConfig, folder: Path) -> int | None:
             f"'{folder}' holds a training with another configuration: {other}; choose a new folder, or change only: "
             "steps (to train on)"
         )
-    if config.steps < stored.steps:
+    finished = _finished_steps(folder)
+    if config.steps < finished:
         raise DataError(
-            f"'{folder}' holds a training of {stored.steps} steps, got steps = {config.steps}; choose a new folder, or "
-            f"steps = {stored.steps} or more"
+            f"'{folder}' holds a finished training of {finished} steps, got steps = {config.steps}; choose a new "
+            f"folder, or steps = {finished} or more"
         )
-    if stored.steps < config.steps and is_finished(folder, stored.steps) and not (folder / CHECKPOINT).exists():
+    path = folder / CHECKPOINT
+    made = _meta(path)["curve"][-1]["step"] if finished < config.steps < stored.steps and path.exists() else 0
+    if config.steps < made:
         raise DataError(
-            f"'{folder}' holds a finished training of {stored.steps} steps without '{CHECKPOINT}', so it cannot be "
+            f"'{folder}' holds a training that has made {made} of {stored.steps} steps, got steps = {config.steps}; "
+            f"choose a new folder, or steps = {made} or more"
+        )
+    if 0 < finished < config.steps and not path.exists():
+        raise DataError(
+            f"'{folder}' holds a finished training of {finished} steps without '{CHECKPOINT}', so it cannot be "
             f"extended to {config.steps}; choose a new folder, and start from this policy with --initial "
             f"{folder / POLICY}"
         )
@@ -162,7 +176,7 @@ def _earlier_steps(config: TrainConfig, folder: Path) -> int | None:
 
 
 def _save_extension(folder: Path, config: TrainConfig, earlier: int, step: int) -> None:
-    """Record that a training of ``earlier`` steps, which has reached ``step``, goes on to those of a configuration."""
+    """Record that a training planned for ``earlier`` steps, which has made ``step``, ends at other ones."""
     path = folder / "provenance.json"
     origin = read_json(path)
     extension = {"from_steps": earlier, "to_steps": config.steps, "at_step": step, "provenance": provenance()}
@@ -336,11 +350,7 @@ def _restore(learner: Learner, path: Path) -> tuple[list[CurvePoint], Tensors, E
     Returns:
         Learning curve, weights of the best policy so far, last evaluation, and CPU time spent so far [s].
     """
-    from safetensors import safe_open
-
-    tensors = read_tensors(path)
-    with safe_open(path, framework="numpy") as opened:
-        meta = json.loads(opened.metadata()["training"])
+    tensors, meta = read_tensors(path), _meta(path)
 
     def part(name: str) -> Tensors:
         return {k.removeprefix(f"{name}/"): v for k, v in tensors.items() if k.startswith(f"{name}/")}
@@ -348,6 +358,21 @@ def _restore(learner: Learner, path: Path) -> tuple[list[CurvePoint], Tensors, E
     learner.load_weights(part("weights"), path)
     learner.restore(part("state"), meta["state"])
     return meta["curve"], part("best"), Evaluation.from_json(meta["outcome"]), float(meta["cpu_seconds"])
+
+
+def _meta(path: Path) -> dict[str, Any]:
+    """Return all but the tensors of a checkpoint.
+
+    Raises:
+        WeightsError: if it is damaged.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="numpy") as opened:
+            return json.loads(opened.metadata()["training"])
+    except SafetensorError as error:
+        raise WeightsError(f"checkpoint '{path}' is damaged or truncated: {error}") from None
 
 
 def _write_curve(path: Path, curve: list[CurvePoint]) -> None:

@@ -204,22 +204,31 @@ def carry() -> dict[str, object]:
 
 
 if __name__ == "__main__":
+    import argparse
     import sys
 
     from softgym_envs.storage import write_json
 
-    if sys.argv[1] == "imitate":
-        imitate(float(sys.argv[2]), Path(sys.argv[3]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if sys.argv[1:2] == ["imitate"]:
+        parser.add_argument("verb")
+        parser.add_argument("payload", type=float, choices=PAYLOADS, help="of the stored swing [kg]")
+        parser.add_argument("file", type=Path, help="of the policy, with the ending .safetensors")
+        given = parser.parse_args()
+        imitate(given.payload, given.file)
         sys.exit()
-    payload, generations = float(sys.argv[1]), int(sys.argv[2])
-    seed = int(sys.argv[3]) if sys.argv[3:] else 0
-    mesh = sys.argv[4] if sys.argv[4:] else "published"
+    parser.add_argument("payload", type=float, choices=PAYLOADS, help="[kg]")
+    parser.add_argument("generations", type=int)
+    parser.add_argument("seed", type=int, nargs="?", default=0)
+    parser.add_argument("mesh", choices=SEARCHED, nargs="?", default="published")
+    given = parser.parse_args()
     entries = _stored()
-    found = search(payload, generations, seed=seed, mesh=mesh)
-    env = make(payload, mesh)
-    before, after = (episode(env, swing(one["parameters"]))[0] for one in (entries[mesh, payload], found))
+    found = search(given.payload, given.generations, seed=given.seed, mesh=given.mesh)
+    env = make(given.payload, given.mesh)
+    kept = entries[given.mesh, given.payload]
+    before, after = (episode(env, swing(one["parameters"]))[0] for one in (kept, found))
     print(f"{after:.1f} mm; the stored swing {before:.1f} mm")
     env.close()
     if after > before:
-        entries[mesh, payload] = found
+        entries[given.mesh, given.payload] = found
     write_json(DATA, list(entries.values()))

@@ -9,8 +9,8 @@ shows that file. Finished parts are not computed again.
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
@@ -66,4 +66,6 @@ def design_networks() -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "results/design_networks"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("results/design_networks"))
+    main(parser.parse_args().folder)

@@ -1,8 +1,8 @@
 """Fingers grown from examples: a latent space of side views against seven parameters, at an equal number of bodies.
 
-``python -m benchmarks.grown_shapes FOLDER [BODIES]`` trains the variational autoencoder, searches with both for three
-seeds of 300 bodies each, and writes ``benchmarks/data/grown_shapes.json``; what is in FOLDER is not computed again.
-With ``quality FOLDER`` only what the autoencoder is worth is measured, and replaced in that file.
+``python -m benchmarks.grown_shapes FOLDER`` trains the variational autoencoder, searches with both for three seeds of
+300 bodies each, and writes ``benchmarks/data/grown_shapes.json``; what is in FOLDER is not computed again. With
+``--quality`` only what the autoencoder is worth is measured, and replaced in that file.
 
 A finger is a side view, extruded to the width of the Soft Finger. The side view is where a function of the place along
 the finger (s) and across it (y) is negative: near its surface the signed distance. Examples have one to four notches,
@@ -12,6 +12,7 @@ stiff it is with the cable held.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import time
@@ -460,7 +461,7 @@ def run(folder: Path, budget: int) -> dict[str, Any]:
             kept = folder / f"{name.replace(' ', '_')}_{seed}.jsonl"
             rows = search(kept, names, bounds, shape, seed, budget)
             entry = {"space": name, "seed": seed, "hypervolume": volume(rows, baseline)}
-            entry["failed"] = sum("failed" in row for row in rows)
+            entry["failed"] = [number for number, row in enumerate(rows) if "failed" in row]
             print(entry, file=sys.stderr, flush=True)
             shapes = [row for row in rows if "failed" not in row]
             entry["bodies"] = [{k: row[k] for k in ("x", "reach", "stiffness", "effort")} for row in shapes]
@@ -468,17 +469,21 @@ def run(folder: Path, budget: int) -> dict[str, Any]:
     return found
 
 
-def grown_shapes_table() -> str:
-    """Hypervolumes of both spaces by seed and their means, and how much larger that of the latent space is."""
+def _kept() -> dict[str, Any]:
     if not KEPT.is_file():
         raise DataError(
             f"'{KEPT}' does not exist; make it with 'python -m benchmarks.grown_shapes results/grown_shapes'"
         )
-    found = json.loads(KEPT.read_text())
+    return json.loads(KEPT.read_text())
+
+
+def grown_shapes_table() -> str:
+    """Hypervolumes of both spaces by seed and their means, and how much larger that of the latent space is."""
+    found = _kept()
     spaces = ("seven parameters", "latent space")
     entries = [[e for e in found["searches"] if e["space"] == space] for space in spaces]
     volumes = np.array([[entry["hypervolume"] for entry in each] for each in entries])
-    unused = [[f"{entry['failed']} of {found['budget']}" for entry in each] + [""] for each in entries]
+    unused = [[f"{len(entry['failed'])} of {found['budget']}" for entry in each] + [""] for each in entries]
     rows = []
     names = [*(f"seed {entry['seed']}" for entry in entries[0]), "mean"]
     for k, (one, two) in enumerate(np.column_stack([volumes, volumes.mean(axis=1)]).T):
@@ -487,13 +492,28 @@ def grown_shapes_table() -> str:
     return markdown(["search", *spaces, "difference", *(f"{space}: not solved" for space in spaces)], rows, "lrrrrr")
 
 
+def grown_leads_table() -> str:
+    """How much larger the hypervolume of the latent space is after some of the bodies, by seed and of the means."""
+    found = _kept()
+    baseline = Judged(**found["baseline"])
+
+    def after(space: str, bodies: int) -> np.ndarray:
+        """Hypervolumes of the first bodies of each search; those that were not solved count as bodies."""
+        entries = [entry for entry in found["searches"] if entry["space"] == space]
+        solved = [bodies - sum(number < bodies for number in entry["failed"]) for entry in entries]
+        return np.array([volume(entry["bodies"][:k], baseline) for entry, k in zip(entries, solved, strict=True)])
+
+    rows = []
+    for bodies in (60, 150, found["budget"]):
+        one, two = after("seven parameters", bodies), after("latent space", bodies)
+        leads = [*(two / one - 1.0), two.mean() / one.mean() - 1.0]
+        rows.append([f"{bodies}", *(f"{100.0 * lead:+.1f} %" for lead in leads)])
+    return markdown(["bodies", *(f"seed {seed}" for seed in SEEDS), "mean"], rows, "rrrrr")
+
+
 def grown_quality_table() -> str:
     """What the autoencoder makes of examples that it has not seen, and of samples."""
-    if not KEPT.is_file():
-        raise DataError(
-            f"'{KEPT}' does not exist; make it with 'python -m benchmarks.grown_shapes results/grown_shapes'"
-        )
-    found = json.loads(KEPT.read_text())["quality"]
+    found = _kept()["quality"]
     rows = [
         ["error of the signed distance within 3 mm of the surface", f"{found['error near the surface [mm]']:.2f} mm"],
         ["common area of example and decoded example, over their union", f"{100.0 * found['overlap']:.0f} %"],
@@ -551,12 +571,20 @@ def draw() -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-TABLES = {"grown_shapes": grown_shapes_table, "grown_quality": grown_quality_table}
+TABLES = {
+    "grown_shapes": grown_shapes_table,
+    "grown_leads": grown_leads_table,
+    "grown_quality": grown_quality_table,
+}
 """Tables of pages by name."""
 
 if __name__ == "__main__":
-    if sys.argv[1] == "quality":
-        write_json(KEPT, json.loads(KEPT.read_text()) | {"quality": measure(Path(sys.argv[2]))[1]})
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="what is finished, for a search that goes on")
+    parser.add_argument("--bodies", type=int, default=300, help="of each search")
+    parser.add_argument("--quality", action="store_true", help="measure the autoencoder only")
+    given = parser.parse_args()
+    if given.quality:
+        write_json(KEPT, _kept() | {"quality": measure(given.folder)[1]})
     else:
-        budget = int(sys.argv[2]) if len(sys.argv) > 2 else 300
-        write_json(KEPT, {**run(Path(sys.argv[1]), budget), "provenance": provenance()})
+        write_json(KEPT, {**run(given.folder, given.bodies), "provenance": provenance()})

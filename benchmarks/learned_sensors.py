@@ -6,6 +6,7 @@ prints those of the finger with four cavities.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import time
@@ -250,4 +251,6 @@ TABLES = {"learned_sensors_strata": strata_table, "learned_sensors_estimates": e
 """Tables of pages by name."""
 
 if __name__ == "__main__":
-    json.dump(_record(int(sys.argv[1]) if len(sys.argv) > 1 else 2), sys.stdout, indent=2)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cavities", type=int, choices=GROUPS, nargs="?", default=2)
+    json.dump(_record(parser.parse_args().cavities), sys.stdout, indent=2)

@@ -11,6 +11,7 @@ exist are not computed again. The rows that this repository keeps are in ``bench
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 import subprocess
@@ -234,4 +235,8 @@ if __name__ == "__main__":
         task, learner, seed, commit, path = sys.argv[2:]
         write_json(Path(path), asdict(measure(task, learner, int(seed), commit, Path(path).parent / "runs")))
     else:
-        main(Path(sys.argv[1] if sys.argv[1:] else "results/learners").resolve(), sys.argv[2:])
+        parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+        parser.add_argument("folder", type=Path, nargs="?", default=Path("results/learners"))
+        parser.add_argument("chosen", nargs="*", metavar="TASK:LEARNER", help="default: all")
+        given = parser.parse_args()
+        main(given.folder.resolve(), given.chosen)

@@ -356,6 +356,39 @@ def module_bounds() -> dict[str, object]:
     return result
 
 
+def accordion_fits() -> dict[str, object]:
+    """Stiffness at rest of the accordions of the arm of eight cells, by fits to states at rest alone.
+
+    The fits learn the bodies of the recipe, with and without the corners of its box, and have corrections of first and
+    of second degree in the logarithms of the dimensions. Errors are the largest over all directions of motion.
+    """
+    from dataclasses import replace
+
+    from softgym_envs.robots.modular_arm import CELLS
+    from softgym_envs.robots.modules import MODULES, learned_module, learning
+    from softgym_envs.robots.modules.learned import polynomials
+    from softgym_envs.robots.modules.states import solve_states
+
+    name, (cells, _) = "accordion", ARMS["eight cells of all kinds"]
+    recipe, dimensions = learning.RECIPES[name], tuple(learning.RECIPES[name].box)
+    space, rng = ModularArm(cells=cells).design_space, np.random.default_rng(0)
+    arms = [space.complete({}), *(space.sample(rng) for _ in range(RANDOM_BODIES))]
+    places = [number for number, cell in enumerate(cells, start=1) if CELLS[cell][0] == name]
+    bodies = np.array([[arm[f"{dimension}_{place}"] for dimension in dimensions] for arm in arms for place in places])
+    true = solve_states(MODULES[name](), bodies, dimensions, rotation=recipe.rotation, rays=0, rng=rng)
+    result: dict[str, object] = {"accordions": len(bodies)}
+    for corners in (False, True):
+        states = learning.training_states(name, replace(recipe, rays=0, corners=corners))
+        for degree, text in ((1, "first"), (2, "second")):
+            model = replace(learned_module(name), degrees=(recipe.degrees[0], degree))
+            P, Q = (polynomials(model.unit(states.designs), each) for each in model.degrees)
+            found = learning._guess_at_rest(model, states, P, Q)
+            errors = learning.stiffness_errors(found, true)
+            key = f"{'with' if corners else 'without'} corners, corrections of {text} degree: largest error [%]"
+            result[key] = 100.0 * float(errors.max())
+    return result
+
+
 def module_meshes() -> dict[str, object]:
     """By how much half as long edges make modules softer or stiffer, in the directions of motion of the extremes."""
     from softgym_envs.robots.modules import MODULES
@@ -373,6 +406,7 @@ def module_meshes() -> dict[str, object]:
 
 BENCHMARKS = {benchmark(name): of(name) for name in ARMS} | {
     "modular_arm_kinds": kinds,
+    "accordion_fits": accordion_fits,
     "modular_arm_stability": stability,
     "module_bounds": module_bounds,
     "module_meshes": module_meshes,

@@ -9,8 +9,8 @@ that this repository keeps are in ``benchmarks/data/networks.json``; ``softgym b
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -329,4 +329,7 @@ def _factor(case: str, runs: list[dict[str, Any]]) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "results/networks"), *map(int, sys.argv[2:3]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("results/networks"))
+    parser.add_argument("workers", type=int, nargs="?", default=1, help="number of processes")
+    main(**vars(parser.parse_args()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shlex
 import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -130,18 +131,24 @@ def run(names: Sequence[str], output: str | Path) -> dict[str, dict[str, object]
     """Run the named benchmarks (default: all) and write each result with its provenance to a JSON file.
 
     The file keeps its results of other benchmarks, with the commit that made them. A name also stands for all
-    benchmarks that begin with it and an underscore: ``convergence`` for those of every robot.
+    benchmarks that begin with it and an underscore: ``convergence`` for those of every robot. Ctrl-C prints the command
+    that runs those which are not finished.
 
     Raises:
         ConfigError: for an unknown name, or a file with other contents.
     """
-    chosen = [full for name in names for full in matching(name)] or list(BENCHMARKS)
+    chosen = list(dict.fromkeys(full for name in names for full in matching(name))) or list(BENCHMARKS)
     kept = _read(Path(output))
     origin = _origin(Path(output))
     results: dict[str, dict[str, object]] = {}
     for name in chosen:
         click.echo(f"\n{name}: {(BENCHMARKS[name].__doc__ or '').splitlines()[0]}")
-        results[name] = BENCHMARKS[name]()
+        try:
+            results[name] = BENCHMARKS[name]()
+        except KeyboardInterrupt:
+            rest = shlex.join(["softgym", "bench", "--output", str(output), *chosen[len(results) :]])
+            click.echo(f"\n{len(results)} of {len(chosen)} benchmarks finished; to go on: {rest}", err=True)
+            raise
         for key, value in results[name].items():
             click.echo(f"  {key:58s} {value:.6g}" if isinstance(value, float) else f"  {key:58s} {value}")
         machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}

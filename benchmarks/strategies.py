@@ -15,10 +15,10 @@ to the best one: 100 % at the baseline, 0 % at the best.
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import json
 import re
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -421,5 +421,8 @@ def strategies() -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    main(Path(given[0] if given else "results/strategies"), int(given[1]) if given[1:] else 1, given[2:])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("results/strategies"))
+    parser.add_argument("workers", type=int, nargs="?", default=1, help="number of processes")
+    parser.add_argument("names", nargs="*", help="of strategies (default: all, and the ground truth)")
+    main(**vars(parser.parse_args()))

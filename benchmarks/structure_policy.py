@@ -9,6 +9,7 @@ order in which both put the bodies of the study. It writes ``benchmarks/data/str
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -90,4 +91,6 @@ TABLES = {"structure_policy": table}
 """Tables of pages by name."""
 
 if __name__ == "__main__":
-    write_json(KEPT, {**compare(Path(sys.argv[1])), "provenance": provenance()})
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of the finished study")
+    write_json(KEPT, {**compare(parser.parse_args().folder), "provenance": provenance()})

@@ -13,6 +13,7 @@ other goals, and quadratic finite elements of the whole body judge the best one 
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Mapping
@@ -213,4 +214,6 @@ TABLES = {"structures": structures_table, "structures_more": more_table}
 """Tables of pages by name."""
 
 if __name__ == "__main__":
-    write_json(KEPT, {"rows": judge_all(Path(sys.argv[1])), "provenance": provenance()})
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of the searches")
+    write_json(KEPT, {"rows": judge_all(parser.parse_args().folder), "provenance": provenance()})

@@ -9,6 +9,7 @@ fingers it started from and for its strongest one, on quadratic meshes of 20 and
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 import sys
@@ -43,4 +44,6 @@ def compare(folder: Path) -> dict[str, list[float]]:
 
 
 if __name__ == "__main__":
-    json.dump(compare(Path(sys.argv[1])), sys.stdout, indent=2)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of the finished search")
+    json.dump(compare(parser.parse_args().folder), sys.stdout, indent=2)

@@ -13,7 +13,7 @@ from softgym_envs.codesign.goals import draw_goals
 from softgym_envs.codesign.records import Account, TrialResult
 from softgym_envs.codesign.scheduling.connect import open_storage
 from softgym_envs.codesign.scheduling.storage import SharedStorage, StudyStorage, file_lock
-from softgym_envs.config import check_compatible, check_config, load_stored, save_resolved
+from softgym_envs.config import check_compatible, check_config, load_stored, save_config, save_resolved
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.storage import atomic_write, read_json, write_json
 
@@ -81,8 +81,10 @@ class StudyFolder:
             if not new:
                 _accept(folder.config, config, f"folder '{path}'", "folder", folder._tested_with())
             goals = None if config.storage == JOURNAL else folder._agree(config, str(path), wait)
-            if new or folder.config != config:
+            if new:
                 save_resolved(folder.path, config)
+            elif folder.config != config:
+                save_config(folder.path, config)  # provenance.json keeps the commit that began the study
                 folder.__dict__.pop("config", None)
             if not (folder.path / "goals.json").exists():
                 write_json(folder.path / "goals.json", draw_goals(config) if goals is None else goals)
@@ -123,10 +125,13 @@ class StudyFolder:
         return shared["goals"]
 
     def _tested_with(self) -> tuple[str, ...]:
-        """Return the settings with which finalists in the folder were tested, or trained for their tests."""
+        """Return the settings with which finalists in the folder were tested, or trained for their tests.
+
+        A training that has not ended depends on none of them: with another number of steps it begins again.
+        """
         if any(self.path.glob("finalists/*.json")):
             return TEST_SETTINGS
-        return TEST_SETTINGS[:1] if any(self.path.glob("finalists/*/")) else ()
+        return TEST_SETTINGS[:1] if any(self.path.glob("finalists/*/policy.safetensors")) else ()
 
     def open_storage(self) -> StudyStorage:
         """Open the storage of the trials."""

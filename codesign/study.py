@@ -77,6 +77,7 @@ def run_study(
     count = config.workers if workers is None else workers
     if count < 1:
         raise ConfigError(f"workers = {count} is out of bounds; allowed: 1 or more")
+    config = config.model_copy(update={"workers": count})  # the report names it
     # Find mistakes before anything is written or started.
     _check_policy(config)
     known = StudyFolder(folder)
@@ -102,7 +103,8 @@ def run_study(
                 _run_finalists(study, count, output)
     except KeyboardInterrupt:
         done = len(study.result_files())
-        output.say(f"interrupted: {done} of {config.trials} trials finished; run the same command again to continue")
+        share = f"{done} of {config.trials}" if done <= config.trials else f"{done}"
+        output.say(f"interrupted: {share} trials finished; run the same command again to continue")
         raise
     results = write_results(load_study(study))
     output.verdict(results)
@@ -198,11 +200,13 @@ def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
                 mirrored = time.monotonic()
             output.trials()
 
-        if queue.left():
+        queue.claimable()  # recovers the trials of dead workers, so that none counts twice
+        if left := queue.left():
             finished = len(study.result_files())
-            bodies = "1 body" if config.trials == 1 else f"{config.trials} bodies"
+            total = finished + left  # more than config.trials if a study goes on with fewer than it was begun with
+            bodies = "1 body" if total == 1 else f"{total} bodies"
             text = f"{bodies} of study '{config.name}', {finished} of them finished before"
-            output.begin("trials", text, config.trials, finished)
+            output.begin("trials", text, total, finished)
         while queue.left():
             if queue.claimable():
                 stopped = run_workers(study, "trials", min(workers, queue.left()), tick)

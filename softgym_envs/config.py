@@ -205,8 +205,11 @@ def _describe(problem: ErrorDetails) -> str:
     message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("\n", " ")
     for pattern, plain in _IN_YAML:
         message = pattern.sub(plain, message)
-    shown = _PASSWORD.sub(r":***@", repr(problem["input"]))
-    if not isinstance(problem["input"], dict) and shown not in message:
+    value = problem["input"]
+    shown = _PASSWORD.sub(r":***@", repr(value))
+    # A text stands in quotes, but a bound in the message may be the same number as the value.
+    named = shown in message if isinstance(value, str) else f"= {shown}" in message or f"got {shown}" in message
+    if not isinstance(value, dict) and not named:
         message += f", got {shown}"
     return f"{key}: {message}" if problem["loc"] else message
 

@@ -49,7 +49,7 @@ def parallel_map(
 
         # loky replaces workers that were idle for minutes or use much memory; the warning needs no action.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
-        with parallel_config("loky", n_jobs=workers, initializer=_end_with_parent, initargs=(os.getpid(),)):
+        with parallel_config("loky", n_jobs=workers, initializer=_begin_worker, initargs=(os.getpid(),)):
             yield from Parallel(return_as="generator_unordered", batch_size=1)(
                 delayed(function)(*row) for row in arguments
             )
@@ -91,16 +91,21 @@ def _map_on_ray(function: Callable, arguments: Sequence[tuple], workers: int) ->
             return Parallel(batch_size=1)(delayed(function)(*row) for row in arguments)
 
 
-def _end_with_parent(parent: int) -> None:
-    """End this process soon after its parent ends, since a killed parent cannot stop its workers.
+def _begin_worker(parent: int) -> None:
+    """Prepare a worker process: it ends soon after its parent, since a killed parent cannot stop its workers.
+
+    Progress bars get a lock of this process. Their own is shared between processes, and Python warns of its semaphore
+    when Ctrl-C has ended the worker.
 
     The thread compares the parent's ID instead of checking whether ``parent`` exists, because a killed process exists
     as a zombie until its own parent collects it.
     """
+    from tqdm import tqdm
 
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(PARENT_CHECK_INTERVAL)
         os._exit(1)
 
+    tqdm.set_lock(threading.RLock())
     threading.Thread(target=watch, name="parent-watch", daemon=True).start()

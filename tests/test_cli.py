@@ -43,6 +43,10 @@ def test_rollout_evaluate_and_record(softgym, tmp_path):
     recording = tmp_path / "episode.rrd"
     status, out, _ = softgym("rollout", "SoftGym/FingerTrack-v0", "--record", recording)
     assert status == 0 and recording.stat().st_size > 10_000
+    assert "100 steps, return " in out and "final distance" in out and " mm, success" in out
+    assert out.endswith(f"open it with 'softgym view {recording}'\n")
+    status, _, error = softgym("rollout", "SoftGym/FingerTrack-v0", "--record", recording.with_suffix(".mp4"))
+    assert status == 2 and "episode.mp4' must end with .rrd" in error
     config = ROOT / "configs" / "agents" / "finger_reach.yaml"
     output = tmp_path / "table.json"
     status, out, _ = softgym("evaluate", "--config", config, "--goals", 4, "--output", output)

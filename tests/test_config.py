@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from softgym_envs.agents import EnvironmentConfig, TrainConfig
-from softgym_envs.config import Config, check_compatible, commit_of, difference
+from softgym_envs.config import Config, check_compatible, check_config, commit_of, difference
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.storage import JsonLines, drop_torn_line, read_json
 
@@ -115,3 +115,13 @@ def test_a_configuration_made_in_python_says_which_keys_are_allowed():
         TrainConfig(environment=EnvironmentConfig(id="SoftGym/FingerReach-v0"), stepz=3)
     with pytest.raises(ValueError, match="unknown key 'gama'; did you mean 'gamma'"):
         TrainConfig(environment={"id": "SoftGym/FingerReach-v0"}, sac={"gama": 0.9})
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "end"), [("steps", 0, "must be greater than 0, got 0"), ("steps", "x", "got 'x'")]
+)
+def test_the_value_is_named_once(key, value, end):
+    data = {"environment": {"id": "SoftGym/FingerReach-v0"}, key: value}
+    with pytest.raises(ConfigError) as caught:
+        check_config(TrainConfig, data, "here")
+    assert str(caught.value).endswith(end) and str(caught.value).count("got") == 1

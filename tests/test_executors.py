@@ -63,6 +63,27 @@ def test_workers_end_with_their_owner():
                 os.kill(left, signal.SIGKILL)
 
 
+def test_ctrl_c_of_workers_with_progress_bars_is_quiet():
+    bar = "import time, tqdm\nwith tqdm.tqdm(total=2) as bar:\n    bar.update()\n    bar.refresh()\n    time.sleep(600)"
+    code = f"from softgym_envs.executors import parallel_map\nlist(parallel_map(exec, [({bar!r},)] * 2, 2))"
+    with subprocess.Popen(
+        [sys.executable, "-c", f"import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n{code}"],
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    ) as process:
+        try:
+            assert process.stderr is not None
+            seen = b""
+            while seen.count(b"1/2") < 2:
+                seen += os.read(process.stderr.fileno(), 4096)
+            os.killpg(process.pid, signal.SIGINT)
+            assert b"leaked" not in process.stderr.read() and process.wait() != 0
+            wait_until(lambda: not live_processes(process.pid))
+        finally:
+            for left in live_processes(process.pid):
+                os.kill(left, signal.SIGKILL)
+
+
 def test_ray_that_is_not_installed(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ValueError, match=r"executor = 'ray' needs Ray \(.*\): pip install 'softgym-envs\[ray\]'"):

@@ -63,3 +63,11 @@ def test_a_finger_with_thinner_joints_is_softer_and_needs_less_effort():
     first, second = (grown.judge(grown.seven_parameters(x)) for x in (grown.BASELINE, thin))
     assert second.stiffness < first.stiffness
     assert 0.0 < second.effort < first.effort
+
+
+def test_leads_after_all_bodies_are_the_differences_of_the_searches():
+    """After all bodies they are the differences of the other table."""
+    rows = [line.split(" | ") for line in grown.grown_leads_table().splitlines()[2:]]
+    found = [row.split(" | ")[3].strip() for row in grown.grown_shapes_table().splitlines()[2:]]
+    assert [cell.strip(" |") for cell in rows[-1][1:]] == [cell.strip(" |") for cell in found]
+    assert rows[0][1:] != rows[-1][1:]

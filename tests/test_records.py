@@ -96,3 +96,21 @@ def test_results_of_uncommitted_code_are_not_recorded(monkeypatch):
     monkeypatch.setattr(run.subprocess, "run", lambda *_, **__: type("Done", (), {"stdout": " M README.md\n"}))
     with pytest.raises(ConfigError, match=r"committed code only, but README.md is changed"):
         run.run(["networks"], run.RECORDS)
+
+
+def test_interrupted_benchmarks_say_how_to_go_on(monkeypatch, tmp_path, capsys):
+    def interrupt():
+        """Stop."""
+        raise KeyboardInterrupt
+
+    def measured():
+        """Measure."""
+        return {"answer": 42.0}
+
+    monkeypatch.setattr(run, "BENCHMARKS", {"first": measured, "second": interrupt, "third": measured})
+    with pytest.raises(KeyboardInterrupt):
+        run.run(("first", "second", "first", "third"), tmp_path / "all.json")
+    assert f"1 of 3 benchmarks finished; to go on: softgym bench --output {tmp_path}/all.json second third\n" in (
+        capsys.readouterr().err
+    )
+    assert list(json.loads((tmp_path / "all.json").read_text())) == ["first"]

@@ -5,12 +5,13 @@ If the study names a finer mesh, baseline and winner are then tested on it too.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.training import train
 from softgym_envs.codesign.config import StudyConfig
@@ -19,6 +20,7 @@ from softgym_envs.codesign.phases.ends import check_policy, run_ends
 from softgym_envs.codesign.phases.trial import assess, measure, training_config
 from softgym_envs.codesign.records import REFINED, Finalist, FinalistTest, FinalistTraining, Job, PlannedTest
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.config import load_stored
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import read_json
 
@@ -148,6 +150,8 @@ def _trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
     name = training_name(finalist.trial, seed)
     place = folder.path / "finalists" / name
     with folder.lock(f"training-{name}"):
+        if (place / "config.yaml").exists() and load_stored(place, TrainConfig, "a training").steps != steps:
+            shutil.rmtree(place)  # it has not ended, else the steps could not have changed; all bodies train alike
         policy = train(training, place, initial=initial, progress=False)
         if not (place / "training.json").exists():
             objective = config.primary

@@ -100,7 +100,7 @@ def _failures(snapshot: StudySnapshot) -> Finding | None:
     failed = snapshot.failures
     if not failed:
         return None
-    texts = "; ".join(f"trial {trial}: {error}" for trial, error in failed.items())
+    texts = ". ".join(f"Trial {trial}: {error}" for trial, error in failed.items())
     return Finding(f"{len(failed)} of {len(snapshot.finalists)} bodies fail on FEM", f"They cannot win. {texts}.")
 
 
@@ -169,9 +169,9 @@ def _alternatives(snapshot: StudySnapshot, results: StudyResults) -> Finding | N
         far = variables[int(np.argmax(steps))]
         differs = f"{far.name.replace('_', ' ')} {present(values[far.name], far.unit)}"
         ends = snapshot.config.distance.text(distance)
-        parts.append(f"trial {body.trial} ({ends}, {differs} instead of {present(winner[far.name], far.unit)})")
+        parts.append(f"Trial {body.trial} ({ends}, {differs} instead of {present(winner[far.name], far.unit)})")
     if not parts:
         return None
     return Finding(
-        "Other bodies do as well", f"{'; '.join(parts)}. Choose the one that is easiest to make.", warns=False
+        "Other bodies do as well", f"{'. '.join(parts)}. Choose the one that is easiest to make.", warns=False
     )

@@ -340,11 +340,12 @@ def _add_goals(figure: Figure, episode: Episode, outcomes: GoalOutcomes | None) 
 
 
 def _scene() -> dict[str, Any]:
-    axis = {"backgroundcolor": "#f8fafc", "gridcolor": "#e2e8f0", "showbackground": True}
+    axis = {"backgroundcolor": "#f8fafc", "gridcolor": "#e2e8f0", "showbackground": True, "nticks": 6}
     return {
         **{f"{name}axis": {"title": f"{name} [mm]", **axis} for name in "xyz"},
         "aspectmode": "data",
-        "camera": {"eye": {"x": 2.3, "y": 1.1, "z": 0.6}},
+        # Far enough for the labels of the axes, which hang below the box.
+        "camera": {"eye": {"x": 2.5, "y": 1.2, "z": 0.55}, "center": {"x": 0.0, "y": 0.0, "z": -0.1}},
     }
 
 
@@ -399,6 +400,7 @@ def _add_player(figure: Figure, episodes: Sequence[Episode], picks: Sequence[lis
     play = {**still, "frame": {"duration": 90, "redraw": True}}
     figure.update_layout(
         margin={"l": 0, "r": 0, "t": 10, "b": 0},
+        modebar={"orientation": "v"},  # beside the legend, not over it
         updatemenus=[
             {
                 "type": "buttons",
@@ -423,6 +425,7 @@ def _add_player(figure: Figure, episodes: Sequence[Episode], picks: Sequence[lis
                 "pad": {"t": 18},
                 "active": length - 1,
                 "ticklen": 0,
+                "minorticklen": 0,
                 "currentvalue": {
                     "prefix": f"{episodes[0].task.distance_scale.name} at ",
                     "xanchor": "left",

@@ -176,6 +176,11 @@ class StudyResults(Record):
     provenance: dict[str, Any]
 
     @property
+    def bodies(self) -> int:
+        """Number of finished trials."""
+        return sum(self.trials[state] for state in ("complete", "pruned", "infeasible"))
+
+    @property
     def roles(self) -> dict[int, str]:
         """Trial numbers of baseline and winner."""
         bodies = {"baseline": self.baseline, "winner": self.winner}

@@ -13,7 +13,7 @@ from softgym_envs.codesign.report.episodes import Episode
 from softgym_envs.codesign.report.results import Comparison, StudyResults
 from softgym_envs.codesign.report.statistics import MIN_GOALS, MeshPart, kendall_tau, rank_correlation
 from softgym_envs.codesign.report.tables import BACKENDS, SHOWN_ALWAYS, percent
-from softgym_envs.codesign.report.units import present
+from softgym_envs.codesign.report.units import present, time_text
 from softgym_envs.codesign.snapshot import StudySnapshot
 
 CONTROLLERS = {
@@ -130,8 +130,7 @@ def key_figures(snapshot: StudySnapshot, results: StudyResults) -> list[KeyFigur
     if transfer and transfer[0].spearman is not None:
         label = f"rank correlation of surrogate and FEM, {len(transfer[0].trials)} bodies"
         add(f"{transfer[0].spearman:.2f}", label)
-    cpu = sum(results.cost.cpu_seconds.values())
-    add(f"{cpu / 60:.1f} min", f"CPU time for {results.trials['requested']} bodies")
+    add(time_text(sum(results.cost.cpu_seconds.values())), f"CPU time for {results.bodies} bodies")
     return figures
 
 
@@ -178,7 +177,7 @@ def _method(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, s
         ("Physics", f"{backend} in the search; {_tested(snapshot)}"),
         ("Controller", CONTROLLERS[config.strategy]),
         ("Goals", f"{_origin_of_goals(snapshot)}; {others}"),
-        ("Budget", f"{config.trials} bodies ({done})"),
+        ("Budget", f"{max(config.trials, results.bodies)} bodies ({done})"),
     ]
     if config.plan.trains:
         rows.append(("Training", f"{config.training.steps:,} environment steps in each trial"))

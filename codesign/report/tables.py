@@ -11,7 +11,7 @@ from softgym_envs.codesign.objectives import Objective
 from softgym_envs.codesign.records import REFINED, TrialResult
 from softgym_envs.codesign.report.results import Comparison, Cost, StudyResults, Transfer, VariableResult
 from softgym_envs.codesign.report.statistics import MeshPart
-from softgym_envs.codesign.report.units import present, shown_unit
+from softgym_envs.codesign.report.units import present, shown_unit, time_text
 from softgym_envs.codesign.snapshot import StudySnapshot
 
 AGENTS = {"policy": "Policy", "qp": "Inverse QP"}
@@ -282,13 +282,11 @@ def cost_rows(cost: Cost) -> list[CostRow]:
         ),
     }
 
-    def minutes(seconds: float | None) -> str:
-        return "-" if seconds is None else f"{seconds / 60:.1f} min"
-
+    wall = {part: time_text(seconds) for part, seconds in cost.wall_seconds.items()}
     rows = [
-        CostRow(title, steps, minutes(cost.cpu_seconds[part]), minutes(cost.wall_seconds.get(part)))
+        CostRow(title, steps, time_text(cost.cpu_seconds[part]), wall.get(part, "-"))
         for part, (title, steps) in parts.items()
         if part not in ("screen", "shared_policy") or cost.cpu_seconds[part]
     ]
-    total = CostRow("Total", "", minutes(sum(cost.cpu_seconds.values())), minutes(sum(cost.wall_seconds.values())))
+    total = CostRow("Total", "", *(time_text(sum(each.values())) for each in (cost.cpu_seconds, cost.wall_seconds)))
     return [*rows, total]

@@ -1,4 +1,4 @@
-"""Units that people read: lengths in mm, pressures in kPa."""
+"""Units that people read: lengths in mm, pressures in kPa, times in seconds or minutes."""
 
 from __future__ import annotations
 
@@ -14,3 +14,8 @@ def present(value: float, unit: str) -> str:
     """Return a quantity [unit] as people read it: ``"41.50 mm"``."""
     name, factor, decimals = shown_unit(unit)
     return f"{value * factor:.{decimals}f}{' ' + name if name else ''}"
+
+
+def time_text(seconds: float) -> str:
+    """Return a time: ``"2.4 s"``, or ``"10.1 min"`` from a minute on."""
+    return f"{seconds:.1f} s" if seconds < 60.0 else f"{seconds / 60.0:.1f} min"

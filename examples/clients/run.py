@@ -46,6 +46,11 @@ def python_of(name: str, requirement: str) -> Path:
 
 def main(names: list[str]) -> None:
     """Run the snippets of some clients, by default of all."""
+    unknown = [name for name in names if name not in CLIENTS]
+    if unknown:
+        sys.exit(f"unknown client '{unknown[0]}'; allowed: {', '.join(CLIENTS)}")
+    if "d3rlpy" in names and not DATA.exists():
+        names = ["minari", *(name for name in names if name != "minari")]  # it records the data
     failed = []
     for name in names or CLIENTS:
         requirement, script, *arguments = CLIENTS[name]

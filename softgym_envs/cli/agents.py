@@ -23,7 +23,7 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
     """Train a policy with the learner that the configuration names.
 
     An interrupted run continues from its last checkpoint. In the same folder, more steps (steps=80000) extend a
-    finished run.
+    finished run, and fewer shorten one that has not ended.
     """
     from softgym_envs.agents.config import TrainConfig
     from softgym_envs.agents.training import is_finished

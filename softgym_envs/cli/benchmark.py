@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from softgym_envs.cli import options
+from softgym_envs.errors import ConfigError
 from softgym_envs.extras import require
 
 FOLDER = Path("results/benchmark")
@@ -99,6 +100,7 @@ def run(
     An interrupted call continues where it stopped.
     """
     from softgym_envs.codesign.benchmark import references, runs
+    from softgym_envs.codesign.benchmark.frozen import load_definition
     from softgym_envs.codesign.benchmark.table import Table
 
     require("codesign")
@@ -112,7 +114,8 @@ def run(
                     found = runs.run(folder, name, method, judge, level, seed, listed, bodies)  # type: ignore[arg-type]
                     click.echo(
                         f"{name} {method} {found.judge} seed {seed}: {found.bodies} bodies, "
-                        f"{found.spent['cpu_seconds']:.1f} CPU s, best {_scores(found.search_scores[:1])}"
+                        f"{found.spent['cpu_seconds']:.1f} CPU s, best {', '.join(load_definition(name).score_names)}: "
+                        f"{_scores(found.search_scores[:1])} (SI)"
                     )
                     if fem:
                         references.check_winners(folder, [found])
@@ -210,16 +213,21 @@ def verify(path: Path, record: bool, as_json: bool) -> None:
 @click.option("--store", is_flag=True, help="Add the runs of the folder to the stored ones (source checkout).")
 @results
 def table_(folder: Path, store: bool) -> None:
-    """Show the stored runs, or those of a folder, one row per problem, judge and method."""
+    """Show the runs of a folder, one row per problem, judge and method.
+
+    Where the default folder has no runs, those that ship with the package.
+    """
     from softgym_envs.codesign.benchmark import board, runs
 
+    own = (folder / "runs").is_dir()
+    if not own and folder != FOLDER:
+        raise ConfigError(f"folder '{folder}' has no runs; 'softgym benchmark run ... --folder {folder}' makes them")
     if store:
         click.echo(f"wrote {runs.collect(folder)}")
-    if (folder / "runs").is_dir():
+    if own:
         runs.collect(folder, folder)
-        click.echo(board.method_table(runs.stored_runs(folder)))
-    else:
-        click.echo(board.method_table(runs.stored_runs()))
+    click.echo(f"runs of {folder}:" if own else "runs that ship with the package:", err=True)
+    click.echo(board.method_table(runs.stored_runs(folder) if own else runs.stored_runs()))
 
 
 @benchmark.command(name="board")

@@ -89,6 +89,8 @@ def rollout(
 
     if record is not None and video is not None:
         raise ConfigError("--record and --video exclude each other; run the episode twice")
+    if record is not None and record.suffix != ".rrd":
+        raise ConfigError(f"recording '{record}' must end with .rrd; --video writes films")
     if video is not None:
         from softgym_envs.viewer.video import check_video, write_video
 
@@ -103,18 +105,18 @@ def rollout(
         from softgym_envs.viewer.recording import record_rollout
 
         summary = record_rollout(env, act, record, seed=seed)
-        click.echo(json.dumps(summary, indent=2))
-        click.echo(f"wrote {record}; open it with 'softgym view {record}'")
-        return
-    observation, info = env.reset(seed=seed)
-    total, step, ended, doubts = 0.0, 0, False, [int(info["doubt"])]
-    frames: list[Any] = [env.render()] if video is not None else []
-    while not ended:
-        observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
-        total, step, ended = total + float(reward), step + 1, terminated or truncated
-        doubts.append(int(info["doubt"]))
-        if video is not None:
-            frames.append(env.render())
+        total, step, doubts = summary["return"], summary["steps"], summary["doubts"]
+        info = {"distance": summary["final_distance"], "is_success": summary["success"]}
+    else:
+        observation, info = env.reset(seed=seed)
+        total, step, ended, doubts = 0.0, 0, False, [int(info["doubt"])]
+        frames: list[Any] = [env.render()] if video is not None else []
+        while not ended:
+            observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
+            total, step, ended = total + float(reward), step + 1, terminated or truncated
+            doubts.append(int(info["doubt"]))
+            if video is not None:
+                frames.append(env.render())
     click.echo(f"{environment} on {config.backend}, agent {agent}: {step} steps, return {total:.2f}")
     scale = config.task_class.distance_scale
     click.echo(f"final {scale.name} {scale.text(info['distance'], 3)}, success {info['is_success']}")
@@ -124,6 +126,8 @@ def rollout(
     if video is not None:
         write_video(video, frames, fps=env.metadata["render_fps"])
         click.echo(f"wrote {video}")
+    if record is not None:
+        click.echo(f"wrote {record}; open it with 'softgym view {record}'")
     env.close()
 
 

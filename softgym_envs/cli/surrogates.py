@@ -48,7 +48,7 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
 
 
 @click.command("calibrate-trust")
-@click.argument("robot")
+@click.argument("robot", shell_complete=options.complete_robot)
 @options.robot_option
 @click.option("--weights", type=options.PATH, help="Folder of the weights (default: the shipped weights).")
 @click.option("--folder", type=options.PATH, help="Keep the FEM states in this folder; an interrupted run continues.")

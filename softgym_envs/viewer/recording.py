@@ -240,7 +240,7 @@ def record_rollout(
 
     Returns:
         ``return`` (sum of rewards), ``final_distance`` (as `Task.distance` returns it: [m] for positions), ``success``
-        at the last step, and ``steps``.
+        at the last step, ``steps``, and ``doubts``, the ``info["doubt"]`` of each state.
 
     Raises:
         ValueError: if the environment is not a `SoftRobotEnv`, or has no time limit while ``steps`` is None.
@@ -283,14 +283,16 @@ def _roll_out(
         recorder.log(step, body.design, body.state, goal, path=path, reward=reward, distance=distance)
 
     log(0, None)
-    total, step, over = 0.0, 0, False
+    total, step, over, doubts = 0.0, 0, False, [int(info["doubt"])]
     while step < steps and not over:
         observation, reward, terminated, truncated, info = env.step(agent(observation, body))
         step, total, over = step + 1, total + float(reward), terminated or truncated
+        doubts.append(int(info["doubt"]))
         log(step, float(reward))
     return {
         "return": total,
         "final_distance": float(info["distance"]),
         "success": bool(info["is_success"]),
         "steps": step,
+        "doubts": doubts,
     }

@@ -199,6 +199,33 @@ def test_an_interrupted_extension_keeps_the_policy_and_ends_as_an_uninterrupted_
         assert [int(row["step"]) for row in csv.DictReader(stream)] == [200, 400, 600]
 
 
+def test_an_extension_with_too_many_steps_is_shortened(tmp_path):
+    short, typo = (LONG.model_copy(update={"steps": steps}) for steps in (200, 60_000))
+    uninterrupted = train(LONG, tmp_path / "uninterrupted", progress=False).read_bytes()
+    folder = tmp_path / "extended"
+    policy = train(short, folder, progress=False, keep_checkpoint=True)
+    before = policy.read_bytes()
+    with interrupted_at(SACLearner, 400):
+        train(typo, folder, progress=False, keep_checkpoint=True)
+    with pytest.raises(DataError, match=r"has made 400 of 60000 steps, got steps = 300; .* steps = 400 or more"):
+        train(LONG.model_copy(update={"steps": 300}), folder, progress=False)
+    assert train(short, folder, progress=False) == policy and policy.read_bytes() == before  # finished before
+    with pytest.raises(DataError, match="holds a finished training of 200 steps, got steps = 100"):
+        train(LONG.model_copy(update={"steps": 100}), folder, progress=False)
+    assert train(LONG, folder, progress=False).read_bytes() == uninterrupted
+    changes = Policy(policy).card["extensions"]
+    assert [[each[key] for key in ("from_steps", "to_steps", "at_step")] for each in changes] == [
+        [200, 60_000, 200],
+        [60_000, 600, 400],
+    ]
+
+
+def test_a_training_ends_where_it_stands(tmp_path):
+    with interrupted_at(SACLearner, 200):
+        train(LONG, tmp_path, progress=False)
+    assert Policy(train(LONG.model_copy(update={"steps": 200}), tmp_path, progress=False)).card["steps"] == 200
+
+
 def test_a_damaged_configuration_of_a_folder_is_named(tmp_path):
     (tmp_path / "config.yaml").write_text("steps: [1, 2")
     with pytest.raises(ConfigError, match=r"config\.yaml' is not valid YAML"):

@@ -359,8 +359,11 @@ def test_options_of_fem(study, tmp_path, tiny):
     assert not (tmp_path / "study").exists()
     folder = asked(fem_options={"dynamics": True})
     assert asked(fem_options={"dynamics": False}).config.finalists.fem_options == {"dynamics": False}
-    (folder.path / "finalists" / "trial0000-seed1").mkdir(parents=True)
+    training = folder.path / "finalists" / "trial0000-seed1"
+    training.mkdir(parents=True)
+    assert asked(steps=7).config.finalists.steps == 7  # a training that has not ended binds nobody
     asked()
+    (training / "policy.safetensors").touch()
     with pytest.raises(ConfigError, match="holds a study with finalists.steps"):
         asked(steps=9)
     write_json(folder.path / "finalists" / "trial0000-qp-fem-unseen.json", {})

@@ -12,6 +12,7 @@ from softgym_envs.codesign.report.collect import collect
 from softgym_envs.codesign.report.episodes import typical_goal
 from softgym_envs.codesign.report.findings import findings
 from softgym_envs.codesign.report.interactive import goal_outcomes, goal_views, history, slices
+from softgym_envs.codesign.report.units import time_text
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.viewer.video import write_video
 
@@ -168,3 +169,8 @@ def test_wrong_films(tmp_path):
         write_video(tmp_path / "film.avi", [np.zeros((4, 4, 3), np.uint8)])
     with pytest.raises(ValueError, match="has no frames"):
         write_video(tmp_path / "film.gif", [])
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(2.41, "2.4 s"), (59.0, "59.0 s"), (606.0, "10.1 min")])
+def test_times_are_in_seconds_or_minutes(seconds, text):
+    assert time_text(seconds) == text

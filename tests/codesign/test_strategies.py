@@ -15,13 +15,16 @@ from PIL import Image
 
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
+from softgym_envs.codesign.phases.finalists import _trained_policy
 from softgym_envs.codesign.phases.shared_policy import joint_config
-from softgym_envs.codesign.records import FinalistTest
+from softgym_envs.codesign.phases.trial import training_config
+from softgym_envs.codesign.records import Finalist, FinalistTest
 from softgym_envs.codesign.report.page import write_report
 from softgym_envs.codesign.report.statistics import kendall_tau
 from softgym_envs.codesign.scheduling.optuna_study import open_study
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
+from softgym_envs.config import save_resolved
 
 SHOWN = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
 LIMIT = 3.5e-5  # m3; bodies of the test lie on both sides
@@ -173,6 +176,25 @@ def test_finalists_are_trained_anew_with_several_seeds(run):
     winner = f"winner-trial{results.winner.trial:04d}"
     assert (folder.path / f"{winner}.stl").stat().st_size > 10_000
     assert (folder.path / f"{winner}.rrd").read_bytes()[:3] == b"RRF"
+
+
+def test_a_training_of_a_finalist_with_other_steps_begins_again(study, monkeypatch):
+    training = {"steps": 160, "report_every": 80, "evaluation_episodes": 2, "sac": QUICK}
+    folder = study(strategy="scratch", training=training, finalists={"count": 1, "seeds": 1, "steps": 240})
+    finalist = Finalist(0, "baseline", folder.config.baseline, {}, 0.0, "trials/0000/policy.safetensors")
+    place = folder.path / "finalists" / "trial0000-seed1"
+    began = []
+
+    def train(config, where, **_):
+        began.append((config.steps, where.exists()))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("softgym_envs.codesign.phases.finalists.train", train)
+    for steps in (240, 90_000):  # the second one was begun by mistake
+        save_resolved(place, training_config(folder, finalist.design, {}).model_copy(update={"steps": steps}))
+        with pytest.raises(KeyboardInterrupt):
+            _trained_policy(folder, finalist, 1)
+    assert began == [(240, True), (240, False)]
 
 
 def test_report_opens_in_a_browser(run, tmp_path, require_program):

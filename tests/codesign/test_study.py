@@ -20,6 +20,7 @@ from softgym_envs.codesign.records import FinalistTest, SharedPolicy, TrialResul
 from softgym_envs.codesign.report.page import write_report
 from softgym_envs.codesign.report.statistics import kendall_tau, mean_interval, rank_correlation, rate_interval
 from softgym_envs.codesign.scheduling.optuna_study import open_study
+from softgym_envs.codesign.scheduling.queue import TrialQueue
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import WeightsError
@@ -363,3 +364,25 @@ def test_objective_stands_in_terminal_and_report(study, capsys):
     assert f"{row.baseline.objective:.2f} → {row.winner.objective:.2f} N" in page
     assert "mean actuator effort [N] on 6 goals, as small as possible" in page
     assert "Only 3 test goals: the difference may be chance." in page
+
+
+def test_a_study_that_goes_on_with_fewer_trials_counts_those_that_it_has(study, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    folder = study(trials=5)
+    with TrialQueue(folder) as queue:
+        queue.enqueue([("baseline", folder.config.baseline_values)])
+        for _ in range(3):
+            number = queue.claim().number
+            write_trial(folder, number, 1e-3 * number)
+            queue.finish(folder.result(number))
+        queue.claim()  # and does not finish
+    monkeypatch.setattr("softgym_envs.codesign.study.run_workers", interrupt)
+    config = folder.config.model_copy(update={"trials": 2})
+    with pytest.raises(KeyboardInterrupt):
+        run_study(config, folder.path, workers=3)
+    out = capsys.readouterr().out
+    assert "4 bodies of study 'tiny', 3 of them finished before" in out and "interrupted: 3 trials finished" in out
+    page = write_report(folder.path).read_text()
+    assert "3 bodies (3 complete, 0 pruned, 0 infeasible)" in page and "3; with several, the bodies" in page

@@ -20,9 +20,11 @@ def test_list_and_show(softgym, tiny):
 def test_run_and_table(softgym, tiny, tmp_path):
     verb = ["benchmark", "run", "tiny-v1", "--method", "random", "--folder", tmp_path]
     status, out, _ = softgym(*verb, "--seeds", "2")
-    assert status == 0 and "tiny-v1 random shared seed 1: 7 bodies" in out
-    status, out, _ = softgym("benchmark", "table", "--folder", tmp_path)
-    assert status == 0 and "| `tiny-v1` | shared | random | 2 |" in out
+    assert status == 0 and "tiny-v1 random shared seed 1: 7 bodies" in out and "best -mean_distance: -" in out
+    status, out, err = softgym("benchmark", "table", "--folder", tmp_path)
+    assert status == 0 and "| `tiny-v1` | shared | random | 2 |" in out and err == f"runs of {tmp_path}:\n"
+    status, _, err = softgym("benchmark", "table", "--folder", tmp_path / "other")
+    assert status == 2 and "other' has no runs; 'softgym benchmark run" in err
     status, _, err = softgym(*verb, "--method", "rndom")
     assert status == 2 and "unknown method 'rndom'; did you mean 'random'" in err
     status, _, err = softgym(*verb, "--level", "tiny")
