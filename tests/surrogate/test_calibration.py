@@ -30,6 +30,7 @@ from softgym_envs.surrogate.calibration import (
 from softgym_envs.surrogate.data import strata
 from softgym_envs.surrogate.data.strata import JudgedStates, draw_commands, strata_of
 from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, Domain, doubt_text
+from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
 from softgym_envs.surrogate.weight_files import load_model
 from softgym_envs.testing import random_states
@@ -323,6 +324,37 @@ def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
     assert judged.error[judged.trusted].max() > 2e-3
     again = attack(model, 320, 4, seed=0)
     np.testing.assert_array_equal(again.design, found.design)
+
+
+def test_an_attack_reaches_the_bounds_of_a_box_of_trust_inside_the_design_box():
+    """The training of the press finger ends at a Poisson's ratio of 0.4989, its design box at 0.499."""
+    model = pretrained_model(make_robot("press_finger"))
+    model = with_domain(model, limit=1.0)
+    space, domain = model.robot.design_space, model.domain
+    k = space.names.index("poisson_ratio")
+    d, n = len(learned_variables(model.robot)), model.count
+    vertices = module._designs(model, np.stack([np.zeros(d), np.ones(d)]))
+    assert model.context(vertices).arrays["known"].all()
+    assert vertices[1, k] == domain.design_high[k] < space["poisson_ratio"].high
+    assert vertices[0, k] == space["poisson_ratio"].low
+    # One step from the bound: nothing is untrusted for another reason here, so all bodies arrive there.
+    x, c = np.full((20, d), 0.5), np.full((20, 3, n), 0.5)
+    x[:, learned_variables(model.robot).index("poisson_ratio")] = 0.97
+    moved, _ = module._climb(model, x, c, steps=1)
+    assert (module._designs(model, moved)[:, k] == domain.design_high[k]).all()
+
+
+def test_bodies_with_one_design_are_told_by_their_commands(trunk):
+    designs = np.tile(trunk.robot.design_space.baseline.array, (4, 1))
+    designs[3] *= 1.01
+    command = np.arange(4 * 2 * trunk.count, dtype=float).reshape(4, 2, -1)
+    states = predicted_states(trunk, "inside", 2, 2, 0)
+    # The second body could not be built.
+    found = replace(
+        states, design=np.repeat(designs[[0, 2]], 2, axis=0), command=command[[0, 2]].reshape(4, trunk.count)
+    )
+    worst = module._worst_of_bodies(designs, command, found, np.array([1.0, 2.0, 4.0, 3.0]))
+    assert worst.tolist() == [2.0, 0.0, 4.0, 0.0]
 
 
 def test_searches_go_on_below_the_limit_that_the_last_one_left(trunk, tmp_path, monkeypatch):
