@@ -331,9 +331,12 @@ def calibrate(
     model = load_model(folder, robot)
     if not model.ensemble:
         raise WeightsError(f"'{folder}': only an ensemble can be calibrated; these weights are '{model.network}'")
+    if model.card.get("calibration", {}).get("limits_growth"):  # the last calibration did, not the training
+        model = with_domain(model, growth=np.inf)
     known = judged_states(model, bodies, states, seed, state_folder, kept_only)
+    limits_growth = False
     if not model.domain.limits_growth and (growth := usual_growth(model, known)) is not None:
-        model = with_domain(model, growth=growth)
+        limits_growth, model = True, with_domain(model, growth=growth)
         softest = _drawn(model, "near buckling", bodies, states, seed, state_folder, kept_only)
         known = JudgedStates.join([known, softest])
     calibration = fit_calibration(model, known)
@@ -351,11 +354,12 @@ def calibrate(
     card = json.loads(card_path.read_text())
     entries = {k: v for k, v in asdict(calibration).items() if np.isfinite(v)}
     card["domain"] |= {"inflation": 1.0, "limit": limit, "calibration": entries}
+    card["domain"].pop("growth", None)
     if model.domain.limits_growth:
         card["domain"]["growth"] = model.domain.growth
     card["calibration"] = {
         "bodies": bodies, "states": states, "attacks": attacks, "seed": seed, "kept_only": kept_only, "limits": limits,
-        "strata": {name: asdict(row) for name, row in found.items()},
+        "limits_growth": limits_growth, "strata": {name: asdict(row) for name, row in found.items()},
     }  # fmt: skip
     write_json(card_path, card)
     return found

@@ -383,6 +383,40 @@ def test_searches_go_on_below_the_limit_that_the_last_one_left(trunk, tmp_path, 
     assert card["calibration"]["limits"] == limits and card["domain"]["limit"] == pytest.approx(limits[1], rel=1e-4)
 
 
+def test_a_new_calibration_sets_its_own_limit_of_growth(trunk, tmp_path, monkeypatch):
+    """Growth is made up. At first some commands have no equilibrium, in the end all have one."""
+    folder = tmp_path / "weights"
+    shutil.copytree(pretrained_folder(trunk.robot), folder)
+    growth, lost = np.ones(40), [0, 10, 20, 30]
+
+    def off(spread, rng):
+        return np.full(len(spread), 1e-4)
+
+    def known(model, *_):
+        kinds = strata_of(model.robot, buckles=model.domain.limits_growth)
+        assert "near buckling" not in kinds  # an earlier calibration's limit does not count
+        states = JudgedStates.join([predicted_states(model, kind, 10, 4, k, off) for k, kind in enumerate(kinds)])
+        states.found[40 + np.array(lost, dtype=int)] = False
+        return states
+
+    def softness(model):
+        return lambda designs, commands: growth[np.arange(len(designs)) % 40]
+
+    monkeypatch.setattr(module, "_drawn", lambda model, stratum, *_: predicted_states(model, stratum, 10, 4, 9, off))
+    monkeypatch.setattr(module, "softness", softness)
+    monkeypatch.setattr(module, "judged_states", known)
+    for largest in (2.0, 3.0):
+        growth[:] = np.linspace(1.0, largest, 40)
+        calibrate(folder, trunk.robot, bodies=10, states=4, attacks=0)
+        card = load_model(folder, trunk.robot).card
+        assert card["domain"]["growth"] == pytest.approx(np.quantile(growth, module.USUAL))
+        assert card["calibration"]["limits_growth"] is True
+    lost.clear()
+    calibrate(folder, trunk.robot, bodies=10, states=4, attacks=0)
+    card = load_model(folder, trunk.robot).card
+    assert "growth" not in card["domain"] and card["calibration"]["limits_growth"] is False
+
+
 def test_calibration_of_weights_from_start_to_end(tmp_path, monkeypatch):
     robot = make_robot("trunk")
     folder = tmp_path / "weights"
