@@ -331,9 +331,12 @@ def calibrate(
     model = load_model(folder, robot)
     if not model.ensemble:
         raise WeightsError(f"'{folder}': only an ensemble can be calibrated; these weights are '{model.network}'")
+    if model.card.get("calibration", {}).get("limits_growth"):  # the last calibration did, not the training
+        model = with_domain(model, growth=np.inf)
     known = judged_states(model, bodies, states, seed, state_folder, kept_only)
+    limits_growth = False
     if not model.domain.limits_growth and (growth := usual_growth(model, known)) is not None:
-        model = with_domain(model, growth=growth)
+        limits_growth, model = True, with_domain(model, growth=growth)
         softest = _drawn(model, "near buckling", bodies, states, seed, state_folder, kept_only)
         known = JudgedStates.join([known, softest])
     calibration = fit_calibration(model, known)
@@ -351,11 +354,12 @@ def calibrate(
     card = json.loads(card_path.read_text())
     entries = {k: v for k, v in asdict(calibration).items() if np.isfinite(v)}
     card["domain"] |= {"inflation": 1.0, "limit": limit, "calibration": entries}
+    card["domain"].pop("growth", None)
     if model.domain.limits_growth:
         card["domain"]["growth"] = model.domain.growth
     card["calibration"] = {
         "bodies": bodies, "states": states, "attacks": attacks, "seed": seed, "kept_only": kept_only, "limits": limits,
-        "strata": {name: asdict(row) for name, row in found.items()},
+        "limits_growth": limits_growth, "strata": {name: asdict(row) for name, row in found.items()},
     }  # fmt: skip
     write_json(card_path, card)
     return found
@@ -413,9 +417,9 @@ def attack(
 ) -> JudgedStates:
     """Search for trusted states with large errors; return all that were judged, in the stratum ``adversarial``.
 
-    In each of `ROUNDS` rounds, gradients of the spread move bodies and commands from anywhere in their boxes to where
-    the spread is largest, and each body keeps the trusted commands with the largest uncertainty. From the second round
-    on, half of the bodies start near those with the largest errors on FEM so far.
+    In each of `ROUNDS` rounds, gradients of the spread move bodies and commands from anywhere in the box of trust to
+    where the spread is largest, and each body keeps the trusted commands with the largest uncertainty. From the second
+    round on, half of the bodies start near those with the largest errors on FEM so far.
 
     Args:
         model: a calibrated model.
@@ -454,23 +458,42 @@ def attack(
         parts.append(found)
         judged = predict(model, found)
         error = np.where(judged.found & judged.trusted, judged.error, 0.0)
-        score = np.zeros(len(x))
-        # Bodies that could not be built are missing.
-        index = {row.tobytes(): k for k, row in enumerate(designs)}
-        for row in range(len(found)):
-            k = index[found.design[row].tobytes()]
-            score[k] = max(score[k], error[row])
         origin.append((x, c))
-        scores.append(score)
+        scores.append(_worst_of_bodies(designs, command, found, error))
     return JudgedStates.join(parts)
 
 
+def _worst_of_bodies(designs: np.ndarray, command: np.ndarray, found: JudgedStates, error: np.ndarray) -> np.ndarray:
+    """Return the largest error (B,) of each body's states; 0 for a body that could not be built.
+
+    Several bodies may share a design, above all at vertices of the box, under different commands.
+
+    Args:
+        designs: bodies, shape (B, len(space)).
+        command: their commands, shape (B, S, n).
+        found: states of the bodies that could be built.
+        error: of these states, shape (N,).
+    """
+    errors: dict[tuple[bytes, bytes], float] = {}
+    for design, wanted, value in zip(found.design, found.command, error, strict=True):
+        errors[design.tobytes(), wanted.tobytes()] = float(value)
+    return np.array(
+        [max(errors.get((x.tobytes(), c.tobytes()), 0.0) for c in row) for x, row in zip(designs, command, strict=True)]
+    )
+
+
 def _designs(model: SurrogateModel, x: np.ndarray) -> np.ndarray:
-    """Return designs (B, len(space)) of points x (B, d) of the unit cube of the learned variables."""
+    """Return designs (B, len(space)) of points x (B, d) of the unit cube, which spans the box of trust.
+
+    A search in the whole design box would not get to the bounds of a narrower box of trust: steps beyond end there.
+    """
     space, names = model.robot.design_space.within(learned_bounds(model)), learned_variables(model.robot)
     designs = np.tile(space.complete(None).array, (len(x), 1))
     for k, name in enumerate(names):
-        designs[:, space.names.index(name)] = space[name].low + x[:, k] * (space[name].high - space[name].low)
+        column = space.names.index(name)
+        low = max(space[name].low, model.domain.design_low[column])
+        high = min(space[name].high, model.domain.design_high[column])
+        designs[:, column] = np.clip(low + x[:, k] * (high - low), low, high)
     return designs
 
 

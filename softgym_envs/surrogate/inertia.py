@@ -24,6 +24,7 @@ from softgym_envs.mechanics.solvers.reduction import root
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.features import Features
+from softgym_envs.surrogate.weight_files import card_of, check_box
 
 FILE = "inertia.safetensors"
 BEYOND = 1.1
@@ -151,7 +152,8 @@ def read_inertia(folder: str | Path, robot: Robot) -> LearnedInertia:
     """Read the learned inertia in a folder of weights.
 
     Raises:
-        WeightsError: if there is none, or it is damaged or for another robot.
+        WeightsError: if there is none, or it is damaged, for another robot or for a design box that does not contain
+            that of the robot.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -167,11 +169,12 @@ def read_inertia(folder: str | Path, robot: Robot) -> LearnedInertia:
             coefficients = file.get_tensor("coefficients")
         if not np.isfinite(coefficients).all():
             raise ValueError("values are not finite")
-        if card["robot"] != robot.name or card["mechanics_key"] != json.loads(json.dumps(robot.mechanics_key)):
+        if card["robot"] != robot.name or card["mechanics_key"] != robot.mechanics_key:
             raise WeightsError(
                 f"inertia '{path}' was learned for another robot: {card['robot']} {card['mechanics_key']}, needed "
                 f"{robot.name} {robot.mechanics_key}"
             )
+        check_box(path.name, card["design_variables"], card_of(robot, "inertia")["design_variables"])
         return LearnedInertia(robot, coefficients, int(card["degree"]), card)
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise WeightsError(f"inertia '{path}' is damaged: {error}") from None

@@ -58,12 +58,17 @@ def check_ensemble(model: SurrogateModel) -> Model:
     """Return the model if it is an ensemble that can decide where it may be trusted.
 
     Raises:
-        WeightsError: for another kind of network, a single member, or a card without a limit.
+        WeightsError: for another kind of network, a single member, a robot with sensor rows, or a card without a limit.
     """
     if not isinstance(model, Model):
         raise WeightsError(f"online learning needs a network of kind 'potential'; these weights are '{model.network}'")
     if not model.robot.convex:
         raise WeightsError(f"online learning needs a convex energy; that of robot '{model.robot.name}' is not")
+    if model.sensors:
+        raise WeightsError(
+            f"online learning does not know sensor rows, which robot '{model.robot.name}' has: use backend='surrogate' "
+            "or backend='fem'"
+        )
     if model.members < model.trained:
         raise WeightsError(
             "online learning needs all members of an ensemble of 2 or more, because their spread decides what is "
@@ -105,9 +110,7 @@ class StateStore:
         self._parts: list[dict[str, np.ndarray]] = []
         if self.folder is None:
             return
-        manifest = json.loads(
-            json.dumps({"format": _FORMAT, "robot": robot.name, "mechanics_key": robot.mechanics_key})
-        )
+        manifest = {"format": _FORMAT, "robot": robot.name, "mechanics_key": robot.mechanics_key}
         path = self.folder / "manifest.json"
         if path.exists():
             try:

@@ -53,8 +53,9 @@ def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         raise WeightsError(f"weights card '{card_path}' does not have format {FORMAT}")
     if card.get("robot") != robot.name or card.get("mechanics_key") != robot.mechanics_key:
+        key = card.get("mechanics_key")
         wanted = {"robot": robot.name, **robot.mechanics_key}
-        found = {"robot": card.get("robot"), **card.get("mechanics_key", {})}
+        found = {"robot": card.get("robot"), **(key if isinstance(key, dict) else {})}
         different = sorted(k for k in wanted | found if wanted.get(k) != found.get(k))
         raise WeightsError(
             f"weights '{folder.name}' were trained for another robot: "
@@ -66,7 +67,7 @@ def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict
         raise WeightsError(
             f"weights '{folder.name}' have actuators = {card.get('actuators')}, needed {expected['actuators']}"
         )
-    _check_box(folder.name, card.get("design_variables"), expected["design_variables"])
+    check_box(folder.name, card.get("design_variables"), expected["design_variables"])
     try:
         tensors = load_file(weights_path)
     except (SafetensorError, OSError, ValueError) as error:
@@ -76,7 +77,7 @@ def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict
     return card, tensors
 
 
-def _check_box(weights: str, learned: Any, needed: dict[str, list]) -> None:
+def check_box(weights: str, learned: Any, needed: dict[str, list]) -> None:
     """Check that the box of a card's design variables contains that of a robot.
 
     Raises:

@@ -30,6 +30,7 @@ from softgym_envs.surrogate.calibration import (
 from softgym_envs.surrogate.data import strata
 from softgym_envs.surrogate.data.strata import JudgedStates, draw_commands, strata_of
 from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, Domain, doubt_text
+from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
 from softgym_envs.surrogate.weight_files import load_model
 from softgym_envs.testing import random_states
@@ -325,6 +326,37 @@ def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
     np.testing.assert_array_equal(again.design, found.design)
 
 
+def test_an_attack_reaches_the_bounds_of_a_box_of_trust_inside_the_design_box():
+    """The training of the press finger ends at a Poisson's ratio of 0.4989, its design box at 0.499."""
+    model = pretrained_model(make_robot("press_finger"))
+    model = with_domain(model, limit=1.0)
+    space, domain = model.robot.design_space, model.domain
+    k = space.names.index("poisson_ratio")
+    d, n = len(learned_variables(model.robot)), model.count
+    vertices = module._designs(model, np.stack([np.zeros(d), np.ones(d)]))
+    assert model.context(vertices).arrays["known"].all()
+    assert vertices[1, k] == domain.design_high[k] < space["poisson_ratio"].high
+    assert vertices[0, k] == space["poisson_ratio"].low
+    # One step from the bound: nothing is untrusted for another reason here, so all bodies arrive there.
+    x, c = np.full((20, d), 0.5), np.full((20, 3, n), 0.5)
+    x[:, learned_variables(model.robot).index("poisson_ratio")] = 0.97
+    moved, _ = module._climb(model, x, c, steps=1)
+    assert (module._designs(model, moved)[:, k] == domain.design_high[k]).all()
+
+
+def test_bodies_with_one_design_are_told_by_their_commands(trunk):
+    designs = np.tile(trunk.robot.design_space.baseline.array, (4, 1))
+    designs[3] *= 1.01
+    command = np.arange(4 * 2 * trunk.count, dtype=float).reshape(4, 2, -1)
+    states = predicted_states(trunk, "inside", 2, 2, 0)
+    # The second body could not be built.
+    found = replace(
+        states, design=np.repeat(designs[[0, 2]], 2, axis=0), command=command[[0, 2]].reshape(4, trunk.count)
+    )
+    worst = module._worst_of_bodies(designs, command, found, np.array([1.0, 2.0, 4.0, 3.0]))
+    assert worst.tolist() == [2.0, 0.0, 4.0, 0.0]
+
+
 def test_searches_go_on_below_the_limit_that_the_last_one_left(trunk, tmp_path, monkeypatch):
     """The first search finds errors of 3 mm, the second none."""
     folder = tmp_path / "weights"
@@ -349,6 +381,40 @@ def test_searches_go_on_below_the_limit_that_the_last_one_left(trunk, tmp_path, 
     card = load_model(folder, trunk.robot).card
     assert limits[0] == trunk.robot.goal_tolerance > limits[1] > 0.0 and len(limits) == 2
     assert card["calibration"]["limits"] == limits and card["domain"]["limit"] == pytest.approx(limits[1], rel=1e-4)
+
+
+def test_a_new_calibration_sets_its_own_limit_of_growth(trunk, tmp_path, monkeypatch):
+    """Growth is made up. At first some commands have no equilibrium, in the end all have one."""
+    folder = tmp_path / "weights"
+    shutil.copytree(pretrained_folder(trunk.robot), folder)
+    growth, lost = np.ones(40), [0, 10, 20, 30]
+
+    def off(spread, rng):
+        return np.full(len(spread), 1e-4)
+
+    def known(model, *_):
+        kinds = strata_of(model.robot, buckles=model.domain.limits_growth)
+        assert "near buckling" not in kinds  # an earlier calibration's limit does not count
+        states = JudgedStates.join([predicted_states(model, kind, 10, 4, k, off) for k, kind in enumerate(kinds)])
+        states.found[40 + np.array(lost, dtype=int)] = False
+        return states
+
+    def softness(model):
+        return lambda designs, commands: growth[np.arange(len(designs)) % 40]
+
+    monkeypatch.setattr(module, "_drawn", lambda model, stratum, *_: predicted_states(model, stratum, 10, 4, 9, off))
+    monkeypatch.setattr(module, "softness", softness)
+    monkeypatch.setattr(module, "judged_states", known)
+    for largest in (2.0, 3.0):
+        growth[:] = np.linspace(1.0, largest, 40)
+        calibrate(folder, trunk.robot, bodies=10, states=4, attacks=0)
+        card = load_model(folder, trunk.robot).card
+        assert card["domain"]["growth"] == pytest.approx(np.quantile(growth, module.USUAL))
+        assert card["calibration"]["limits_growth"] is True
+    lost.clear()
+    calibrate(folder, trunk.robot, bodies=10, states=4, attacks=0)
+    card = load_model(folder, trunk.robot).card
+    assert "growth" not in card["domain"] and card["calibration"]["limits_growth"] is False
 
 
 def test_calibration_of_weights_from_start_to_end(tmp_path, monkeypatch):

@@ -7,7 +7,9 @@ from softgym_envs.errors import WeightsError
 from softgym_envs.mechanics.contact.obstacles import Cylinder, Plane, RoundedPrism, Sphere
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.robots.registry import make_robot
+from softgym_envs.surrogate.chain import closings
 from softgym_envs.surrogate.chain.body import KINDS, FingerChain
+from softgym_envs.surrogate.chain.closings import Closings
 from softgym_envs.surrogate.chain.contact import ChainBatch, changes_along_z, rows_for, table_of
 from softgym_envs.surrogate.chain.kernels import assemble, bow, gap_of, points_near, segment, turns
 from softgym_envs.surrogate.chain.model import ChainModel, load_chain, save_chain
@@ -332,6 +334,9 @@ def test_weights_on_disk(robot, tmp_path):
     tensors = untrained(robot, lambda shape: np.random.default_rng(0).normal(size=shape))
     card = {"domain": {"design": {"e1": [0.004, 0.015]}, "limit": 10.0}}
     model = ChainModel(robot, tensors, card)
+    save_chain(ChainModel(robot, {name: value for name, value in tensors.items() if name != "depth"}, card), tmp_path)
+    with pytest.raises(WeightsError, match="do not fit network 'chain': depth"):
+        load_chain(robot, tmp_path)
     save_chain(model, tmp_path)
     again = load_chain(robot, tmp_path)
     designs = np.concatenate([body(robot), body(robot, e1=0.002)])
@@ -341,6 +346,31 @@ def test_weights_on_disk(robot, tmp_path):
         load_chain(make_robot("contact_aided_finger", mesh="published"), tmp_path)
     with pytest.raises(ValueError, match="not for 'diamond'"):
         FingerChain(make_robot("diamond"))
+
+
+def test_closings_are_kept_for_bodies_and_seed(robot, tmp_path, monkeypatch):
+    made = []
+
+    def close(robot, bodies, seed):
+        made.append(seed)
+        count = len(bodies)
+        return Closings(
+            np.pad(bodies, ((0, 0), (0, 3))),
+            *(np.full((count, 2, *rest), float(seed)) for rest in ((2,), (2,), (), ())),
+        )
+
+    monkeypatch.setattr(closings, "close_bodies", close)
+    path = tmp_path / "closings.npz"
+    bodies = np.concatenate([body(robot), body(robot, e1=0.012)])
+    first = closings.kept_closings(path, robot, bodies, 1)
+    again = closings.kept_closings(path, robot, bodies, 1)
+    assert made == [1] and all(np.array_equal(*pair) for pair in zip(first, again, strict=True))
+    assert closings.kept_closings(path, robot, bodies, 2).torque[0, 0] == 2.0  # other objects are drawn
+    closings.kept_closings(path, robot, bodies[:1], 2)
+    assert made == [1, 2, 2]
+    path.write_bytes(path.read_bytes()[:100])
+    closings.kept_closings(path, robot, bodies[:1], 2)
+    assert made == [1, 2, 2, 2]
 
 
 def test_stiffness_is_positive_definite_for_all_weights(robot):

@@ -88,6 +88,9 @@ def test_missing_and_damaged_files(tmp_path):
     robot = make_robot("finger")
     with pytest.raises(WeightsError, match="softgym fit-inertia"):
         read_inertia(tmp_path, robot)
+    (tmp_path / FILE).write_bytes((pretrained_folder(robot) / FILE).read_bytes())
+    with pytest.raises(WeightsError, match=r"trained for length = \[0.038, 0.042, 'm'\], which does not contain"):
+        read_inertia(tmp_path, make_robot("finger", design_box="wide"))
     (tmp_path / FILE).write_bytes((pretrained_folder(robot) / FILE).read_bytes()[:200])
     with pytest.raises(WeightsError, match="is damaged"):
         read_inertia(tmp_path, robot)

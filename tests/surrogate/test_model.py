@@ -431,6 +431,9 @@ def test_missing_and_foreign_weights(copied):
     (folder / "model.json").write_text(json.dumps({**card, "network": "oracle"}))
     with pytest.raises(WeightsError, match=r"oracle.*residual"):
         load_model(folder, robot)
+    (folder / "model.json").write_text(json.dumps({**card, "mechanics_key": None}))
+    with pytest.raises(WeightsError, match=r"trained for another robot: cables = None, needed 2"):
+        load_model(folder, robot)
     (folder / "model.json").write_text(json.dumps({**card, "format": 99}))
     with pytest.raises(WeightsError, match="format 2"):
         load_model(folder, robot)

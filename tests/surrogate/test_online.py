@@ -13,6 +13,7 @@ from softgym_envs.surrogate.data.dataset import COLUMNS
 from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_tuned_from, rehearsal_states
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.training import stack_members, unstack_members
+from softgym_envs.surrogate.pretrained import pretrained_model
 from softgym_envs.surrogate.weight_files import load_model, save_model
 from softgym_envs.testing import sample_states
 
@@ -172,6 +173,9 @@ def test_models_without_a_calibrated_ensemble_are_refused(robot, weights, middle
         check_ensemble(load_model(weights, robot, members=2))
     with pytest.raises(WeightsError, match="where they are trusted"):
         check_ensemble(Model(robot, model.tensors, {}))
+    touched = make_robot("sensorized_finger", touch=True, meshing="morph")
+    with pytest.raises(WeightsError, match="does not know sensor rows, which robot 'sensorized_finger' has"):
+        check_ensemble(pretrained_model(touched))
     unstable = {**middle, "compliance": -middle["compliance"]}
     with pytest.raises(DataError, match="stable"):
         fine_tune(model, unstable, steps=1)

@@ -7,7 +7,7 @@ are many. It is exact at the samples and needs no training. W is symmetric but n
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -20,16 +20,17 @@ from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.model import Context
 from softgym_envs.surrogate.trainer import History, Trainer
 
+Kernel = Literal["thin_plate_spline", "cubic", "quintic", "linear"]
+KERNELS = get_args(Kernel)
+"""Weights hold the number of their kernel."""
+
 
 class Options(Config):
     """Hyper-parameters of the interpolation."""
 
     kind: Literal["rbf"] = "rbf"
-    kernel: Literal["thin_plate_spline", "cubic", "quintic", "linear"] = "cubic"
+    kernel: Kernel = "cubic"
     neighbors: int = Field(default=200, gt=0)
-
-
-KERNELS = ("thin_plate_spline", "cubic", "quintic", "linear")
 
 
 class Model(DirectModel):

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.errors import ConvergenceError, DataError, InfeasibleDesign
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.grasping_hands import GraspingFinger
-from softgym_envs.storage import atomic_write
+from softgym_envs.storage import atomic_write, read_npz
 from softgym_envs.surrogate.chain.contact import ChainBatch, rows_for
 from softgym_envs.surrogate.chain.model import ChainModel
 
@@ -72,17 +72,16 @@ def close_bodies(robot: GraspingFinger, bodies: np.ndarray, seed: int) -> Closin
 
 
 def kept_closings(path: Path, robot: GraspingFinger, bodies: np.ndarray, seed: int) -> Closings:
-    """Return the closings in a file, which is written if it does not hold those of these bodies."""
-    if path.is_file():
-        with np.load(path) as file:
-            kept = Closings(*(file[name] for name in Closings._fields))
-        if kept.design.shape == (len(bodies), len(robot.design_space)) and np.array_equal(
-            kept.design[:, : bodies.shape[1]], bodies
-        ):
-            return kept
+    """Return the closings in a file, which is written if it does not hold those of these bodies and this seed."""
+    try:
+        kept = read_npz(path, ("seed", *Closings._fields))
+    except DataError:  # missing, damaged, or written before the seed was kept
+        kept = {}
+    if kept and kept["seed"] == seed and np.array_equal(kept["design"][:, : bodies.shape[1]], bodies):
+        return Closings(*(kept[name] for name in Closings._fields))
     found = close_bodies(robot, bodies, seed)
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, allow_pickle=False, **found._asdict())
+        np.savez_compressed(stream, allow_pickle=False, seed=seed, **found._asdict())
     return found
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from softgym_envs.errors import WeightsError
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.chain.body import ChainBodies, FingerChain
+from softgym_envs.surrogate.chain.body import KINDS, ChainBodies, FingerChain
 from softgym_envs.surrogate.chain.equilibrium import advance, condense
 from softgym_envs.surrogate.chain.segments import segment_stiffness
 from softgym_envs.surrogate.domain import OUTSIDE, SPREAD
@@ -251,4 +251,8 @@ def load_chain(robot: Robot, folder: str | Path | None = None) -> ChainModel:
     card, tensors = read_weights(folder, robot)
     if card.get("network") != NETWORK:
         raise WeightsError(f"weights '{folder}' have network {json.dumps(card.get('network'))}, needed '{NETWORK}'")
+    layers = {f"{kind}.{layer}.{part}" for kind in KINDS for layer in range(3) for part in ("weight", "bias")}
+    if tensors.keys() != layers | {"depth"}:
+        wrong = sorted(tensors.keys() ^ (layers | {"depth"}))
+        raise WeightsError(f"weights '{folder}' do not fit network '{NETWORK}': {', '.join(wrong)}")
     return ChainModel(robot, tensors, card)
