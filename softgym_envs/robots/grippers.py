@@ -22,6 +22,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.geometry.finger_shape import in_flange
+from softgym_envs.robots.geometry.symmetry import Symmetry
 from softgym_envs.robots.soft_finger import TIP_RADIUS, SoftFinger
 
 STRAIGHT = np.eye(3)
@@ -242,6 +243,12 @@ class TwoFingerGripper(FingerRobot):
     placements = ((STRAIGHT, (0.0, 0.0, 0.0)), (TURNED, (0.0, 0.080, 0.0)))
     goal_axes = np.array([1.0, 1.0, 0.0])
     goal_tolerance = 5e-4
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        if not (any(self.gravity[:2]) or self.obstacles):
+            # Half a turn exchanges the fingers, which are copies of each other.
+            self.symmetries = (Symmetry(TURNED, np.array([2, 3, 0, 1]), 0.5 * np.array(self.placements[1][1])),)
 
     def variables(self) -> tuple[DesignVariable, ...]:
         """Return the variables of the finger and the length of the bar."""

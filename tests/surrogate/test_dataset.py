@@ -18,11 +18,13 @@ from hypothesis import strategies as st
 
 from softgym_envs import make_robot
 from softgym_envs.errors import ConvergenceError, DataError, DesignError, InfeasibleDesign
-from softgym_envs.surrogate.data import dataset
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.surrogate.data import dataset, sampling
 from softgym_envs.surrogate.data.dataset import COLUMNS, generate_dataset, load_dataset
 from softgym_envs.surrogate.data.sampling import (
     SEQUENCES,
     SamplingPlan,
+    may_be_joined,
     path_order,
     sample_group,
     select_states,
@@ -680,7 +682,48 @@ def test_ten_kills_lose_no_finished_shard_and_repeat_none(tmp_path, rng):
     assert (folder / "README.md").read_text() == (whole / "README.md").read_text()
 
 
-def test_a_solve_that_began_at_rest_is_not_repeated_from_rest():
+def test_a_gripper_is_not_turned_inside_out():
+    robot = make_robot("two_finger_gripper")
+    statics = Statics(robot.build({"length": 0.038, "joint_height": 0.005, "bar_length": 0.030}))
+    rest, command = statics.solve(np.zeros(4)), np.array([0.0, 0.02, 0.0, 0.02])
+    turned = statics.solve(command)  # Newton's method ends far away, on the other side of the flanges
+    assert turned.slack.all() and turned.condensed.delta.e[2] > 0.02 and not may_be_joined(rest, turned)
+    statics.restore(rest.x, rest.effort)
+    found = dict(solve_path(robot, statics, rest, np.array([command, 0.25 * command])))
+    assert found[0] is None and may_be_joined(rest, found[1])
+
+
+@pytest.mark.parametrize("end", [0.009, np.inf])
+def test_a_solve_that_leaves_the_branch_is_repeated_slowly(end):
+    robot = make_robot("finger", cables=1)  # its cable moves by 1 mm in a step
+    places = []
+
+    class Statics:
+        place = 0.0
+
+        def solve(self, command):
+            moved, self.place = abs(command[0] - self.place), command[0]
+            places.append(round(1e3 * self.place, 6))
+            return state(self.place, effort=self.place if moved < 0.0011 and self.place < end else 0.0)
+
+        def restore(self, x, effort):
+            self.place = x
+
+    def state(place, effort):
+        W = SimpleNamespace(aa=np.eye(1))
+        rows = SimpleNamespace(
+            delta=SimpleNamespace(a=np.array([place])), lambda_=SimpleNamespace(a=np.array([effort]))
+        )
+        return SimpleNamespace(x=place, effort=effort, condensed=SimpleNamespace(W=W, **vars(rows)))
+
+    rest, commands = state(0.0, 0.0), np.array([[0.008], [0.0101]])
+    found = dict(solve_path(robot, Statics(), rest, commands))
+    assert places[:9] == [8.0, *range(1, 9)] and found[0].effort == 0.008
+    assert places[9:13] == [10.1, 8.7, 9.4, 10.1] if end > 1.0 else places[9:12] == [10.1, 8.7, 9.4]
+    assert found[1].effort == 0.0101 if end > 1.0 else found[1] is None
+
+
+def test_a_solve_that_began_at_rest_is_not_repeated_from_rest(monkeypatch):
     class Statics:
         calls = 0
         fails = True
@@ -694,6 +737,7 @@ def test_a_solve_that_began_at_rest_is_not_repeated_from_rest():
         def restore(self, x, effort):
             pass
 
+    monkeypatch.setattr(sampling, "may_be_joined", lambda first, second: True)
     robot, rest = make_robot("finger", cables=1), SimpleNamespace(x=None, effort=None)
     commands, statics = np.array([[0.005], [0.015], [0.018]]), Statics()
     assert [found for _, found in solve_path(robot, statics, rest, commands)] == [None] * 3 and statics.calls == 3

@@ -13,6 +13,7 @@ ROBOTS = {
     "finger": ({"mesh": "accurate", "mesh_size": 0.03, "self_contact": False}, [0.004, 0.008]),
     "diamond": ({}, [0.006, 0.011, -0.003, 0.002]),
     "cable_trunk": ({}, [0.008, 0.003, 0.0, 0.001, 0.002, 0.0, 0.005, 0.004]),
+    "two_finger_gripper": ({}, [0.010, 0.0, 0.005, 0.003]),
 }
 
 
@@ -35,7 +36,7 @@ def test_images_are_equilibria_of_the_exchanged_commands(name):
             }
         )
     found = with_images(robot, {column: value[None] for column, value in rows[0].items()})
-    assert len(found["rest"]) == len(rows) == {"finger": 2}.get(name, 8)
+    assert len(found["rest"]) == len(rows) == {"finger": 2, "two_finger_gripper": 2}.get(name, 8)
     for k, row in enumerate(rows):
         for column, value in row.items():
             scale = np.abs(value).max()
@@ -51,6 +52,7 @@ def test_images_are_equilibria_of_the_exchanged_commands(name):
         ("finger", {"mesh": "accurate", "gravity": (1.0, 0.0, 0.0)}),
         ("diamond", {"gravity": (0.0, 1.0, 0.0)}),
         ("cable_trunk", {"gravity": (0.0, 1.0, 0.0)}),
+        ("two_finger_gripper", {"gravity": (1.0, 0.0, 0.0)}),
     ],
 )
 def test_a_robot_that_is_not_symmetric_has_no_images(name, options):

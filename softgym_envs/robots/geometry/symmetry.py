@@ -7,7 +7,7 @@ part responds as symmetrically as its shape, up to round-off.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -16,21 +16,29 @@ from softgym_envs.robots.geometry.meshing import BodyMesh
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """A reflection or rotation about the origin that maps each body of a robot, and its mesh, to itself.
+    """A reflection or rotation that maps each body of a robot, and its mesh, to itself.
 
     The image of an equilibrium is then an equilibrium too.
 
     Attributes:
-        matrix: orthogonal; maps positions and forces, shape (3, 3). Every effector is its own image at rest.
+        matrix: orthogonal; maps forces, and positions about the centre, shape (3, 3). Every effector is its own image
+            at rest.
         order: actuator ``k`` of the image does what actuator ``order[k]`` does, shape (n_a,).
+        centre: a point that is its own image [m], shape (3,).
     """
 
     matrix: np.ndarray
     order: np.ndarray
+    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def rows(self, effectors: int) -> np.ndarray:
         """Return the map of the coordinates of several effectors, shape (3 effectors, 3 effectors)."""
         return np.kron(np.eye(effectors), self.matrix)
+
+    def positions(self, effectors: np.ndarray) -> np.ndarray:
+        """Return the images of effectors [m], shape (..., 3 effectors)."""
+        points = effectors.reshape(*effectors.shape[:-1], -1, 3) - self.centre
+        return (points @ self.matrix.T + self.centre).reshape(effectors.shape)
 
 
 def left_right(order: Sequence[int]) -> tuple[Symmetry, ...]:

@@ -26,6 +26,9 @@ SEQUENCES = ("halton", "sobol", "latin", "random", "vertices")
 """Kinds of points: scrambled Halton and Sobol sequences, a Latin hypercube, independent draws, and for the designs the
 vertices of their box with independent draws of the commands."""
 
+SOFTEST = 0.01
+"""Smallest mean stiffness between two joined equilibria, relative to that at the first (see `may_be_joined`)."""
+
 
 @dataclass(frozen=True)
 class SamplingPlan:
@@ -190,15 +193,31 @@ def solve_path(
 ) -> Iterator[tuple[int, Equilibrium | None]]:
     """Solve commands (n, n_a) of one body, each starting from the nearest one before, or else from rest.
 
+    Newton's method may pass from an equilibrium that ends to one far away, such as that of a gripper turned inside
+    out. Such a command is approached once more as slowly as the actuators move (`Actuator.rate`), and has no
+    equilibrium if that one ends on this way, too.
+
     Yields:
         The number of a command, and its equilibrium or None if there is none, in the order of the path.
     """
     span = robot.upper - robot.lower
+    rates = np.array([actuator.rate for actuator in robot.actuators])
     at_rest = True  # where the next solve starts
+    start, begun = rest, np.zeros(len(span))  # and the equilibrium and the command there
 
     def solve(command: np.ndarray) -> Equilibrium | None:
         try:
-            return statics.solve(command)
+            found = statics.solve(command)
+            if not robot.convex or may_be_joined(start, found):
+                return found
+            statics.restore(start.x, start.effort)
+            steps, before = int(np.ceil((np.abs(command - begun) / rates).max())), start
+            for step in range(1, steps + 1):
+                found = statics.solve(begun + step / steps * (command - begun))
+                if not may_be_joined(before, found):
+                    return None
+                before = found
+            return found
         except ConvergenceError:
             return None
 
@@ -210,12 +229,30 @@ def solve_path(
         found = solve(commands[k])
         if found is None and not at_rest:
             statics.restore(rest.x, rest.effort)
+            start, begun = rest, np.zeros(len(span))
             found = solve(commands[k])
         if found is None:
             lost.add(commands[k].tobytes())
             statics.restore(rest.x, rest.effort)
+        start, begun = (rest, np.zeros(len(span))) if found is None else (found, commands[k])
         at_rest = found is None or not commands[k].any()
         yield int(k), found
+
+
+def may_be_joined(first: Equilibrium, second: Equilibrium) -> bool:
+    """Return whether stable equilibria of a body, along which efforts grow with displacements, may join two others.
+
+    Along them, displacements change by the integral of ``W d lambda`` with positive definite ``W``, so efforts and
+    displacements change in the same direction. If this takes a mean stiffness of less than `SOFTEST` of that of the
+    first equilibrium, the two do not count as joined. Nothing is known if the first is unstable.
+    """
+    moved = second.condensed.delta.a - first.condensed.delta.a
+    try:
+        half = np.linalg.solve(np.linalg.cholesky(first.condensed.W.aa), moved)
+    except np.linalg.LinAlgError:
+        return True
+    work = moved @ (second.condensed.lambda_.a - first.condensed.lambda_.a)
+    return bool(work >= SOFTEST * (half @ half) - 1e-12)
 
 
 def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str, np.ndarray] | None, int]:

@@ -94,7 +94,7 @@ def with_images(robot: Robot, data: Mapping[str, np.ndarray]) -> dict[str, np.nd
                 **data,
                 "displacement": data["displacement"][:, symmetry.order],
                 "effort": data["effort"][:, symmetry.order],
-                "effector": data["effector"] @ turn[count:, count:].T,
+                "effector": symmetry.positions(data["effector"]),
                 "compliance": (turn @ W @ turn.T)[:, *upper],
             }
         )

@@ -295,7 +295,7 @@ def _solve_body(robot: Robot, commands: Commands, number: int, second_start: boo
         symmetry = robot.symmetries[image[k]]
         for name in ("displacement", "effort", "slack"):
             getattr(part, name)[k] = getattr(part, name)[k][symmetry.order]
-        part.effector[k] = symmetry.rows(len(robot.effectors)) @ part.effector[k]
+        part.effector[k] = symmetry.positions(part.effector[k])
     return part
 
 

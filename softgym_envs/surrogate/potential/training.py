@@ -28,6 +28,8 @@ class Options(TrainingOptions):
         body_width: hidden units of the layers of the design.
         members: of the ensemble.
         sensor_weight: of the squared errors of sensor rows, relative to those of effectors.
+        command_weight: of the squared errors of effectors at equal commands (see `potential_loss`), which slack cables
+            make larger than those at equal displacements.
     """
 
     kind: Literal["potential"] = "potential"
@@ -35,6 +37,7 @@ class Options(TrainingOptions):
     body_width: int = Field(default=64, gt=0)
     members: int = Field(default=5, gt=0)
     sensor_weight: float = Field(default=1.0, gt=0.0)
+    command_weight: float = Field(default=0.0, ge=0.0)
 
 
 def train(
@@ -105,7 +108,7 @@ def _train_member(
 
     def loss(rows: Tensor | None) -> Tensor:
         batch = validation if rows is None else training.rows(rows)
-        return potential_loss(net, batch, effort_spread, row_weights)
+        return potential_loss(net, batch, effort_spread, row_weights, options.command_weight)
 
     history = trainer.optimise(f"member {member}", net, loss, len(training.design), seed=seed)
     return member, {k: v.detach().numpy().copy() for k, v in net.state_dict().items()}, history
@@ -152,6 +155,8 @@ class Targets(NamedTuple):
         jacobian: of the effector, shape (N, e, n).
         whitening: metric of the held compliance, shape (N, e, e).
         held: held compliance, shape (N, e, e).
+        sliding: how far the effector moves per effort on slack actuators while the others are held, shape (N, e, n);
+            zero for taut ones.
     """
 
     design: Tensor
@@ -163,6 +168,7 @@ class Targets(NamedTuple):
     jacobian: Tensor
     whitening: Tensor
     held: Tensor
+    sliding: Tensor
 
     def rows(self, index: Tensor) -> Targets:
         """Return some of the rows."""
@@ -195,6 +201,7 @@ def make_targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) ->
     floor = 1e-6 * np.einsum("bii->b", W_ee)[:, None, None] / size
     C = 0.5 * (C + C.swapaxes(1, 2)) + 2.0 * size * floor * np.eye(size)
     whitening = np.linalg.inv(np.linalg.cholesky(C + 0.03 * W_ee))
+    J = J * half / scales["effector"]
     parts = (
         states.design,
         states.actuation,
@@ -202,18 +209,39 @@ def make_targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) ->
         (states.effector - scales["effector_mean"]) / scales["effector"],
         S,
         hessian,
-        J * half / scales["effector"],
+        J,
         whitening,
         C,
+        J @ _slack_compliance(robot, states.effort, W_aa),
     )
     return Targets(*(torch.as_tensor(np.ascontiguousarray(part), dtype=torch.float32) for part in parts))
 
 
-def potential_loss(net: PotentialNet, batch: Targets, effort_spread: float, weights: Tensor | float = 1.0) -> Tensor:
-    """Return the sum of five mean squared errors of a network.
+def _slack_compliance(robot: Robot, effort: np.ndarray, W_aa: np.ndarray) -> np.ndarray:
+    """Return the compliance of the slack actuators while the others are held, zero for those, shape (N, n, n).
+
+    Training states in which slack cables were moved back towards their commands have negative efforts there.
+    """
+    slack = robot.unilateral & (effort <= 1e-6 * robot.effort_scale)
+    both = slack[:, :, None] & slack[:, None, :]
+    return np.where(both, np.linalg.inv(np.where(both, np.linalg.inv(W_aa), np.eye(effort.shape[1]))), 0.0)
+
+
+def potential_loss(
+    net: PotentialNet,
+    batch: Targets,
+    effort_spread: float,
+    weights: Tensor | float = 1.0,
+    command_weight: float = 0.0,
+) -> Tensor:
+    """Return the sum of mean squared errors of a network.
 
     Efforts and Hessian are measured in their metric, the held compliance in its own, effector and Jacobian as they are,
     their rows with weights (e,).
+
+    At equal commands, a slack cable reaches where its effort vanishes, so an error of the effort there moves it by the
+    compliance, and the effector with it. With a ``command_weight`` the effector counts once more with this motion
+    included, to first order.
     """
     gradient, hessian, x, jacobian, L = net(batch.design, batch.actuation)
     S, whitening = batch.metric, batch.whitening
@@ -224,4 +252,8 @@ def potential_loss(net: PotentialNet, batch: Targets, effort_spread: float, weig
         ((jacobian - batch.jacobian).mT ** 2 * weights).mean(),
         ((whitening @ (L @ L.mT - batch.held) @ whitening.mT) ** 2).mean(),
     )
-    return sum(terms[1:], terms[0])
+    total = sum(terms[1:], terms[0])
+    if command_weight:
+        slid = x - (batch.sliding @ (gradient - batch.effort)[:, :, None])[:, :, 0]
+        total = total + command_weight * ((slid - batch.effector) ** 2 * weights).mean()
+    return total
