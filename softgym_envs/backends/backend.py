@@ -42,7 +42,7 @@ class State:
         effector: effector positions [m], shape (k, 3).
         slack: which actuators are slack, shape (n_a,).
         condensed: condensed model at the state; learned models, and FEM in contact, evaluate it when it is first read.
-        bonds: forces in the bonds of the body [N], in the order of its model; empty if it has none.
+        row_effort: efforts of all rows of the body's model, bonds last, shape (size,); empty on the surrogate.
         velocity: effector velocities [m/s], shape (k, 3); zero without dynamics.
         motion: time, velocities and energies of the body; None without dynamics, and on the surrogate.
         stable: the equilibrium is stable whether displacements or efforts are commanded (always True on the
@@ -67,7 +67,7 @@ class State:
     nodes: np.ndarray | None = None
     velocity: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
     motion: Motion | None = None
-    bonds: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    row_effort: np.ndarray = field(default_factory=lambda: np.zeros(0))
     stable: bool = True
     uncertainty: float = 0.0
     doubt: int = 0

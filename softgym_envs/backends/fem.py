@@ -232,7 +232,7 @@ class FEMBackend(Backend):
         """
         if state.nodes is None:
             raise ValueError("the state has no deformed nodes; finite elements can only restore their own states")
-        effort = np.concatenate([state.condensed.effort, state.bonds])
+        effort = state.row_effort
         self._statics.restore(state.nodes, effort, memory=state.memory)
         if self._dynamics is not None:
             velocity = None if state.motion is None else state.motion.velocity
@@ -276,6 +276,7 @@ class FEMBackend(Backend):
             command=command.copy(),
             displacement=delta[:count].copy(),
             effort=effort[:count].copy(),
+            row_effort=effort.copy(),
             effector=delta[e].reshape(-1, 3).copy(),
             nodes=x.copy(),
         )
@@ -375,7 +376,7 @@ class FEMBackend(Backend):
             nodes=equilibrium.x,
             velocity=velocity,
             motion=motion,
-            bonds=equilibrium.effort[len(condensed.effort) :],
+            row_effort=equilibrium.effort,
             stable=equilibrium.stable,
             uncertainty=uncertainty,
             doubt=doubt,

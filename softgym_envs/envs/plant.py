@@ -183,4 +183,4 @@ def stiffened(state: State, factor: float) -> State:
         model = state.condensed
         return replace(model, compliance=model.compliance / factor, effort=factor * model.effort)
 
-    return replace(state, effort=factor * state.effort, bonds=factor * state.bonds, condensed=condensed)
+    return replace(state, effort=factor * state.effort, row_effort=factor * state.row_effort, condensed=condensed)

@@ -156,7 +156,7 @@ def test_all_forces_are_carried_by_the_servos():
     """The roots of the legs pull up with the weight of the robot."""
     model, state = rest_of()
     statics = Statics(model)
-    statics.restore(state.nodes, np.concatenate([state.condensed.effort, state.bonds]))
+    statics.restore(state.nodes, state.row_effort)
     gradient = np.zeros_like(model.nodes)
     for block in model.blocks:
         block.add(state.nodes, gradient, None, None)
