@@ -260,7 +260,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         for option in sorted({*state.options, *self._made}):
             theirs, mine = (made.get(option, "its default") for made in (state.options, self._made))
             if theirs != mine:
-                raise ValueError(f"the state belongs to a {option} = {theirs}, but the environment has {mine}")
+                raise ValueError(f"the state belongs to a {option} = {theirs:.80}, but the environment has {mine:.80}")
         self.backend.cable_friction = state.plant.cable_friction
         self.backend.resume(state.physics)
         self.plant, self._sent, self._sensed = state.plant, state.sent.copy(), state.sensed
