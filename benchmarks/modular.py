@@ -377,8 +377,9 @@ def accordion_fits() -> dict[str, object]:
     bodies = np.array([[arm[f"{dimension}_{place}"] for dimension in dimensions] for arm in arms for place in places])
     true = solve_states(MODULES[name](), bodies, dimensions, rotation=recipe.rotation, rays=0, rng=rng)
     result: dict[str, object] = {"accordions": len(bodies)}
+    every = learning.training_states(name, replace(recipe, rays=0, corners=True))  # one a body, the corners last
     for corners in (False, True):
-        states = learning.training_states(name, replace(recipe, rays=0, corners=corners))
+        states = every if corners else every.rows(np.arange(len(every)) < recipe.unloaded + recipe.bodies)
         for degree, text in ((1, "first"), (2, "second")):
             model = replace(learned_module(name), degrees=(recipe.degrees[0], degree))
             P, Q = (polynomials(model.unit(states.designs), each) for each in model.degrees)

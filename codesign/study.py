@@ -104,7 +104,9 @@ def run_study(
     except KeyboardInterrupt:
         done = len(study.result_files())
         share = f"{done} of {config.trials}" if done <= config.trials else f"{done}"
-        output.say(f"interrupted: {share} trials finished; run the same command again to continue")
+        tests = len(list(study.path.glob("finalists/trial*.json")))
+        more = f" and {tests} test{'s' * (tests != 1)} of finalists" if tests else ""
+        output.say(f"interrupted: {share} trials{more} finished; run the same command again to continue")
         raise
     results = write_results(load_study(study))
     output.verdict(results)
@@ -232,7 +234,9 @@ def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
             else:
                 goals, backends = len(study.goals["unseen"]), " and ".join(study.config.test_backends)
                 text = f"{len(snapshot.finalists)} bodies on {goals} unseen goals, {backends}"
-            output.begin("test", text, len(jobs), len(jobs) - len(missing))
+            done = len(jobs) - len(missing)
+            before = f", {done} of {len(jobs)} tests finished before" if done else ""
+            output.begin("test", text + before, len(jobs), done)
             _run_jobs(study, "finalists", missing, workers, output.tests)
 
 
