@@ -76,15 +76,16 @@ class Episode:
 
 
 def typical_goal(snapshot: StudySnapshot, results: StudyResults) -> int:
-    """Return the index of the unseen goal at which the winner gains as much as at half of all goals (the median)."""
-    tests = {group.key: group.mean.distances for group in snapshot.unseen_tests}
+    """Return the index of the unseen goal with the median gain of those that the baseline misses, or else of all."""
+    tests = {group.key: group.mean for group in snapshot.unseen_tests}
     if not results.comparison or results.baseline is None or results.winner is None:
         return 0
     row = results.comparison[0]
-    gains = np.subtract(
-        *(tests[body.trial, row.agent, row.backend] for body in (results.baseline, results.winner)),
-    )
-    return int(np.argsort(gains, kind="stable")[len(gains) // 2])
+    before, after = (tests[body.trial, row.agent, row.backend] for body in (results.baseline, results.winner))
+    missed = np.flatnonzero(before.successes < 0.5)
+    goals = missed if len(missed) else np.arange(len(before.successes))
+    gains = np.subtract(before.distances, after.distances)[goals]
+    return int(goals[np.argsort(gains, kind="stable")[len(goals) // 2]])
 
 
 def run_episodes(snapshot: StudySnapshot, results: StudyResults) -> list[Episode]:

@@ -280,8 +280,9 @@ def episode_text(episodes: Sequence[Episode]) -> str:
         return ""
     ends = " and ".join(f"{episode.distance_text(-1)} for the {episode.role}" for episode in episodes)
     text = (
-        f"Computed with finite elements at a typical goal, where the winner gains the median of all goals: "
-        f"{episodes[-1].goal_text}. The {episodes[-1].task.distance_scale.name} at the end is {ends}."
+        f"Computed with finite elements at a typical goal: {episodes[-1].goal_text}. There the winner gains the median "
+        f"of the goals that the baseline misses, or of all goals if it misses none. "
+        f"The {episodes[-1].task.distance_scale.name} at the end is {ends}."
     )
     if all(reward is None for reward in episodes[-1].rewards):
         text += f" The {len(episodes[-1].states)} moments have the commands of an episode on the surrogate."

@@ -103,6 +103,12 @@ def test_a_typical_goal_has_the_median_gain(tested):
     assert typical_goal(snapshot, collect(snapshot)) == 3
 
 
+def test_a_typical_goal_is_one_that_the_baseline_misses(tested):
+    # The gains are -3, 0, -2, -1, 1 and 2 mm. The baseline reaches only the goal with 0 mm, the upper median of all.
+    snapshot = tested([8e-3, 1e-3, 7e-3, 6e-3, 4e-3, 3e-3], FAR)
+    assert typical_goal(snapshot, collect(snapshot)) == 3
+
+
 def test_outcomes_of_goals(tested):
     snapshot = tested([1e-3, 1e-3, 4e-3, 4e-3, 4e-3, 1e-3], FAR)  # the baseline reaches the second goal only
     outcomes = goal_outcomes(snapshot, collect(snapshot))
