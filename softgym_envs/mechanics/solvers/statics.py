@@ -351,7 +351,7 @@ class Statics:
             remaining = self._norm(step_q)
             if remaining <= self.tolerance or remaining**2 > 0.1 * self.tolerance * norm:
                 break
-            closer = x + self._displacement(x, step_q)
+            closer = x + self.model.kinematics.displacement(x, step_q)  # too short to need warping
             if linear.contact.free_path(x, closer) < 1.0:
                 break
             x, effort, total, norm = closer, effort + step_effort, total + step_q, remaining
