@@ -249,7 +249,7 @@ def derivative_errors(model: MechanicalModel, x: np.ndarray, effort: np.ndarray)
 
     def evaluate(y: np.ndarray) -> list[np.ndarray]:
         assembled = model.assembly.evaluate(y, effort, model.loads)
-        assert assembled is not None, "an element is inverted"
+        assert assembled is not None and assembled.tangent is not None, "an element is inverted"
         return [array.copy() for array in (assembled.residual, assembled.tangent, assembled.gradients, assembled.delta)]
 
     residual, values, H, _ = evaluate(x)

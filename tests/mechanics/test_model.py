@@ -9,6 +9,7 @@ from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.registry import make_robot
 from softgym_envs.testing import dense_tangent
 
 ONE_TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -277,3 +278,17 @@ def test_malformed_fixed_nodes_are_rejected(fixed):
 def test_unknown_role_is_rejected(beam):
     with pytest.raises(ValueError, match="unknown role 'x'"):
         beam.add("x", beam.constraints["a"][0])
+
+
+@pytest.mark.parametrize(
+    "name", ["finger", "two_finger_gripper", "tetrapod", "trunk"]
+)  # cables, bonds, frames, chambers
+def test_equations_without_the_tangent_are_the_same(name):
+    model = make_robot(name).build()
+    effort = np.linspace(0.1, 1.0, model.assembly.size)
+    whole = evaluate(model, model.nodes, effort)
+    expected = [np.array(part) for part in (whole.residual, whole.gradients, whole.delta, whole.energy)]
+    found = model.assembly.evaluate(model.nodes, effort, model.loads, tangent=False)
+    assert found.tangent is None
+    for part, known in zip((found.residual, found.gradients, found.delta, found.energy), expected, strict=True):
+        np.testing.assert_array_equal(part, known)
