@@ -285,6 +285,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     except SoftGymError as error:
         parser.error(str(error))
+    except KeyboardInterrupt:
+        print("stopped; run the same command again to continue", file=sys.stderr)
+        return 130
     return 1 if failed else 0
 
 

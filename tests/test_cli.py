@@ -234,6 +234,14 @@ def test_a_finished_training_is_extended_and_its_folder_is_named(softgym, monkey
     assert "it is a folder; its file is run/config.yaml" in err
 
 
+def test_indices_of_a_sensitivity_study_are_explained(softgym, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["sensitivity", "--config", "finger_sensitivity", "--quiet", "method=oat", "levels=2"]
+    status, out, _ = softgym(*arguments, "bodies.variables=[poisson_ratio]", "metrics=[bending_angle]")
+    assert status == 0 and out.startswith("share: range along a variable, of that over all designs [%]; low, high: ")
+    assert "bending_angle" in out and "3 designs, 0 infeasible; wrote results/finger_sensitivity" in out
+
+
 @pytest.mark.parametrize(
     "arguments",
     [["deploy", "finger", "x.h"], ["show", "finger", "--picture", "x.png"], ["configs", "--copy", "copies"]],

@@ -45,6 +45,14 @@ def codesign(
     click.echo(f"report: {report}")
 
 
+INDICES = {
+    "oat": "share: range along a variable, of that over all designs [%]; low, high: its ends (SI units)",
+    "morris": "mu, mu_star, sigma: effects of a whole range of a variable (SI units); interval: {}",
+    "sobol": "first, total: shares of the variance, from 0 to 1; interval: {}",
+}
+"""What the numbers of `sensitivity` mean, by method."""
+
+
 @click.command()
 @options.run_options("design")
 @options.results_folder
@@ -63,6 +71,7 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
     folder = Path("results") / study.name if folder is None else folder
     with options.resumable():
         result = analyse_sensitivity(study, folder, progress=not quiet)
+    click.echo(INDICES[result.method].format(f"half widths of {100.0 * study.confidence:g} % intervals"))
     for metric, table in result.indices.items():
         keys = list(next(iter(table.values())))
         click.echo(f"\n{metric:24s} " + " ".join(f"{key:>16s}" for key in keys))

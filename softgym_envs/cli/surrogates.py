@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import click
@@ -84,10 +85,11 @@ def calibrate_trust(
     from softgym_envs.surrogate.pretrained import pretrained_folder
 
     body = options.robot_of(robot, options_)
-    found = calibrate(
-        weights or pretrained_folder(body), body, bodies=bodies, states=states, attacks=attacks, seed=seed,
-        state_folder=folder, kept_only=kept_only,
-    )  # fmt: skip
+    with nullcontext() if folder is None else options.resumable():
+        found = calibrate(
+            weights or pretrained_folder(body), body, bodies=bodies, states=states, attacks=attacks, seed=seed,
+            state_folder=folder, kept_only=kept_only,
+        )  # fmt: skip
     click.echo(json.dumps({name: asdict(row) for name, row in found.items()}, indent=2))
 
 

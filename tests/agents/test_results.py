@@ -235,3 +235,14 @@ def test_the_table_and_the_curves(swept, tmp_path):
     (tmp_path / "broken" / "seed0.json").write_text("{")
     with pytest.raises(DataError, match=r"seed0\.json' cannot be read"):
         load_runs(tmp_path)
+
+
+def test_an_interrupted_sweep_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweep, "sweep", interrupt)
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "SOFTGYM_CACHE"):
+        monkeypatch.setenv(variable, "1")  # so that what `main` sets is undone
+    assert sweep.main(["--configs", "any.yaml", "--folder", str(tmp_path)]) == 130
+    assert capsys.readouterr().err == "stopped; run the same command again to continue\n"
