@@ -107,7 +107,7 @@ def _curves(
             )
             labelled.add(label)
         ax.set(xlabel="environment steps of training", ylabel=f"{objective.axis} in training")
-        ax.legend(fontsize=8)
+        ax.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)  # above the curves, not over them
     return out[0]
 
 

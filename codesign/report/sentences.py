@@ -216,6 +216,8 @@ def _tested(snapshot: StudySnapshot) -> str:
         )
     if (finer := finalists.refinement) is not None:
         options = ", ".join(f"{name} = {value}" for name, value in finer.robot_options.items())
+        if any(isinstance(value, float) for value in finer.robot_options.values()):
+            options += " in SI units"
         text += f"; baseline and winner also on a finer mesh ({options})"
     return text
 

@@ -314,7 +314,7 @@ def test_a_body_that_fails_never_wins(written):
     assert snapshot.winner.role == "baseline" and snapshot.refinements == []
     results = collect(snapshot)
     titles = {finding.title: finding.text for finding in findings(snapshot, results)}
-    assert "trial 1: goal 2 of 6: no equilibrium" in titles["1 of 2 bodies fail on FEM"]
+    assert "They cannot win. Trial 1: goal 2 of 6: no equilibrium." in titles["1 of 2 bodies fail on FEM"]
     test = snapshot.folder.path / "finalists" / "trial0000-qp-fem-unseen.json"
     FinalistTest(0, "qp", "fem", "unseen", error="goal 1 of 6: lost").write(test)
     assert (
@@ -360,7 +360,7 @@ def test_its_report_shows_every_mesh(killed_and_continued):
     folder, *_ = killed_and_continued
     text = write_report(folder.path).read_text()
     snapshot = load_study(folder)
-    assert "FEM in the test, where episodes end" in text and "a finer mesh (mesh_size = 0.0065)" in text
+    assert "FEM in the test, where episodes end" in text and "a finer mesh (mesh_size = 0.0065 in SI units)" in text
     assert snapshot.winner.role == "finalist"
     assert "FEM, finer mesh" in text and "With the mesh” adds what is left" in text
     coarse, fine = (
