@@ -83,6 +83,11 @@ class Linearisation:
         """Whether the factorised tangent is exact and positive definite."""
         return self.exact and self._tangent.solver.positive_definite
 
+    @property
+    def negative_eigenvalues(self) -> int:
+        """How many eigenvalues of the factorised tangent are negative; -1 if that is not known."""
+        return self._tangent.solver.negative_eigenvalues
+
     def assemble(self, x: np.ndarray, effort: np.ndarray) -> Assembled | None:
         """Return the equations at rows ``x`` (n, 3) and efforts (size,), or None if an element is inverted."""
         loads = self.loads

@@ -26,7 +26,7 @@ from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.cable_friction import CableMemory
-from softgym_envs.mechanics.solvers.complementarity import complementary_step
+from softgym_envs.mechanics.solvers.complementarity import complementary_step, held_step
 from softgym_envs.mechanics.solvers.contact_rows import ContactRows
 from softgym_envs.mechanics.solvers.equilibrium import (
     CAUTIOUS,
@@ -167,8 +167,9 @@ class Statics:
             W = linear.W[driven[:, None], driven]
             unilateral = np.zeros(len(effort), dtype=bool)
             unilateral[: self._actuators] = self.unilateral
+            step = held_step if self._buckles(driven, effort) else complementary_step
             try:
-                step_effort[driven] = complementary_step(W, gap, effort[driven], unilateral[driven])
+                step_effort[driven] = step(W, gap, effort[driven], unilateral[driven])
             except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (two actuators act alike)
                 raise NewtonFailure from None
         step_q = linear.response(step_effort, 1.0) if Ar is None else linear.response(step_effort) - Ar
@@ -177,6 +178,20 @@ class Statics:
             open_by = delta[self._bonds] - target[self._bonds]
             step_effort[self._bonds] += self._assembly.bond_stiffness * open_by
         return step_q, step_effort
+
+    def _buckles(self, driven: np.ndarray, effort: np.ndarray) -> int:
+        """Return how many negative eigenvalues W has among the driven rows that carry efforts, 0 with contact.
+
+        The body would buckle if these efforts were given. It is stable with the rows held in place if its tangent has
+        as many.
+        """
+        linear = self.linearisation
+        if linear.contact is not None or linear.positive_definite or not self.unilateral.any():
+            return 0
+        loose = np.zeros(len(effort), dtype=bool)
+        loose[: self._actuators] = self.unilateral
+        held = driven[~loose[driven] | (effort[driven] > 0.0)]
+        return int((np.linalg.eigvalsh(linear.W[held[:, None], held]) < 0.0).sum())
 
     def _norm(self, step: np.ndarray) -> float:
         """Largest displacement [m] of a step of the equations."""
@@ -233,6 +248,9 @@ class Statics:
                 raise NewtonFailure
             step_q, step_effort = self._correction(None, linear.delta, effort, target, driven)
             if length == 1.0 and self._norm(step_q) <= self.tolerance:
+                negative = self._buckles(driven, self.effort)
+                if negative and negative != linear.negative_eigenvalues:
+                    raise NewtonFailure  # unstable, even with the driven rows held in place
                 return iteration
             length = min(1.0, 2.0 * length)
         raise NewtonFailure
